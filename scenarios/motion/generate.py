@@ -114,7 +114,7 @@ class Generated:
         return float(np.mean([motion.peak_c.max() < self.verification.cool_c for motion in self.motions] or [np.nan]))
 
 
-class _Rejected(Exception):
+class Rejected(Exception):
     """Reason of a rejection, as it is counted."""
 
 
@@ -159,7 +159,7 @@ def generate(
         source = usable[order.pop()]
         try:
             motions.append(_verified(vary(twin, source, s, rng), source, arm, model, clearance, verification))
-        except _Rejected as why:
+        except Rejected as why:
             rejected[str(why)] += 1
         progress(len(motions) / count)
     if not motions:
@@ -174,25 +174,25 @@ def generate(
 def _verified(
     made: Variation, source: Plan, arm: Arm, model: ArmModel, clearance: CollisionChecker, asked: Verification
 ) -> Motion:
-    """The verified motion of a variation; raises _Rejected if a check fails."""
+    """The verified motion of a variation; raises Rejected if a check fails."""
     plan = planned(made, source, model)
     every = round(CLEARANCE_STEP_S * RATE_HZ)
     postures = np.concatenate([phase.profile[::every, 0] for phase in plan.phases]).astype(float)
     payload_kg = np.concatenate([phase.payload_kg[::every] for phase in plan.phases])
     if any(clearance.deepest_collision(postures[payload_kg == kg], float(kg)) for kg in np.unique(payload_kg)):
-        raise _Rejected("collision")
+        raise Rejected("collision")
     allowed_c = asked.cool_c - asked.margin_k
     if asked.peak_c(plan).max() > allowed_c:
-        raise _Rejected("heat")
+        raise Rejected("heat")
     done = perform(arm, plan, start_c=np.full(NODES, asked.ambient_c), ambient_c=asked.ambient_c)
     if done.clipped:
-        raise _Rejected("torque clip")
+        raise Rejected("torque clip")
     if done.error_rad > asked.tracking_rad:
-        raise _Rejected("tracking")
+        raise Rejected("tracking")
     measured = done.as_plan()
     predicted_c = asked.peak_c(measured)
     if predicted_c.max() > allowed_c:
-        raise _Rejected("heat")
+        raise Rejected("heat")
     return Motion(
         plan=plan,
         source=source,
@@ -213,12 +213,12 @@ def propose(twin: Twin, source: Plan, s: float, rng: np.random.Generator, model:
 
 
 def planned(made: Variation, source: Plan, model: ArmModel) -> Plan:
-    """The plan of a variation with the torque of inverse dynamics; raises _Rejected beyond a joint or torque limit."""
+    """The plan of a variation with the torque of inverse dynamics; raises Rejected beyond a joint or torque limit."""
     phases = []
     for part in made.phases:
         tau = model.inverse_dynamics(part.q, part.qd, part.qdd, part.payload_kg)
         if broken := limit_violation(part.q, part.qd, part.qdd, tau, model.position_range):
-            raise _Rejected(broken[1].split(":")[0])
+            raise Rejected(broken[1].split(":")[0])
         profile = np.stack([part.q, part.qd, tau], axis=1).astype(np.float32)
         phases.append(Phase(profile, part.payload_kg.astype(np.float32)))
     approach, cycle, retreat = phases

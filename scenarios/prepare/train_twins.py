@@ -7,13 +7,14 @@ motion would score as difficult. `scenarios/studies/exploration.py` measures the
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from fleet.motion import Plan
-from fleet.planning.random_motions import RANDOM_MOTIONS_VERSION, light_jobs
+from fleet.planning.random_motions import RANDOM_MOTIONS_VERSION, light_jobs, random_jobs
 from scenarios.prepare.cool_motion import cool_plans, records, require_cool_plans
 from scenarios.prepare.model_cache import CachedModel, load_or_make
 from scenarios.prepare.planned_arm import ArmHardware, PlannedArm
@@ -26,13 +27,15 @@ from twin.vae.twin import Twin
 
 Array = np.ndarray
 
-REHEARSAL_VERSION = 3
+REHEARSAL_VERSION = 4
 """Raise it whenever the same arm would get other training or calibration data."""
 
-EXPLORATION, HELD_OUT, USUAL = 1, 2, 3
+EXPLORATION, HELD_OUT, HELD_OUT_WORK = 1, 2, 3
 """Spawn keys that keep the random draws of one arm apart."""
 FEWEST_HELD_OUT = 8
-"""With fewer held-out motions a twin stays uncalibrated."""
+"""With fewer held-out motions of a kind a twin stays uncalibrated."""
+MOST_DRAWS = 12
+"""Most draws of work per held-out job: little work of an arm in a hot place stays cool."""
 
 
 def train_twins(
@@ -83,8 +86,7 @@ def train_twin(
 ) -> Twin:
     """The twin of an arm: trained on its own cool motion and its exploration, and calibrated.
 
-    Half of the calibration data is new exploration, half is own work that was trained on, since own work recurs
-    unchanged. Against slow exploration alone, a fifth of fast cool work would score as unusual.
+    It is calibrated on cool jobs of two kinds, on none of which it was trained: light motions, and random work.
 
     Args:
         own: The arm's cool plans.
@@ -94,12 +96,23 @@ def train_twin(
     from twin.vae.train import train  # imports torch, which scoring does not need
 
     twin = train(trained_on, config, seed, arm=arm.hardware.robot.name, progress=progress)
-    held_out = _cool_exploration(scenario, arm, HELD_OUT)
-    if len(held_out) < FEWEST_HELD_OUT:
-        return twin
-    rng = np.random.default_rng(_draw_seed(scenario, arm, USUAL))
-    chosen = rng.choice(len(own), size=min(len(own), len(held_out)), replace=False)
-    return twin.with_calibration([(plan, 1) for plan in (*held_out, *(own[i] for i in chosen))])
+    kinds = [[(plan, 1) for plan in plans] for plans in held_out(scenario, arm)]
+    return twin.with_calibration(*kinds) if min(map(len, kinds)) >= FEWEST_HELD_OUT else twin
+
+
+def held_out(scenario: Scenario, arm: PlannedArm, *key: int) -> tuple[tuple[Plan, ...], tuple[Plan, ...]]:
+    """Cool light motions and cool random work of an arm that its twin is not trained on.
+
+    Args:
+        key: Other spawn keys give other draws.
+    """
+    work = np.random.default_rng(_draw_seed(scenario, arm, HELD_OUT_WORK, *key))
+    robot, wanted = arm.hardware.robot, scenario.twin.exploration
+    jobs = list[Plan]()
+    for _ in range(MOST_DRAWS):
+        if len(jobs) < wanted:
+            jobs += cool_plans(random_jobs(robot, wanted, work), arm.hardware, scenario.twin)
+    return _cool_exploration(scenario, arm, HELD_OUT, *key), tuple(jobs[:wanted])
 
 
 def exploration_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
@@ -107,14 +120,14 @@ def exploration_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
     return records(_cool_exploration(scenario, arm, EXPLORATION))
 
 
-def _cool_exploration(scenario: Scenario, arm: PlannedArm, draw: int) -> tuple[Plan, ...]:
-    rng = np.random.default_rng(_draw_seed(scenario, arm, draw))
+def _cool_exploration(scenario: Scenario, arm: PlannedArm, *draw: int) -> tuple[Plan, ...]:
+    rng = np.random.default_rng(_draw_seed(scenario, arm, *draw))
     light = light_jobs(arm.hardware.robot, scenario.twin.exploration, rng)
     return cool_plans(light, arm.hardware, scenario.twin)
 
 
-def _draw_seed(scenario: Scenario, arm: PlannedArm, draw: int) -> np.random.SeedSequence:
-    return np.random.SeedSequence([scenario.spread.seed, arm.index], spawn_key=(draw,))
+def _draw_seed(scenario: Scenario, arm: PlannedArm, *draw: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence([scenario.spread.seed, arm.index], spawn_key=draw)
 
 
 def arm_seed(seed: int, index: int) -> np.random.SeedSequence:
@@ -147,4 +160,5 @@ def train_or_load(
         save(train(records, config, seed, arm=arm), home)
 
     home = folder / "twins" / training_key(records, config, seed)
-    return load_or_make([CachedModel(home, load, make)], "training")[0]
+    of_same_joints = partial(load, joints=records[0].shape[-1])
+    return load_or_make([CachedModel(home, of_same_joints, make)], "training")[0]

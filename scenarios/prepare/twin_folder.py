@@ -19,12 +19,14 @@ from scenarios.progress import Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.schema import Scenario
 from twin.logs.recording import Recording
-from twin.training_data import cool_stretches
+from twin.training_data import NothingCool, cool_stretches
 from twin.vae.checkpoint import CARD as TWIN_CARD
 from twin.vae.checkpoint import load, save
 from twin.vae.config import TwinConfig
+from twin.vae.measures import Features
 from twin.vae.train import train
 from twin.vae.twin import Twin, net_names
+from twin.verdict.log_features import log_features
 
 Array = np.ndarray
 
@@ -58,10 +60,27 @@ LOADED = (0, 1, 2, 3)
 """The large motors, index 0..6, which determine whether a log is cool: idle wrists are above 40 °C."""
 
 
+HOLD_OUT = 0.3
+"""Share of the cool recordings that calibrate the twin of a log and are not trained on."""
+FEWEST_RECORDINGS = 4
+"""With fewer held-out recordings the twin of a log stays uncalibrated and is trained on all of them."""
+
+
 def train_log(
-    recordings: Sequence[Recording], config: TwinConfig, seed: int, *, cool_c: float, progress: Progress = quiet
+    recordings: Sequence[Recording],
+    config: TwinConfig,
+    seed: int,
+    *,
+    cool_c: float,
+    hold_out: float = HOLD_OUT,
+    progress: Progress = quiet,
 ) -> Twin:
     """The twin of the arm of some recordings, trained on the parts after which no large motor got warm.
+
+    Some of the recordings that are cool from start to end are held out, drawn by the seed, and calibrate the twin.
+
+    Args:
+        hold_out: Share of the cool recordings that are held out.
 
     Raises:
         FleetError: a recording has no temperatures, nothing stayed cool, or the latent space of a joint collapsed.
@@ -75,16 +94,47 @@ def train_log(
     if len(names) > 1:
         raise FleetError(f"The log holds several arms ({', '.join(names)}); train on the log of one arm.")
     config = replace(config, record_hz=config.rate_hz)
+    entropy = np.random.SeedSequence([seed, 0])
+    held_out = _held_out(recordings, config, hold_out, np.random.default_rng(entropy.spawn(1)[0]), cool_c)
+    reserved = {recording.name for recording in held_out}
+    own = [recording for recording in recordings if recording.name not in reserved]
     least_s = config.window / config.rate_hz
-    cool = cool_stretches(recordings, config.rate_hz, cool_c=cool_c, horizon_s=np.inf, joints=LOADED, least_s=least_s)
+    cool = cool_stretches(own, config.rate_hz, cool_c=cool_c, horizon_s=np.inf, joints=LOADED, least_s=least_s)
     progress("learning the log", 0.0)
-    return train(
+    twin = train(
         [stretch.profile for stretch in cool],
         config,
         np.random.SeedSequence([seed, 0]),
         arm=names[0],
         progress=lambda share: progress("learning the log", share),
     )
+    if not held_out:
+        return twin
+    features = [log_features(twin, recording) for recording in held_out]
+    return twin.calibrated_on(Features(np.stack([each.packed for each in features])), np.zeros(len(features), int))
+
+
+def _held_out(
+    recordings: Sequence[Recording], config: TwinConfig, share: float, rng: np.random.Generator, cool_c: float
+) -> list[Recording]:
+    """Recordings that are cool from start to end and last a window, to be held out; none if too few are."""
+    cool = [r for r in recordings if _is_cool(r, config, cool_c)]
+    count = round(share * len(cool))
+    if count < FEWEST_RECORDINGS:
+        return []
+    return [cool[i] for i in np.sort(rng.permutation(len(cool))[:count])]
+
+
+def _is_cool(recording: Recording, config: TwinConfig, cool_c: float) -> bool:
+    assert recording.temp_c is not None
+    if not len(recording.time_s) or recording.temp_c[:, list(LOADED)].max() >= cool_c:
+        return False
+    try:
+        least_s = config.window / config.rate_hz
+        cool_stretches([recording], config.rate_hz, cool_c=cool_c, horizon_s=np.inf, joints=LOADED, least_s=least_s)
+    except NothingCool:
+        return False
+    return True
 
 
 def arms_of(recordings: Sequence[Recording]) -> list[str]:

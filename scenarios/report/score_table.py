@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from rich.table import Table
 
-from fleet.errors import FleetError
 from fleet.files import cache_folder
 from fleet.motion import Plan
 from scenarios.job_stream import all_works
@@ -16,8 +15,11 @@ from scenarios.prepare.planned_arm import plan_arms
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
 from twin.logs.recording import Recording
-from twin.logs.resampling import Stretch, stretches
+from twin.logs.resampling import Stretch
+from twin.vae.measures import Features, Measures
 from twin.vae.twin import Twin
+from twin.verdict.log_features import log_features, log_windows
+from twin.verdict.rule import Rule, word
 
 Array = np.ndarray
 Cell = str | float | None
@@ -28,14 +30,53 @@ OMITTED = ("twin", "data", "log", "elbow", "end_s", *(f"d_{joint}" for joint in 
 """Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
 
 
-def job_rows(twin: Twin, scenario: Scenario, progress: Progress = quiet) -> list[Row]:
-    """One row per plan of the twin's arm for each work of a scenario.
+def jobs_of_arm(twin: Twin, scenario: Scenario, progress: Progress = quiet) -> list[tuple[Plan, int]]:
+    """The plans of the twin's arm for each work of a scenario, with their repetitions.
 
     Raises:
         FleetError: the scenario has no arm of the twin's name.
     """
     (arm,) = plan_arms(scenario, [scenario.index_of(twin.arm)], all_works(scenario), cache_folder(), progress)
-    return [_job_row(twin, plan, _repetitions(scenario, plan)) for plan in arm.all_plans]
+    return [(plan, _repetitions(scenario, plan)) for plan in arm.all_plans]
+
+
+def job_rows(twin: Twin, jobs: Sequence[tuple[Plan, int]]) -> list[Row]:
+    """One row of scores per job."""
+    return [_job_row(twin, plan, repetitions) for plan, repetitions in jobs]
+
+
+def log_rows(twin: Twin, recordings: Sequence[Recording]) -> list[Row]:
+    """One row of mean scores per recording.
+
+    Raises:
+        FleetError: as `twin.verdict.log_features.log_windows`.
+    """
+    return [_log_row(twin, recording) for recording in recordings]
+
+
+def _log_row(twin: Twin, recording: Recording) -> Row:
+    measures = twin.measures_of(log_features(twin, recording))
+    temp_c = recording.temp_c
+    return {
+        "recording": recording.name,
+        "minutes": recording.duration_s / 60,
+        **_scores(measures),
+        "p_value": None if measures.p_value is None else float(measures.p_value),
+        "hottest_c": None if temp_c is None else float(temp_c.max()),
+        "why": measures.why(),
+        "twin": twin.version,
+        "data": twin.data_hash,
+    }
+
+
+def with_verdicts(rows: Sequence[Row], rule: Rule, features: Features) -> list[Row]:
+    """The rows with the p-value and the verdict of a rule on their features [row, joint] before the reasons."""
+    judged = list[Row]()
+    for row, p in zip(rows, rule.p_value(features).tolist(), strict=True):
+        ends = {name: row[name] for name in ("why", "twin", "data")}
+        begins = {name: value for name, value in row.items() if name not in (*ends, "p_value")}
+        judged.append({**begins, "p_value": p, "verdict": word(p <= rule.alpha), **ends})
+    return judged
 
 
 def _repetitions(scenario: Scenario, plan: Plan) -> int:
@@ -53,10 +94,8 @@ def _job_row(twin: Twin, plan: Plan, repetitions: int) -> Row:
         "elbow": plan.elbow,
         "speed": plan.speed,
         "repetitions": repetitions,
-        "d": float(measures.total),
-        **{f"d_{j + 1}": float(d) for j, d in enumerate(measures.difficulty)},
+        **_scores(measures),
         "d_cal": None if calibrated is None else float(calibrated.max()),
-        "load": float(measures.load.sum()),
         "p_value": None if measures.p_value is None else float(measures.p_value),
         "why": measures.why(),
         "twin": twin.version,
@@ -70,42 +109,37 @@ def window_rows(twin: Twin, recording: Recording) -> list[Row]:
     Raises:
         FleetError: the recording has another number of joints than the twin, or is shorter than one window.
     """
-    if recording.joints != twin.joints:
-        raise FleetError(f"'{recording.name}' has {recording.joints} joints, the twin of '{twin.arm}' {twin.joints}.")
-    c = twin.config
-    rows = [row for stretch in stretches(recording, c.rate_hz) for row in _stretch_rows(twin, stretch)]
-    if not rows:
-        raise FleetError(
-            f"'{recording.name}' has no stretch of {c.window / c.rate_hz:g} s without a gap, which one window needs."
-        )
-    return rows
+    return [row for part in log_windows(twin, recording) for row in _stretch_rows(twin, *part)]
 
 
-def _stretch_rows(twin: Twin, stretch: Stretch) -> list[Row]:
-    c = twin.config
-    first = np.arange(0, len(stretch.profile) - c.window + 1, c.window)
-    if not len(first):
-        return []
-    inside = first[:, None] + np.arange(c.window)
-    measures = twin.measures_of(twin.window_features(stretch.profile[inside].transpose(0, 1, 3, 2)))
-    rows = []
+def _stretch_rows(twin: Twin, stretch: Stretch, first: Array, features: Features) -> list[Row]:
+    window, measures, rows = twin.config.window, twin.measures_of(features), list[Row]()
     for number, i in enumerate(first.tolist()):
         one = measures.of_job(number)
         rows.append(
             {
                 "log": stretch.recording,
                 "start_s": float(stretch.time_s[i]),
-                "end_s": float(stretch.time_s[i + c.window - 1]),
-                "d": float(one.total),
-                **{f"d_{j + 1}": float(d) for j, d in enumerate(one.difficulty)},
-                "load": float(one.load.sum()),
-                "hottest_c": None if stretch.temp_c is None else float(stretch.temp_c[i : i + c.window].max()),
+                "end_s": float(stretch.time_s[i + window - 1]),
+                **_scores(one),
+                "hottest_c": None if stretch.temp_c is None else float(stretch.temp_c[i : i + window].max()),
                 "why": one.why(),
                 "twin": twin.version,
                 "data": twin.data_hash,
             }
         )
     return rows
+
+
+def _scores(measures: Measures) -> Row:
+    """The scores of one job or window."""
+    latent = measures.total_latent
+    return {
+        "d": float(measures.total),
+        **{f"d_{j + 1}": float(d) for j, d in enumerate(measures.difficulty)},
+        "load": float(measures.total_load),
+        "latent": None if latent is None else float(latent),
+    }
 
 
 def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
@@ -123,7 +157,9 @@ def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
     table = Table(box=None, pad_edge=False, caption=caption, caption_justify="left")
     for head in (head for head in heads if head not in OMITTED):
         text = isinstance(rows[0][head], str)
-        table.add_column(SHORT.get(head, head), justify="left" if text else "right", no_wrap=not text)
+        table.add_column(
+            SHORT.get(head, head), justify="left" if text else "right", no_wrap=not text or head == "verdict"
+        )
     for row in rows:
         table.add_row(*(_cell(value) for head, value in row.items() if head not in OMITTED))
     return table

@@ -98,7 +98,8 @@ def twin_scorers(twins: dict[str, Twin], reference: Jobs) -> list[Scorer]:
         reference: Held-out cool jobs, that define the usual level for d_cal.
     """
     vae = twins[VAE]
-    calibration = Calibration(vae.features(reference.plans, reference.repetitions))
+    known = vae.features(reference.plans, reference.repetitions)
+    calibration = Calibration(known, np.zeros(len(known.packed), int))
     scorers: list[Scorer] = [
         TwinScorer(VAE, vae),
         TwinScorer("VAE weighted", vae, weighted=True),
@@ -106,6 +107,8 @@ def twin_scorers(twins: dict[str, Twin], reference: Jobs) -> list[Scorer]:
         TwinScorer("VAE torque channel", vae, lambda features: difficulty_of_error(features.errors[..., TAU])),
         TwinScorer("VAE one-sided torque", vae, attrgetter("load")),
         TwinScorer("VAE excess torque²", vae, attrgetter("excess_sq")),
+        TwinScorer("VAE load", vae, attrgetter("one_sided"), weighted=True),
+        TwinScorer("VAE latent", vae, calibration.latent, weighted=True),
     ]
     for name, twin in twins.items():
         if name != VAE:

@@ -1,7 +1,8 @@
 """Twins trained on cool logs of a real arm, tested on hot ones: the paper's claim on held-out files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,9 @@ from twin.logs.recording import Recording
 from twin.logs.resampling import Stretch, stretches
 from twin.training_data import cool_stretches
 from twin.vae.config import TwinConfig
+from twin.vae.measures import Calibration, Features
 from twin.vae.twin import Twin
-from twin.vae.window import cut, starts
+from twin.vae.window import cut, starts, windows_of
 
 Array = np.ndarray
 
@@ -53,8 +55,20 @@ class LogStudy:
     """Motor temperature at its last sample, [window, joint]."""
     peak_next_c: Array
     """Highest temperature within `AHEAD_S` after its end; nan where the recording ends before, [window, joint]."""
-    errors: Array
-    """Time mean of the absolute error in training standard deviations, [window, joint, channel]."""
+    features: Features
+    """[window, joint]."""
+    known: Features
+    """Of the training windows, [window, joint]."""
+
+    @property
+    def errors(self) -> Array:
+        """Time mean of the absolute error in training standard deviations, [window, joint, channel]."""
+        return self.features.errors
+
+    @cached_property
+    def latent(self) -> Array:
+        """Distance from the cluster of the training windows in the latent space, [window, joint]."""
+        return Calibration(self.known, np.zeros(len(self.known.packed), int)).latent(self.features)
 
     @property
     def hot(self) -> Array:
@@ -87,7 +101,8 @@ class HotAndCool:
     """Median d_2."""
     hot_difficulty: float
     ranking: dict[str, dict[str, float]]
-    """AUROC and AUPRC of hot against cool by d_2, by the error of each channel, and by RMS torque."""
+    """AUROC and AUPRC of hot against cool by d_2, by the error of each channel, by torque above the reconstruction
+    (load), by the latent distance, and by RMS torque."""
 
 
 def log_study(
@@ -102,7 +117,7 @@ def log_study(
         FleetError: too few files are cool, or none is left to test on.
         ValueError: a recording without temperatures.
     """
-    cool = [r.name for r in recordings if _temperatures(r)[:, CARRIER].max(initial=-np.inf) < HOT_C]
+    cool = [name for name, peak_c in recording_peaks(recordings).items() if peak_c < HOT_C]
     count = round(TRAIN_SHARE * len(cool))
     if not 0 < count < len(recordings):
         raise FleetError(
@@ -110,6 +125,18 @@ def log_study(
             f"{TRAIN_SHARE:.0%} of them and test on the rest needs at least two; add logs of light work."
         )
     names = {cool[i] for i in np.random.default_rng(seed).permutation(len(cool))[:count]}
+    return study_of(recordings, names, seed, config=config, folder=folder)
+
+
+def study_of(
+    recordings: Sequence[Recording],
+    names: Collection[str],
+    seed: int,
+    *,
+    config: TwinConfig = CONFIG,
+    folder: Path | None = None,
+) -> LogStudy:
+    """A twin trained on the cool parts of the named recordings, and its errors on all others; as `log_study`."""
     training, test = ([r for r in recordings if (r.name in names) == wanted] for wanted in (True, False))
     normal = cool_stretches(training, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(CARRIER,))
     records = [stretch.profile for stretch in normal]
@@ -126,7 +153,8 @@ def log_study(
     return LogStudy(
         twin=twin,
         train_files=tuple(r.name for r in training),
-        errors=twin.window_errors(joined["windows"]),
+        features=twin.window_features(joined["windows"]),
+        known=twin.window_features(windows_of(records, twin.config)),
         **joined,
     )
 
@@ -144,6 +172,7 @@ def hot_and_cool(study: LogStudy) -> HotAndCool:
         )
     errors, d = study.errors[:, CARRIER], study.difficulty[:, CARRIER]
     scores = {"d": errors.sum(axis=1), **dict(zip(CHANNELS, errors.T, strict=True))}
+    scores["load"], scores["latent"] = study.features.one_sided[:, CARRIER], study.latent[:, CARRIER]
     scores["rms_torque"] = study.rms_torque[:, CARRIER]
     cool_error, hot_error = errors[~hot].mean(axis=0), errors[hot].mean(axis=0)
     return HotAndCool(
@@ -162,6 +191,11 @@ def ranking(event: Array, scores: Mapping[str, Array]) -> dict[str, dict[str, fl
     """AUROC and AUPRC of scores [window] for an event, bool [window]: [measure][score]."""
     measures = {"auroc": roc_auc_score, "auprc": average_precision_score}
     return {m: {name: float(of(event, score)) for name, score in scores.items()} for m, of in measures.items()}
+
+
+def recording_peaks(recordings: Sequence[Recording]) -> dict[str, float]:
+    """Highest temperature of joint 2 in each recording, °C; raises ValueError for one without temperatures."""
+    return {r.name: float(_temperatures(r)[:, CARRIER].max(initial=-np.inf)) for r in recordings}
 
 
 def _temperatures(recording: Recording) -> Array:

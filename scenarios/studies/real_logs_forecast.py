@@ -40,7 +40,8 @@ class Passing:
     files_passing: int
     """Files with such windows; windows of one file are much alike."""
     auroc: dict[str, float]
-    """`d`: difficulty of joint 2 in the window. `temperature`: of joint 2 at its end. `rc, load continued`: peak
+    """`d`: difficulty of joint 2 in the window. `load`: torque above the reconstruction. `latent`: distance from cool
+    motion. `RMS torque`: of joint 2. `temperature`: of joint 2 at its end. `rc, load continued`: peak
     predicted by the identified network if the load of the window continues. `rc, load planned`: the same with q, qd,
     tau of the next five minutes, as from a plan. `all`: logistic of d, temperature and `rc, load continued`, held out
     by files. `nominal rc, …`: by the project's defaults."""
@@ -70,13 +71,29 @@ def log_rc(study: LogStudy, recordings: Sequence[Recording], *, identified: Iden
     """
     by_name = {r.name: r for r in recordings}
     arm = identified or identify([by_name[name] for name in study.train_files], arm="logged")
-    scores = {"d": study.difficulty[:, CARRIER], "temperature": study.end_c[:, CARRIER]}
+    scores = {**motion_scores(study), "temperature": study.end_c[:, CARRIER]}
     for label, twin in (("rc", RcTwin.of(arm)), ("nominal rc", RcTwin.nominal())):
         continued, planned = forecasts(study, by_name, twin)
         scores |= {f"{label}, load continued": continued, f"{label}, load planned": planned}
     complete = np.isfinite(study.peak_next_c[:, CARRIER]) & np.all([np.isfinite(s) for s in scores.values()], axis=0)
     below = complete & (study.end_c[:, CARRIER] < HOT_C)
     return LogRc(identified=arm, below=_passing(study, scores, below), every=_passing(study, scores, complete))
+
+
+def motion_scores(study: LogStudy) -> dict[str, Array]:
+    """Scores of joint 2 from the motion in the window alone, each [window]."""
+    return {
+        "d": study.difficulty[:, CARRIER],
+        "load": study.features.one_sided[:, CARRIER],
+        "latent": study.latent[:, CARRIER],
+        "RMS torque": study.rms_torque[:, CARRIER],
+    }
+
+
+def by_motion(study: LogStudy) -> Passing:
+    """The ranking by motion alone of the windows at whose end joint 2 is below 40 °C; raises as `log_rc`."""
+    known = np.isfinite(study.peak_next_c[:, CARRIER]) & (study.end_c[:, CARRIER] < HOT_C)
+    return _passing(study, motion_scores(study), known)
 
 
 def forecasts(study: LogStudy, recordings: dict[str, Recording], twin: RcTwin) -> tuple[Array, Array]:
@@ -107,7 +124,7 @@ def _passing(study: LogStudy, scores: dict[str, Array], chosen: Array) -> Passin
             "tell apart. Add logs of heavier or of lighter work."
         )
     picked = {name: values[chosen] for name, values in scores.items()}
-    if len(np.unique(files[passes])) >= FOLDS:
+    if "temperature" in picked and len(np.unique(files[passes])) >= FOLDS:
         picked["all"] = _together([picked[n] for n in ("d", "temperature", "rc, load continued")], passes, files)
     return Passing(
         windows=len(passes),

@@ -11,6 +11,7 @@ from fleet.errors import FleetError
 from scenarios.studies.real_logs import AHEAD_S, CONFIG, LogStudy, hot_and_cool, log_study, peak_within
 from twin.logs.reader import read_folder
 from twin.logs.recording import Recording
+from twin.vae.measures import PARTS, Features, moments
 from twin.vae.twin import Twin
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
@@ -54,15 +55,16 @@ def test_the_next_peak_is_unknown_past_the_end():
 
 def study_of(errors: np.ndarray, temp_2_c: np.ndarray, tau_nm: np.ndarray) -> LogStudy:
     """A study with given errors of joint 2 [window, channel]."""
-    every, temp_c = np.zeros((len(errors), 7, 3)), np.full((len(errors), 7), 30.0)
-    every[:, 1], temp_c[:, 1] = errors, temp_2_c
+    packed, temp_c = np.zeros((len(errors), 7, PARTS + moments(2))), np.full((len(errors), 7), 30.0)
+    packed[:, 1, :3], temp_c[:, 1] = errors, temp_2_c
     windows = np.zeros((len(errors), 50, 7, 3), np.float32)
     windows[:, :, 1, 2] = tau_nm[:, None]
     given: dict[str, Any] = {"twin": cast(Twin, None), "train_files": ("a",)}
-    moments = {name: np.zeros(len(errors)) for name in ("start_s", "end_s")}
+    known = Features(np.zeros((2, 7, PARTS + moments(2))))  # no latent and no load: both rank nothing
+    times = {name: np.zeros(len(errors)) for name in ("start_s", "end_s")}
     return LogStudy(
-        **given, **moments, file=np.full(len(errors), "b"), windows=windows, temp_c=temp_c, end_c=temp_c,
-        peak_next_c=temp_c, errors=every,
+        **given, **times, file=np.full(len(errors), "b"), windows=windows, temp_c=temp_c, end_c=temp_c,
+        peak_next_c=temp_c, features=Features(packed), known=known,
     )  # fmt: skip
 
 
@@ -78,10 +80,10 @@ def test_errors_are_compared_between_hot_and_cool_windows():
     assert result.hot_difficulty == pytest.approx(1 - np.exp(-1.2))
     # By hand: share of the cool windows that the hot one is above; the precision where it is found.
     assert result.ranking["auroc"] == pytest.approx(
-        {"d": 2 / 3, "q": 1.0, "qd": 1 / 3, "tau": 1.0, "rms_torque": 2 / 3}
+        {"d": 2 / 3, "q": 1.0, "qd": 1 / 3, "tau": 1.0, "load": 1 / 2, "latent": 1 / 2, "rms_torque": 2 / 3}
     )
     assert result.ranking["auprc"] == pytest.approx(
-        {"d": 1 / 2, "q": 1.0, "qd": 1 / 3, "tau": 1.0, "rms_torque": 1 / 2}
+        {"d": 1 / 2, "q": 1.0, "qd": 1 / 3, "tau": 1.0, "load": 1 / 4, "latent": 1 / 4, "rms_torque": 1 / 2}
     )
 
 

@@ -15,7 +15,7 @@ from fleet.thermal import gen3_network, thermal_model
 from scenarios.load import library, load
 from scenarios.prepare import model_cache
 from scenarios.prepare import train_twins as rehearse
-from scenarios.prepare.cool_motion import records, require_cool_plans
+from scenarios.prepare.cool_motion import cool_plans, records, require_cool_plans
 from scenarios.prepare.planned_arm import ArmHardware, PlannedArm
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
@@ -143,7 +143,7 @@ def test_other_motors_are_another_twin_since_other_exploration_stays_cool(plans,
     assert len(list((tmp_path / "twins").iterdir())) == 2
 
 
-def test_a_twin_is_told_what_is_usual_by_fresh_motion_and_as_much_of_its_own(plans, scenario, monkeypatch):
+def test_a_twin_is_calibrated_on_two_kinds_of_cool_motion_that_it_was_not_trained_on(plans, scenario, monkeypatch):
     """Second method: train on what was handed to the training, and calibrate by hand."""
     explores = replace(scenario, twin=replace(scenario.twin, exploration=9))
     (arm,) = arms(1)
@@ -151,26 +151,26 @@ def test_a_twin_is_told_what_is_usual_by_fresh_motion_and_as_much_of_its_own(pla
     monkeypatch.setattr(rehearse, "light_jobs", lambda *some: drawn.append(light_jobs(*some)) or drawn[-1])
     seed = rehearse.arm_seed(0, 0)
     own = [plan for variants in plans.values() for plan in variants]
-    assert 0 < len(own) < 9  # all of it is chosen
     twin = rehearse.train_twin(own, TINY, seed, scenario=explores, arm=arm)
-    learned, held_out = drawn
-    assert not {plan.cycle.profile.tobytes() for plan in learned} & {plan.cycle.profile.tobytes() for plan in held_out}
+    learned, light = drawn
+    light, work = rehearse.held_out(explores, arm)
+    assert (len(light), len(work)) == (9, 9)
+    motions = [{plan.cycle.profile.tobytes() for plan in some} for some in (own, learned, light, work)]
+    assert len(set.union(*motions)) == sum(map(len, motions))  # no motion is in two of them
     untold = train([*records(own), *records(learned)], TINY, seed, arm="arm_0")
     assert untold.calibration is None
-    told = twin.calibration.reference.packed
-    assert len(told) == len(held_out) + len(own)
-    by_hand = untold.features([*held_out, *own], [1] * len(told)).packed
-    assert np.allclose(np.sort(told, axis=0), np.sort(by_hand, axis=0), rtol=1e-4, atol=1e-5)
+    by_hand = untold.features([*light, *work], [1] * 18).packed
+    assert np.allclose(twin.calibration.reference.packed, by_hand, rtol=1e-4, atol=1e-5)
+    assert twin.calibration.group.tolist() == [0] * 9 + [1] * 9
 
 
-def test_of_much_own_work_only_as_much_is_usual_as_there_is_fresh_motion(plans, scenario):
+def test_held_out_work_stays_cool(scenario):
     explores = replace(scenario, twin=replace(scenario.twin, exploration=9))
     (arm,) = arms(1)
-    own = [plan for variants in plans.values() for plan in variants] * 8
-    twin = rehearse.train_twin(own, TINY, rehearse.arm_seed(0, 0), scenario=explores, arm=arm)
-    fresh = len(rehearse._cool_exploration(explores, arm, rehearse.HELD_OUT))
-    assert len(own) > fresh
-    assert len(twin.calibration.reference.packed) == 2 * fresh
+    _, work = rehearse.held_out(explores, arm)
+    assert cool_plans(work, arm.hardware, explores.twin) == work
+    other = rehearse.held_out(explores, arm, 1)[1]
+    assert not {plan.cycle.profile.tobytes() for plan in work} & {plan.cycle.profile.tobytes() for plan in other}
 
 
 def test_too_few_held_out_motions_leave_a_twin_uncalibrated(scenario):

@@ -7,6 +7,7 @@ import pytest
 
 from fleet.job import Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
+from twin.logs.recording import Recording
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.twin import Twin
@@ -69,3 +70,14 @@ def small() -> TwinConfig:
 @pytest.fixture(scope="session")
 def twin(records: list[np.ndarray], small: TwinConfig) -> Twin:
     return train(records, small, np.random.SeedSequence(3), arm="arm_0")
+
+
+@pytest.fixture(scope="session")
+def recording_of() -> Callable[[float], Recording]:
+    """A recording of smooth motion that lasts some seconds."""
+
+    def make(seconds: float) -> Recording:
+        q, qd, tau = smooth_motion(np.random.default_rng(3), seconds).astype(float).swapaxes(0, 1)
+        return Recording(name="log", time_s=np.arange(len(q)) / RATE_HZ, q=q, qd=qd, tau=tau)
+
+    return make

@@ -6,12 +6,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.distance import mahalanobis
 
 from fleet.errors import CheckpointError
 from fleet.motion import Phase
 from twin.vae.checkpoint import CARD, load, save
-from twin.vae.measures import PARTS, TIE, Calibration, Features, measures_of, score_of
-from twin.vae.window import cut, resample
+from twin.vae.measures import (
+    LEAST_VARIANCE,
+    PARTS,
+    READINGS,
+    TIE,
+    Calibration,
+    Features,
+    latent_moments,
+    measures_of,
+    score_of,
+)
+from twin.vae.window import cut, cut_jobs, resample
 
 errors = st.floats(0.0, 20.0)
 
@@ -20,9 +31,14 @@ def packed(count, rng):
     return Features(rng.gamma(3.0, 0.2, (count, 7, PARTS)))
 
 
+def calibrated(reference, *counts):
+    """A calibration on kinds of so many jobs; all of one kind by default."""
+    return Calibration(reference, np.repeat(np.arange(max(len(counts), 1)), counts or len(reference.packed)))
+
+
 @pytest.fixture(scope="module")
 def calibration():
-    return Calibration(packed(200, np.random.default_rng(0)))
+    return calibrated(packed(200, np.random.default_rng(0)))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +86,7 @@ def test_calibrated_difficulty_is_zero_at_the_median_half_at_the_95th_percentile
 
 
 def test_joints_that_never_differ_have_a_least_spread():
-    calibration = Calibration(Features(np.full((5, 7, PARTS), 0.2)))
+    calibration = calibrated(Features(np.full((5, 7, PARTS), 0.2)))
     np.testing.assert_allclose(calibration.spread, 0.01)
     assert np.all(np.isfinite(calibration.difficulty(Features(np.full((7, PARTS), 0.3)))))
 
@@ -78,17 +94,59 @@ def test_joints_that_never_differ_have_a_least_spread():
 @given(st.integers(2, 60), st.integers(0, 2**32 - 1))
 def test_the_p_value_counts_cool_jobs_that_score_as_high(count, seed):
     rng = np.random.default_rng(seed)
-    calibration = Calibration(packed(count, rng))
+    calibration, weight = calibrated(packed(count, rng)), rng.uniform(0.1, 2.0, 7)
     new = Features(np.concatenate([packed(6, rng).packed, calibration.reference.packed[:2]]))  # the last two are ties
-    reference = score_of(calibration.reference, "load")
-    for s, p in zip(score_of(new, "load"), calibration.p_value(new), strict=True):
+    reference = calibration.reference.one_sided @ weight
+    for s, p in zip(new.one_sided @ weight, calibration.p_value(new, weight), strict=True):
         assert p == (1 + sum(r >= s - TIE * abs(s) for r in reference)) / (count + 1)  # what is nearly as high counts
+
+
+def test_the_p_value_is_the_largest_over_the_kinds_of_cool_jobs(rng):
+    light, heavy = packed(30, rng), Features(packed(50, rng).packed * 1.5)
+    both, weight, new = (
+        calibrated(Features(np.concatenate([light.packed, heavy.packed])), 30, 50),
+        np.ones(7),
+        packed(20, rng),
+    )
+    for reading in READINGS:
+        if reading != "latent":  # its cluster is that of all jobs
+            each = [calibrated(kind).p_value(new, weight, reading) for kind in (light, heavy)]
+            np.testing.assert_array_equal(both.p_value(new, weight, reading), np.maximum(*each))
+    with pytest.raises(ValueError, match="No reading 'lod'; did you mean 'load'"):
+        both.p_value(new, weight, "lod")
+
+
+def test_the_latent_distance_is_that_of_mahalanobis_averaged_over_time(rng):
+    """Second method: scipy, window by window. Over the calibration its mean square is the number of latent units."""
+    mu = rng.normal(size=(60, 7, 2)) @ rng.normal(size=(2, 2)) + 3.0  # [window, joint, latent]
+    windows = Features(np.concatenate([np.zeros((60, 7, PARTS)), latent_moments(mu)], axis=-1))
+    jobs = Features(windows.packed.reshape(20, 3, 7, -1).mean(axis=1))  # three windows each
+    known = calibrated(jobs)
+    np.testing.assert_allclose((known.latent(jobs) ** 2).mean(axis=0), 2.0, rtol=1e-2)
+    for j in range(7):
+        inverse = np.linalg.inv(np.cov(mu[:, j].T, bias=True) + LEAST_VARIANCE * np.eye(2))
+        want = [mahalanobis(each, mu[:, j].mean(axis=0), inverse) for each in mu[:, j]]
+        np.testing.assert_allclose(known.latent(windows)[:, j], want, rtol=1e-9)
+        np.testing.assert_allclose(
+            known.latent(jobs)[:, j] ** 2, np.square(want).reshape(20, 3).mean(axis=1), rtol=1e-9
+        )
+
+
+def test_a_twin_places_motion_in_its_latent_space(known, jobs):
+    """Second method: the posterior of each window."""
+    plan, times = jobs[3]
+    reading = cut_jobs([plan], [times], known.config)
+    mu, _ = known.posterior(reading.windows)
+    weight = reading.weight.sum(axis=1)
+    mean, square = known.features([plan], [times]).latent_moments
+    np.testing.assert_allclose(mean[0], np.einsum("b,bjl->jl", weight, mu), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(square[0], np.einsum("b,bjl,bjm->jlm", weight, mu, mu), rtol=1e-4, atol=1e-5)
 
 
 def test_cool_jobs_raise_false_alarms_as_often_as_asked():
     """Split conformal: over many calibrations, P(p ≤ α) ≤ α for exchangeable jobs."""
     rng = np.random.default_rng(2)
-    alarms = np.concatenate([Calibration(packed(39, rng)).p_value(packed(20, rng)) for _ in range(300)])
+    alarms = np.concatenate([calibrated(packed(39, rng)).p_value(packed(20, rng), np.ones(7)) for _ in range(300)])
     for alpha in (0.05, 0.1, 0.25):
         assert np.mean(alarms <= alpha) == pytest.approx(alpha, abs=0.012)
 
@@ -111,7 +169,9 @@ def test_a_score_may_be_one_joint_and_must_exist(calibration, rng):
 @pytest.mark.parametrize("shape", [(1, 7, PARTS), (7, PARTS)])
 def test_a_calibration_needs_some_jobs(shape):
     with pytest.raises(ValueError, match="two or more held-out cool jobs"):
-        Calibration(Features(np.zeros(shape)))
+        Calibration(Features(np.zeros(shape)), np.zeros(shape[0], int))
+    with pytest.raises(ValueError, match="one group per job"):
+        Calibration(Features(np.zeros((4, 7, PARTS))), np.zeros(3, int))
     with pytest.raises(ValueError, match="must be"):
         Features(np.zeros((7, 3)))
 

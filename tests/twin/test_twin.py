@@ -197,4 +197,4 @@ def test_a_twin_needs_its_networks(twin):
 
 def test_a_calibration_of_another_arm_is_refused(twin):
     with pytest.raises(ValueError, match="calibration is for 6 joints, the twin has 7"):
-        replace(twin, calibration=Calibration(Features(np.zeros((4, 6, PARTS)))))
+        replace(twin, calibration=Calibration(Features(np.zeros((4, 6, PARTS))), np.zeros(4, int)))

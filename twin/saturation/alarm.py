@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import beta
 
 from fleet.errors import FleetError
+from twin.conformal import allowed, fewest, rate_interval
 
 Array = np.ndarray
 
@@ -37,9 +37,8 @@ class ConformalAlarm:
         if list(self.scores) != sorted(self.scores):
             raise ValueError("ConformalAlarm.scores must be sorted.")
         if self._allowed() < 1:
-            least = int(np.ceil(1 / self.alpha - 1 - 1e-9))
             raise TooFewJobs(
-                f"A false-alarm rate of {self.alpha:g} needs {least} or more jobs without the event "
+                f"A false-alarm rate of {self.alpha:g} needs {fewest(self.alpha)} or more jobs without the event "
                 f"(got {len(self.scores)}). Collect more jobs, or choose a larger alpha."
             )
 
@@ -63,15 +62,9 @@ class ConformalAlarm:
         return ~(np.asarray(score, dtype=float) <= self.threshold)
 
     def spread(self, confidence: float = 0.9) -> tuple[float, float]:
-        """Interval of the rate of false alarms of this one calibration, for scores without ties.
-
-        Given the calibration, the rate is Beta(m, n + 1 − m), m = floor(alpha (n + 1)) (Vovk 2012, Prop. 2a).
-        """
-        m = self._allowed()
-        tail = 0.5 * (1 - confidence)
-        low, high = beta.ppf([tail, 1 - tail], m, len(self.scores) + 1 - m)
-        return float(low), float(high)
+        """Interval of the rate of false alarms of this one calibration; see `twin.conformal.rate_interval`."""
+        return rate_interval(len(self.scores), self.alpha, confidence)
 
     def _allowed(self) -> int:
-        """floor(alpha (n + 1)): how far from the top the threshold lies."""
-        return int(np.floor(self.alpha * (len(self.scores) + 1) + 1e-9))
+        """How far from the top the threshold lies."""
+        return allowed(len(self.scores), self.alpha)

@@ -23,8 +23,9 @@ Array = np.ndarray
 FORMAT = 3
 WEIGHTS = "weights.safetensors"
 CARD = "twin.json"
-REFERENCE = "calibration.reference"
-"""Tensor with the features of held-out cool jobs, float64 [job, joint, part]; absent without a calibration."""
+REFERENCE, GROUP = "calibration.reference", "calibration.group"
+"""Tensors with the features of held-out cool jobs, float64 [job, joint, part], and their kinds, int64 [job]; absent
+without a calibration."""
 
 
 class _Card(msgspec.Struct, forbid_unknown_fields=True):
@@ -53,6 +54,7 @@ def save(twin: Twin, folder: Path) -> None:
     tensors = twin.tensors()
     if twin.calibration is not None:
         tensors[REFERENCE] = np.array(twin.calibration.reference.packed, dtype=float)
+        tensors[GROUP] = np.array(twin.calibration.group, dtype=np.int64)
     with atomic_path(folder / WEIGHTS) as draft:
         save_file(tensors, draft)
     shared = {name: getattr(twin, name) for name in _SHARED}
@@ -77,7 +79,7 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
     wanted = shapes(card.config, card.config.channels(joints))
     try:
         tensors = load_file(folder / WEIGHTS)
-        calibration = Calibration(Features(tensors.pop(REFERENCE))) if card.calibrated else None
+        calibration = Calibration(Features(tensors.pop(REFERENCE)), tensors.pop(GROUP)) if card.calibrated else None
         nets = [
             {name: _tensor(tensors, f"{net}.{name}", shape) for name, shape in wanted.items()}
             for net in net_names(card.config, joints)

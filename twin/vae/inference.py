@@ -137,9 +137,18 @@ def decode(networks: Networks, latent: Array, steps: int) -> Array:
     return _in_chunks(lambda part: (networks.decode(part, steps),), np.asarray(latent, dtype=np.float32))[0]
 
 
-def reconstruct(networks: Networks, z: Array) -> Array:
-    """Windows [batch, time, joint, channel] decoded from the means of their posteriors, float32."""
-    return _in_chunks(lambda part: (networks.decode(networks.encode(part)[0], z.shape[1]),), z)[0]
+def reconstruct(networks: Networks, z: Array) -> tuple[Array, Array]:
+    """Windows [batch, time, joint, channel] decoded from the means of their posteriors, float32, and these means.
+
+    The means are [batch, net, latent].
+    """
+
+    def both(part: Array) -> tuple[Array, Array]:
+        mu = networks.encode(part)[0]
+        return networks.decode(mu, z.shape[1]), mu
+
+    z_hat, mu = _in_chunks(both, z)
+    return z_hat, mu
 
 
 def _in_chunks(function: Callable[[Array], tuple[Array, ...]], values: Array) -> list[Array]:

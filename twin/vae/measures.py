@@ -13,7 +13,7 @@ import numpy as np
 from fleet.difficulty import difficulty_of_error
 from fleet.errors import nearest
 from fleet.motion import CHANNELS
-from twin.conformal import p_value
+from twin.conformal import largest_p_value
 
 Array = np.ndarray
 
@@ -23,7 +23,10 @@ LEAST_SPREAD = 0.01
 """Least p95 − median of a joint's error, z units: below it, held-out jobs differ by rounding and sensor noise."""
 TAU = CHANNELS.index("tau")
 PARTS = len(CHANNELS) + 3
-"""Numbers per joint in packed features: error of each channel, one-sided torque error, excess tau², tau²."""
+"""First numbers per joint in packed features: error of each channel, one-sided torque error, excess tau², tau². The
+time means of mu and of the upper triangle of mu muᵀ may follow, mu the posterior mean of the joint's network."""
+LEAST_VARIANCE = 1e-4
+"""Added to the variances of the latent cluster: a unit that is not used does not vary."""
 TIE = 1e-5
 """Scores closer than this relative difference are equal: the last digits of float32 depend on the batch, and counting
 a tie as higher keeps the p-value valid."""
@@ -37,8 +40,16 @@ class Features:
     """[..., joint, part]; see `PARTS`."""
 
     def __post_init__(self) -> None:
-        if self.packed.ndim < 2 or self.packed.shape[-1] != PARTS:
-            raise ValueError(f"Features.packed must be [..., joint, {PARTS}] (got {self.packed.shape}).")
+        if self.packed.ndim < 2 or self.packed.shape[-1] != PARTS + moments(self.latent):
+            raise ValueError(
+                f"Features.packed must be [..., joint, {PARTS} + moments of the latent] (got {self.packed.shape})."
+            )
+
+    @property
+    def latent(self) -> int:
+        """Latent units of which the moments are known."""
+        extra = max(0, self.packed.shape[-1] - PARTS)
+        return int((np.sqrt(9 + 8 * extra) - 3) // 2)
 
     @property
     def errors(self) -> Array:
@@ -70,6 +81,27 @@ class Features:
         """One-sided torque difficulty 1 − exp(−one-sided error), [..., joint], each in [0, 1)."""
         return _saturated(self.one_sided)
 
+    @property
+    def latent_moments(self) -> tuple[Array, Array]:
+        """Time means of mu, [..., joint, latent], and of mu muᵀ, [..., joint, latent, latent]."""
+        size = self.latent
+        mean, second = np.split(self.packed[..., PARTS:], [size], axis=-1)
+        square = np.empty((*mean.shape, size))
+        rows, columns = np.triu_indices(size)
+        square[..., rows, columns] = square[..., columns, rows] = second
+        return mean, square
+
+
+def moments(latent: int) -> int:
+    """Number of latent moments in packed features: means, and the upper triangle of the second moments."""
+    return latent * (latent + 3) // 2
+
+
+def latent_moments(mu: Array) -> Array:
+    """mu and the upper triangle of mu muᵀ of posterior means [..., latent], [..., moment]."""
+    rows, columns = np.triu_indices(mu.shape[-1])
+    return np.concatenate([mu, mu[..., rows] * mu[..., columns]], axis=-1)
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
@@ -77,8 +109,14 @@ class Calibration:
 
     reference: Features
     """[job, joint, part]."""
+    group: Array
+    """Kind of each job, int [job]: the jobs of one kind are exchangeable, those of different kinds need not be."""
 
     def __post_init__(self) -> None:
+        if self.group.shape != self.reference.packed.shape[:1]:
+            raise ValueError(
+                f"A calibration needs one group per job (got {self.group.shape} for {self.reference.packed.shape})."
+            )
         if self.reference.packed.ndim != 3 or len(self.reference.packed) < 2:
             raise ValueError(
                 "A calibration needs the features of two or more held-out cool jobs, better a hundred "
@@ -109,14 +147,57 @@ class Calibration:
         beyond = np.maximum(features.errors.sum(axis=-1) - self.floor, 0.0) / self.spread
         return _saturated(np.log(2) * beyond)
 
-    def p_value(self, features: Features) -> Array:
-        """Share of cool jobs whose score `load` is as high, [...]; see `twin.conformal.p_value`.
+    @cached_property
+    def cluster(self) -> tuple[Array, Array]:
+        """Centre [joint, latent] and inverse covariance [joint, latent, latent] of the cool jobs' latents."""
+        mean, second = (each.mean(axis=0) for each in self.reference.latent_moments)
+        covariance = second - mean[..., None] * mean[..., None, :]
+        return mean, np.linalg.inv(covariance + LEAST_VARIANCE * np.eye(mean.shape[-1]))
 
-        Valid for cool jobs exchangeable with the reference (one-class: Bates et al., Annals of Statistics 51, 2023),
-        not for light motion of a new kind.
+    def latent(self, features: Features) -> Array:
+        """RMS Mahalanobis distance of the motion's latents from the cluster of the cool jobs, [..., joint].
+
+        Over all windows of these cool jobs its mean square is the number of latent units. Zero without latents.
         """
-        scores = score_of(features, "load")
-        return p_value(np.sort(score_of(self.reference, "load")), scores - TIE * np.abs(scores))
+        (centre, inverse), (mean, second) = self.cluster, features.latent_moments
+        square = (
+            np.einsum("jab,...jab->...j", inverse, second)
+            - 2 * np.einsum("jab,ja,...jb->...j", inverse, centre, mean)
+            + np.einsum("jab,ja,jb->j", inverse, centre, centre)
+        )
+        return np.sqrt(np.maximum(square, 0.0))
+
+    def p_value(self, features: Features, weight: Array, reading: str = "load") -> Array:
+        """Largest p-value against the kinds of cool jobs, [...]; see `twin.conformal.largest_p_value`.
+
+        Valid for a job exchangeable with the cool jobs of one kind (one-class: Bates et al., Annals of Statistics 51,
+        2023).
+
+        Args:
+            weight: w_k of the joints, [joint].
+            reading: One of `READINGS`.
+
+        Raises:
+            ValueError: another reading.
+        """
+        if reading not in READINGS:
+            raise ValueError(f"No reading '{reading}'{nearest(reading, READINGS)}")
+        reference, scores = (READINGS[reading](each, self) @ weight for each in (self.reference, features))
+        return largest_p_value(reference, self.group, scores - TIE * np.abs(scores))
+
+    @property
+    def smallest_group(self) -> int:
+        """Number of jobs of the kind with the fewest."""
+        return int(np.unique(self.group, return_counts=True)[1].min())
+
+
+READINGS: Mapping[str, Callable[[Features, Calibration], Array]] = {
+    "load": lambda features, _: features.one_sided,
+    "d": lambda features, _: features.difficulty,
+    "latent": lambda features, calibration: calibration.latent(features),
+}
+"""Scores [..., joint] that a verdict may use; the joints are summed with the weights of d. The torque error is not put
+through 1 − exp(−e), which is flat where the heat is (`scenarios.studies.verdict.readings`)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -131,6 +212,8 @@ class Measures:
     """d_k measured from the median of cool jobs, [joint]; None without a calibration."""
     load: Array
     """One-sided torque difficulty, [joint]: counts only torque above the reconstruction."""
+    latent: Array | None
+    """Distance from the cluster of cool jobs in the latent space, [joint]; None without a calibration."""
     shares: Array
     """Share of each joint and channel in the error above the median of cool jobs (in all error, without a calibration),
     [joint, channel]. Sums to one, or to zero without such error."""
@@ -145,6 +228,16 @@ class Measures:
     def total(self) -> Array:
         """d = Σ_k w_k d_k, scalar."""
         return self.difficulty @ self.weight
+
+    @property
+    def total_load(self) -> Array:
+        """Torque above the reconstruction, training standard deviations, mean of the joints weighted by w_k, scalar."""
+        return -np.log1p(-self.load) @ (self.weight / self.weight.sum())
+
+    @property
+    def total_latent(self) -> Array | None:
+        """Σ_k w_k latent_k / Σ_k w_k, scalar; None without a calibration."""
+        return None if self.latent is None else self.latent @ (self.weight / self.weight.sum())
 
     def of_job(self, i: int) -> "Measures":
         """The measures of one of many jobs."""
@@ -183,9 +276,10 @@ def measures_of(features: Features, calibration: Calibration | None, *, weight: 
         weight=weight,
         calibrated=None if calibration is None else calibration.difficulty(features),
         load=features.load,
+        latent=None if calibration is None else calibration.latent(features),
         shares=np.divide(beyond, whole, out=np.zeros_like(beyond), where=whole > 0),
         heavier=features.one_sided > 0.5 * features.errors[..., TAU],
-        p_value=None if calibration is None else calibration.p_value(features),
+        p_value=None if calibration is None else calibration.p_value(features, weight),
         version=version,
     )
 

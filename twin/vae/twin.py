@@ -13,7 +13,7 @@ from fleet.motion import CHANNELS, Plan
 from twin.plan_cache import PlanCache
 from twin.vae import inference
 from twin.vae.config import TwinConfig
-from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, measures_of
+from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, latent_moments, measures_of, moments
 from twin.vae.window import PHASES, Scaler, check_jobs, cut_phases
 
 Array = np.ndarray
@@ -109,6 +109,7 @@ class Twin:
             digest.update(tensor.tobytes())
         if self.calibration is not None:
             digest.update(np.ascontiguousarray(self.calibration.reference.packed, dtype=float).tobytes())
+            digest.update(np.ascontiguousarray(self.calibration.group, dtype=np.int64).tobytes())
         return digest.hexdigest()[:16]
 
     def tensors(self) -> dict[str, Array]:
@@ -140,14 +141,22 @@ class Twin:
         """All measures of this twin's features, of jobs or of windows."""
         return measures_of(features, self.calibration, weight=self.joint_weight, version=self.version)
 
-    def with_calibration(self, jobs: Sequence[tuple[Plan, int]]) -> "Twin":
+    def with_calibration(self, *kinds: Sequence[tuple[Plan, int]]) -> "Twin":
         """The same twin, calibrated on held-out cool jobs (plan, repetitions).
+
+        Args:
+            kinds: Jobs of each kind; those of one kind are exchangeable.
 
         Raises:
             ValueError: fewer than two jobs.
         """
+        jobs = [job for kind in kinds for job in kind]
         reference = self.features([plan for plan, _ in jobs], [times for _, times in jobs])
-        return replace(self, calibration=Calibration(reference))
+        return self.calibrated_on(reference, np.repeat(np.arange(len(kinds)), [len(kind) for kind in kinds]))
+
+    def calibrated_on(self, reference: Features, group: Array) -> "Twin":
+        """The same twin, calibrated on features of held-out cool jobs [job, joint] of several kinds, int [job]."""
+        return replace(self, calibration=Calibration(reference, group))
 
     def features(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Features:
         """Time means over whole jobs, [job, joint]; new plans go through the networks together.
@@ -161,7 +170,8 @@ class Twin:
             self._score_phases(new[first : first + _CHUNK])
         weights = [plan.weights(times) for plan, times in zip(plans, repetitions, strict=True)]
         shares = np.reshape(weights, (len(plans), len(PHASES)))
-        packed = np.reshape([self._scored[plan] for plan in plans], (*shares.shape, self.joints, PARTS))
+        parts = PARTS + moments(self.config.latent)
+        packed = np.reshape([self._scored[plan] for plan in plans], (*shares.shape, self.joints, parts))
         return Features(np.einsum("np,npjf->njf", shares, packed))
 
     def window_features(self, windows: Array) -> Features:
@@ -185,7 +195,7 @@ class Twin:
 
     def reconstruct(self, windows: Array) -> Array:
         """Reconstructed windows, SI units, [batch, time, joint, channel]; angles near the training data."""
-        return self.scaler.to_si(inference.reconstruct(self.networks, self._to_z(windows)))
+        return self.scaler.to_si(inference.reconstruct(self.networks, self._to_z(windows))[0])
 
     def _to_z(self, windows: Array) -> Array:
         wanted = (self.config.window, self.joints, len(CHANNELS))
@@ -211,7 +221,7 @@ class Twin:
 
     def _window_features(self, z: Array, weights: Array) -> Array:
         """Packed features of windows in z-scores, summed over time with weights [batch, time], [batch, joint, part]."""
-        z_hat = inference.reconstruct(self.networks, z)
+        z_hat, mu = inference.reconstruct(self.networks, z)
         std = self.scaler.std[:, TAU]
         offset = (self.scaler.mean[:, TAU] / std).astype(np.float32)
         size, size_hat = np.abs(z[..., TAU] + offset), np.abs(z_hat[..., TAU] + offset)
@@ -222,8 +232,11 @@ class Twin:
         np.square(size, out=parts[-1])
         np.maximum(parts[-1] - np.square(size_hat), 0.0, out=parts[-2])
         means = np.matmul(weights[:, None].astype(np.float32), parts)[:, :, 0]  # [part, batch, joint]
-        packed = means.transpose(1, 2, 0).astype(float)
-        packed[..., -2:] *= std[:, None] ** 2
+        packed = np.empty((len(z), self.joints, PARTS + moments(mu.shape[-1])))
+        packed[..., :PARTS] = means.transpose(1, 2, 0)
+        packed[..., PARTS - 2 : PARTS] *= std[:, None] ** 2
+        # One network of the whole arm has one latent for all joints.
+        packed[..., PARTS:] = weights.sum(axis=1)[:, None, None] * latent_moments(mu.astype(float))
         return packed
 
 

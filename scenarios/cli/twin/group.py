@@ -14,6 +14,7 @@ from scenarios.cli import options
 from scenarios.cli.studies.sweep import parsimony_command, sweep_command
 from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
 from scenarios.cli.twin.motion import export_command, generate_command, identify_command, recover_command
+from scenarios.cli.twin.verdict import questions_command, readings_command, sides_command, verdict_command
 from scenarios.load import load
 from scenarios.schema_errors import choose
 
@@ -54,6 +55,9 @@ def train_command(
         float,
         options.number("--log: temperature limit of motors 1 to 4 for training data, °C.", 0, 200),
     ] = 40.0,
+    hold_out: Annotated[
+        float, options.number("--log: share of the cool recordings held out to calibrate verdicts.", 0, 0.9)
+    ] = 0.3,
     allow_collapse: Annotated[
         bool, typer.Option("--allow-collapse", help="Keep a twin whose latent space collapsed, as a baseline.")
     ] = False,
@@ -87,7 +91,7 @@ def train_command(
         if log is not None:
             config = config_of(size or "quick", given, of_log=True)
             recordings = options.recordings_of(log, skip_damaged)
-            twins = [train_log(recordings, config, seed or 0, cool_c=cool, progress=progress)]
+            twins = [train_log(recordings, config, seed or 0, cool_c=cool, hold_out=hold_out, progress=progress)]
             source = f"log {log}"
         else:
             of_scenario = load(str(scenario))
@@ -120,12 +124,12 @@ def score_command(
     check_source(scenario, log)
     choose("format", format_, Literal["table", "csv", "json"])
     from scenarios.prepare.twin_folder import open_twin
-    from scenarios.report.score_table import job_rows, render, window_rows
+    from scenarios.report.score_table import job_rows, jobs_of_arm, render, window_rows
 
     chosen, twin = load(scenario) if scenario else None, open_twin(twins, arm)
     if chosen is not None:
         with progress_bar() as progress:
-            rows = job_rows(twin, chosen, progress)
+            rows = job_rows(twin, jobs_of_arm(twin, chosen, progress))
     else:
         recordings = options.recordings_of(Path(str(log)), skip_damaged)
         rows = [row for recording in recordings for row in window_rows(twin, recording)]
@@ -142,6 +146,10 @@ twin_app.command("recover")(recover_command)
 twin_app.command("export")(export_command)
 twin_app.command("sweep")(sweep_command)
 twin_app.command("parsimony")(parsimony_command)
+twin_app.command("verdict")(verdict_command)
+twin_app.command("readings")(readings_command)
+twin_app.command("sides")(sides_command)
+twin_app.command("questions")(questions_command)
 
 
 @twin_app.command("reliability")

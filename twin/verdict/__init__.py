@@ -1,0 +1,1 @@
+"""Uncritical or anomalous: verdicts on jobs and recordings."""
