@@ -24,6 +24,7 @@ CarrierOption = Annotated[
     bool,
     typer.Option("--carrier-only", help="Train networks up to the carrying joint only: faster, d of it alone."),
 ]
+ShowOption = Annotated[bool, typer.Option("--show", help="Compute nothing: print the rows of the file.")]
 FormatOption = Annotated[str, typer.Option("--format", help="table, markdown or json.")]
 
 
@@ -37,6 +38,7 @@ def sweep_command(
     test: TestOption = 600,
     carrier_only: CarrierOption = False,
     only: Annotated[str | None, typer.Option(help="Configurations, separated by commas; default: all.")] = None,
+    show_only: ShowOption = False,
     format_: FormatOption = "table",
 ) -> None:
     """Train twins under many configurations, the paper's own among them, and compare how d ranks jobs.
@@ -49,7 +51,7 @@ def sweep_command(
     from scenarios.studies.sweep.configurations import CONFIGURATIONS
     from scenarios.studies.sweep.measure import sweep
     from scenarios.studies.sweep.rows import Rows
-    from scenarios.studies.sweep.table import HEADS, lines_of
+    from scenarios.studies.sweep.table import lines_of, table_of
 
     names = list(CONFIGURATIONS) if only is None else [name.strip() for name in only.split(",")]
     for name in names:
@@ -59,13 +61,13 @@ def sweep_command(
     subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=carrier_only)
     rows = Rows(out)
     with progress_bar(kept="Finished rows are") as progress:
-        wanted = sweep(subjects, chosen, rows, progress=progress)
+        wanted = sweep(subjects, chosen, rows, compute=not show_only, progress=progress)
     if format_ == "json":
         print_json(wanted)
         return
-    cells = [line.cells() for line in lines_of(wanted, chosen)]
+    heads, cells = table_of(lines_of(wanted, chosen))
     caption = "in brackets: paired difference to ours, ± half its 95 % interval over the arms; * if it excludes zero"
-    show(HEADS, cells, format_, title=f"d of the carrying joint on {len(subjects)} arms", caption=caption)
+    show(heads, cells, format_, title=f"d of the carrying joint on {len(subjects)} arms", caption=caption)
 
 
 def places(text: str) -> list[int]:
@@ -91,6 +93,7 @@ def parsimony_command(
     arms: ArmsOption = "0,2",
     seeds: SeedsOption = 1,
     test: TestOption = 600,
+    show_only: ShowOption = False,
     format_: FormatOption = "table",
 ) -> None:
     """Compare twins and temperature regressors trained on more and more jobs: how much data each needs.
@@ -105,7 +108,7 @@ def parsimony_command(
 
     subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=True)
     with progress_bar(kept="Finished rows are") as progress:
-        rows = parsimony(subjects, Rows(out), progress=progress)
+        rows = parsimony(subjects, Rows(out), compute=not show_only, progress=progress)
     if format_ == "json":
         print_json(rows)
         return

@@ -37,9 +37,13 @@ def sweep(
     configurations: Mapping[str, Configuration],
     rows: Rows,
     *,
+    compute: bool = True,
     progress: Progress = quiet,
 ) -> list[Row]:
     """Append the missing rows to the file; return those of all these configurations and subjects.
+
+    Args:
+        compute: Whether to compute missing rows; else those in the file are returned.
 
     Raises:
         FleetError: all jobs of a subject are critical, or none is.
@@ -50,7 +54,7 @@ def sweep(
     for done, (name, configuration) in enumerate(configurations.items()):
         progress("sweeping", Count(done, len(configurations)))
         keys = {key_of(name, configuration.config, subject): subject for subject in subjects}
-        missing = {key: subject for key, subject in keys.items() if key not in rows}
+        missing = {key: subject for key, subject in keys.items() if key not in rows and compute}
         wanted += keys
         for subject in missing.values():
             if subject.name not in studies:
@@ -69,7 +73,7 @@ def sweep(
             }
             rows.append(key, row | {"epochs": configuration.config.epochs, "cpu_s": round(cpu_s, 2)})
     progress("sweeping", 1.0)
-    return [rows.by_key[key] for key in wanted]
+    return rows.some(wanted)
 
 
 def key_of(name: str, config: TwinConfig, subject: Subject) -> str:

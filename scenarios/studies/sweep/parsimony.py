@@ -38,8 +38,13 @@ KNEE = 0.02
 """The knee is the least data whose measure is within this of that with most."""
 
 
-def parsimony(subjects: Sequence[Subject], rows: Rows, *, progress: Progress = quiet) -> list[Row]:
+def parsimony(
+    subjects: Sequence[Subject], rows: Rows, *, compute: bool = True, progress: Progress = quiet
+) -> list[Row]:
     """Append the missing rows, one for each subject, number of jobs and model; return all of them.
+
+    Args:
+        compute: Whether to compute missing rows; else those in the file are returned.
 
     Raises:
         FleetError: all test jobs of a subject are critical, or none is.
@@ -49,7 +54,7 @@ def parsimony(subjects: Sequence[Subject], rows: Rows, *, progress: Progress = q
         progress("computing data parsimony", Count(done, len(subjects)))
         keys = {(model, jobs): _key(model, jobs, subject) for jobs in JOBS for model in MODELS}
         wanted += keys.values()
-        if all(key in rows for key in keys.values()):
+        if not compute or all(key in rows for key in keys.values()):
             continue
         study, hot = subject.study(), subject.any_motion()
         for (model, jobs), key in keys.items():
@@ -57,7 +62,7 @@ def parsimony(subjects: Sequence[Subject], rows: Rows, *, progress: Progress = q
                 card = {"model": model, "jobs": jobs, "subject": subject.name}
                 rows.append(key, card | _row(model, jobs, subject, study, hot))
     progress("computing data parsimony", 1.0)
-    return [rows.by_key[key] for key in wanted]
+    return rows.some(wanted)
 
 
 def _key(model: str, jobs: int, subject: Subject) -> str:

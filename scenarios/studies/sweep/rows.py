@@ -1,7 +1,7 @@
 """Results of a long study as JSON lines: each row is appended when it is known, so a stopped study goes on."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any  # JSON values
 
@@ -36,6 +36,10 @@ class Rows:
 
     def __contains__(self, key: str) -> bool:
         return key in self.by_key
+
+    def some(self, keys: Iterable[str]) -> list[Row]:
+        """The rows of these keys that are there."""
+        return [self.by_key[key] for key in keys if key in self.by_key]
 
     def append(self, key: str, row: Mapping[str, Any]) -> None:
         """Add a row to the file."""

@@ -55,13 +55,13 @@ class Line:
     plain: Mapping[str, float]
     """Means, by the names of `PLAIN`."""
 
-    def cells(self) -> list[str]:
-        """The line as text: group, configuration, measures, plain numbers and the number of subjects."""
+    def cells(self, columns: Iterable[str]) -> list[str]:
+        """The line as text: group, configuration, these measures, plain numbers and the number of subjects."""
         units, nats, epochs, cpu_s = (self.plain[name] for name in PLAIN)
         return [
             self.configuration.group,
             self.configuration.label,
-            *(str(self.measures.get(column, "–")) for column in COLUMNS),
+            *(str(self.measures.get(column, "–")) for column in columns),
             f"{units:.1f}",
             f"{nats:.2f}",
             f"{epochs:.0f}",
@@ -70,7 +70,11 @@ class Line:
         ]
 
 
-HEADS = ("group", "configuration", *COLUMNS, *PLAIN, "arms")
+def table_of(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
+    """Heads and cells; columns that no line has are left out."""
+    columns = [column for column in COLUMNS if any(column in line.measures for line in lines)]
+    heads = ["group", "configuration", *columns, *PLAIN, "arms"]
+    return heads, [line.cells(columns) for line in lines]
 
 
 def lines_of(rows: Iterable[Row], configurations: Mapping[str, Configuration]) -> list[Line]:
