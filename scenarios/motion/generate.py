@@ -208,7 +208,7 @@ def propose(twin: Twin, source: Plan, s: float, rng: np.random.Generator, model:
     """One motion near a known one; None beyond a joint or torque limit. Clearance and heat are not checked."""
     try:
         return planned(vary(twin, source, s, rng), source, model)
-    except _Rejected:
+    except Rejected:
         return None
 
 
