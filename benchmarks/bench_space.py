@@ -83,7 +83,7 @@ def value(fleet: Fleet, seeds: range) -> None:
     for policy in WORTH:
         solid, free = ([each.value for each in outcomes(one, policy, seeds)] for one in (fleet, ghosts))
         lost = np.subtract(solid, free)
-        low, high = interval(lost, np.random.default_rng(0))
+        low, high = interval(lost)
         name = f"{fleet.scenario.name} {policy}"
         print(f"{name:<36}{np.mean(solid):>8.1f}{np.mean(free):>8.1f}{lost.mean():>+8.1f} [{low:+.1f}, {high:+.1f}]")
 

@@ -124,7 +124,7 @@ def shifts(library: Library, seeds: Sequence[int], asked: int | None, by: str) -
 
 def print_asked(arms: int, seeds: int, difficulty: DifficultyName, arrivals: float) -> None:
     """Print the table of value against the number of arms that are asked."""
-    library, rng = large_cell(arms, difficulty, arrivals), np.random.default_rng(np.random.SeedSequence(0))
+    library = large_cell(arms, difficulty, arrivals)
     full = np.array(list(shifts(library, range(seeds), None, "coolest")))
     print(f"{arms} arms, {arrivals:g} × arrivals, {seeds} shifts, {difficulty}; loss of value with 95 % interval")
     columns = (("asked", 14), ("quotes/job", 12), ("finished", 10), ("value", 9), ("loss %", 9), ("interval", 18))
@@ -132,7 +132,7 @@ def print_asked(arms: int, seeds: int, difficulty: DifficultyName, arrivals: flo
 
     def line(name: str, rows: Array) -> None:
         loss = 100.0 * (full[:, 0] - rows[:, 0]) / full[:, 0]
-        low, high = interval(loss, rng)
+        low, high = interval(loss)
         mean = rows.mean(axis=0)
         print(
             f"{name:>14}{mean[4]:>12.1f}{mean[1]:>10.1f}{mean[0]:>9.1f}{loss.mean():>9.2f}"

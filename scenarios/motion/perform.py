@@ -87,7 +87,7 @@ def perform(arm: Arm, plan: Plan, *, start_c: Array, ambient_c: float, tick_s: f
     world, plans = build_world(
         [single],
         [[job]],
-        limits=ThermalLimits(warning_c=NEVER_C, error_c=2 * NEVER_C, restart_c=0.0),
+        limits=ThermalLimits(warning_c=NEVER_C, error_c=2 * NEVER_C, restart_c=1.0),
         dt_s=samples / RATE_HZ,
         ticks=ticks,
         slots=1,

@@ -139,9 +139,8 @@ def compare(
     for n, ((policy, _), result) in enumerate(zip(parts, results, strict=True)):
         by_policy[policy] += result
         progress("comparing", Count((n + 1) * len(seeds) * len(policies) // len(parts), len(seeds) * len(policies)))
-    rng = np.random.default_rng(np.random.SeedSequence(0))
     figures = {
-        p: {name: figure_of(name, rows, by_policy[baseline], rng) for name in FIGURES} for p, rows in by_policy.items()
+        p: {name: figure_of(name, rows, by_policy[baseline]) for name in FIGURES} for p, rows in by_policy.items()
     }
     scopes = {policy: scope_of(policy) for policy in policies}
     return Comparison(scenario.name, tuple(seeds), baseline, figures, scopes, channel.described(), channel.text)
@@ -174,7 +173,7 @@ def _run_in_worker(
     return outcomes(_fleet(scenario, models, folder), policy, seeds, channel)
 
 
-def figure_of(name: str, rows: Sequence[Outcome], base: Sequence[Outcome], rng: np.random.Generator) -> Figure:
+def figure_of(name: str, rows: Sequence[Outcome], base: Sequence[Outcome]) -> Figure:
     """One figure over seeds: mean, and paired difference to the rows of a baseline.
 
     Args:
@@ -183,13 +182,14 @@ def figure_of(name: str, rows: Sequence[Outcome], base: Sequence[Outcome], rng: 
     values = np.array([getattr(each, name) for each in rows], dtype=float)
     paired = values - np.array([getattr(each, name) for each in base], dtype=float)
     mean, iqm = float(values.mean()), float(trim_mean(values, 0.25))
-    return Figure(mean, iqm, *interval(values, rng), float(paired.mean()), *interval(paired, rng))
+    return Figure(mean, iqm, *interval(values), float(paired.mean()), *interval(paired))
 
 
-def interval(values: Array, rng: np.random.Generator) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean over seeds, [seed]."""
+def interval(values: Array) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the mean over seeds, [seed]; depends on these values alone."""
     if np.ptp(values) == 0:
         return float(values[0]), float(values[0])
+    rng = np.random.default_rng(np.random.SeedSequence(0))
     result = bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=rng, vectorized=True)
     return float(result.confidence_interval.low), float(result.confidence_interval.high)
 

@@ -53,7 +53,7 @@ def test_help_imports_no_large_library():
     [
         ("thermofleet re", ["record", "replay", "report", "reset", "resume"]),
         ("thermofleet run --pl", ["--plant"]),
-        ("thermofleet twin re", ["recover", "reliability", "report"]),
+        ("thermofleet twin re", ["readings", "recover", "reliability", "report"]),
     ],
 )
 def test_the_shell_completes_commands_and_their_options(words, completions):

@@ -23,6 +23,7 @@ from twin.thermal.least_squares import Noise, Problem
 from twin.thermal.parameters import ParameterVector
 from twin.thermal.result import HeatModel, nominal_heat_model
 from twin.thermal.thermal_twin import RcTwin
+from twin.vae.measures import PARTS, Features, latent_moments
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 
@@ -109,6 +110,11 @@ def heated(name: str, load: float, rng: np.random.Generator) -> Recording:
     )
 
 
+def noise(count: int, rng: np.random.Generator) -> Features:
+    moments = latent_moments(rng.standard_normal((count, 7, 2)))
+    return Features(np.concatenate([rng.random((count, 7, PARTS)), moments], axis=-1))
+
+
 def windows_of(recordings: list[Recording]) -> LogStudy:
     """A study's windows every 30 s with a difficulty that knows nothing."""
     end_s = np.arange(30.0, 590.0, 30.0)
@@ -130,7 +136,8 @@ def windows_of(recordings: list[Recording]) -> LogStudy:
         temp_c=np.array(temps),
         end_c=np.array(temps),
         peak_next_c=np.array(peaks),
-        errors=rng.random((len(files), 7, 3)),
+        features=noise(len(files), rng),
+        known=noise(9, rng),
     )
 
 

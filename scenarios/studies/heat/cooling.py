@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from fleet.heat.cooled_motor import ZHU_MOTOR, published
 from fleet.robot import Cooling
 from fleet.thermal import gen3_network, housing, in_series, winding
@@ -117,7 +115,6 @@ def fleet_rows(
     Args:
         strategies: Differences refer to the first one.
     """
-    rng = np.random.default_rng(np.random.SeedSequence(0))
     rows, base = list[FleetRow](), {}
     for n, cooling in enumerate(strategies):
         arms = tuple(replace(arm, cooling=cooling) for arm in scenario.arms)
@@ -125,7 +122,7 @@ def fleet_rows(
         for policy in policies:
             shifts = outcomes(fleet, policy, seeds)
             against = base.setdefault(policy, shifts)
-            figures = {name: figure_of(name, shifts, against, rng) for name in FIGURES}
+            figures = {name: figure_of(name, shifts, against) for name in FIGURES}
             rows.append(FleetRow(cooling=cooling, policy=policy, figures=figures))
         progress("comparing", Count(n + 1, len(strategies)))
     return rows
