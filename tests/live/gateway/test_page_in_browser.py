@@ -245,6 +245,7 @@ def test_hostile_names_stay_text(router, open_page):
         page.locator("#back").click()
         assert page.evaluate("document.querySelectorAll('img, main script').length") == 0
         assert page.evaluate("document.body.dataset.boom") is None
+        page.close()  # before its gateway ends: it would try to connect again
 
 
 def test_long_names_and_names_of_javascript_s_own_leave_the_page_as_it_is(router, open_page):
@@ -262,6 +263,7 @@ def test_long_names_and_names_of_javascript_s_own_leave_the_page_as_it_is(router
         confirm(page)
         answer(page).to_contain_text("Paused: __proto__.")
         expect(page.locator("#arms tr", has_text="__proto__")).to_contain_text("paused")
+        page.close()  # before its gateway ends: it would try to connect again
 
 
 def test_without_webgl_the_tables_and_requests_still_work(browser, served, fleet):
