@@ -30,8 +30,8 @@ AHEAD_S = 300.0
 """Time after a window in which its peak temperature is taken."""
 TRAIN_SHARE = 0.6
 """Share of the cool files that train the twin."""
-CONFIG = TwinConfig(rate_hz=2.0, record_hz=2.0, window=50, stride=10, epochs=40, restarts=1)
-"""Windows of 25 s at the sampling rate of the logs."""
+CONFIG = TwinConfig(rate_hz=2.0, record_hz=2.0, epochs=40, restarts=1).changed(window=50)
+"""Windows of 25 s at the sampling rate of the logs, a new one every 10 samples."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

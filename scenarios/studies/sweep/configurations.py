@@ -27,9 +27,7 @@ class Configuration:
     @property
     def config(self) -> TwinConfig:
         """The configuration; strides no longer than the window."""
-        window = self.changes.get("window", BASE.window)
-        base = replace(BASE, stride=min(BASE.stride, window), score_stride=min(BASE.score_stride, window))
-        return replace(base, **self.changes)
+        return BASE.changed(**self.changes)
 
 
 SGD = {"optimizer": "sgd", "learning_rate": 0.1, "epochs": 60}
@@ -62,6 +60,8 @@ CONFIGURATIONS: Mapping[str, Configuration] = {
     "epochs_180": Configuration("training", "180 epochs", {"epochs": 180}),
     "best_2s": Configuration("together", "2 s, latent 4, 60 epochs", {"window": 25, "latent": 4, "epochs": 60}),
     "best_1s": Configuration("together", "1 s, latent 4, 60 epochs", {"window": 12, "latent": 4, "epochs": 60}),
+    "window_1s_16": Configuration("together", "1 s, 16 hidden units", {"window": 12, "hidden": 16}),
+    "window_half_16": Configuration("together", "0.5 s, 16 hidden units", {"window": 6, "hidden": 16}),
     "hidden_16": Configuration("hidden units", "16", {"hidden": 16}),
     "hidden_64": Configuration("hidden units", "64", {"hidden": 64}),
     "whole_arm": Configuration("scope", "one network", {"scope": "arm", "hidden": 64, "latent": 8}),
