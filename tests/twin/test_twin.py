@@ -140,7 +140,9 @@ def test_a_plan_of_another_arm_is_refused(twin, plan):
 
 
 def test_known_motion_fills_the_latent_like_the_prior(twin, records):
-    windows = np.concatenate([cut(resample(record, 50.0, 12.5), twin.config.window, twin.config.window) for record in records])
+    windows = np.concatenate(
+        [cut(resample(record, 50.0, 12.5), twin.config.window, twin.config.window) for record in records]
+    )
     z = twin.posterior(windows)[0]
     assert z.shape == (len(windows), 7, 2)
     active = z.var(axis=0) > 0.01

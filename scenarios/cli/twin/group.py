@@ -278,12 +278,12 @@ def report_command(
 
 def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> "TwinConfig":
     """The configuration of a size, with the options given on the command line (Any: one per field)."""
-    from scenarios.prepare.twin_folder import LOG_RATE_HZ, LOG_WINDOW
+    from scenarios.prepare.twin_folder import LOG_INPUT
     from twin.vae.config import TwinConfig
 
     base = TwinConfig.quick() if size == "quick" else TwinConfig()
     try:
-        return base.changed(**({"rate_hz": LOG_RATE_HZ, "window": LOG_WINDOW} if of_log else {}) | given)
+        return base.changed(**(LOG_INPUT if of_log else {}) | given)
     except ValueError as error:
         option = re.sub(r"TwinConfig\.(\w+)", lambda field: f"--{field[1].replace('_', '-')}", str(error), count=1)
         raise FleetError(option.replace("--rate-hz", "--rate")) from error
