@@ -6,7 +6,7 @@
 CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
 layers, decoder, loss and backward pass, or the forward pass alone. The lower bound ("floor") is the matrix
 multiplications of the same passes, as `torch.mm` of their shapes. Training is extrapolated from its steps; --full runs
-it on random smooth motion. A job of the target has four windows; a real plan has the median number of the quickstart's.
+it on random smooth motion. A job of the target lasts 16 s; a real plan has the median number of the quickstart's.
 --arms trains that many twins of the quick size side by side in two processes, and has them score 1 000 jobs each;
 beside it a training of one twin network after network with `nn.LSTM` (peer), extrapolated.
 """
@@ -37,13 +37,15 @@ from twin.vae.onnx import export_onnx
 from twin.vae.run import Run
 from twin.vae.train import SIDE_BY_SIDE, Motion, train, train_all
 from twin.vae.twin import Fit, Twin
-from twin.vae.window import Scaler, cut, resample
+from twin.vae.window import Scaler, cut, resample, starts
 
 JOINTS = 7
 RUNS = 15
 BESIDE = (1, 7, SIDE_BY_SIDE, 28)
 """Numbers of networks trained side by side."""
 JOBS = 1000
+JOB_S = 16.0
+"""Duration of a job that is scored."""
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -181,6 +183,11 @@ def _onnx(twin: Twin, z: np.ndarray) -> dict[str, Callable[[], object]]:
     return {"onnx": lambda: session.run(["errors"], feed)}
 
 
+def windows_in(length_s: float, config: TwinConfig) -> int:
+    """Number of windows in which a twin scores so much motion."""
+    return len(starts(round(length_s * config.rate_hz), config.window, config.score_stride))
+
+
 def some_arms(first: int, count: int) -> tuple[float, float, int]:
     """Train twins and have each score 1 000 jobs of its own; CPU time of both, s, and the bytes of a saved twin."""
     torch.set_num_threads(1)
@@ -190,13 +197,14 @@ def some_arms(first: int, count: int) -> tuple[float, float, int]:
         rng = np.random.default_rng(arm)
         records = [smooth(rng, 12.0) for _ in range(90)]
         motions.append(Motion(arm=f"arm_{arm}", records=records, seed=np.random.SeedSequence(arm)))
-        windows.append(np.concatenate([cut(resample(r, RATE_HZ, config.rate_hz), config.window, 50) for r in records]))
+        parts = [cut(resample(r, RATE_HZ, config.rate_hz), config.window, config.score_stride) for r in records]
+        windows.append(np.concatenate(parts))
     train_all(motions[:1], replace(config, epochs=1, allow_collapse=True))  # loads compiled code
     twins: list[Twin] = []
     training_s = seconds(lambda: twins.extend(train_all(motions, config)))
     scoring_s = 0.0
     for twin, own in zip(twins, windows, strict=True):
-        drawn = own[np.random.default_rng(0).integers(0, len(own), 4 * JOBS)]
+        drawn = own[np.random.default_rng(0).integers(0, len(own), JOBS * windows_in(JOB_S, config))]
         scoring_s += seconds(lambda twin=twin, drawn=drawn: twin.window_features(drawn))
     with tempfile.TemporaryDirectory() as folder:
         save(twins[0], Path(folder))
@@ -238,10 +246,10 @@ def main() -> None:
     training(arm, "whole arm")
     columns = ("features", "networks", "plain", "floor", "onnx")
     print(f"\n{'scoring, 7 joints, ms':<34}" + "".join(f"{name:>11}" for name in columns) + f"{'ratio':>8}")
-    scoring(default, "1 job of 4 windows", 4, 200)
-    scoring(default, "1 real plan, 9 windows", 9, 100)
-    scoring(default, "1 000 jobs of 4 windows", 4000, 3)
-    scoring(arm, "whole arm, 1 000 jobs of 4 windows", 4000, 3)
+    for config, name in ((default, "1 job of 16 s"), (arm, "whole arm, 1 job of 16 s")):
+        scoring(config, name, windows_in(JOB_S, config), 200)
+        scoring(config, name.replace("1 job", "1 000 jobs"), JOBS * windows_in(JOB_S, config), 3)
+    scoring(default, "1 real plan, 11 windows", 11, 100)
     if arguments.full:
         rng = np.random.default_rng(0)
         records = [smooth(rng, 12.0) for _ in range(250)]

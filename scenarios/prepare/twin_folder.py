@@ -54,8 +54,8 @@ def train_arms(
     return train_twins(scenario, planned, cache_folder(), progress, config=config, seed=seed)
 
 
-LOG_RATE_HZ = 2.0
-"""Common rate of Gen3 loggers; a window of 50 samples then covers 25 s."""
+LOG_INPUT = {"rate_hz": 2.0, "window": 50, "hidden": 32}
+"""Twins of logs: at the common rate of Gen3 loggers a second has two samples only, so windows last 25 s."""
 LOADED = (0, 1, 2, 3)
 """The large motors, index 0..6, which determine whether a log is cool: idle wrists are above 40 °C."""
 

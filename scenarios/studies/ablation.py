@@ -30,7 +30,7 @@ from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import outcomes
 from scenarios.run.shift import scenario_hash
 from scenarios.schema import Scenario
-from scenarios.studies.score_sources import SOURCES, DrawnFleet
+from scenarios.studies.score_sources import ALL_SOURCES, SOURCES, DrawnFleet
 
 Array = np.ndarray
 
@@ -56,8 +56,8 @@ class AblationPlan:
     def __post_init__(self) -> None:
         for i, name in enumerate(self.scores):
             policy, source = self.parts(name)
-            if source not in SOURCES:
-                raise FleetError(f"No source of scores '{source}'{nearest(source, SOURCES)}")
+            if source not in ALL_SOURCES:
+                raise FleetError(f"No source of scores '{source}'{nearest(source, ALL_SOURCES)}")
             if name in self.scores[:i]:
                 raise FleetError(f"The source '{name}' is given twice; names must be unique.")
             policy_of(policy)
@@ -70,7 +70,7 @@ class AblationPlan:
     def label(self, name: str) -> str:
         """Name of one of `scores` in a table."""
         policy, source = self.parts(name)
-        return ("" if policy == self.policy else f"{label(policy)}, ") + SOURCES[source].label
+        return ("" if policy == self.policy else f"{label(policy)}, ") + ALL_SOURCES[source].label
 
 
 class Row(NamedTuple):
@@ -119,7 +119,7 @@ def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progr
         (name, fleet, training)
         for fleet in range(plan.fleets)
         for name in plan.scores
-        for training in range(plan.trainings if SOURCES[plan.parts(name)[1]].trained else 1)
+        for training in range(plan.trainings if ALL_SOURCES[plan.parts(name)[1]].trained else 1)
     ]
     seeds, drawn, drawn_index = range(plan.first_seed, plan.first_seed + plan.seeds), None, -1
     for n, (name, fleet, training) in enumerate(draws):
@@ -131,7 +131,7 @@ def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progr
         if drawn is None or drawn_index != fleet:
             spread = replace(scenario.spread, seed=scenario.spread.seed + fleet)
             drawn, drawn_index = DrawnFleet(replace(scenario, spread=spread), cache_folder(), quiet), fleet
-        results = outcomes(SOURCES[source].make(drawn, training), policy, missing)
+        results = outcomes(ALL_SOURCES[source].make(drawn, training), policy, missing)
         made = [
             Row(name, fleet, training, seed, *(float(getattr(result, figure)) for figure in FIGURES))
             for seed, result in zip(missing, results, strict=True)
@@ -208,7 +208,7 @@ def _effects(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row]) -> 
 
 def _values(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row], name: str, figure: str) -> Array:
     """A figure of one source, [fleet, training, seed]; the same for every training if the source has none."""
-    trained = SOURCES[plan.parts(name)[1]].trained
+    trained = ALL_SOURCES[plan.parts(name)[1]].trained
     return np.array(
         [
             [

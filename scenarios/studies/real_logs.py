@@ -13,6 +13,7 @@ from fleet.errors import FleetError
 from fleet.files import cache_folder
 from fleet.motion import CHANNELS
 from scenarios.prepare.train_twins import train_or_load
+from scenarios.prepare.twin_folder import LOG_INPUT
 from scenarios.studies.ranking import CARRIER
 from twin.logs.recording import Recording
 from twin.logs.resampling import Stretch, stretches
@@ -30,8 +31,8 @@ AHEAD_S = 300.0
 """Time after a window in which its peak temperature is taken."""
 TRAIN_SHARE = 0.6
 """Share of the cool files that train the twin."""
-CONFIG = TwinConfig(rate_hz=2.0, record_hz=2.0, window=50, stride=10, epochs=40, restarts=1)
-"""Windows of 25 s at the sampling rate of the logs."""
+CONFIG = TwinConfig(record_hz=2.0, epochs=40, restarts=1).changed(**LOG_INPUT)
+"""Windows of 25 s at the sampling rate of the logs, a new one every 10 samples."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -5,7 +5,7 @@ its reconstruction errors alone, and only thermal networks predict peak temperat
 """
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -60,10 +60,16 @@ class DrawnFleet:
         arms = range(len(self.scenario.arms))
         return plan_arms(self.scenario, arms, rehearsal_works(self.scenario), self.folder, self.progress)
 
-    def calibrated(self, training: int, risk: RiskName, *, trained: bool = True) -> list[CalibratedTwin]:
-        """The arms' twins of a training, with P(saturation) of a kind; or the same networks before training."""
+    def calibrated(
+        self, training: int, risk: RiskName, *, trained: bool = True, changes: Mapping[str, int] | None = None
+    ) -> list[CalibratedTwin]:
+        """The arms' twins of a training, with P(saturation) of a kind; or the same networks before training.
+
+        Args:
+            changes: Fields of the configuration with other values.
+        """
         spec = self.scenario.twin
-        config = TwinConfig.quick() if spec.size == "quick" else TwinConfig()
+        config = (TwinConfig.quick() if spec.size == "quick" else TwinConfig()).changed(**changes or {})
         seed = self.scenario.spread.seed + TRAINING_STEP * training
         twins = train_twins(
             self.scenario,
@@ -180,8 +186,9 @@ class Source:
     """Whether it depends on the training; else one training stands for all."""
 
 
-def _vae(drawn: DrawnFleet, training: int, *, trained: bool) -> Fleet:
-    return drawn.scored([_WithoutPeak(model) for model in drawn.calibrated(training, "excess", trained=trained)])
+def _vae(drawn: DrawnFleet, training: int, *, trained: bool = True, changes: Mapping[str, int] | None = None) -> Fleet:
+    models = drawn.calibrated(training, "excess", trained=trained, changes=changes)
+    return drawn.scored([_WithoutPeak(model) for model in models])
 
 
 def _unweighted(drawn: DrawnFleet, fleet: Fleet) -> Fleet:
@@ -213,11 +220,11 @@ def _random(drawn: DrawnFleet, training: int) -> Fleet:
 
 
 SOURCES: dict[str, Source] = {
-    "trained": Source("trained VAE", lambda drawn, training: _vae(drawn, training, trained=True)),
+    "trained": Source("trained VAE", lambda drawn, training: _vae(drawn, training)),
     "untrained": Source("untrained VAE", lambda drawn, training: _vae(drawn, training, trained=False)),
     "unweighted": Source(
         "trained VAE, unweighted",
-        lambda drawn, training: _unweighted(drawn, _vae(drawn, training, trained=True)),
+        lambda drawn, training: _unweighted(drawn, _vae(drawn, training)),
     ),
     "torque": Source("RMS torque", lambda drawn, _: _unweighted(drawn, _torque(drawn)), trained=False),
     "weighted-torque": Source("RMS torque, weighted", lambda drawn, _: _torque(drawn), trained=False),
@@ -232,3 +239,15 @@ SOURCES: dict[str, Source] = {
     "oracle": Source("oracle", lambda drawn, _: drawn.oracle, trained=False),
 }
 """By name, as `--scores` takes them."""
+
+
+def _variant(label: str, **changes: int) -> Source:
+    return Source(f"trained VAE, {label}", lambda drawn, training: _vae(drawn, training, changes=changes))
+
+
+ALL_SOURCES = SOURCES | {
+    "trained-1s-16": _variant("1 s, 16 hidden units", window=12, hidden=16),
+    "trained-1s-32": _variant("1 s, 32 hidden units", window=12, hidden=32),
+    "trained-4s-32": _variant("4 s, 32 hidden units", window=50, hidden=32),
+}
+"""Besides, twins of other windows and sizes, which are compared only if named."""

@@ -72,7 +72,7 @@ def test_the_variants_differ_in_one_thing_each():
     assert named[VAE] == TwinConfig()
     assert replace(named["AE"], kind="vae") == TwinConfig()
     assert replace(named["VAE z=8"], latent=2) == TwinConfig()
-    assert replace(named["VAE whole arm"], scope="joint", hidden=32, latent=2) == TwinConfig()
+    assert replace(named["VAE whole arm"], scope="joint", hidden=16, latent=2) == TwinConfig()
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from scenarios.studies.sweep.subjects import Sizes, subjects_of
 from scenarios.studies.sweep.table import lines_of, table_of
 
 TINY = {"hidden": 4, "max_windows": 32, "epochs": 1, "batch": 32}
+ARM = {"arm": Configuration("scope", "one network", {**TINY, "scope": "arm"})}
 TWO = {OURS: Configuration("ours", "tiny", TINY), "short": Configuration("window", "1 s", {**TINY, "window": 12})}
 
 
@@ -100,10 +101,11 @@ def test_every_configuration_can_be_and_the_base_is_ours():
 
 
 def test_the_command_prints_the_table_of_what_is_there(thermofleet, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.studies.sweep.configurations.CONFIGURATIONS", TWO)
+    monkeypatch.setattr("scenarios.studies.sweep.configurations.CONFIGURATIONS", TWO | ARM)
     sizes = ("--scenarios", "heat_wave", "--arms", "0", "--test", 100, "--out", tmp_path / "rows.jsonl")
     said = thermofleet("twin", "sweep", *sizes, "--only", OURS, "--format", "markdown")
     assert said.code == 0, said.err
     assert said.out.splitlines()[2].startswith("| ours | tiny |")
     assert "No configuration 'beta'" in thermofleet("twin", "sweep", *sizes, "--only", "beta").err
+    assert "leave out --carrier-only" in thermofleet("twin", "sweep", *sizes, "--carrier-only", "--only", "arm").err
     assert "--arms must be whole numbers" in thermofleet("twin", "sweep", "--arms", "x").err

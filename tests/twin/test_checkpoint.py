@@ -105,7 +105,7 @@ def test_a_changed_weight_is_noticed(folder):
     [
         (lambda card: card["mean"][2].__setitem__(1, 0.5), "changed since it was saved"),
         (lambda card: card.update(arm="arm_9"), "changed since it was saved"),
-        (lambda card: card["config"].update(score_stride=25), "changed since it was saved"),
+        (lambda card: card["config"].update(score_stride=6), "changed since it was saved"),
         (lambda card: card["config"].update(hidden=8), "not float32"),
         (lambda card: card["config"].update(hidden=-8), "hidden must be >= 1"),
         (lambda card: card["std"].pop(), "must each have 7 joints"),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3
 from twin.vae.config import TwinConfig
-from twin.vae.generate import STRIDE, rest_to_rest, time_spline, vary
+from twin.vae.generate import OVERLAP, rest_to_rest, time_spline, vary
 
 LIMITS = [np.array(limit) for limit in (GEN3.velocity, GEN3.acceleration, GEN3.jerk)]
 PEAKS = (15 / 8, 10 / np.sqrt(3), 60.0)
@@ -127,7 +127,7 @@ def test_windows_share_noise_as_they_share_time(source, make_plan, motion):
     vary(exact_twin(still), plan, 0.0, np.random.default_rng(0))
     noise = told[1] - still[1]
     assert noise.std() == pytest.approx(2.0, rel=0.03)
-    shared = 1 - STRIDE / twin.config.window
+    shared = 1 - (twin.config.window // OVERLAP) / twin.config.window
     assert np.mean(noise[1:] * noise[:-1]) / np.mean(noise**2) == pytest.approx(shared, abs=0.03)
 
 

@@ -200,7 +200,7 @@ def test_nothing_beyond_the_usual_says_so(calibration):
 
 def test_one_sided_torque_counts_only_more_load_than_the_twin_makes_of_it(twin, jobs, known):
     """Second way: from the reconstruction in SI units."""
-    windows = cut(resample(heavier(jobs[0][0], 1, 2.0).cycle.profile, 50.0, 12.5), 50, 25)
+    windows = cut(resample(heavier(jobs[0][0], 1, 2.0).cycle.profile, 50.0, 12.5), twin.config.window, 6)
     tau, tau_hat = windows[..., 2], twin.reconstruct(windows)[..., 2]
     features = twin.window_features(windows)
     more = np.maximum(np.abs(tau) - np.abs(tau_hat), 0) / twin.scaler.std[:, 2]
@@ -246,7 +246,7 @@ def test_without_a_calibration_there_is_no_opinion_on_what_is_usual(twin, jobs):
 
 
 def test_windows_have_measures_too(known, jobs):
-    windows = cut(resample(jobs[0][0].cycle.profile, 50.0, 12.5), 50, 50)
+    windows = cut(resample(jobs[0][0].cycle.profile, 50.0, 12.5), known.config.window, known.config.window)
     measures = known.measures_of(known.window_features(windows))
     assert measures.calibrated.shape == (len(windows), 7)
     assert np.all((measures.p_value > 0) & (measures.p_value <= 1))

@@ -4,13 +4,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from twin.vae.config import TwinConfig
 from twin.vae.onnx import MODEL, ExportError, export_onnx
 from twin.vae.train import train
 
 onnxruntime = pytest.importorskip("onnxruntime")
 
 
-def windows(rng, motion, count, seconds=4.0):
+def windows(rng, motion, count):
+    seconds = TwinConfig().window / 12.5
     made = np.stack([motion(rng, seconds)[::4] for _ in range(count)]).transpose(0, 1, 3, 2).astype(float)
     made[::2, :, ::2, 0] += 4 * np.pi * np.sign(made[::2, :1, ::2, 0])  # other turns of the continuous joints
     return made
@@ -42,7 +44,7 @@ def test_the_file_says_whose_it_is(twin, exported):
     assert said["twin_version"] == twin.version
     assert said["arm"] == "arm_0"
     assert said["data_hash"] == twin.data_hash
-    assert (said["channels"], said["rate_hz"], said["window"]) == ("q,qd,tau", "12.5", "50")
+    assert (said["channels"], said["rate_hz"], said["window"]) == ("q,qd,tau", "12.5", "12")
     assert [path.name for path in exported.parent.iterdir()] == [MODEL]
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from fleet.difficulty import DifficultyModel
 from fleet.motion import Phase
+from twin.vae.config import TwinConfig
 from twin.vae.measures import PARTS, Calibration, Features
 from twin.vae.twin import Twin
 from twin.vae.window import cut, resample
@@ -80,8 +81,9 @@ def test_the_job_error_is_the_mean_over_its_time(twin, plan):
 
 
 def test_the_phase_error_is_the_plain_mean_of_the_reconstruction_error(twin, make_plan, motion, rng):
-    plan = make_plan(motion(rng, 4.0), motion(rng, 8.0), motion(rng, 4.0))
-    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), 50, 50)
+    whole_windows_s = 8 * twin.config.window / 12.5
+    plan = make_plan(motion(rng, 4.0), motion(rng, whole_windows_s), motion(rng, 4.0))
+    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), twin.config.window, twin.config.window)
     away = np.abs(windows - twin.reconstruct(windows)) / twin.scaler.std
     np.testing.assert_allclose(phase_errors(twin, plan)[1], away.mean(axis=(0, 1)), rtol=1e-4)
 
@@ -138,7 +140,9 @@ def test_a_plan_of_another_arm_is_refused(twin, plan):
 
 
 def test_known_motion_fills_the_latent_like_the_prior(twin, records):
-    windows = np.concatenate([cut(resample(record, 50.0, 12.5), 50, 50) for record in records])
+    windows = np.concatenate(
+        [cut(resample(record, 50.0, 12.5), twin.config.window, twin.config.window) for record in records]
+    )
     z = twin.posterior(windows)[0]
     assert z.shape == (len(windows), 7, 2)
     active = z.var(axis=0) > 0.01
@@ -147,7 +151,7 @@ def test_known_motion_fills_the_latent_like_the_prior(twin, records):
     assert z.std(axis=0).max() < 1.5
 
 
-@pytest.mark.parametrize("bad", [np.zeros((2, 40, 7, 3)), np.full((2, 50, 7, 3), np.nan)])
+@pytest.mark.parametrize("bad", [np.zeros((2, 9, 7, 3)), np.full((2, TwinConfig().window, 7, 3), np.nan)])
 def test_windows_that_do_not_fit_are_refused(twin, bad):
     with pytest.raises(ValueError, match="Windows must be"):
         twin.posterior(bad)[0]
@@ -162,13 +166,13 @@ def test_many_jobs_score_as_each_alone(twin, make_plan, motion, rng):
 
 
 def test_window_errors_are_the_mean_distance_to_the_reconstruction(twin, plan):
-    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), 50, 25)
+    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), twin.config.window, 6)
     away = np.abs(windows - twin.reconstruct(windows)) / twin.scaler.std
     np.testing.assert_allclose(twin.window_features(windows).errors, away.mean(axis=1), rtol=1e-4)
 
 
 def test_decoding_the_posterior_mean_is_the_reconstruction(twin, plan):
-    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), 50, 25)
+    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), twin.config.window, 6)
     mu, sigma = twin.posterior(windows)
     assert mu.shape == sigma.shape == (len(windows), 7, 2)
     assert np.all((sigma > 0) & (sigma < 1.5))

@@ -1,7 +1,7 @@
 """Input, size and training of a twin's networks."""
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 from fleet.motion import CHANNELS, RATE_HZ
 
@@ -29,17 +29,17 @@ class TwinConfig:
     kind: Kind = "vae"
     latent: int = 2
     """Latent units of each network."""
-    hidden: int = 32
+    hidden: int = 16
     layers: int = 1
-    window: int = 50
-    """Samples per window."""
+    window: int = 12
+    """Samples per window: about a second. Longer ones rank jobs worse and take longer (docs/paper.md, the sweep)."""
     rate_hz: float = 12.5
     """Samples per second inside a window."""
     record_hz: float = RATE_HZ
     """Samples per second of the training records; plans always come at fleet.motion.RATE_HZ."""
     stride: int = 10
     """Samples from one training window to the next."""
-    score_stride: int = 50
+    score_stride: int = 12
     """Samples from one scored window to the next; the last window ends at the end."""
     max_windows: int = 1792
     """Most training windows, drawn at random; 14 batches."""
@@ -93,6 +93,17 @@ class TwinConfig:
     def quick(cls) -> "TwinConfig":
         """A tenth of the training steps of the default."""
         return cls(max_windows=768, epochs=20, learning_rate=5e-3, restarts=1)
+
+    def changed(self, **changes: Any) -> "TwinConfig":  # Any: values of any field
+        """The same with other values; with another window, windows to score follow each other without overlap.
+
+        Raises:
+            ValueError: a value is not allowed.
+        """
+        if "window" in changes:
+            window = max(1, changes["window"])  # a stride longer than the window would leave gaps
+            changes = {"stride": min(self.stride, window), "score_stride": window} | changes
+        return replace(self, **changes)
 
     def networks(self, joints: int) -> int:
         """Number of networks of an arm."""

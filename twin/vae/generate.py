@@ -24,8 +24,8 @@ DEGREE = 5
 KNOT_S = 0.8
 """Time between knots: details below about a second are smoothed away. Denser knots follow decoder artefacts where
 windows meet, and the jerk limit then stretches a cycle by 20 % instead of 7 %."""
-STRIDE = 10
-"""Samples of the twin's clock from one decoded window to the next."""
+OVERLAP = 5
+"""Decoded windows that overlap at any time."""
 DENSE_HZ = 200.0
 """Sample rate at which a path is checked for its limits."""
 
@@ -101,7 +101,7 @@ def _decoded(twin: Twin, samples: Array, s: float, rng: np.random.Generator) -> 
     config = twin.config
     if len(samples) == 0:
         return np.zeros((0, samples.shape[-1]))
-    stride = min(STRIDE, config.window)
+    stride = max(1, config.window // OVERLAP)
     windows = cut(samples, config.window, stride)
     mu, sigma = twin.posterior(windows)
     eps = _correlated_noise(mu.shape, 1.0 - stride / config.window, rng)

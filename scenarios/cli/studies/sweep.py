@@ -53,10 +53,13 @@ def sweep_command(
     from scenarios.studies.sweep.rows import Rows
     from scenarios.studies.sweep.table import lines_of, table_of
 
-    names = list(CONFIGURATIONS) if only is None else [name.strip() for name in only.split(",")]
+    whole = {name for name, each in CONFIGURATIONS.items() if carrier_only and each.config.scope == "arm"}
+    names = [n for n in CONFIGURATIONS if n not in whole] if only is None else [n.strip() for n in only.split(",")]
     for name in names:
         if name not in CONFIGURATIONS:
             raise FleetError(f"No configuration '{name}'{nearest(name, CONFIGURATIONS)}")
+        if name in whole:
+            raise FleetError(f"'{name}' is one network of all joints; leave out --carrier-only.")
     chosen = {name: CONFIGURATIONS[name] for name in names}
     subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=carrier_only)
     rows = Rows(out)

@@ -278,17 +278,12 @@ def report_command(
 
 def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> "TwinConfig":
     """The configuration of a size, with the options given on the command line (Any: one per field)."""
-    from dataclasses import replace
-
-    from scenarios.prepare.twin_folder import LOG_RATE_HZ
+    from scenarios.prepare.twin_folder import LOG_INPUT
     from twin.vae.config import TwinConfig
 
     base = TwinConfig.quick() if size == "quick" else TwinConfig()
-    # A window smaller than the usual stride would leave gaps between windows.
-    window = max(1, given.get("window", base.window))
-    base = replace(base, stride=min(base.stride, window), score_stride=min(base.score_stride, window))
     try:
-        return replace(base, **({"rate_hz": LOG_RATE_HZ} if of_log else {}) | given)
+        return base.changed(**(LOG_INPUT if of_log else {}) | given)
     except ValueError as error:
         option = re.sub(r"TwinConfig\.(\w+)", lambda field: f"--{field[1].replace('_', '-')}", str(error), count=1)
         raise FleetError(option.replace("--rate-hz", "--rate")) from error

@@ -193,6 +193,7 @@ def sides_command(
 def questions_command(
     log: Annotated[Path, typer.Option("--log", help="A folder of logs of one arm, with motor temperatures.")],
     seeds: Annotated[int, options.number("Number of seeds, from 0.", 1, 100)] = 3,
+    window: Annotated[int, options.number("Samples per window, 2 in a second.", 10, 10_000)] = 50,
     skip_damaged: options.DamagedOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -203,13 +204,15 @@ def questions_command(
     from dataclasses import asdict
 
     from fleet.files import cache_folder
+    from scenarios.studies.real_logs import CONFIG
     from scenarios.studies.verdict.log_questions import answers, judged_windows
 
+    config = CONFIG.changed(window=window)
     recordings = options.recordings_of(log, skip_damaged)
     found = {}
     with progress_bar() as progress:
         for seed in range(seeds):
-            windows = judged_windows(recordings, seed, folder=cache_folder(), progress=progress)
+            windows = judged_windows(recordings, seed, config=config, folder=cache_folder(), progress=progress)
             found[seed] = answers(windows)
     if as_json:
         print_json({str(s): {q: asdict(answer) for q, answer in by.items()} for s, by in found.items()})

@@ -39,10 +39,9 @@ def log_transfer(
     Raises:
         FleetError: too few files are cool.
     """
-    config = replace(
-        size.config, rate_hz=CONFIG.rate_hz, record_hz=CONFIG.record_hz, window=CONFIG.window, stride=CONFIG.stride
-    )
-    size = replace(size, config=replace(config, score_stride=CONFIG.window))
+    own = {name: getattr(CONFIG, name) for name in ("rate_hz", "record_hz", "window", "stride")}
+    config = size.config.changed(**own)
+    size = replace(size, config=config)
     cool = [r for r in recordings if r.temp_c is not None and r.temp_c[:, CARRIER].max(initial=-np.inf) < HOT_C]
     parts = [
         [

@@ -118,7 +118,7 @@ def study_arms(
         The content of `out`: for each arm and seed what it measured.
     """
     basis = {"sizes": dict(sizes), "epochs": config.epochs, "max_windows": config.max_windows, "window": config.window}
-    basis |= {"latent": config.latent, "beta": config.beta, "alpha": ALPHA}
+    basis |= {"hidden": config.hidden, "latent": config.latent, "beta": config.beta, "alpha": ALPHA}
     card: dict[str, Any] = {**basis, "arms": {}}
     if out.exists():
         kept = json.loads(out.read_text(encoding="utf-8"))
