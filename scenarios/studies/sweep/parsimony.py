@@ -49,6 +49,8 @@ def parsimony(
     Raises:
         FleetError: all test jobs of a subject are critical, or none is.
     """
+    if compute:
+        rows.check_writable()
     wanted: list[str] = []
     for done, subject in enumerate(subjects):
         progress("computing data parsimony", Count(done, len(subjects)))
