@@ -18,6 +18,8 @@ from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
 from fleet.errors import FleetError, nearest
 from fleet.seeding import child
 
+MOST_WRAPPERS = 8
+"""Wrappers in one another; more than a policy can need."""
 METHODS = {
     "central": {"reset": "rng", "act": "observations"},
     "arm": {"reset": "rng", "choose": "observation, place"},
@@ -86,9 +88,11 @@ def _is_folder(name: str) -> bool:
     return bool(name) and Path(name).is_dir()
 
 
-def _maker(name: str) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
+def _maker(name: str, depth: int = 0) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
+    if depth > MOST_WRAPPERS:
+        raise FleetError(f"A policy has at most {MOST_WRAPPERS} wrappers round it ({', '.join(WRAPPERS)}).")
     if wrapped := _wrapped(name):
-        wrapper, inner = wrapped[0], _maker(wrapped[1])
+        wrapper, inner = wrapped[0], _maker(wrapped[1], depth + 1)
         return lambda: guarded(wrapper.kind, inner())  # pyright: ignore[reportReturnType]  # as the policy in it
     if _is_folder(name):
         from agents.learned.policy import load_policy  # loads torch

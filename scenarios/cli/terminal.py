@@ -1,10 +1,12 @@
 """Output of every command: sentences, tables, JSON and a progress bar."""
 
+import os
 import textwrap
 import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -51,7 +53,11 @@ class Interrupted(FleetError):
 
 @contextmanager
 def progress_bar(
-    *, kept: str = "Plans and twins already made are", every_s: float = EVERY_S, after_s: float = AFTER_S
+    *,
+    kept: str = "Plans and twins already made are",
+    file: Path | None = None,
+    every_s: float = EVERY_S,
+    after_s: float = AFTER_S,
 ) -> Iterator[Progress]:
     """Show a bar on standard error: what is going on, count and time left. Without a terminal, print lines.
 
@@ -59,6 +65,7 @@ def progress_bar(
 
     Args:
         kept: What an interruption leaves in the cache, as the beginning of a sentence; empty for nothing.
+        file: A file that has it, in place of the cache.
 
     Raises:
         Interrupted: Ctrl-C.
@@ -68,9 +75,10 @@ def progress_bar(
         try:
             yield shown.report
         except KeyboardInterrupt:
-            rest = f" {kept} kept in {cache_folder()}, and the same command continues from there." if kept else ""
+            where = file or cache_folder()
+            rest = f" {kept} kept in {where}, and the same command continues from there." if kept else ""
             stage = shown.clock.stage or "starting"
-            raise Interrupted(f"Interrupted while {stage}: nothing was written.{rest}") from None
+            raise Interrupted(f"Interrupted while {stage}{'.' if file else ': nothing was written.'}{rest}") from None
 
 
 class _Bar:
@@ -168,6 +176,16 @@ def plain_table(*heads: str, numbers: bool = True, title: str | None = None, cap
             max_width=MOST_LABEL if named else None,
         )
     return table
+
+
+WIDE = 200
+"""Columns of a table with many columns in a file or a pipe, which have no width of their own."""
+
+
+def print_wide(table: Table) -> None:
+    """Print a table with many columns: in the width of the terminal, without one in `WIDE`."""
+    wide = out_console.is_terminal or "COLUMNS" in os.environ
+    (out_console if wide else SafeConsole(width=WIDE)).print(table)
 
 
 def say(sentence: str, console: Console = err_console) -> None:

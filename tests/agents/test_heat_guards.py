@@ -130,6 +130,8 @@ def test_a_wrapped_arm_policy_can_be_had_alone_and_wrappers_nest() -> None:
     assert isinstance(arm_policy_of("limited:least_difficulty"), GuardedArm)
     assert isinstance(policy_of("fuzzy:limited:wsept"), GuardedFleet)
     assert label("fuzzy:limited:agents.rules:Wspt") == "fuzzy:limited:Wspt"
+    with pytest.raises(FleetError, match="at most 8 wrappers"):
+        policy_of("limited:" * 3000 + "wsept")
     with pytest.raises(FleetError, match="'limited:wsept' is a central policy"):
         arm_policy_of("limited:wsept")
     with pytest.raises(FleetError, match="did you mean 'wsept'"):

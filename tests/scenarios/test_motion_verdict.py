@@ -9,7 +9,7 @@ import pytest
 from fleet.errors import FleetError
 from scenarios.prepare.twin_folder import train_log
 from scenarios.studies.verdict.log_questions import QUESTIONS, Windows, answers, judged_windows
-from scenarios.studies.verdict.readings import JOINTS, TOTALS, Errors, mean_interval
+from scenarios.studies.verdict.readings import ALPHA, JOINTS, SIZES, TOTALS, Errors, mean_interval
 from scenarios.studies.verdict.sides import share_of
 from twin.logs.recording import Recording
 from twin.training_data import cool_stretches
@@ -91,7 +91,7 @@ def test_logs_get_a_verdict_and_a_map(thermofleet, folder, tmp_path) -> None:
     for extra, sentence in (
         ((), "A false-alarm rate of 0.05 needs 19 held-out cool jobs of each kind or more"),
         (("--alpha", 0.2, "--reading", "lod"), "No reading 'lod'; did you mean 'load'?"),
-        (("--alpha", 0.2, "--map", tmp_path / "map.svg"), "--map must name a file that ends in .png"),
+        (("--alpha", 0.2, "--map", tmp_path / "map.svg"), "--map must end in .png"),
     ):
         said = thermofleet(*asked, folder / "heavy.csv", *extra)
         assert said.code == 2
@@ -147,6 +147,23 @@ def test_readings_rank_more_error_higher_and_tell_jobs_apart() -> None:
         assert np.all(high >= low), name
         if not name.startswith("latent"):
             assert np.any(high > low), name
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [("hello", "no result of `twin readings`"), ("{}", "no result of"), (None, "readings of other settings")],
+)
+def test_readings_replace_no_file_of_something_else(thermofleet, tmp_path, text, wrong) -> None:
+    file = tmp_path / "readings.json"
+    quick = TwinConfig.quick()
+    basis = {"sizes": SIZES, "epochs": quick.epochs + 1, "max_windows": quick.max_windows, "window": quick.window}
+    card = {**basis, "latent": quick.latent, "beta": quick.beta, "alpha": ALPHA, "arms": {}}
+    file.write_text(json.dumps(card) if text is None else text, encoding="utf-8")
+    before = file.read_bytes()
+    said = thermofleet("twin", "readings", "quickstart", "--out", file)
+    assert said.code == 2
+    assert wrong in said.err
+    assert file.read_bytes() == before
 
 
 def test_shares_and_means_have_their_intervals() -> None:

@@ -68,6 +68,42 @@ def test_a_file_of_something_else_is_refused(tmp_path):
         Rows(tmp_path / "notes.jsonl")
 
 
+def test_reading_leaves_a_file_as_it_is_and_a_row_replaces_an_unfinished_line(tmp_path):
+    file = tmp_path / "rows.jsonl"
+    for text in ("hello", '{"key": "a"}\nhello', "\udcff"):
+        file.write_bytes(text.encode(errors="surrogateescape"))
+        with pytest.raises(FleetError, match="not a row of this study"):
+            Rows(file)
+        assert file.read_bytes() == text.encode(errors="surrogateescape")
+    file.write_text('{"key": "a"}\n{"key": "b", "kl', encoding="utf-8")
+    first, second = Rows(file), Rows(file)
+    assert "kl" in file.read_text(encoding="utf-8")
+    first.append("c", {})
+    second.append("d", {})  # of another process, which must not remove the first one's row
+    assert list(Rows(file).by_key) == ["a", "c", "d"]
+
+
+def test_show_without_such_rows_is_an_error(thermofleet, tmp_path):
+    show = ("--show", "--out", tmp_path / "rows.jsonl")
+    for command in ("sweep", "parsimony"):
+        said = thermofleet("twin", command, *show)
+        assert said.code == 2
+        assert "has no such row" in said.err
+        assert "--arms must be 0 to 3" in thermofleet("twin", command, *show, "--arms", "0,4").err
+    assert not (tmp_path / "rows.jsonl").exists()
+    (tmp_path / "rows.jsonl").write_text(
+        json.dumps({"key": key_of_first(), "configuration": OURS, "subject": "s"}) + "\n", encoding="utf-8"
+    )
+    said = thermofleet("twin", "sweep", *show, "--scenarios", "heat_wave", "--arms", "0,0")
+    assert said.code == 2
+    assert "has a missing or odd value" in said.err
+
+
+def key_of_first() -> str:
+    (subject,) = subjects_of([load("heat_wave")], arms=[0], seeds=[1], sizes=Sizes())
+    return measure.key_of(OURS, CONFIGURATIONS[OURS].config, subject)
+
+
 def test_the_interval_is_that_of_student():
     mean, half = measure.interval([0.9, 0.92, 0.97])
     assert mean == pytest.approx(0.93)

@@ -8,11 +8,12 @@ import typer
 
 from fleet.errors import FleetError, nearest
 from scenarios.cli import options
-from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar
+from scenarios.cli.terminal import echo, plain_table, print_json, print_wide, progress_bar, say
 from scenarios.load import load
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
+    from scenarios.studies.sweep.rows import Row
     from scenarios.studies.sweep.subjects import Subject
 
 SCENARIOS = "quickstart,active_waiting,heat_wave"
@@ -54,7 +55,8 @@ def sweep_command(
     from scenarios.studies.sweep.table import lines_of, table_of
 
     whole = {name for name, each in CONFIGURATIONS.items() if carrier_only and each.config.scope == "arm"}
-    names = [n for n in CONFIGURATIONS if n not in whole] if only is None else [n.strip() for n in only.split(",")]
+    every = [name for name in CONFIGURATIONS if name not in whole]
+    names = every if only is None else list(dict.fromkeys(name.strip() for name in only.split(",")))
     for name in names:
         if name not in CONFIGURATIONS:
             raise FleetError(f"No configuration '{name}'{nearest(name, CONFIGURATIONS)}")
@@ -63,14 +65,21 @@ def sweep_command(
     chosen = {name: CONFIGURATIONS[name] for name in names}
     subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=carrier_only)
     rows = Rows(out)
-    with progress_bar(kept="Finished rows are") as progress:
-        wanted = sweep(subjects, chosen, rows, compute=not show_only, progress=progress)
+    if show_only:
+        wanted = sweep(subjects, chosen, rows, compute=False)
+        check_some(wanted, out, " and --carrier-only, if they had it")
+    else:
+        with progress_bar(kept="Finished rows are", file=out) as progress:
+            wanted = sweep(subjects, chosen, rows, progress=progress)
     if format_ == "json":
         print_json(wanted)
         return
-    heads, cells = table_of(lines_of(wanted, chosen))
+    with rows.readable():
+        heads, cells = table_of(lines_of(wanted, chosen))
+        title = f"d of the carrying joint on {count_of(wanted)}"
     caption = "in brackets: paired difference to ours, ± half its 95 % interval over the arms; * if it excludes zero"
-    show(heads, cells, format_, title=f"d of the carrying joint on {len(subjects)} arms", caption=caption)
+    show(heads, cells, format_, title=title, caption=caption)
+    say(f"The rows are in {out}.")
 
 
 def places(text: str) -> list[int]:
@@ -80,7 +89,7 @@ def places(text: str) -> list[int]:
         FleetError: not whole numbers from zero.
     """
     try:
-        found = [int(part) for part in text.split(",")]
+        found = list(dict.fromkeys(int(part) for part in text.split(",")))
     except ValueError:
         found = [-1]
     if min(found) < 0:
@@ -110,23 +119,47 @@ def parsimony_command(
     from scenarios.studies.sweep.rows import Rows
 
     subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=True)
-    with progress_bar(kept="Finished rows are") as progress:
-        rows = parsimony(subjects, Rows(out), compute=not show_only, progress=progress)
+    rows = Rows(out)
+    if show_only:
+        wanted = parsimony(subjects, rows, compute=False)
+        check_some(wanted, out)
+    else:
+        with progress_bar(kept="Finished rows are", file=out) as progress:
+            wanted = parsimony(subjects, rows, progress=progress)
     if format_ == "json":
-        print_json(rows)
+        print_json(wanted)
         return
-    show(HEADS, summary(rows), format_, title=f"Quality by amount of training data, {len(subjects)} arms")
+    with rows.readable():
+        lines, title = summary(wanted), f"Quality by amount of training data, {count_of(wanted)}"
+    show(HEADS, lines, format_, title=title)
+    say(f"The rows are in {out}.")
+
+
+def check_some(rows: "Sequence[Row]", out: Path, more: str = "") -> None:
+    """Raise a FleetError if the file has none of the rows that --show asks for."""
+    if not rows:
+        raise FleetError(
+            f"'{out}' has no such row. Give the options with which its rows were computed (--scenarios, --arms, "
+            f"--seeds, --test{more}), or leave out --show to compute them."
+        )
+
+
+def count_of(rows: "Sequence[Row]") -> str:
+    """`6 arms`: the subjects of the rows."""
+    count = len({row["subject"] for row in rows})
+    return f"{count} arm{'s' * (count != 1)}"
 
 
 def subjects_from(scenarios: str, arms: str, seeds: int, test: int, *, carrier_only: bool = False) -> "list[Subject]":
     """The subjects that the options name."""
     from scenarios.studies.sweep.subjects import Sizes, subjects_of
 
-    chosen = [load(name.strip()) for name in scenarios.split(",")]
-    numbers = range(1, seeds + 1)
-    return list(
-        subjects_of(chosen, arms=places(arms), seeds=numbers, sizes=Sizes(test=test), carrier_only=carrier_only)
-    )
+    chosen = {name: load(name) for name in (part.strip() for part in scenarios.split(","))}
+    wanted, most = places(arms), max(len(scenario.arms) for scenario in chosen.values()) - 1
+    if max(wanted) > most:
+        raise FleetError(f"--arms must be 0 to {most}, as the scenarios have arms (got '{arms}').")
+    numbers, of = range(1, seeds + 1), tuple(chosen.values())
+    return list(subjects_of(of, arms=wanted, seeds=numbers, sizes=Sizes(test=test), carrier_only=carrier_only))
 
 
 def show(heads: Sequence[str], rows: Sequence[Sequence[str]], format_: str, *, title: str, caption: str = "") -> None:
@@ -139,4 +172,4 @@ def show(heads: Sequence[str], rows: Sequence[Sequence[str]], format_: str, *, t
     table = plain_table(*heads, title=title, caption=caption or None)
     for row in rows:
         table.add_row(*row)
-    out_console.print(table)
+    print_wide(table)

@@ -12,7 +12,7 @@ from rich.table import Table
 from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.studies.sweep import parsimony_command, sweep_command
-from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
+from scenarios.cli.terminal import echo, out_console, plain_table, print_json, print_wide, progress_bar, say
 from scenarios.cli.twin.motion import export_command, generate_command, identify_command, recover_command
 from scenarios.cli.twin.verdict import questions_command, readings_command, sides_command, verdict_command
 from scenarios.load import load
@@ -137,7 +137,7 @@ def score_command(
     if isinstance(shown, str):
         echo(shown, nl=False)
     else:
-        out_console.print(shown)
+        print_wide(shown)
 
 
 twin_app.command("identify")(identify_command)

@@ -8,8 +8,9 @@ from rich.table import Table
 
 from fleet.errors import FleetError
 from scenarios.cli import options
-from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
+from scenarios.cli.terminal import echo, out_console, plain_table, print_json, print_wide, progress_bar, say
 from scenarios.load import load
+from scenarios.result_folder import check_file, disk_errors
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
@@ -33,18 +34,19 @@ def verdict_command(
     ] = None,
     format_: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
     skip_damaged: options.DamagedOption = False,
-    overwrite: options.OverwriteOption = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier map.")] = False,
 ) -> None:
     """Call each job of a scenario, or each recording of a log, uncritical or anomalous.
 
     The threshold is a conformal p-value: a new cool job is called anomalous with
     probability alpha at most, if it is like the cool jobs that the twin held out
-    of its training. Motion files of `twin generate` are recordings, too.
+    of its training. Motion files of `twin generate` are recordings, too. Takes
+    seconds; the first time for a scenario, half a minute for planning.
     """
     check_one_source(scenario, log)
     choose("format", format_, Literal["table", "csv", "json"])
     if map_ is not None:
-        check_map(map_, overwrite=overwrite)
+        check_file(map_, (".png",), overwrite, "--map")
     import numpy as np
 
     from scenarios.prepare.twin_folder import open_twin
@@ -65,14 +67,13 @@ def verdict_command(
         features = Features(np.stack([log_features(twin, recording).packed for recording in recordings]))
         rows = log_rows(twin, recordings)
     judged = with_verdicts(rows, rule, features)
-    if map_ is not None:
-        draw_map(map_, rule, features)
     shown = render(judged, format_, caption=f"{rule.guarantee} Twin of {twin.arm}, version {twin.version}")
     if isinstance(shown, str):
         echo(shown, nl=False)
     else:
-        out_console.print(shown)
+        print_wide(shown)
     if map_ is not None:
+        draw_map(map_, rule, features)
         say(f"Map written to {map_}.")
 
 
@@ -83,32 +84,24 @@ def check_one_source(scenario: str | None, log: Path | None) -> None:
         raise FleetError(f"Give either a scenario or --log FILE_OR_FOLDER (got {given}).")
 
 
-def check_map(path: Path, *, overwrite: bool) -> None:
-    """Raise a FleetError unless the map can be written."""
-    from scenarios.result_folder import check_overwrite
-
-    if path.suffix != ".png":
-        raise FleetError(f"--map must name a file that ends in .png (got '{path}').")
-    if not path.parent.is_dir():
-        raise FleetError(f"--map: there is no folder '{path.parent}'.")
-    check_overwrite(path, overwrite)
-
-
 def draw_map(path: Path, rule: "Rule", features: "Features") -> None:
     """Write the latent plane with the verdicts."""
     from fleet.files import atomic_path
     from scenarios.studies.report.figures import picture
     from scenarios.studies.verdict.latent_map import verdict_map
 
-    with atomic_path(path) as draft:
-        draft.write_bytes(picture("verdict", verdict_map(rule, features), "Latent plane with verdicts.").png)
+    png = picture("verdict", verdict_map(rule, features), "Latent plane with verdicts.").png
+    with disk_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as draft:
+            draft.write_bytes(png)
 
 
 def readings_command(
     scenarios: Annotated[
         str, typer.Argument(help="Scenarios whose arms are studied, separated by commas.")
     ] = "quickstart,active_waiting,heat_wave",
-    seeds: Annotated[int, options.number("Number of seeds, from 1.", 1, 100)] = 1,
+    seeds: Annotated[int, options.number("Number of seeds: 1, 2, …", 1, 100)] = 1,
     out: Annotated[Path, typer.Option(help="JSON of all numbers; a later call continues it.")] = Path(
         "runs/readings.json"
     ),
@@ -126,9 +119,10 @@ def readings_command(
 
     choose("size", size, Literal["quick", "full"])
     config = TwinConfig.quick() if size == "quick" else TwinConfig()
-    chosen = [load(name.strip()) for name in scenarios.split(",")]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with progress_bar() as progress:
+    chosen = [load(name) for name in dict.fromkeys(part.strip() for part in scenarios.split(","))]
+    with disk_errors(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+    with progress_bar(kept="Finished arms are", file=out) as progress:
         card = study_arms(chosen, range(1, seeds + 1), out, config=config, folder=cache_folder(), progress=progress)
     if as_json:
         print_json(card)
@@ -192,7 +186,7 @@ def sides_command(
 
 def questions_command(
     log: Annotated[Path, typer.Option("--log", help="A folder of logs of one arm, with motor temperatures.")],
-    seeds: Annotated[int, options.number("Number of seeds, from 0.", 1, 100)] = 3,
+    seeds: Annotated[int, options.number("Number of seeds: 0, 1, …", 1, 100)] = 3,
     window: Annotated[int, options.number("Samples per window, 2 in a second.", 10, 10_000)] = 50,
     skip_damaged: options.DamagedOption = False,
     as_json: options.JsonOption = False,
@@ -205,7 +199,7 @@ def questions_command(
 
     from fleet.files import cache_folder
     from scenarios.studies.real_logs import CONFIG
-    from scenarios.studies.verdict.log_questions import answers, judged_windows
+    from scenarios.studies.verdict.log_questions import QUESTIONS, answers, judged_windows
 
     config = CONFIG.changed(window=window)
     recordings = options.recordings_of(log, skip_damaged)
@@ -214,10 +208,15 @@ def questions_command(
         for seed in range(seeds):
             windows = judged_windows(recordings, seed, config=config, folder=cache_folder(), progress=progress)
             found[seed] = answers(windows)
+    if not found[0]:
+        raise FleetError("No question has an answer: each needs windows of both kinds, also in two files. Add logs.")
     if as_json:
         print_json({str(s): {q: asdict(answer) for q, answer in by.items()} for s, by in found.items()})
         return
     caption = "[95 % interval, bootstrap over files]; lead: AUROC minus that of RMS torque"
+    for question in QUESTIONS:
+        if question not in found[0]:
+            say(f"Left out: {question}; it needs windows of both kinds, also in two files.")
     for question, first in found[0].items():
         title = f"{question}: {first.events} of {first.windows} windows, in {first.files_with} of {first.files} files"
         table = plain_table("seed", "score", "AUROC", "lead", title=title, caption=caption)

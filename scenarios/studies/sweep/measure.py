@@ -49,6 +49,8 @@ def sweep(
         FleetError: all jobs of a subject are critical, or none is.
         Diverged: a training ended without finite weights.
     """
+    if compute:
+        rows.check_writable()
     studies: dict[str, Study] = {}
     wanted: list[str] = []
     for done, (name, configuration) in enumerate(configurations.items()):

@@ -49,6 +49,8 @@ def parsimony(
     Raises:
         FleetError: all test jobs of a subject are critical, or none is.
     """
+    if compute:
+        rows.check_writable()
     wanted: list[str] = []
     for done, subject in enumerate(subjects):
         progress("computing data parsimony", Count(done, len(subjects)))
@@ -107,7 +109,8 @@ def summary(rows: Sequence[Row]) -> list[list[str]]:
         present = {jobs: some for jobs, some in by_jobs.items() if some}
         knees = {measure: knee({jobs: _mean(some, measure) for jobs, some in present.items()}) for measure in RANKING}
         for jobs, some in present.items():
-            cells = ["{:.3f} ± {:.3f}".format(*interval([row[measure] for row in some])) for measure in RANKING]
+            spans = [interval([row[measure] for row in some]) for measure in RANKING]
+            cells = [f"{mean:.3f} ± {half:.3f}" if half else f"{mean:.3f}" for mean, half in spans]
             reached = ", ".join(LABELS[measure] for measure in RANKING if knees[measure] == jobs)
             lines.append([model, str(jobs), f"{_mean(some, 'minutes'):.1f}", *cells, reached])
     return lines

@@ -1,38 +1,47 @@
 """Results of a long study as JSON lines: each row is appended when it is known, so a stopped study goes on."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any  # JSON values
 
 from fleet.errors import FleetError
+from scenarios.result_folder import disk_errors
 
 Row = dict[str, Any]
 KEY = "key"
+_BEGIN = f'{{"{KEY}": '.encode()
+"""Every row begins with this."""
 
 
 class Rows:
-    """The rows of a file, by key; a later row replaces an earlier one.
+    """The rows of a file, by key; a later row replaces an earlier one. Reading leaves the file as it is.
 
     Raises:
-        FleetError: the file has a complete line that is no row.
+        FleetError: the file has a line that is no row.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.by_key: dict[str, Row] = {}
-        text = path.read_text(encoding="utf-8") if path.exists() else ""
-        *lines, unfinished = text.split("\n")
+        data = path.read_bytes() if path.exists() else b""
+        *lines, unfinished = data.split(b"\n")
+        self._size, self._unfinished = len(data), len(unfinished)
+        """Bytes of the file, and those of its last line if a process was stopped while it wrote."""
         for number, line in enumerate(lines, start=1):
             try:
                 row = json.loads(line)
                 self.by_key[row[KEY]] = row
             except (ValueError, KeyError, TypeError):
-                raise FleetError(
-                    f"{path}, line {number}: not a row of this study; remove the line, or write to another file."
-                ) from None
-        if unfinished:  # of a process that was stopped while it wrote
-            path.write_text(text[: len(text) - len(unfinished)], encoding="utf-8")
+                raise self._refusal(number) from None
+        if unfinished[: len(_BEGIN)] != _BEGIN[: len(unfinished)]:
+            raise self._refusal(len(lines) + 1)
+
+    def _refusal(self, line: int) -> FleetError:
+        return FleetError(
+            f"{self.path}, line {line}: not a row of this study; remove the line, or write to another file."
+        )
 
     def __contains__(self, key: str) -> bool:
         return key in self.by_key
@@ -42,9 +51,30 @@ class Rows:
         return [self.by_key[key] for key in keys if key in self.by_key]
 
     def append(self, key: str, row: Mapping[str, Any]) -> None:
-        """Add a row to the file."""
+        """Add a row to the file; an unfinished line at its end is removed."""
         whole = {KEY: key, **row}
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(whole, ensure_ascii=False) + "\n")
+        self._write(json.dumps(whole, ensure_ascii=False) + "\n")
         self.by_key[key] = whole
+
+    def check_writable(self) -> None:
+        """Raise a FleetError if rows cannot be appended."""
+        self._write("")
+
+    def _write(self, text: str) -> None:
+        with disk_errors(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("ab") as file:
+                if self._unfinished and file.tell() == self._size:  # else another process continued the file
+                    file.truncate(self._size - self._unfinished)
+                self._unfinished = 0
+                file.write(text.encode())
+
+    @contextmanager
+    def readable(self) -> Iterator[None]:
+        """Turn the error of a row with missing or odd values into a FleetError that names the file."""
+        try:
+            yield
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise FleetError(
+                f"A row of '{self.path}' has a missing or odd value ({type(error).__name__}: {error}); remove the row."
+            ) from error

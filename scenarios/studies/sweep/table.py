@@ -37,10 +37,11 @@ class Cell:
 
     def __str__(self) -> str:
         if self.lead is None:
-            return f"{_short(self.mean)} ± {_short(self.half)}"
+            return f"{_short(self.mean)} ± {_short(self.half)}" if self.half else _short(self.mean)
         clear = "*" if abs(self.lead) > self.lead_half > 0 else ""
         sign = "−" if self.lead < 0 else "+"
-        return f"{_short(self.mean)} ({sign}{_short(abs(self.lead))} ± {_short(self.lead_half)}{clear})"
+        half = f" ± {_short(self.lead_half)}{clear}" if self.lead_half else ""  # one subject has no interval
+        return f"{_short(self.mean)} ({sign}{_short(abs(self.lead))}{half})"
 
 
 @dataclass(frozen=True)

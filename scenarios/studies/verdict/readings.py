@@ -15,9 +15,11 @@ import numpy as np
 from scipy.stats import spearmanr
 from sklearn.metrics import average_precision_score, roc_auc_score
 
+from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.prepare.train_twins import train_or_load
 from scenarios.progress import Count, Progress, quiet
+from scenarios.result_folder import disk_errors
 from scenarios.schema import Scenario
 from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.setup import Sample, Study, make_study
@@ -116,14 +118,15 @@ def study_arms(
 
     Returns:
         The content of `out`: for each arm and seed what it measured.
+
+    Raises:
+        FleetError: `out` holds something else, or cannot be written.
     """
     basis = {"sizes": dict(sizes), "epochs": config.epochs, "max_windows": config.max_windows, "window": config.window}
     basis |= {"hidden": config.hidden, "latent": config.latent, "beta": config.beta, "alpha": ALPHA}
     card: dict[str, Any] = {**basis, "arms": {}}
     if out.exists():
-        kept = json.loads(out.read_text(encoding="utf-8"))
-        if {name: kept.get(name) for name in basis} == basis:
-            card = kept
+        card = _kept(out, basis)
     units = [(s, i) for s in scenarios for i in range(len(s.arms))]
     names = [f"{s.name}/{s.arms[i].name}/{seed}" for seed in seeds for s, i in units]
     for done, name in enumerate(names):
@@ -136,9 +139,20 @@ def study_arms(
         study = make(draw, **sizes, robot=scenario.arms[arm].robot())
         twin = train_or_load(study.train.records(), config, draw, arm="arm", folder=folder)
         card["arms"][name] = judge_arm(study, twin)
-        with atomic_path(out) as draft:
+        with disk_errors(out), atomic_path(out) as draft:
             draft.write_text(json.dumps(card, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return {**card, "arms": {name: card["arms"][name] for name in names}}
+
+
+def _kept(out: Path, basis: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        card = json.loads(out.read_bytes())
+        same = {name: card[name] for name in basis} == basis and isinstance(card["arms"], dict)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise FleetError(f"'{out}' is no result of `twin readings`; give another --out.") from None
+    if not same:
+        raise FleetError(f"'{out}' has readings of other settings, such as --size; give another --out.")
+    return card
 
 
 def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def sides(
         s: Perturbation in posterior standard deviations.
 
     Raises:
-        FleetError: a side has no jobs.
+        FleetError: a side has no jobs, or none of its motions is possible.
     """
     score, critical, rest = hot_side(study, twin)
     chosen = {"hot": rest[score[rest] > 0], "cool": rest[score[rest] <= 0]}
@@ -92,6 +92,8 @@ def sides(
                     plans.append(_realised(model, made, source, COMMON_KG if name == "common" else None))
                 except Rejected:
                     rejected[name] += 1
+        if not all(motions.values()):
+            raise FleetError(f"No motion from the {side} side stays within the arm's limits; take a smaller --s.")
         for name, plans in motions.items():
             result[name][side] = _share(study, plans, rejected[name])
     return Sides(
