@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import beta, chi2
 
-from scenarios.statistics.means import LEVEL, Interval, interval, paired
+from scenarios.statistics.means import LEVEL, Interval, draws, interval, paired
 
 Array = np.ndarray
 
@@ -45,7 +45,7 @@ def count_interval(values: ArrayLike, *, level: float = LEVEL) -> Interval:
     x = np.asarray(values, dtype=float)
     if x.any() or not x.size:
         return interval(x, least=0.0, level=level)
-    return Interval(0.0, *rate_bounds(0, _draws(x), level=level), 1.0, f"none in {_draws(x)}, Poisson")
+    return Interval(0.0, *rate_bounds(0, draws(x), level=level), 1.0, f"none in {draws(x)}, Poisson")
 
 
 def paired_counts(values: ArrayLike, base: ArrayLike, *, level: float = LEVEL) -> Interval:
@@ -53,15 +53,5 @@ def paired_counts(values: ArrayLike, base: ArrayLike, *, level: float = LEVEL) -
     x, y = np.asarray(values, dtype=float), np.asarray(base, dtype=float)
     if x.any() or y.any() or x.shape != y.shape:
         return paired(x, y, level=level)
-    most = rate_bounds(0, _draws(x), level=level)[1]
-    return Interval(0.0, -most, most, 1.0, f"none in {_draws(x)}, Poisson")
-
-
-def most_that_differ(count: int, *, level: float = LEVEL) -> float:
-    """The largest share of a population that may differ from `count` equal draws."""
-    return share_bounds(0, count, level=level)[1]
-
-
-def _draws(x: Array) -> int:
-    """Independent draws among [seed] or [fleet, training, seed]: the smaller number of clusters, as for a variance."""
-    return min((n for n in (x.shape[0], x.shape[-1]) if n > 1), default=1)
+    most = rate_bounds(0, draws(x), level=level)[1]
+    return Interval(0.0, -most, most, 1.0, f"none in {draws(x)}, Poisson")

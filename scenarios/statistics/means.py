@@ -10,6 +10,8 @@ Society B 54, 1992). Both are in closed form: no resampling, and p-values as sma
 `tests/statistics/test_coverage.py` measures how often the intervals contain the mean.
 """
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -35,10 +37,10 @@ class Interval:
     """A mean, its interval, and the test whether it is 0."""
 
     mean: float
-    low: float = float("nan")
+    low: float = math.nan
     """NaN where the values do not determine it; `note` says why."""
-    high: float = float("nan")
-    p: float = float("nan")
+    high: float = math.nan
+    p: float = math.nan
     """Two-sided p-value of the mean being 0, below 1 − level exactly if the interval excludes 0; NaN without a test."""
     note: str = ""
     """What the bounds rest on if not on the spread of the values, or why there are none."""
@@ -49,9 +51,9 @@ class Interval:
         return self.low > 0 or self.high < 0
 
     @property
-    def half(self) -> float:
-        """Half the width."""
-        return (self.high - self.low) / 2
+    def margin(self) -> float:
+        """Distance from the mean to the farther bound."""
+        return max(self.high - self.mean, self.mean - self.low)
 
     def text(self, digits: int = 2) -> str:
         """`0.41 [0.35, 0.47]`; the mean alone without bounds."""
@@ -81,7 +83,16 @@ def interval(values: ArrayLike, *, least: float = -np.inf, most: float = np.inf,
     """
     x = _checked(values)
     mean, low, high, p = (float(each) for each in mean_bounds(x, level=level))
-    return Interval(mean, max(low, least), min(high, most), p, _why_none(x) if np.isnan(low) else "")
+    if not np.isnan(low):
+        return Interval(mean, max(low, least), min(high, most), p)
+    if x.size == 1:
+        return Interval(mean, note="one value")
+    note = f"no variation in {draws(x)}"
+    if not np.isfinite(most - least) or mean not in (least, most):
+        return Interval(mean, note=note)
+    # All of n values at one end of a range: if the mean were `away` of it, that has less probability than one tail.
+    away = (most - least) * (1 - ((1 - level) / 2) ** (1 / draws(x)))
+    return Interval(mean, max(least, mean - away), min(most, mean + away), note=note)
 
 
 def paired(values: ArrayLike, base: ArrayLike, *, level: float = LEVEL) -> Interval:
@@ -94,6 +105,21 @@ def paired(values: ArrayLike, base: ArrayLike, *, level: float = LEVEL) -> Inter
     if x.shape != y.shape:
         raise ValueError(f"Paired values need equal shapes (got {x.shape}, {y.shape}).")
     return interval(x - y, level=level)
+
+
+def mean_by_group(values: Iterable[tuple[str, float]]) -> Interval:
+    """The interval of the mean over groups that each have some values, such as arms under seeds of their own.
+
+    The groups are the sample; of a single group, its values are.
+
+    Args:
+        values: Name of the group, and a value of it.
+    """
+    groups = dict[str, list[float]]()
+    for name, value in values:
+        groups.setdefault(name, []).append(value)
+    several = list(groups.values())
+    return interval([np.mean(each) for each in several] if len(several) > 1 else several[0])
 
 
 def mean_bounds(values: Array, *, level: float = LEVEL) -> Bounds:
@@ -121,6 +147,11 @@ def mean_bounds(values: Array, *, level: float = LEVEL) -> Bounds:
     tails = (side(both, max(clusters - 1, 1)).max(axis=0) for side in (student.cdf, student.sf))
     p = np.minimum(1.0, 2 * np.minimum(*tails))
     return Bounds(mean, mean - above * spread, mean - below * spread, p)
+
+
+def draws(values: Array) -> int:
+    """Independent draws among [seed] or [fleet, training, seed]: the smaller number of clusters, as for a variance."""
+    return min((count for count in (values.shape[0], values.shape[-1]) if count > 1), default=1)
 
 
 def unit(shape: tuple[int, ...]) -> str:
@@ -176,7 +207,3 @@ def _checked(values: ArrayLike) -> Array:
         raise ValueError("Values must be finite.")
     x = x if x.ndim == 3 else x[None, None]
     return x if np.ptp(x, axis=1).any() else x[:, :1]  # without trainings of its own
-
-
-def _why_none(x: Array) -> str:
-    return "one value" if x.size == 1 else f"no variation in {x.size}"

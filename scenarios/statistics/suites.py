@@ -102,7 +102,7 @@ def improvement(scores: ArrayLike, base: ArrayLike, unit: Unit = "instances", *,
     share, (most, least) = float(better.mean()), _beyond(x.shape, unit, level)
     if share in (0, 1):
         return Interval(share, share and least, share or most, note="the same everywhere, Clopper–Pearson")
-    return _interval(share, drawn / better.size, level)
+    return percentile_interval(share, drawn / better.size, level=level)
 
 
 def _beyond(shape: tuple[int, ...], unit: Unit, level: float) -> tuple[float, float]:
@@ -115,7 +115,10 @@ def _aggregate(x: Array, unit: Unit, level: float) -> Aggregate:
     weights, lack = _weights(x.shape, unit), 1 - np.minimum(x, 1)
     iqm, whole = _trimmed(x, weights), _trimmed(x, np.ones((1, *x.shape)))
     gap = weights.reshape(DRAWS, -1) @ lack.ravel() / x.size
-    return Aggregate(_interval(float(whole[0]), iqm, level), _interval(float(lack.mean()), gap, level))
+    return Aggregate(
+        percentile_interval(float(whole[0]), iqm, level=level),
+        percentile_interval(float(lack.mean()), gap, level=level),
+    )
 
 
 def _trimmed(x: Array, weights: Array) -> Array:
@@ -161,9 +164,10 @@ def _drawn(count: int, size: tuple[int, ...], stream: int) -> Array:
     return rng.multinomial(count, np.full(count, 1 / count), size=size).astype(float)
 
 
-def _interval(at: float, drawn: Array, level: float) -> Interval:
+def percentile_interval(at: float, drawn: Array, *, level: float = LEVEL) -> Interval:
+    """The interval of a figure between the percentiles of its values in resamples, [draw]."""
     if np.ptp(drawn) <= SAME * abs(at):
-        return Interval(at, note=f"no variation in {DRAWS} resamples")
+        return Interval(at, note=f"no variation in {len(drawn)} resamples")
     low, high = _percentiles(drawn, level)
     return Interval(at, float(low), float(high))
 

@@ -66,7 +66,7 @@ def sweep_command(
         print_json(wanted)
         return
     heads, cells = table_of(lines_of(wanted, chosen))
-    caption = "in brackets: paired difference to ours, ± half its 95 % interval over the arms; * if it excludes zero"
+    caption = "in brackets: paired difference to ours, ± the 95 % margin over the arms; * if that excludes zero"
     show(heads, cells, format_, title=f"d of the carrying joint on {len(subjects)} arms", caption=caption)
 
 

@@ -41,7 +41,7 @@ def study_command(
     if log is not None and chosen != "transfer":
         raise FleetError(f"--log belongs to the study 'transfer' (got '{chosen}'); leave it out.")
     require_extra("twin")
-    from scenarios.studies.lifetime.intervals import study_result, write_result
+    from scenarios.studies.lifetime.results import study_result, write_result
 
     given, file = range(first_seed, first_seed + seeds), out or Path(f"runs/study-{chosen}.json")
     recordings = None if log is None else options.recordings_of(log, skip_damaged)
