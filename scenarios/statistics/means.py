@@ -195,8 +195,9 @@ def _transformed(ratio: Array, skew: Array) -> Array:
 
 def _untransformed(value: float, skew: Array) -> Array:
     """The t that `_transformed` maps to a value."""
-    a = np.where(np.abs(skew) < 1e-9, 1e-9, skew)
-    return (np.cbrt(1 + 6 * a * (value - a)) - 1) / (2 * a)
+    small = np.abs(skew) < 1e-6
+    a = np.where(small, 1.0, skew)
+    return np.where(small, value - skew * (1 + 2 * value**2), (np.cbrt(1 + 6 * a * (value - a)) - 1) / (2 * a))
 
 
 def _checked(values: ArrayLike) -> Array:

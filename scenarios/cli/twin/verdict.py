@@ -157,13 +157,13 @@ def sides_command(
     The arm gets random jobs with true outcomes and a twin trained on its cool
     ones, as in `twin readings`. Takes some minutes.
     """
-    from scenarios.statistics.means import Interval
     from dataclasses import asdict
 
     import numpy as np
 
     from fleet.files import cache_folder
     from scenarios.prepare.train_twins import train_or_load
+    from scenarios.statistics.means import Interval
     from scenarios.studies.setup import make_study
     from scenarios.studies.verdict.readings import SIZES
     from scenarios.studies.verdict.sides import COMMON_KG, sides
