@@ -3,11 +3,11 @@
     python benchmarks/bench_channel.py [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
 
 Means over the seeds; in brackets the mean paired difference to the same policy and seed on a perfect channel, with *
-if its 95 % bootstrap interval excludes zero (too narrow for a handful of seeds). `heard`: share of messages delivered,
-over all pairs of arms. `lost`: claims for a job or station that another arm won. Policies that use no peer messages
-(round_robin) are equal on every channel. In memory, with the profile plant and the arms' twins, on all cores. The
-defaults are 130 shifts: some eight minutes of CPU time, half of that on two idle cores, and a few minutes more if the
-twins are not cached. `heat_wave` takes three times as long.
+if its 95 % interval excludes zero. `heard`: share of messages delivered, over all pairs of arms. `lost`: claims for a
+job or station that another arm won. Policies that use no peer messages (round_robin) are equal on every channel. In
+memory, with the profile plant and the arms' twins, on all cores. The defaults are 130 shifts: some eight minutes of CPU
+time, half of that on two idle cores, and a few minutes more if the twins are not cached. `heat_wave` takes three times
+as long.
 """
 
 import argparse
@@ -26,9 +26,9 @@ from fleet.bus.exchange.channel import Channel, Partition
 from fleet.files import cache_folder
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
-from scenarios.run.compare import interval
 from scenarios.run.shift import RunSpec, run
 from scenarios.schema import Scenario
+from scenarios.statistics.means import interval
 
 FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "heard")
 DIGITS = {"value": 1, "on_time": 1, "faults": 2, "above_warning_min": 0, "lost": 1}
@@ -75,8 +75,7 @@ def row(values: np.ndarray, base: np.ndarray) -> str:
     cells = []
     for i, (name, digits) in enumerate(DIGITS.items()):
         gap = values[:, i] - base[:, i]
-        low, high = interval(gap)
-        star = "*" if low > 0 or high < 0 else ""
+        star = "*" if interval(gap).excludes_zero else ""
         more = f" ({gap.mean():+.{digits}f}{star})" if gap.any() else ""
         cells.append(f"{values[:, i].mean():.{digits}f}{more} | ")
         assert FIGURES[i] == name

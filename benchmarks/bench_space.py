@@ -5,7 +5,7 @@
 Every shift is played on the profile plant and its recorded postures, one each second, are given to MuJoCo, which finds
 contacts of arms, floor and fixtures; the plant `mujoco` is played for `--mujoco-s` seconds of each and looks at 100
 postures a second. The time to compare the plans is that of one core with nothing cached but the plans. The value of
-finished jobs is compared with the same shifts of arms that pass through each other (twins, paired, 95 % bootstrap).
+finished jobs is compared with the same shifts of arms that pass through each other (twins, paired, 95 % interval).
 """
 
 import argparse
@@ -24,9 +24,9 @@ from fleet.planning.space import space_table
 from fleet.robot import Mount, Robot
 from scenarios.load import library, load
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.compare import interval
 from scenarios.run.evaluate import outcomes
 from scenarios.run.shift import RunSpec, run
+from scenarios.statistics.means import interval
 
 SIXTEEN = 4
 """Cells of four arms that stand beside each other, for the larger table."""
@@ -83,9 +83,8 @@ def value(fleet: Fleet, seeds: range) -> None:
     for policy in WORTH:
         solid, free = ([each.value for each in outcomes(one, policy, seeds)] for one in (fleet, ghosts))
         lost = np.subtract(solid, free)
-        low, high = interval(lost)
         name = f"{fleet.scenario.name} {policy}"
-        print(f"{name:<36}{np.mean(solid):>8.1f}{np.mean(free):>8.1f}{lost.mean():>+8.1f} [{low:+.1f}, {high:+.1f}]")
+        print(f"{name:<36}{np.mean(solid):>8.1f}{np.mean(free):>8.1f}{interval(lost).text(1):>24}")
 
 
 def _beside(robot: Robot, cell: int) -> Robot:

@@ -97,7 +97,11 @@ def test_nothing_is_pinned_that_is_not_asked_for():
     assert set(pinned_in("constraints.txt")) == {name_of(requirement) for requirement in SHARED}
 
 
-OTHERWISE = {"agilerl": {"tensordict"}, "benchmarl": {"av", "tensordict", "torchrl"}, "rllib": {"gymnasium"}}
+OTHERWISE = {
+    "agilerl": {"pandas", "tensordict"},
+    "benchmarl": {"av", "tensordict", "torchrl"},
+    "rllib": {"gymnasium", "pandas"},
+}
 """What it wants in another version than everybody else."""
 
 

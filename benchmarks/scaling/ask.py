@@ -14,8 +14,8 @@ from scenarios.fault_price import weights_of
 from scenarios.load import load
 from scenarios.prepare.fleet import DifficultyName, prepare
 from scenarios.run.batch import Randomisation, library_of
-from scenarios.run.compare import interval
 from scenarios.run.outcome import common_figures
+from scenarios.statistics.means import interval
 
 Array = np.ndarray
 ASKED = (1, 2, 3, 4, 6, 8)
@@ -132,11 +132,12 @@ def print_asked(arms: int, seeds: int, difficulty: DifficultyName, arrivals: flo
 
     def line(name: str, rows: Array) -> None:
         loss = 100.0 * (full[:, 0] - rows[:, 0]) / full[:, 0]
-        low, high = interval(loss)
+        of_loss = interval(loss)
+        bounds = "" if of_loss.note else f"{of_loss.low:.2f} … {of_loss.high:.2f}"
         mean = rows.mean(axis=0)
         print(
             f"{name:>14}{mean[4]:>12.1f}{mean[1]:>10.1f}{mean[0]:>9.1f}{loss.mean():>9.2f}"
-            f"{f'{low:.2f} … {high:.2f}':>18}{mean[2]:>8.2f}{mean[3]:>9.1f}",
+            f"{bounds:>18}{mean[2]:>8.2f}{mean[3]:>9.1f}",
             flush=True,
         )
 

@@ -1,7 +1,7 @@
 """Several policies on the same seeds, with paired differences."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, delayed
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
-from scipy.stats import bootstrap, trim_mean
 
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
@@ -21,8 +19,10 @@ from scenarios.policy_loader import label, policy_of, scope_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
 from scenarios.report.page import table
-from scenarios.run.evaluate import FIGURES, Outcome, outcomes
+from scenarios.run.evaluate import COUNTS, FIGURES, POSSIBLE, Outcome, outcomes
 from scenarios.schema import Scenario
+from scenarios.statistics.means import unit
+from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
 
 Array = np.ndarray
 Models = tuple[DifficultyName, RiskName]
@@ -45,33 +45,10 @@ HEADINGS = {
 """Headings of the figures in the table, with units."""
 LEAST_DIGITS = {"availability": 3, "tool_drift_mm": 2}
 """Decimals of a figure; 1 for others."""
-MORE_DIGITS = 3
-RESAMPLES = 2000
 TOGETHER = 16
 """Shifts of a policy that are stepped side by side."""
 HERE_S = 5.0
 """About the time that a worker process takes to start; until then this process does the work."""
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One figure of one policy over the seeds."""
-
-    mean: float
-    iqm: float
-    """Interquartile mean (Agarwal et al., NeurIPS 2021)."""
-    low: float
-    high: float
-    """95 % bootstrap interval of the mean."""
-    difference: float
-    """Mean paired difference to the baseline."""
-    difference_low: float
-    difference_high: float
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the interval of the difference excludes 0."""
-        return self.difference_low > 0 or self.difference_high < 0
 
 
 @dataclass(frozen=True)
@@ -89,16 +66,23 @@ class Comparison:
     """`Channel.described`."""
     channel_text: str
 
+    @property
+    def unit(self) -> str:
+        """What the intervals speak about."""
+        return unit((1, 1, len(self.seeds)))
+
     def _repr_html_(self) -> str:
         head = ("policy", *(HEADINGS[name] for name in FIGURES))
         rows = [[label(policy), *map(self._cell, figures.values())] for policy, figures in self.figures.items()]
-        what = f"mean (difference to {label(self.baseline)}; * its 95 % interval excludes 0)"
-        return table(head, rows, caption=f"{self.scenario}, {len(self.seeds)} seeds: {what}")
+        what = f"mean [interval] and paired difference to {label(self.baseline)}; {LEGEND}"
+        more = "".join(f" {each}" for each in remarks(self.figures, len(self.seeds)))
+        return table(head, rows, caption=f"{self.scenario}, {self.unit}: {what}.{more}")
 
     @staticmethod
     def _cell(figure: Figure) -> str:
-        difference = f" ({figure.difference:+.3g}{'*' * figure.excludes_zero})" if figure.difference else ""
-        return f"{figure.mean:.4g}{difference}"
+        bounds = f" [{figure.low:.3g}, {figure.high:.3g}]" if figure.low == figure.low else ""
+        difference = f" {figure.difference:+.3g}{figure.stars}" if figure.difference else ""
+        return f"{figure.mean:.4g}{bounds}{difference}"
 
 
 def compare(
@@ -139,9 +123,7 @@ def compare(
     for n, ((policy, _), result) in enumerate(zip(parts, results, strict=True)):
         by_policy[policy] += result
         progress("comparing", Count((n + 1) * len(seeds) * len(policies) // len(parts), len(seeds) * len(policies)))
-    figures = {
-        p: {name: figure_of(name, rows, by_policy[baseline]) for name in FIGURES} for p, rows in by_policy.items()
-    }
+    figures = figures_of_shifts(by_policy, baseline)
     scopes = {policy: scope_of(policy) for policy in policies}
     return Comparison(scenario.name, tuple(seeds), baseline, figures, scopes, channel.described(), channel.text)
 
@@ -173,64 +155,37 @@ def _run_in_worker(
     return outcomes(_fleet(scenario, models, folder), policy, seeds, channel)
 
 
-def figure_of(name: str, rows: Sequence[Outcome], base: Sequence[Outcome]) -> Figure:
-    """One figure over seeds: mean, and paired difference to the rows of a baseline.
+def figures_of_shifts(by_policy: Mapping[str, Sequence[Outcome]], baseline: str) -> dict[str, dict[str, Figure]]:
+    """The compared figures of several policies, or of other variants, by its name and that of the figure.
 
     Args:
-        rows, base: On the same seeds, in the same order.
+        by_policy: On the same seeds, in the same order.
+        baseline: The one that differences refer to.
     """
-    values = np.array([getattr(each, name) for each in rows], dtype=float)
-    paired = values - np.array([getattr(each, name) for each in base], dtype=float)
-    mean, iqm = float(values.mean()), float(trim_mean(values, 0.25))
-    return Figure(mean, iqm, *interval(values), float(paired.mean()), *interval(paired))
-
-
-def interval(values: Array) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean over seeds, [seed]; depends on these values alone."""
-    if np.ptp(values) == 0:
-        return float(values[0]), float(values[0])
-    rng = np.random.default_rng(np.random.SeedSequence(0))
-    result = bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=rng, vectorized=True)
-    return float(result.confidence_interval.low), float(result.confidence_interval.high)
-
-
-def _digits(figures: Sequence[Figure], least: int) -> int:
-    """Decimals, up to `MORE_DIGITS` more than the least, with which no interval that excludes 0 seems to include it."""
-    nearest = [min(abs(f.difference_low), abs(f.difference_high)) for f in figures if f.excludes_zero]
-    enough = (n for n in range(least, least + MORE_DIGITS) if all(round(bound, n) for bound in nearest))
-    return next(enough, least + MORE_DIGITS)
+    values = {
+        policy: {name: np.array([getattr(row, name) for row in rows], dtype=float) for name in FIGURES}
+        for policy, rows in by_policy.items()
+    }
+    return figures_of(values, baseline, counts=COUNTS, possible=POSSIBLE)
 
 
 def comparison_table(result: Comparison) -> Group:
     """A block per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
     title = (
-        f"{result.scenario}, seeds {result.seeds[0]} to {result.seeds[-1]}: mean, paired difference to "
-        f"{result.baseline}, 95 % intervals; * excludes 0"
+        f"{result.scenario}, seeds {result.seeds[0]} to {result.seeds[-1]} ({result.unit}): mean, paired difference to "
+        f"{result.baseline}, {LEGEND}"
     )
     if result.channel != PERFECT.described():
         title += f"\nChannel: {result.channel_text}."
-    table = Table(box=None, pad_edge=False)
-    table.add_column("", overflow="fold")
-    for name in ("mean", "interval", "difference", "interval", ""):
-        table.add_column(name, justify="right")
+    table = empty_table()
     table.add_row("[bold]scope[/bold]")
     for policy, scope in result.scopes.items():
         table.add_row(f"  {label(policy)}", scope)
     for name in FIGURES:
-        table.add_row(f"[bold]{HEADINGS[name]}[/bold]")
-        digits = _digits([figures[name] for figures in result.figures.values()], LEAST_DIGITS.get(name, 1))
-        for policy, figures in result.figures.items():
-            f = figures[name]
-            mean, low, high = (f"{value:z.{digits}f}" for value in (f.mean, f.low, f.high))
-            cells = [f"  {label(policy)}", mean, f"{low} … {high}"]
-            if policy != result.baseline:
-                difference, low, high = (
-                    f"{value:+z.{digits}f}" for value in (f.difference, f.difference_low, f.difference_high)
-                )
-                star = "*" if float(low) > 0 or float(high) < 0 else ""
-                cells += [difference, f"{low} … {high}", star]
-            table.add_row(*cells)
+        figures = {policy: each[name] for policy, each in result.figures.items()}
+        add_block(table, HEADINGS[name], figures, result.baseline, label, LEAST_DIGITS.get(name, 1))
+    below = list(remarks(result.figures, len(result.seeds)))
     central = [label(policy) for policy, scope in result.scopes.items() if scope == "central"]
     if result.channel != PERFECT.described() and central:
-        return Group(Text(title), table, Text(f"Central policies read no messages: {', '.join(central)}."))
-    return Group(Text(title), table)
+        below.append(f"Central policies read no messages: {', '.join(central)}.")
+    return Group(Text(title), table, *map(Text, below))

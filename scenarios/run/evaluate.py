@@ -1,5 +1,6 @@
 """A policy on several seeds, and the figures of each of its shifts."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -44,6 +45,12 @@ class Outcome:
 
 FIGURES = tuple(field.name for field in fields(Outcome))
 """Names of the compared figures."""
+COUNTS = ("finished", "on_time", "faults")
+"""Figures that count events."""
+POSSIBLE = {name: (0.0, math.inf) for name in FIGURES if name not in ("reward", "peak_c")} | {
+    "availability": (0.0, 1.0)
+}
+"""Smallest and largest possible value of a figure."""
 
 
 def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel = PERFECT) -> list[Outcome]:

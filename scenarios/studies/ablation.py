@@ -1,10 +1,6 @@
 """Compare sources of scores: one policy with difficulty, P(saturation) and predicted peak from each source.
 
-Every source runs on the same fleets, trainings and seeds. Results of one fleet are correlated, and so are results of
-one seed, which draws the same jobs for every fleet. So the variance of a mean is clustered both ways,
-V = V_fleet + V_seed − V_fleet×seed. The t quantiles have the smaller number of clusters minus one as degrees of freedom
-(Cameron, Gelbach & Miller, Journal of Business & Economic Statistics 29, 2011). Trainings differ within fleets, so
-V_fleet includes them.
+Every source runs on the same fleets, trainings and seeds; intervals count all three (`scenarios.statistics.means`).
 """
 
 import csv
@@ -18,18 +14,18 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
-from scipy import stats
 
 from fleet.errors import FleetError, nearest
 from fleet.files import atomic_path, cache_folder
 from scenarios.policy_loader import label, policy_of
 from scenarios.progress import COUNTED, Count, Progress, quiet
 from scenarios.result_folder import disk_errors
-from scenarios.run.evaluate import outcomes
+from scenarios.run.evaluate import COUNTS, POSSIBLE, outcomes
 from scenarios.run.shift import scenario_hash
 from scenarios.schema import Scenario
+from scenarios.statistics.means import unit
+from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
 from scenarios.studies.score_sources import ALL_SOURCES, SOURCES, DrawnFleet
 
 Array = np.ndarray
@@ -86,24 +82,12 @@ class Row(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Effect:
-    """A mean over fleets, trainings and seeds, and its difference to the first source, with 95 % intervals."""
-
-    mean: float
-    low: float
-    high: float
-    difference: float
-    difference_low: float
-    difference_high: float
-
-
-@dataclass(frozen=True)
 class Ablation:
     """Result of an ablation."""
 
     scenario: str
     plan: AblationPlan
-    effects: dict[str, dict[str, Effect]]
+    effects: dict[str, dict[str, Figure]]
     """[scores][figure]."""
 
 
@@ -139,9 +123,7 @@ def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progr
         rows |= {row[:4]: row for row in made}
         _append(out, made)
     result = Ablation(scenario.name, plan, _effects(plan, rows))
-    _write_card(
-        out, {**card, "status": "finished", "plan": asdict(plan), "effects": msgspec.to_builtins(result.effects)}
-    )
+    _write_card(out, {**card, "status": "finished", "plan": asdict(plan), "effects": result.effects})
     return result
 
 
@@ -191,19 +173,12 @@ def _append(out: Path, rows: Sequence[Row]) -> None:
 
 def _write_card(out: Path, card: object) -> None:
     with disk_errors(out), atomic_path(out / CARD) as file:
-        file.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+        file.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")  # NaN as null
 
 
-def _effects(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row]) -> dict[str, dict[str, Effect]]:
-    base = {figure: _values(plan, rows, plan.scores[0], figure) for figure in FIGURES}
-    effects: dict[str, dict[str, Effect]] = {}
-    for name in plan.scores:
-        effects[name] = {}
-        for figure in FIGURES:
-            values = _values(plan, rows, name, figure)
-            parts = (values, values - base[figure])
-            effects[name][figure] = Effect(*(x for part in parts for x in (float(part.mean()), *interval(part))))
-    return effects
+def _effects(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row]) -> dict[str, dict[str, Figure]]:
+    values = {name: {figure: _values(plan, rows, name, figure) for figure in FIGURES} for name in plan.scores}
+    return figures_of(values, plan.scores[0], counts=COUNTS, possible=POSSIBLE)
 
 
 def _values(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row], name: str, figure: str) -> Array:
@@ -223,48 +198,14 @@ def _values(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row], name
     )
 
 
-def interval(values: Array, level: float = 0.95) -> tuple[float, float]:
-    """Interval of the mean of [fleet, training, seed], clustered by fleet and by seed; see the module docstring.
-
-    A single fleet or a single seed counts as fixed, not as a sample.
-    """
-    cells = values.mean(axis=1)  # trainings are within fleets
-    fleets, seeds = cells.shape
-    mean = float(cells.mean())
-    by_fleet, by_seed, by_cell = (_variance_of_mean(x) for x in (cells.mean(axis=1), cells.mean(axis=0), cells.ravel()))
-    # The sum can be too small, even negative, in small samples; use the larger of the one-way variances then.
-    variance = max(by_fleet + by_seed - by_cell, by_fleet, by_seed)
-    clusters = min(count for count in (fleets, seeds, cells.size) if count > 1) if cells.size > 1 else 1
-    if clusters == 1 or variance == 0:
-        return mean, mean
-    half = float(stats.t.ppf(0.5 + level / 2.0, clusters - 1)) * variance**0.5
-    return mean - half, mean + half
-
-
-def _variance_of_mean(values: Array) -> float:
-    return float(values.var(ddof=1) / len(values)) if len(values) > 1 else 0.0
-
-
 def ablation_table(result: Ablation) -> Group:
     """Table with a block per figure: mean and difference to the first source of each source, with intervals."""
     plan = result.plan
-    count = f"{plan.fleets} fleets × {plan.trainings} trainings × {plan.seeds} seeds"
     title = (
-        f"{result.scenario}, {label(plan.policy)}, {count}: mean, paired difference to "
-        f"{plan.label(plan.scores[0])}, 95 % intervals over fleets, trainings and seeds; * excludes 0"
+        f"{result.scenario}, {label(plan.policy)}, {unit((plan.fleets, plan.trainings, plan.seeds))}: mean, paired "
+        f"difference to {plan.label(plan.scores[0])}, {LEGEND}"
     )
-    table = Table(box=None, pad_edge=False)
-    table.add_column("")
-    for head in ("mean", "interval", "difference", "interval", ""):
-        table.add_column(head, justify="right")
-    for figure in FIGURES:
-        table.add_row(f"[bold]{figure}[/bold]")
-        for name in plan.scores:
-            e = result.effects[name][figure]
-            cells = [f"  {plan.label(name)}", f"{e.mean:.2f}", f"{e.low:.2f} … {e.high:.2f}"]
-            if name != plan.scores[0]:
-                star = "*" if e.difference_low > 0 or e.difference_high < 0 else ""
-                between = f"{e.difference_low:+z.2f} … {e.difference_high:+z.2f}"
-                cells += [f"{e.difference:+z.2f}", between, star]
-            table.add_row(*cells)
-    return Group(Text(title), table)
+    table = empty_table()
+    for name in FIGURES:
+        add_block(table, name, {scores: e[name] for scores, e in result.effects.items()}, plan.scores[0], plan.label, 2)
+    return Group(Text(title), table, *map(Text, remarks(result.effects, min(plan.fleets, plan.seeds))))

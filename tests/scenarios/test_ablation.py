@@ -1,4 +1,4 @@
-"""Intervals that count fleets, sources of scores, and the command."""
+"""Sources of scores, and the command that compares them."""
 
 import csv
 import json
@@ -10,38 +10,8 @@ from scipy import stats
 
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from scenarios.studies import ablation
-from scenarios.studies.ablation import FIGURES, interval
+from scenarios.studies.ablation import FIGURES
 from scenarios.studies.score_sources import SOURCES, _Inverted, _Random
-
-
-def test_without_differences_between_fleets_the_interval_is_that_of_seeds() -> None:
-    seeds = np.array([1.0, 4.0, 2.0, 7.0, 3.0])
-    values = np.tile(seeds, (20, 2, 1))  # [fleet, training, seed]
-    low, high = interval(values)
-    half = stats.t.ppf(0.975, 4) * seeds.std(ddof=1) / np.sqrt(5)
-    assert (low, high) == pytest.approx((seeds.mean() - half, seeds.mean() + half), rel=0.02)
-
-
-def test_without_differences_between_seeds_the_interval_is_that_of_fleets() -> None:
-    fleets = np.array([1.0, 4.0, 2.0])
-    values = np.tile(fleets[:, None, None], (1, 2, 50))
-    low, high = interval(values)
-    half = stats.t.ppf(0.975, 2) * fleets.std(ddof=1) / np.sqrt(3)
-    assert (low, high) == pytest.approx((fleets.mean() - half, fleets.mean() + half), rel=0.02)
-
-
-def test_the_interval_covers_the_mean_where_one_over_shifts_does_not() -> None:
-    """Fleets, trainings within fleets, seeds and shifts all vary; the mean is 0."""
-    rng = np.random.default_rng(np.random.SeedSequence(1))
-    covered, naive, trials = 0, 0, 400
-    for _ in range(trials):
-        f, t, s = (rng.standard_normal(shape) for shape in ((5, 1, 1), (5, 2, 1), (1, 1, 20)))
-        values = f + t + 0.5 * s + rng.standard_normal((5, 2, 20))
-        low, high = interval(values)
-        covered += low <= 0 <= high
-        naive += abs(values.mean()) < 1.96 * values.std(ddof=1) / np.sqrt(values.size)
-    assert covered / trials > 0.92
-    assert naive / trials < 0.6
 
 
 def plan(profile: np.ndarray) -> SimpleNamespace:

@@ -1,18 +1,20 @@
-"""Comparisons: paired by seed, the same on any number of cores, intervals that cover."""
+"""Comparisons: paired by seed, the same on any number of cores."""
 
 import io
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.load import load
-from scenarios.run.compare import FIGURES, HEADINGS, Comparison, Figure, compare, comparison_table, interval
+from scenarios.run.compare import FIGURES, HEADINGS, Comparison, compare, comparison_table
 from scenarios.schema import Scenario
+from scenarios.statistics.tables import Figure
 
 POLICIES = ("random", "round_robin")
 
@@ -57,30 +59,10 @@ def test_figures_are_means_over_seeds_with_intervals_around_them(scenario, plans
     for figures in result.figures.values():
         assert set(figures) == set(FIGURES)
         for figure in figures.values():
-            assert figure.low <= figure.mean <= figure.high
-            assert figure.difference_low <= figure.difference <= figure.difference_high
+            assert figure.low <= figure.mean <= figure.high or "no variation in 3" in figure.note
+            assert figure.difference_low <= figure.difference <= figure.difference_high or figure.difference_note
     random, base = result.figures["random"]["peak_c"], result.figures["round_robin"]["peak_c"]
     assert random.difference == pytest.approx(random.mean - base.mean)
-
-
-def test_the_bootstrap_interval_covers_the_true_mean_as_it_should():
-    """Percentile bootstrap of 30 normal values covers a little less than 95 % (Efron & Tibshirani, ch. 13)."""
-    rng = np.random.default_rng(0)
-    hits = 0
-    for _ in range(200):
-        low, high = interval(rng.normal(3.0, 2.0, size=30))
-        hits += low <= 3.0 <= high
-    assert 0.88 <= hits / 200 <= 0.98
-
-
-def test_the_width_of_the_interval_is_that_of_the_normal_law():
-    values = np.random.default_rng(1).normal(0.0, 1.0, size=400)
-    low, high = interval(values)
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(400), rel=0.1)
-
-
-def test_equal_values_have_an_interval_of_no_width():
-    assert interval(np.full(5, 4.0)) == (4.0, 4.0)
 
 
 @pytest.mark.parametrize(
@@ -115,9 +97,12 @@ def test_the_table_fits_eighty_columns_without_losing_a_word(scenario, plans):
     assert [difference, *bounds] == pytest.approx(differences, abs=0.05)
 
 
-def shown(difference, low, high):
+def shown(difference, low, high, p_holm):
     """Cells of a row of the table with this difference and its interval."""
-    same, other = Figure(1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0), Figure(-0.01, 1.0, -0.04, 1.0, difference, low, high)
+    same = Figure(mean=1.0, iqm=1.0, low=1.0, high=1.0, note="", difference=0.0, difference_low=0.0,
+                  difference_high=0.0, difference_note="", p=1.0, p_holm=1.0)  # fmt: skip
+    other = replace(same, mean=-0.01, low=-0.04, difference=difference, difference_low=low, difference_high=high,
+                    p_holm=p_holm)  # fmt: skip
     figures = {"a": dict.fromkeys(FIGURES, same), "b": dict.fromkeys(FIGURES, other)}
     result = Comparison("s", (0, 1), "a", figures, {"a": "arm", "b": "arm"}, PERFECT.described(), "")
     page = io.StringIO()
@@ -129,10 +114,11 @@ def shown(difference, low, high):
 @pytest.mark.parametrize(
     ("values", "cells"),
     [
-        ((-0.01, -0.02, 0.01), "b 0.0 0.0 … 1.0 +0.0 +0.0 … +0.0"),
-        ((0.3, 0.02, 0.5), "b -0.01 -0.04 … 1.00 +0.30 +0.02 … +0.50 *"),
-        ((-2.0, -3.0, -0.5), "b 0.0 0.0 … 1.0 -2.0 -3.0 … -0.5 *"),
-        ((1e-6, 1e-7, 1e-5), "b -0.0100 -0.0400 … 1.0000 +0.0000 +0.0000 … +0.0000"),
+        ((-0.01, -0.02, 0.01, 1.0), "b 0.0 0.0 … 1.0 +0.0 +0.0 … +0.0"),
+        ((0.3, 0.02, 0.5, 0.06), "b -0.01 -0.04 … 1.00 +0.30 +0.02 … +0.50 *"),
+        ((-2.0, -3.0, -0.5, 0.04), "b 0.0 0.0 … 1.0 -2.0 -3.0 … -0.5 **"),
+        ((1e-6, 1e-7, 1e-5, 0.01), "b -0.0100 -0.0400 … 1.0000 +0.0000 +0.0000 … +0.0000"),
+        ((-0.2, math.nan, math.nan, math.nan), "b 0.0 0.0 … 1.0 -0.2 all equal"),
     ],
 )
 def test_no_starred_zero_and_no_negative_zero_is_shown(values, cells):

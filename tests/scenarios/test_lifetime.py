@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import t as student
 
 from fleet.motor import gen3_motors
 from fleet.thermal import gen3_network, thermal_model
@@ -27,7 +26,6 @@ from scenarios.studies.lifetime.drift import (
     with_cooling,
     work_days,
 )
-from scenarios.studies.lifetime.intervals import in_words, mean_interval
 from scenarios.studies.lifetime.latent_features import cross_validated, with_wear, worn_jobs
 from scenarios.studies.lifetime.sensed_torque import sensed
 from scenarios.studies.setup import make_study
@@ -67,14 +65,6 @@ def test_fewest_jobs_of_equal_quality_are_interpolated_over_their_logarithm():
     assert equal_quality(jobs, np.array([0.3, 0.2, 0.1]), 0.3) == 5
     assert equal_quality(jobs, np.array([0.3, 0.2, 0.1]), 0.15) == pytest.approx(np.sqrt(10 * 20))
     assert equal_quality(jobs, np.array([0.3, 0.2, 0.1]), 0.05) == 40
-
-
-def test_the_interval_is_that_of_student():
-    values = np.array([1.0, 2.0, 4.0])
-    mean, low, high = mean_interval(values)
-    assert (mean + low, high - mean) == pytest.approx((2 * mean - (high - mean), (high - low) / 2))
-    assert (high - low) / 2 == pytest.approx(student.ppf(0.975, 2) * values.std(ddof=1) / np.sqrt(3))
-    assert in_words([2.0]) == "2.00"
 
 
 def test_further_training_starts_from_the_given_weights(twin, study):

@@ -8,8 +8,9 @@ import pytest
 
 from fleet.errors import FleetError
 from scenarios.prepare.twin_folder import train_log
+from scenarios.statistics.means import interval
 from scenarios.studies.verdict.log_questions import QUESTIONS, Windows, answers, judged_windows
-from scenarios.studies.verdict.readings import ALPHA, JOINTS, SIZES, TOTALS, Errors, mean_interval
+from scenarios.studies.verdict.readings import ALPHA, JOINTS, MEASURES, SIZES, TOTALS, Errors, summary
 from scenarios.studies.verdict.sides import share_of
 from twin.logs.recording import Recording
 from twin.training_data import cool_stretches
@@ -114,9 +115,9 @@ def test_a_lead_over_rms_torque_has_an_interval_over_files() -> None:
     assert list(found) == list(QUESTIONS)[:1]  # nothing passes 40 °C from below, nothing gains 1 K
     (answer,) = found.values()
     assert (answer.windows, answer.events, answer.files, answer.files_with) == (24, 12, 6, 3)
-    assert answer.auroc["d"] == (1.0, 1.0, 1.0)
-    assert answer.auroc["rms_torque"] == (0.5, 0.5, 0.5)
-    assert answer.lead["d"] == (0.5, 0.5, 0.5)
+    means = answer.auroc["d"].mean, answer.auroc["rms_torque"].mean, answer.lead["d"].mean
+    assert means == (1.0, 0.5, 0.5)
+    assert answer.lead["d"].note.startswith("no variation in ")
     # One file with the event: no interval over files.
     alone = [45.0 if name == "a" else 30.0 for name in file]
     assert answers(windows_of(file, alone, alone, alone)) == {}
@@ -157,7 +158,7 @@ def test_readings_replace_no_file_of_something_else(thermofleet, tmp_path, text,
     file = tmp_path / "readings.json"
     quick = TwinConfig.quick()
     basis = {"sizes": SIZES, "epochs": quick.epochs + 1, "max_windows": quick.max_windows, "window": quick.window}
-    card = {**basis, "latent": quick.latent, "beta": quick.beta, "alpha": ALPHA, "arms": {}}
+    card = {**basis, "hidden": quick.hidden, "latent": quick.latent, "beta": quick.beta, "alpha": ALPHA, "arms": {}}
     file.write_text(json.dumps(card) if text is None else text, encoding="utf-8")
     before = file.read_bytes()
     said = thermofleet("twin", "readings", "quickstart", "--out", file)
@@ -166,12 +167,17 @@ def test_readings_replace_no_file_of_something_else(thermofleet, tmp_path, text,
     assert file.read_bytes() == before
 
 
-def test_shares_and_means_have_their_intervals() -> None:
+def test_shares_have_their_intervals() -> None:
     share, low, high = share_of(np.repeat([True, False], [9, 1]))
     # Wilson's interval of 9 of 10, Agresti & Coull, The American Statistician 52 (1998): centre (9 + 1.92) / 13.84.
     assert share == 0.9
     assert (low + high) / 2 == pytest.approx((9 + 1.96**2 / 2) / (10 + 1.96**2), abs=1e-3)
-    mean, low, high = mean_interval([1.0, 2.0, None, 3.0])
-    assert mean == 2.0
-    assert 1.0 <= low < 2.0 < high <= 3.0
-    assert np.isnan(mean_interval([None])[0])
+
+
+def test_readings_are_means_over_arms_not_over_their_seeds() -> None:
+    values = {"s/a/0": 1.0, "s/a/1": 3.0, "s/b/0": 5.0, "s/b/1": None, "s/c/0": 6.0, "s/c/1": 6.0}
+    arms = {name: {"any": {"d": dict.fromkeys(MEASURES) | {"auroc": value}}} for name, value in values.items()}
+    ((reading, found),) = summary({"arms": arms}, "any")
+    assert reading == "d"
+    assert found["auroc"] == interval([2.0, 5.0, 6.0])
+    assert np.isnan(found["hits"].mean)

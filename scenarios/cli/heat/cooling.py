@@ -138,10 +138,12 @@ def _limit_table() -> Table:
 
 
 def _fleet_table(rows: "Sequence[FleetRow]", title: str) -> Table:
+    from scenarios.statistics.tables import LEGEND
+
     table = plain_table(
         "",
         *("value", "difference", "95 %", "", "faults", "min > warning"),
-        title=f"{title}: mean, and paired difference of value to {rows[0].cooling}; * excludes 0",
+        title=f"{title}: mean, and paired difference of value to {rows[0].cooling}; {LEGEND}",
     )
     for policy in dict.fromkeys(row.policy for row in rows):
         table.add_row(f"[bold]{policy}[/bold]")
@@ -150,7 +152,7 @@ def _fleet_table(rows: "Sequence[FleetRow]", title: str) -> Table:
             paired = ["", "", ""]
             if row.cooling != rows[0].cooling:
                 span = f"{value.difference_low:+.1f} … {value.difference_high:+.1f}"
-                paired = [f"{value.difference:+.1f}", span, "*" if value.excludes_zero else ""]
+                paired = [f"{value.difference:+.1f}", span, value.stars]
             cells = [f"{value.mean:.1f}", *paired, f"{faults.mean:.1f}", f"{warm.mean:.0f}"]
             table.add_row(f"  {row.cooling}", *cells)
     return table

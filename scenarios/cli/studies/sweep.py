@@ -77,7 +77,7 @@ def sweep_command(
     with rows.readable():
         heads, cells = table_of(lines_of(wanted, chosen))
         title = f"d of the carrying joint on {count_of(wanted)}"
-    caption = "in brackets: paired difference to ours, ± half its 95 % interval over the arms; * if it excludes zero"
+    caption = "in brackets: paired difference to ours, ± the 95 % margin over the arms; * if that excludes zero"
     show(heads, cells, format_, title=title, caption=caption)
     say(f"The rows are in {out}.")
 

@@ -14,6 +14,7 @@ from scenarios.result_folder import check_file, disk_errors
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
+    from scenarios.statistics.means import Interval
     from twin.vae.measures import Features
     from twin.verdict.rule import Rule
 
@@ -156,6 +157,7 @@ def sides_command(
 
     from fleet.files import cache_folder
     from scenarios.prepare.train_twins import train_or_load
+    from scenarios.statistics.means import Interval
     from scenarios.studies.setup import make_study
     from scenarios.studies.verdict.readings import SIZES
     from scenarios.studies.verdict.sides import COMMON_KG, sides
@@ -179,7 +181,7 @@ def sides_command(
     table = plain_table("payload", "side", "motions", "warm", "critical", "median °C", title=title, caption=caption)
     for name, by_side in (("as the source", result.own), (f"{COMMON_KG:g} kg for all", result.common)):
         for side, share in by_side.items():
-            shares = interval_text(*share.warm), interval_text(*share.critical)
+            shares = (interval_text(Interval(*each)) for each in (share.warm, share.critical))
             table.add_row(name, side, str(share.motions), *shares, f"{share.peak_c:.1f}")
     out_console.print(table)
 
@@ -223,8 +225,8 @@ def questions_command(
         for seed, by_question in found.items():
             answer = by_question[question]
             for name, auroc in answer.auroc.items():
-                lead = interval_text(*answer.lead[name]) if name in answer.lead else ""
-                table.add_row(str(seed), name, interval_text(*auroc), lead)
+                lead = interval_text(answer.lead[name]) if name in answer.lead else ""
+                table.add_row(str(seed), name, interval_text(auroc), lead)
         out_console.print(table)
 
 
@@ -234,18 +236,18 @@ def readings_table(card: dict[str, Any], question: str, title: str) -> Table:  #
 
     caption = (
         f"{len(card['arms'])} arms and seeds. Hits and false alarms (new work, new light motion) of a verdict at "
-        f"{ALPHA:.0%}, calibrated on held-out jobs. [95 % interval, bootstrap over arms and seeds]"
+        f"{ALPHA:.0%}, calibrated on held-out jobs. [95 % interval over the arms]"
     )
     table = plain_table("score", "AUROC", "AUPRC", "ρ", "hits", "work", "light", title=title, caption=caption)
     for reading, measured in summary(card, question):
         first, *others = (measured[m] for m in ("auroc", "auprc", "spearman", "hits", "false_work", "false_light"))
-        table.add_row(reading, interval_text(*first), *(_short(mean) for mean, _, _ in others))
+        table.add_row(reading, interval_text(first), *(_short(each.mean) for each in others))
     return table
 
 
-def interval_text(mean: float, low: float, high: float) -> str:
+def interval_text(found: "Interval") -> str:
     """`.997 [.995, .999]`."""
-    return f"{_short(mean)} [{_short(low)}, {_short(high)}]"
+    return _short(found.mean) + ("" if found.low != found.low else f" [{_short(found.low)}, {_short(found.high)}]")
 
 
 def _short(value: float) -> str:

@@ -10,9 +10,10 @@ from fleet.thermal import gen3_network, housing, in_series, winding
 from scenarios.motion.hold import hold
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
-from scenarios.run.compare import Figure, figure_of
-from scenarios.run.evaluate import FIGURES, outcomes
+from scenarios.run.compare import figures_of_shifts
+from scenarios.run.evaluate import Outcome, outcomes
 from scenarios.schema import Scenario
+from scenarios.statistics.tables import Figure
 
 STRATEGIES: tuple[Cooling, ...] = ("still_air", "heat_sink", "heat_spreader", "forced_air", "liquid", "immersion")
 """Ways of cooling on Earth, the first of which the others are compared with; two passive, three active."""
@@ -115,14 +116,16 @@ def fleet_rows(
     Args:
         strategies: Differences refer to the first one.
     """
-    rows, base = list[FleetRow](), {}
+    shifts: dict[str, dict[str, list[Outcome]]] = {policy: {} for policy in policies}
     for n, cooling in enumerate(strategies):
         arms = tuple(replace(arm, cooling=cooling) for arm in scenario.arms)
         fleet = prepare(replace(scenario, arms=arms), difficulty=difficulty, risk=risk, cache=cache_dir)
         for policy in policies:
-            shifts = outcomes(fleet, policy, seeds)
-            against = base.setdefault(policy, shifts)
-            figures = {name: figure_of(name, shifts, against) for name in FIGURES}
-            rows.append(FleetRow(cooling=cooling, policy=policy, figures=figures))
+            shifts[policy][cooling] = outcomes(fleet, policy, seeds)
         progress("comparing", Count(n + 1, len(strategies)))
-    return rows
+    figures = {policy: figures_of_shifts(each, strategies[0]) for policy, each in shifts.items()}
+    return [
+        FleetRow(cooling=cooling, policy=policy, figures=figures[policy][cooling])
+        for cooling in strategies
+        for policy in policies
+    ]

@@ -45,7 +45,7 @@ def study_command(
         raise FleetError(f"--log belongs to the study 'transfer' (got '{chosen}'); leave it out.")
     require_extra("twin")
     from scenarios.result_folder import check_writable
-    from scenarios.studies.lifetime.intervals import study_result, write_result
+    from scenarios.studies.lifetime.results import study_result, write_result
 
     given, file = range(first_seed, first_seed + seeds), out or Path(f"runs/study-{chosen}.json")
     check_writable(file)

@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from scenarios.report.page import Table
+from scenarios.statistics.means import interval
 from scenarios.studies.lifetime.arm_transfer import FURTHER, NOTHING, RESCALED, STARTS, Cell
 from scenarios.studies.lifetime.augmentation import DATA, NETWORK, REAL, Fitted
 from scenarios.studies.lifetime.drift import D_CAL, NEVER, NONE, P_VALUE, THERMAL, WATCHED, DriftSize, Life, delay_days
-from scenarios.studies.lifetime.intervals import in_words
 from scenarios.studies.lifetime.latent_features import INPUTS, Estimate
 from scenarios.studies.transfer import REGRESSORS
 
@@ -25,7 +25,7 @@ def transfer_tables(cells: Sequence[Cell]) -> tuple[Table, ...]:
             for row in cell.trained
             if (row.start, row.jobs) == (start, count)
         ]
-        return in_words([getattr(row, name) for row in rows], 3)
+        return interval([getattr(row, name) for row in rows]).text(3)
 
     errors = tuple(
         (f"{target}, {start}", *(of(target, start, count, "error") for count in jobs))
@@ -35,8 +35,8 @@ def transfer_tables(cells: Sequence[Cell]) -> tuple[Table, ...]:
     saved = []
     for target in targets:
         some = [cell for cell in cells if cell.target == target]
-        ratios = [in_words([cell.data_ratio(start) for cell in some]) for start in (RESCALED, FURTHER)]
-        unchanged = in_words([cell.unchanged_error for cell in some], 3)
+        ratios = [interval([cell.data_ratio(start) for cell in some]).text() for start in (RESCALED, FURTHER)]
+        unchanged = interval([cell.unchanged_error for cell in some]).text(3)
         cpu = [of(target, start, jobs[-1], "cpu_s").split(" ")[0] for start in (NOTHING, FURTHER)]
         auroc = [of(target, start, jobs[-1], "auroc").split(" ")[0] for start in (NOTHING, FURTHER)]
         saved.append((target, unchanged, *ratios, " → ".join(cpu), " → ".join(auroc)))
@@ -67,7 +67,7 @@ def feature_tables(rows: Sequence[Estimate]) -> tuple[Table, ...]:
     keys = dict.fromkeys((row.target, row.labels) for row in rows)
 
     def r2(target: str, labels: int, inputs: str) -> str:
-        return in_words([r.r2 for r in rows if (r.target, r.labels, r.inputs) == (target, labels, inputs)])
+        return interval([r.r2 for r in rows if (r.target, r.labels, r.inputs) == (target, labels, inputs)]).text()
 
     return (
         Table(
@@ -90,7 +90,7 @@ def augmentation_tables(rows: Sequence[Fitted]) -> tuple[Table, ...]:
         found = []
         for name in ("cool_rmse_k", "all_rmse_k"):
             own, base = values(count, data, regressor, name), values(count, REAL, regressor, name)
-            found += [f"{own.mean():.2f}", "" if data == REAL else in_words(own - base)]
+            found += [f"{own.mean():.2f}", "" if data == REAL else interval(own - base).text()]
         return tuple(found)
 
     table = tuple(
@@ -141,7 +141,10 @@ def drift_tables(lives: Sequence[Life], size: DriftSize) -> tuple[Table, ...]:
         "CPU s": lambda life: life.cpu_s,
     }
     costs = tuple(
-        (f"{kind}, {policy}", *(in_words([of(life) for life in some(kind, policy)], 1) for of in measures.values()))
+        (
+            f"{kind}, {policy}",
+            *(interval([of(life) for life in some(kind, policy)]).text(1) for of in measures.values()),
+        )
         for kind in kinds
         for policy in policies
     )

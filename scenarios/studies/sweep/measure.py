@@ -7,7 +7,6 @@ from dataclasses import asdict
 
 import msgspec
 import numpy as np
-from scipy.stats import t as student
 
 from scenarios.prepare.cool_motion import records
 from scenarios.progress import Count, Progress, quiet
@@ -127,11 +126,3 @@ def _scores(twin: Twin, subject: Subject, jobs: Jobs, carrier: int) -> dict[str,
     d = features.difficulty
     values = d[:, carrier], d @ twin.joint_weight, d.sum(axis=1), means.sum(axis=1)
     return dict(zip(SCORES, values, strict=True))
-
-
-def interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % interval by Student's t; zero for one value."""
-    mean, count = float(np.mean(values)), len(values)
-    if count < 2:
-        return mean, 0.0
-    return mean, float(student.ppf(0.975, count - 1) * np.std(values, ddof=1) / np.sqrt(count))

@@ -14,14 +14,14 @@ import numpy as np
 from fleet.motion import RATE_HZ
 from scenarios.prepare.cool_motion import records
 from scenarios.progress import Count, Progress, quiet
+from scenarios.statistics.means import mean_by_group
 from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.detection_metrics import detection
 from scenarios.studies.ranking import LABELS, RANKING
 from scenarios.studies.setup import Study
 from scenarios.studies.sweep.configurations import BASE
-from scenarios.studies.sweep.measure import interval
 from scenarios.studies.sweep.rows import Row, Rows
-from scenarios.studies.sweep.subjects import Subject, carrier_of
+from scenarios.studies.sweep.subjects import Subject, arm_of, carrier_of
 from twin.baselines.temperature import train_regressor
 from twin.vae.train import train
 from twin.vae.training_key import RECIPE
@@ -102,15 +102,15 @@ HEADS = ("model", "jobs", "minutes of motion", "AUROC", "AUPRC", "Spearman", "kn
 
 
 def summary(rows: Sequence[Row]) -> list[list[str]]:
-    """A line for each model and number of jobs: means over the subjects ± half the 95 % interval, and the knees."""
+    """A line for each model and number of jobs: means over the arms ± the 95 % margin, and the knees."""
     lines = []
     for model in MODELS:
         by_jobs = {jobs: [row for row in rows if (row["model"], row["jobs"]) == (model, jobs)] for jobs in JOBS}
         present = {jobs: some for jobs, some in by_jobs.items() if some}
         knees = {measure: knee({jobs: _mean(some, measure) for jobs, some in present.items()}) for measure in RANKING}
         for jobs, some in present.items():
-            spans = [interval([row[measure] for row in some]) for measure in RANKING]
-            cells = [f"{mean:.3f} ± {half:.3f}" if half else f"{mean:.3f}" for mean, half in spans]
+            found = [mean_by_group((arm_of(row["subject"]), row[measure]) for row in some) for measure in RANKING]
+            cells = [f"{each.mean:.3f}" + f" ± {each.margin:.3f}" * (not each.note) for each in found]
             reached = ", ".join(LABELS[measure] for measure in RANKING if knees[measure] == jobs)
             lines.append([model, str(jobs), f"{_mean(some, 'minutes'):.1f}", *cells, reached])
     return lines

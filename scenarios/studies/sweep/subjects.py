@@ -62,6 +62,11 @@ class Subject:
         return self.study(cool_c=EVERYTHING_C, reference=0, test=0)
 
 
+def arm_of(subject: str) -> str:
+    """The arm of a subject's name, without the seed."""
+    return subject.rsplit("/", 1)[0]
+
+
 def carrier_of(study: Study) -> int:
     """The joint that overheats in most test jobs, 0 … 6: joint 2 of a standing arm, joint 1 of one on a wall."""
     return int((study.test.peak_c >= study.warning_c).sum(axis=0).argmax())

@@ -6,9 +6,10 @@ from functools import reduce
 
 import numpy as np
 
+from scenarios.statistics.means import Interval, mean_by_group
 from scenarios.studies.sweep.configurations import OURS, Configuration
-from scenarios.studies.sweep.measure import interval
 from scenarios.studies.sweep.rows import Row
+from scenarios.studies.sweep.subjects import arm_of
 
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "AUROC": ("hot_60", "carrier", "auroc"),
@@ -28,20 +29,17 @@ PLAIN = ("active units", "KL, nat", "epochs", "CPU s")
 class Cell:
     """A measure of one configuration."""
 
-    mean: float
-    half: float
-    """Half the width of its 95 % interval over the subjects."""
-    lead: float | None = None
-    """Mean difference to our configuration on the same subjects; None for ours."""
-    lead_half: float = 0.0
+    own: Interval
+    """Of the mean over the arms."""
+    lead: Interval | None = None
+    """Of the mean difference to our configuration on the same subjects; None for ours."""
 
     def __str__(self) -> str:
         if self.lead is None:
-            return f"{_short(self.mean)} ± {_short(self.half)}" if self.half else _short(self.mean)
-        clear = "*" if abs(self.lead) > self.lead_half > 0 else ""
-        sign = "−" if self.lead < 0 else "+"
-        half = f" ± {_short(self.lead_half)}{clear}" if self.lead_half else ""  # one subject has no interval
-        return f"{_short(self.mean)} ({sign}{_short(abs(self.lead))}{half})"
+            return _short(self.own.mean) + _margin(self.own)
+        clear = "*" if abs(self.lead.mean) > self.lead.margin else ""
+        sign = "−" if self.lead.mean < 0 else "+"
+        return f"{_short(self.own.mean)} ({sign}{_short(abs(self.lead.mean))}{_margin(self.lead)}{clear})"
 
 
 @dataclass(frozen=True)
@@ -93,9 +91,9 @@ def _line(name: str, configuration: Configuration, rows: Mapping[str, Row], ours
     for column, path in COLUMNS.items():
         if any(path[1] not in row[path[0]] for row in rows.values()):
             continue  # of the carrying joint only
-        mean, half = interval([_at(row, path) for row in rows.values()])
-        leads = [_at(rows[subject], path) - _at(ours[subject], path) for subject in shared]
-        measures[column] = Cell(mean, half, *interval(leads)) if leads else Cell(mean, half)
+        own = mean_by_group((arm_of(subject), _at(row, path)) for subject, row in rows.items())
+        leads = [(arm_of(subject), _at(rows[subject], path) - _at(ours[subject], path)) for subject in shared]
+        measures[column] = Cell(own, mean_by_group(leads) if leads else None)
     columns = {
         "active units": [row["active_units"][0] for row in rows.values()],
         "KL, nat": [row["kl"][0] for row in rows.values()],
@@ -107,6 +105,10 @@ def _line(name: str, configuration: Configuration, rows: Mapping[str, Row], ours
 
 def _at(row: Row, path: Sequence[str]) -> float:
     return float(reduce(lambda part, key: part[key], path, row))  # pyright: ignore[reportArgumentType]
+
+
+def _margin(mean: Interval) -> str:
+    return "" if mean.note else f" ± {_short(mean.margin)}"
 
 
 def _short(value: float) -> str:

@@ -13,6 +13,8 @@ from sklearn.metrics import roc_auc_score
 
 from fleet.errors import FleetError
 from scenarios.progress import Count, Progress, quiet
+from scenarios.statistics.means import Interval
+from scenarios.statistics.suites import percentile_interval
 from scenarios.studies.ranking import CARRIER
 from scenarios.studies.real_logs import CONFIG, HOT_C, LogStudy, recording_peaks, study_of
 from twin.logs.recording import READINGS, Recording
@@ -118,9 +120,9 @@ class Answer:
     files: int
     files_with: int
     """Files with such windows."""
-    auroc: dict[str, tuple[float, float, float]]
+    auroc: dict[str, Interval]
     """Of each score, with its 95 % interval over files."""
-    lead: dict[str, tuple[float, float, float]]
+    lead: dict[str, Interval]
     """AUROC minus that of RMS torque, with the interval of the difference."""
 
 
@@ -142,9 +144,9 @@ def answers(windows: Windows) -> dict[str, Answer]:
             events=int(event.sum()),
             files=len(np.unique(file)),
             files_with=with_event,
-            auroc={name: (value, *_interval(drawn[name])) for name, value in auroc.items()},
+            auroc={name: percentile_interval(value, drawn[name]) for name, value in auroc.items()},
             lead={
-                name: (value - base, *_interval(drawn[name] - drawn["rms_torque"]))
+                name: percentile_interval(value - base, drawn[name] - drawn["rms_torque"])
                 for name, value in auroc.items()
                 if name != "rms_torque"
             },
@@ -163,8 +165,3 @@ def _resampled(event: Array, file: Array, scores: Mapping[str, Array]) -> dict[s
             for name, score in scores.items():
                 drawn[name].append(float(roc_auc_score(event[some], score[some])))
     return {name: np.array(values) for name, values in drawn.items()}
-
-
-def _interval(values: Array) -> tuple[float, float]:
-    low, high = np.percentile(values, [2.5, 97.5])
-    return float(low), float(high)

@@ -6,6 +6,7 @@ often does a verdict with it call a cool job anomalous?
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +22,10 @@ from scenarios.prepare.train_twins import train_or_load
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import disk_errors
 from scenarios.schema import Scenario
+from scenarios.statistics.means import Interval, mean_by_group
 from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.setup import Sample, Study, make_study
+from scenarios.studies.sweep.subjects import arm_of
 from twin.conformal import largest_p_value, p_value
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU, Calibration, Features
@@ -38,8 +41,6 @@ WORK = 100
 """Cool work that calibrates; the rest, and the cool test jobs, test."""
 CALIBRATION_BEFORE = 64
 """Jobs of each kind in the calibration that was used before: light held-out motion, and work that was trained on."""
-DRAWS = 2000
-"""Bootstrap resamples of arms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,24 +224,14 @@ def _stack(parts: Sequence[Features]) -> Features:
     return Features(np.concatenate([part.packed for part in parts]))
 
 
-def summary(card: Mapping[str, Any], question: str) -> Iterator[tuple[str, dict[str, tuple[float, float, float]]]]:
-    """Mean over arms and seeds of each measure with its 95 % interval, reading by reading.
-
-    The interval is a bootstrap over arms and seeds: jobs of one arm are alike.
+def summary(card: Mapping[str, Any], question: str) -> Iterator[tuple[str, dict[str, Interval]]]:
+    """Mean of each measure with its 95 % interval over arms, reading by reading; NaN for one that no arm has.
 
     Args:
         question: `any` or `joint`.
     """
-    arms = list(card["arms"].values())
-    for reading in arms[0][question]:
-        yield reading, {m: mean_interval([arm[question][reading][m] for arm in arms]) for m in MEASURES}
-
-
-def mean_interval(values: Sequence[float | None]) -> tuple[float, float, float]:
-    """Mean, and the 2.5th and 97.5th percentiles of the means of bootstrap resamples; without the missing values."""
-    known = np.array([value for value in values if value is not None], dtype=float)
-    if not len(known):
-        return float("nan"), float("nan"), float("nan")
-    picks = np.random.default_rng(0).integers(len(known), size=(DRAWS, len(known)))
-    low, high = np.percentile(known[picks].mean(axis=1), [2.5, 97.5])
-    return float(known.mean()), float(low), float(high)
+    arms = card["arms"]
+    for reading in next(iter(arms.values()))[question]:
+        found = {m: [(arm_of(name), arm[question][reading][m]) for name, arm in arms.items()] for m in MEASURES}
+        known = {m: [(arm, value) for arm, value in values if value is not None] for m, values in found.items()}
+        yield reading, {m: mean_by_group(values) if values else Interval(math.nan) for m, values in known.items()}

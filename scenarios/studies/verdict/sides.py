@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import binomtest
 from sklearn.covariance import LedoitWolf
 
 from fleet.errors import FleetError
@@ -20,6 +19,7 @@ from scenarios.prepare.cool_motion import cold_peaks
 from scenarios.progress import Count, Progress, quiet
 from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.setup import Study
+from twin.saturation.reliability import wilson
 from twin.vae.generate import Variation, vary
 from twin.vae.twin import Twin
 
@@ -145,6 +145,5 @@ def _share(study: Study, plans: Sequence[Plan], rejected: int) -> Share:
 
 def share_of(event: Array) -> tuple[float, float, float]:
     """Share of true values with its 95 % Wilson interval."""
-    test = binomtest(int(event.sum()), len(event))
-    interval = test.proportion_ci(method="wilson")
-    return float(event.mean()), float(interval.low), float(interval.high)
+    low, high = wilson(event.mean(keepdims=True), np.array([len(event)]))
+    return float(event.mean()), float(low[0]), float(high[0])

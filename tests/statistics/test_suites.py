@@ -1,0 +1,156 @@
+"""Scores over a suite against rliable, arch and SciPy, and the export against marl-eval's own reader."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fleet.errors import FleetError
+from scenarios.statistics.marl_eval import to_marl_eval
+from scenarios.statistics.suites import aggregates, improvement, profile
+
+THRESHOLDS = np.linspace(0.0, 1.0, 5)
+
+
+@pytest.fixture(scope="module")
+def scores() -> tuple[np.ndarray, np.ndarray]:
+    """[run, instance] of two policies; instances differ, and one instance has equal scores."""
+    rng = np.random.default_rng(0)
+    level = rng.uniform(0.2, 0.9, 24)
+    own, base = level + rng.normal(0.05, 0.2, (10, 24)), level + rng.normal(0.0, 0.2, (8, 24))
+    own[:, 0] = base[:, 0] = 0.5
+    return own, base
+
+
+def test_figures_and_stratified_intervals_are_those_of_rliable(scores):
+    library = pytest.importorskip("rliable.library", reason="rliable is in the extra `dev`")
+    from rliable import metrics
+
+    own, base = scores
+    names = {"iqm": metrics.aggregate_iqm, "optimality_gap": metrics.aggregate_optimality_gap}
+    np.random.seed(0)  # noqa: NPY002 # rliable draws from the global state
+    points, bounds = library.get_interval_estimates(
+        {"own": own}, lambda x: np.array([figure(x) for figure in names.values()]), reps=2000
+    )
+    found = aggregates({"own": own}, "within")["own"]
+    for i, name in enumerate(names):
+        one = getattr(found, name)
+        assert one.mean == pytest.approx(points["own"][i])
+        assert (one.low, one.high) == pytest.approx(bounds["own"][:, i], abs=0.15 * one.margin)
+    shares, around = library.create_performance_profile({"own": own}, THRESHOLDS, reps=2000)
+    drawn = profile(own, THRESHOLDS, "within")
+    np.testing.assert_allclose(drawn.share, shares["own"])
+    inner = (shares["own"] > 0) & (shares["own"] < 1)
+    np.testing.assert_allclose([drawn.low[inner], drawn.high[inner]], around["own"][:, inner], atol=0.012)
+    points, bounds = library.get_interval_estimates(
+        {"pair": [own, base]}, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]), reps=100
+    )
+    better = improvement(own, base, "within")
+    assert better.mean == pytest.approx(points["pair"][0])
+    assert (better.low, better.high) == pytest.approx(bounds["pair"][:, 0], abs=0.3 * better.margin)
+
+
+def test_resamples_of_runs_or_instances_are_those_of_arch(scores):
+    bootstrap = pytest.importorskip("arch.bootstrap", reason="arch is in the extra `dev`")
+    own = scores[0]
+    for unit, rows in (("runs", own), ("instances", own.T)):
+        by_arch = bootstrap.IIDBootstrap(rows, seed=np.random.default_rng(1))
+        low, high = by_arch.conf_int(lambda x: stats.trim_mean(x, 0.25, axis=None), reps=2000, method="percentile")[
+            :, 0
+        ]
+        found = aggregates({"own": own}, unit)["own"].iqm
+        assert (found.low, found.high) == pytest.approx((low, high), abs=0.15 * found.margin)
+
+
+def test_figures_are_those_of_scipy_and_by_hand(scores):
+    own, base = scores
+    found = aggregates({"own": own}, "both")["own"]
+    assert found.iqm.mean == pytest.approx(stats.trim_mean(own, 0.25, axis=None))
+    assert found.optimality_gap.mean == pytest.approx(np.maximum(1 - own, 0).mean())
+    by_instance = [stats.mannwhitneyu(x, y).statistic / 80 for x, y in zip(own.T, base.T, strict=True)]
+    assert improvement(own, base).mean == pytest.approx(np.mean(by_instance))
+    assert improvement(own, own).mean == 0.5
+
+
+def test_more_is_drawn_the_wider_the_interval(scores):
+    width = {unit: aggregates({"own": scores[0]}, unit)["own"].iqm for unit in ("within", "instances", "both")}
+    assert width["within"].margin < width["instances"].margin < width["both"].margin
+
+
+def test_a_certain_order_has_the_bound_of_a_share():
+    """Better on all of 20 instances: the probability of improvement is at least .83 (Clopper & Pearson)."""
+    own = np.linspace(0.5, 0.9, 20)[None]
+    found = improvement(own, own - 0.1)
+    assert (found.mean, found.high) == (1.0, 1.0)
+    assert found.low == pytest.approx(stats.binomtest(20, 20).proportion_ci().low)
+    ends = profile(own, [0.0, 1.0])
+    assert (ends.low[0], ends.high[0]) == pytest.approx((found.low, 1.0))
+    assert (ends.low[1], ends.high[1]) == pytest.approx((0.0, 1 - found.low))
+
+
+def test_bad_scores_are_refused():
+    for scores, unit in (([[1.0, np.nan]], "instances"), ([1.0], "instances")):
+        with pytest.raises(ValueError, match="Scores must be"):
+            aggregates({"x": scores}, unit)
+    with pytest.raises(ValueError, match="'within' needs two runs"):
+        aggregates({"x": [[1.0, 2.0]]}, "within")
+    with pytest.raises(ValueError, match="'both' needs two instances"):
+        aggregates({"x": [[1.0], [2.0]]}, "both")
+    with pytest.raises(ValueError, match="same instances"):
+        improvement([[1.0, 2.0]], [[1.0]])
+
+
+def rows() -> list[dict[str, object]]:
+    """A rule without trainings and a policy with two, on two instances of a split, with two fleets."""
+    result = []
+    for policy, trainings in (("wspt", 1), ("Learned, large", 2)):
+        for n in range(2):
+            for fleet in range(2):
+                for training in range(trainings):
+                    value = 10.0 * n + fleet + 0.1 * training
+                    key = {"policy": policy, "instance": f"test/{n:04}", "fleet": fleet, "training": training}
+                    result.append({**key, "seed": n, "difficulty": "twin", "reward": value, "faults": 0})
+    return result
+
+
+def test_the_export_has_the_documented_structure():
+    """https://github.com/instadeepai/marl-eval#data-structure-for-raw-experiment-data."""
+    made = json.loads(json.dumps(to_marl_eval(rows(), ["reward", "faults"])))
+    assert list(made) == ["test"]
+    assert list(made["test"]) == ["0000", "0001"]
+    for task in made["test"].values():
+        assert sorted(task) == ["Learned; large", "wspt"]
+        for runs in task.values():
+            assert list(runs) == ["run_1", "run_2", "run_3", "run_4"]
+            for steps in runs.values():
+                assert steps["step_1"] == {"step_count": 1, **steps["absolute_metrics"]}
+    rewards = {name: [run["absolute_metrics"]["reward"] for run in runs.values()] for name, runs in task.items()}
+    assert rewards == {"wspt": [[10.0], [10.0], [11.0], [11.0]], "Learned; large": [[10.0], [10.1], [11.0], [11.1]]}
+
+
+def test_marl_eval_reads_the_export():
+    """Its release pins pandas 1.4.4, which Python 3.11 has not; `pip install --no-deps id-marl-eval colorama` does."""
+    processing = pytest.importorskip("marl_eval.utils.data_processing_utils")
+    from marl_eval.utils.diagnose_data_errors import DiagnoseData
+
+    made = to_marl_eval(rows(), ["reward", "faults"])
+    checks = DiagnoseData(made).check_data()["test"]
+    assert all(checks.values()), checks
+    processed = processing.data_process_pipeline(made, ["reward"])
+    matrices, _ = processing.create_matrices_for_rliable(processed, "test", ["reward"])
+    normalised = matrices["mean_norm_reward"]["learned; large"]  # [run, instance], from 0 to 1 in each instance
+    np.testing.assert_allclose(normalised, [[0, 0], [1 / 11, 1 / 11], [10 / 11, 10 / 11], [1, 1]], atol=1e-4)
+
+
+def test_an_export_that_marl_eval_cannot_read_is_refused():
+    complete = rows()
+    for damaged, sentence in (
+        (complete[:3] + complete[4:], "wspt on test/0001, fleet 1, training 0, seed 1 is missing"),
+        ([*complete, complete[0]], "wspt on test/0000, fleet 0, training 0, seed 0 is given twice"),
+        ([*complete[1:], {**complete[0], "reward": np.nan}], "has no finite reward"),
+        ([*complete, {**complete[0], "policy": "WSPT"}], "names must differ by more"),
+        ([row for row in complete if row["instance"] == "test/0000" or row["fleet"] == 0], "as many runs"),
+    ):
+        with pytest.raises(FleetError, match=sentence):
+            to_marl_eval(damaged, ["reward", "faults"])
