@@ -68,7 +68,7 @@ def to_marl_eval(rows: Iterable[Mapping[str, Any]], metrics: Sequence[str]) -> d
 
 def _figures(runs: Runs, key: Key, algorithm: str, instance: str) -> dict[str, list[float]]:
     trainings = {training for _, training, _ in runs}
-    own = (key[0], *trainings, key[2]) if len(trainings) == 1 else key
+    own = (key[0], min(trainings), key[2]) if len(trainings) == 1 else key
     if own not in runs:
         raise FleetError(f"{_run_name(algorithm, instance, key)} is missing.")
     return runs[own]

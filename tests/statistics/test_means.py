@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from scenarios.statistics.holm import holm
-from scenarios.statistics.means import SKEW_BIAS, interval, mean_bounds, mean_by_group, paired, unit
+from scenarios.statistics.means import FARTHEST, SKEW_BIAS, interval, mean_bounds, mean_by_group, paired, unit
 
 SYMMETRIC = np.array([-4.0, -1.0, 0.0, 1.0, 4.0]) + 2.0
 
@@ -27,13 +27,15 @@ def test_without_skewness_the_interval_and_the_test_are_student_s() -> None:
 
 def test_a_skewed_sample_reaches_as_far_as_hall_s_transformation() -> None:
     """Hall, JRSS B 54 (1992): g(T) = T + a (2 T² + 1) + 4/3 a² T³, a = skewness / (6 √n), is nearly Student's t."""
-    x = np.random.default_rng(5).exponential(size=12)
+    x = np.random.default_rng(5).exponential(size=12) ** 0.7
     found, (_, high) = interval(x), student(x)
     t = (x.mean() - found.high) / stats.sem(x)
     a = (1 + SKEW_BIAS / 12) * stats.skew(x) / 6 / np.sqrt(12)
     assert t + a * (2 * t**2 + 1) + 4 / 3 * a**2 * t**3 == pytest.approx(stats.t.ppf(0.025, 11))
     assert found.high > high
     assert found.low == pytest.approx(student(x)[0])  # the other bound is Student's
+    far, (_, high) = interval(x**3), student(x**3)
+    assert far.high - far.mean == pytest.approx(FARTHEST * (high - far.mean))
 
 
 def test_without_differences_between_fleets_the_interval_is_that_of_seeds() -> None:

@@ -17,7 +17,7 @@ def values() -> dict[str, dict[str, np.ndarray]]:
     rng = np.random.default_rng(0)
     jobs, noise = rng.normal(100.0, 30.0, 10), rng.normal(0.0, 1.0, 10)
     noise = (noise - noise.mean()) / noise.std(ddof=1)
-    value = {"base": jobs, "better": jobs + 8.0 + noise, "luck": jobs + 0.95 + noise, "same": jobs + 2.0}
+    value = {"base": jobs, "better": jobs + 8.0 + noise, "luck": jobs + 1.1 + noise, "same": jobs + 2.0}
     return {policy: {"value": each, "faults": np.zeros(10)} for policy, each in value.items()}
 
 
