@@ -54,7 +54,7 @@ def sweep_command(
     from scenarios.studies.sweep.rows import Rows
     from scenarios.studies.sweep.table import lines_of, table_of
 
-    names = list(CONFIGURATIONS) if only is None else list(dict.fromkeys(name.strip() for name in only.split(",")))
+    names = list(CONFIGURATIONS) if only is None else [name.strip() for name in only.split(",")]
     for name in names:
         if name not in CONFIGURATIONS:
             raise FleetError(f"No configuration '{name}'{nearest(name, CONFIGURATIONS)}")

@@ -186,7 +186,7 @@ def sides_command(
 
 def questions_command(
     log: Annotated[Path, typer.Option("--log", help="A folder of logs of one arm, with motor temperatures.")],
-    seeds: Annotated[int, options.number("Number of seeds: 0, 1, …", 1, 100)] = 3,
+    seeds: Annotated[int, options.number("Number of seeds, from 0.", 1, 100)] = 3,
     skip_damaged: options.DamagedOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
