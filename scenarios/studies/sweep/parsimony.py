@@ -109,8 +109,7 @@ def summary(rows: Sequence[Row]) -> list[list[str]]:
         present = {jobs: some for jobs, some in by_jobs.items() if some}
         knees = {measure: knee({jobs: _mean(some, measure) for jobs, some in present.items()}) for measure in RANKING}
         for jobs, some in present.items():
-            spans = [interval([row[measure] for row in some]) for measure in RANKING]
-            cells = [f"{mean:.3f} ± {half:.3f}" if half else f"{mean:.3f}" for mean, half in spans]
+            cells = ["{:.3f} ± {:.3f}".format(*interval([row[measure] for row in some])) for measure in RANKING]
             reached = ", ".join(LABELS[measure] for measure in RANKING if knees[measure] == jobs)
             lines.append([model, str(jobs), f"{_mean(some, 'minutes'):.1f}", *cells, reached])
     return lines

@@ -37,11 +37,10 @@ class Cell:
 
     def __str__(self) -> str:
         if self.lead is None:
-            return f"{_short(self.mean)} ± {_short(self.half)}" if self.half else _short(self.mean)
+            return f"{_short(self.mean)} ± {_short(self.half)}"
         clear = "*" if abs(self.lead) > self.lead_half > 0 else ""
         sign = "−" if self.lead < 0 else "+"
-        half = f" ± {_short(self.lead_half)}{clear}" if self.lead_half else ""  # one subject has no interval
-        return f"{_short(self.mean)} ({sign}{_short(abs(self.lead))}{half})"
+        return f"{_short(self.mean)} ({sign}{_short(abs(self.lead))} ± {_short(self.lead_half)}{clear})"
 
 
 @dataclass(frozen=True)
