@@ -8,6 +8,7 @@ from typing import Annotated, Any  # values of run.json
 
 import typer
 from rich.console import Group
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -66,7 +67,7 @@ def thread_screen(thread: Thread) -> Group:
 
     def row(name: str, *parts: object) -> None:
         if text := ", ".join(str(part) for part in parts if part not in ("", None)):
-            table.add_row(name, visible(text))
+            table.add_row(name, escape(visible(text)))
 
     row("event", f"row {thread.row} of {thread.folder}", _alike(thread))
     row("", *_words(event), MEANINGS[event.kind].text)

@@ -1,6 +1,7 @@
 """The thread of an event: what it shows is what the files of the run and its twins hold."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -10,13 +11,14 @@ from fleet.bus.protocol.auction import ArmEvent, ArmOffer, JobStatus, PlanQuote,
 from fleet.errors import FleetError
 from fleet.events import Event
 from scenarios.cli.main import main
+from scenarios.cli.terminal import out_console
 from scenarios.live.recorder import Recorder
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.provenance import code_hash
 from scenarios.run.run_folder import write
 from scenarios.run.shift import RunSpec, run
-from scenarios.trace.command import last_folder
+from scenarios.trace.command import last_folder, thread_screen
 from scenarios.trace.thread import NOT_RECORDED, rows_of, thread_of
 
 JOBS = ("a", "b")
@@ -101,6 +103,10 @@ def test_the_command_shows_one_screen_or_json(folder: Path, capsys, monkeypatch)
     screen, text = capsys.readouterr().out.split("{", 1)
     assert len(screen.splitlines()) < 60
     assert all(head in screen for head in ("event", "job", "award", "plan", "offers", "twin", "configuration", "code"))
+    thread = thread_of(Path("runs/one"), "finish")
+    odd = replace(thread, event=replace(thread.event, reason="[bold]a[/b] of others"))
+    out_console.print(thread_screen(odd))
+    assert "[bold]a[/b] of others" in capsys.readouterr().out
     shown = json.loads("{" + text)
     assert (shown["event"]["kind"], shown["award"]["kind"]) == ("finish", "award")
     assert code_hash() in screen

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from fleet.errors import FleetError
@@ -146,7 +147,7 @@ def _fleet_table(rows: "Sequence[FleetRow]", title: str) -> Table:
         title=f"{title}: mean, and paired difference of value to {rows[0].cooling}; {LEGEND}",
     )
     for policy in dict.fromkeys(row.policy for row in rows):
-        table.add_row(f"[bold]{policy}[/bold]")
+        table.add_row(f"[bold]{escape(policy)}[/bold]")
         for row in (each for each in rows if each.policy == policy):
             value, faults, warm = (row.figures[name] for name in ("value", "faults", "above_warning_min"))
             paired = ["", "", ""]
