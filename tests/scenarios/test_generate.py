@@ -75,7 +75,9 @@ def test_the_seed_repeats_and_more_begin_with_the_same(subject, asked, made):
     assert elsewhere.motions[0].distance_rad != made.motions[0].distance_rad
 
 
-@pytest.mark.parametrize(("changes", "reason"), [({"cool_c": 24.5}, "heat"), ({"tracking_rad": 1e-9}, "tracking")])
+@pytest.mark.parametrize(
+    ("changes", "reason"), [({"cool_c": 24.5}, "heat"), ({"tracking_rad": 1e-9, "cool_c": 90.0}, "tracking")]
+)
 def test_what_fails_is_rejected_with_its_reason(subject, asked, changes, reason):
     strict = replace(asked, **changes)
     with pytest.raises(GenerationError, match=rf"None of 20 motions of arm 'arm' passed \({reason} 20\)"):

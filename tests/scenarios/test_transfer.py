@@ -75,7 +75,7 @@ def test_more_labels_help_and_an_input_that_knows_beats_noise(rng):
 def test_aggregation_by_hand(small):
     work = small.work()
     plan = small.arm(0, [work], times=small.Times(approach=4.0, cycle=8.0, retreat=4.0)).plans[work][0]
-    reading = cut_jobs([plan, plan], [1, 3], TINY)  # windows of 4 s: 1 + 2 + 1
+    reading = cut_jobs([plan, plan], [1, 3], TINY.changed(window=50))  # windows of 4 s: 1 + 2 + 1
     found = over_time(reading, np.array([0.0, 1.0, 3.0, 4.0] * 2)[:, None])
     np.testing.assert_allclose(found[0], [2.0, np.sqrt((4 + 1 + 1 + 4) / 4)])
     np.testing.assert_allclose(found[1], [(0 + 3 * 1 + 3 * 3 + 4) / 8, np.sqrt((4 + 3 * 1 + 3 * 1 + 4) / 8)])
