@@ -142,6 +142,10 @@ def _check(scenario: Scenario, path: Path) -> None:
             if name not in streams[:i]:
                 known = nearest(name, streams[:i]) if i else "."
                 raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
+    try:
+        scenario.bus.channel().check([arm.name for arm in scenario.arms])
+    except ValueError as error:
+        raise ScenarioError(f"{file}: bus.partitions: {error}") from error
     total = sum(stream.arrivals.expected(scenario.horizon_s) for stream in scenario.jobs)
     if total > MOST_JOBS:
         raise ScenarioError(

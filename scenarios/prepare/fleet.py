@@ -315,7 +315,7 @@ def make_env(
         risk: Model of the twins' P(saturation); see `RiskName`.
         plant: Motion of the arms: `profile` (exactly as planned) or `mujoco` (closed loop).
         bus: Transport of the messages between arms.
-        channel: Topology, delay, loss and partitions of the messages.
+        channel: Topology, delay, loss and partitions of the messages; if it is perfect, those of the scenario.
         cache: Folder of plans and twins.
         max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v1.AllocationEnv`.
         peers: Number of peers in an arm's observation, the nearest ones; default: all.
@@ -348,7 +348,7 @@ def env_of(
 
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)
-    exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, channel)
+    exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, fleet.scenario.channel(channel))
     options = {"weights": weights_of(fleet.scenario), "cell": cell_of(fleet.scenario), **options}
     options.setdefault("decisions", fleet.scenario.decisions)
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, **options)

@@ -132,6 +132,7 @@ def compare(
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
     folder = cache_dir or cache_folder()  # here: a worker may have started with another one
     fleet = prepare(scenario, difficulty=difficulty, risk=risk, cache=folder, progress=progress)
+    channel = scenario.channel(channel)
     together = TOGETHER if channel.perfect else 1
     parts = [(policy, seeds[i : i + together]) for policy in policies for i in range(0, len(seeds), together)]
     by_policy: dict[str, list[Outcome]] = {policy: [] for policy in policies}
