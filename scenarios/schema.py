@@ -187,7 +187,7 @@ class People:
 
 @dataclass(frozen=True, kw_only=True)
 class BusSpec:
-    """How the arms' messages reach their peers in a simulated shift; `fleet.bus.exchange.channel.Channel` defines the fields.
+    """How the arms' messages reach their peers in a simulated shift; fields as in `fleet.bus.exchange.channel.Channel`.
 
     A channel that a command or a call is given, other than a perfect one, takes its place.
     """
@@ -250,9 +250,7 @@ class TwinSpec:
         if min(self.payload_kg, default=0.0) < 0:
             raise ValueError(f"TwinSpec.payload_kg must be masses >= 0 (got {list(self.payload_kg)})")
         if self.air_c is not None and not -40 <= self.air_c[0] <= self.air_c[1] <= 60:
-            raise ValueError(
-                f"TwinSpec.air_c must be [lowest, highest] between -40 and 60 °C (got {list(self.air_c)})"
-            )
+            raise ValueError(f"TwinSpec.air_c must be [lowest, highest] between -40 and 60 °C (got {list(self.air_c)})")
         if not 0 <= self.exploration <= MOST_EXPLORATION:
             raise ValueError(f"TwinSpec.exploration must be between 0 and {MOST_EXPLORATION} (got {self.exploration})")
 

@@ -101,4 +101,4 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
 
 @lru_cache(maxsize=1)
 def _library(fleet: Fleet) -> Library:
-    return library_of([fleet])
+    return library_of(fleet)

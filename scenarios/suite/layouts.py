@@ -6,7 +6,8 @@ dimensions keep arms at home apart, and let each arm work in a group while its n
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import cos, degrees, pi, sin
+from itertools import pairwise
+from math import ceil, cos, degrees, pi, sin
 from typing import Literal
 
 from fleet.job import Place
@@ -16,6 +17,9 @@ from scenarios.schema import ArmSpec
 LayoutName = Literal["bench", "line", "ring", "gantry", "wall_ceiling"]
 HOME = "retract"
 DIGITS = 4
+MOST_IN_ROW = 16
+APART_M = 2.6
+"""Distance between two rows of a line, out of each other's reach."""
 SIDE_M = 0.15
 """Distance of the stations a and b from the middle of their group."""
 
@@ -56,9 +60,12 @@ def layout_of(name: LayoutName, arms: int, stations: int = 2, *, pitch_m: float 
 
 
 def _line(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
-    """Arms on the floor in a row; the stations are in front of them."""
-    mounted = tuple(_arm(i, (i * pitch_m, 0.0, 0.0), (0.0, 0.0, 90.0)) for i in range(arms))
-    middles = [((i + 0.5) * pitch_m, front_m) for i in range(arms - 1)]
+    """Arms on the floor in rows; the stations are in front of them."""
+    rows = ceil(arms / MOST_IN_ROW)
+    lengths = [arms // rows + (row < arms % rows) for row in range(rows)]
+    spots = [(x, APART_M * (row - (rows - 1) / 2)) for row, n in enumerate(lengths) for x in _along(n, pitch_m)]
+    mounted = tuple(_arm(i, (x, y, 0.0), (0.0, 0.0, 90.0)) for i, (x, y) in enumerate(spots))
+    middles = [((x + next_x) / 2, y + front_m) for (x, y), (next_x, next_y) in pairwise(spots) if y == next_y]
     return Layout(mounted, tuple(_group(i, at, 0.0, 0.25, stations) for i, at in enumerate(middles)))
 
 
@@ -66,13 +73,13 @@ def _bench(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
     """Two rows of arms that face each other across a bench; each group has stations on both sides of its middle."""
     across_m, columns = front_m + 0.15, arms // 2
     mounted = [
-        _arm(2 * i + row, (i * pitch_m, side * across_m, 0.0), (0.0, 0.0, -90.0 * side))
-        for i in range(columns)
+        _arm(2 * i + row, (x, side * across_m, 0.0), (0.0, 0.0, -90.0 * side))
+        for i, x in enumerate(_along(columns, pitch_m))
         for row, side in enumerate((-1.0, 1.0))
     ]
     groups = [
-        _group(2 * i + row, ((i + 0.5) * pitch_m, side * 0.15), 0.0, 0.25, stations)
-        for i in range(columns - 1)
+        _group(2 * i + row, ((x + next_x) / 2, side * 0.15), 0.0, 0.25, stations)
+        for i, (x, next_x) in enumerate(pairwise(_along(columns, pitch_m)))
         for row, side in enumerate((-1.0, 1.0))
     ]
     return Layout(tuple(mounted), tuple(groups))
@@ -92,17 +99,19 @@ def _ring(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
 
 def _gantry(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
     """Arms that hang from a beam in a row; the stations are in front of it, below."""
-    mounted = tuple(_arm(i, (i * pitch_m, 0.0, 1.2), (180.0, 0.0, 90.0)) for i in range(arms))
-    middles = [((i + 0.5) * pitch_m, front_m - 0.08) for i in range(arms - 1)]
+    along = _along(arms, pitch_m)
+    mounted = tuple(_arm(i, (x, 0.0, 1.2), (180.0, 0.0, 90.0)) for i, x in enumerate(along))
+    middles = [((x + next_x) / 2, front_m - 0.08) for x, next_x in pairwise(along)]
     return Layout(mounted, tuple(_group(i, at, 0.0, 0.45, stations) for i, at in enumerate(middles)))
 
 
 def _wall_ceiling(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
     """Arms in turns on a wall and on the ceiling; the stations are between wall and beam."""
     wall, ceiling = ((1.0, 0.5), (90.0, 0.0, 0.0)), ((0.1, 1.2), (180.0, 0.0, 90.0))
-    mounts = [(wall, ceiling)[i % 2] for i in range(arms)]
-    mounted = tuple(_arm(i, (i * pitch_m, y, z), tilt) for i, ((y, z), tilt) in enumerate(mounts))
-    middles = [((i + 0.5) * pitch_m, front_m) for i in range(arms - 1)]
+    along = _along(arms, pitch_m)
+    mounts = [(x, *(wall, ceiling)[i % 2]) for i, x in enumerate(along)]
+    mounted = tuple(_arm(i, (x, y, z), tilt) for i, (x, (y, z), tilt) in enumerate(mounts))
+    middles = [((x + next_x) / 2, front_m) for x, next_x in pairwise(along)]
     return Layout(mounted, tuple(_group(i, at, 0.0, 0.45, stations) for i, at in enumerate(middles)))
 
 
@@ -113,6 +122,11 @@ _LAYOUTS: dict[LayoutName, Callable[[int, int, float, float], Layout]] = {
     "gantry": _gantry,
     "wall_ceiling": _wall_ceiling,
 }
+
+
+def _along(arms: int, pitch_m: float) -> list[float]:
+    """Coordinates of a row of arms about its middle, m."""
+    return [(i - (arms - 1) / 2) * pitch_m for i in range(arms)]
 
 
 def _arm(number: int, at: tuple[float, float, float], tilt: tuple[float, float, float]) -> ArmSpec:

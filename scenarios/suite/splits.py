@@ -152,4 +152,4 @@ def _hash(content: Any) -> str:
 def instance_of(row: Row) -> Instance:
     """The instance of a line of a manifest."""
     name = row.name.replace("/", "-")
-    return Instance(row.name, scenario_of(name, cell_ofinstance_of(row), row.axes, row.seed), row.seed)
+    return Instance(row.name, scenario_of(name, cell_of_instance(row), row.axes, row.seed), row.seed)
