@@ -35,10 +35,10 @@ class Severity(NamedTuple):
 
 
 SEVERITY: dict[Heat, Severity] = {
-    "mild": Severity(0.15, 0.6),
-    "warm": Severity(0.35, 0.5),
-    "hot": Severity(0.6, 0.35),
-    "severe": Severity(0.85, 0.2),
+    "mild": Severity(0.25, 0.75),
+    "warm": Severity(0.5, 0.6),
+    "hot": Severity(0.75, 0.45),
+    "severe": Severity(1.0, 0.3),
 }
 """The thermal load factor that follows depends on cell and ambient temperature; it is in the manifest."""
 LEAST_JOBS = 0.25
@@ -46,14 +46,16 @@ LEAST_JOBS = 0.25
 DUE: dict[Due, float] = {"loose": 2.0, "usual": 1.0, "tight": 0.5, "hard": 0.75}
 """Factor on the due times of the tasks. hard: jobs that wait then expire."""
 AIR_C: dict[Air, tuple[float, float]] = {
-    "cool": (22.0, 22.0),
-    "warm": (28.0, 28.0),
-    "hot": (33.0, 33.0),
-    "rising": (22.0, 34.0),
+    "cool": (20.0, 20.0),
+    "warm": (24.0, 24.0),
+    "hot": (28.0, 28.0),
+    "rising": (20.0, 30.0),
 }
 """Ambient temperature at the beginning and, after two thirds of the shift, at the end, °C."""
-PAST_AIR_C = (22.0, 34.0)
+PAST_AIR_C = (20.0, 30.0)
 """In the arms' past jobs, the same for all instances of a cell."""
+LIMITS = ThermalLimits(warning_c=53.0, error_c=60.0, restart_c=44.0)
+"""Lower than usual, as users set them where people work beside the arms: heat then decides within an hour."""
 UNATTENDED_S = 2400.0
 """unattended: time until somebody clears a fault of an arm that is cool again, and moves it home."""
 NOISE_K = 2.0
@@ -132,7 +134,9 @@ def scenario_of(name: str, cell: Cell, axes: Axes, seed: int, jobs: tuple[float,
             streams += _streams(cell, axes, group, task, expected, rng)
     first_c, last_c = AIR_C[axes.air]
     points = ((0.0, first_c),) if first_c == last_c else ((0.0, first_c), (horizon_s * 2 / 3, last_c))
-    late_s = UNATTENDED_S if axes.faults == "unattended" else ThermalLimits.clear_s
+    limits = LIMITS
+    if axes.faults == "unattended":
+        limits = replace(limits, clear_s=UNATTENDED_S, move_home_s=UNATTENDED_S)
     arms = layout(cell).arms
     if axes.faults == "noisy":
         arms = tuple(replace(arm, sensor_noise_k=NOISE_K) if i % 2 else arm for i, arm in enumerate(arms))
@@ -145,7 +149,7 @@ def scenario_of(name: str, cell: Cell, axes: Axes, seed: int, jobs: tuple[float,
         jobs=tuple(streams),
         slots=cell.slots,
         ambient=Ambient(points=points),
-        limits=ThermalLimits(clear_s=late_s, move_home_s=max(late_s, ThermalLimits.move_home_s)),
+        limits=limits,
         twin=TwinSpec(size="quick", exploration=32, air_c=PAST_AIR_C),
         spread=Spread(scale=SPREAD[cell.unlike], seed=cell.seed),
         bus=_bus(axes.bus, [arm.name for arm in arms], horizon_s),

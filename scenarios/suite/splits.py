@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from importlib import resources
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -88,11 +88,6 @@ def manifest(name: str) -> tuple[Row, ...]:
     file = resources.files("scenarios").joinpath(f"suite/{choose('split', name, SplitName)}.jsonl")
     lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
     return tuple(Row(**{**line, "axes": Axes(**line["axes"]), "load": tuple(line["load"])}) for line in lines)
-
-
-def is_instance(name: str) -> bool:
-    """Whether a name is that of an instance of a split, existing or not."""
-    return name.partition("/")[0] in get_args(SplitName) and "/" in name
 
 
 def cell_of_instance(row: Row) -> Cell:
