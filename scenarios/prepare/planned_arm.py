@@ -13,7 +13,7 @@ from fleet.job import Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors, thermal_data
 from fleet.planning.plan_cache import CachedPlanner
-from fleet.planning.space import conflicts_with_homes
+from fleet.planning.space import FARTHEST_M, conflicts_with_homes
 from fleet.robot import JOINTS, Robot
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from scenarios.progress import Count, Progress
@@ -91,6 +91,10 @@ class CellPlanner:
         Raises:
             InfeasibleJob: there is none.
         """
+        for place in work.places:
+            far_m = float(np.linalg.norm(np.subtract(place.position_m, self._robot.mount.position_m)))
+            if far_m > FARTHEST_M:  # not worth a search, nor a file in the cache
+                raise InfeasibleJob(self._robot.name, place.name, f"reach: {far_m:.2f} m from the base of the arm")
         plans = self._planner.plan(work)
         reasons = conflicts_with_homes(self._robot, self._others, plans, self._clearance_m, self._folder)
         clear = tuple(plan for plan, reason in zip(plans, reasons, strict=True) if reason is None)

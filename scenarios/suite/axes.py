@@ -46,15 +46,15 @@ LEAST_JOBS = 0.25
 DUE: dict[Due, float] = {"loose": 2.0, "usual": 1.0, "tight": 0.5, "hard": 0.75}
 """Factor on the due times of the tasks. hard: jobs that wait then expire."""
 AIR_C: dict[Air, tuple[float, float]] = {
-    "cool": (20.0, 20.0),
-    "warm": (24.0, 24.0),
-    "hot": (28.0, 28.0),
-    "rising": (20.0, 30.0),
+    "cool": (22.0, 22.0),
+    "warm": (26.0, 26.0),
+    "hot": (30.0, 30.0),
+    "rising": (22.0, 31.0),
 }
 """Ambient temperature at the beginning and, after two thirds of the shift, at the end, °C."""
-PAST_AIR_C = (20.0, 30.0)
+PAST_AIR_C = (22.0, 31.0)
 """In the arms' past jobs, the same for all instances of a cell."""
-LIMITS = ThermalLimits(warning_c=53.0, error_c=60.0, restart_c=44.0)
+LIMITS = ThermalLimits(warning_c=52.0, error_c=59.0, restart_c=43.0)
 """Lower than usual, as users set them where people work beside the arms: heat then decides within an hour."""
 UNATTENDED_S = 2400.0
 """unattended: time until somebody clears a fault of an arm that is cool again, and moves it home."""

@@ -70,7 +70,7 @@ def test_axes_are_honoured() -> None:
     assert at(bus="late").bus == BUSES["late"] != BusSpec()
     (cut,) = at(bus="cut").bus.partitions
     assert cut.cuts([arm.name for arm in plain.arms]).sum() == 8
-    assert [c for _, c in at(air="rising").ambient.points] == [20.0, 30.0]
+    assert [c for _, c in at(air="rising").ambient.points] == [22.0, 31.0]
 
 
 def test_heat_severity_raises_the_thermal_load(tmp_path_factory) -> None:
