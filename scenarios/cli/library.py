@@ -27,7 +27,8 @@ def list_command(as_json: JsonOption = False) -> None:
 
 def suite_command(
     split: Annotated[
-        str | None, typer.Option(help="List the instances of this split: train, validation or test.", show_default=False)
+        str | None,
+        typer.Option(help="List the instances of this split: train, validation or test.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -43,10 +44,10 @@ def suite_command(
         if as_json:
             print_json([asdict(row) for row in rows])
             return
-        table = plain_table("instance", "cell", "axes", "jobs", "thermal load", numbers=False)
+        table = plain_table("instance", "cell", "axes", "jobs", numbers=False)
         for row in rows:
             axes = ", ".join(f"{name} {value}" for name, value in asdict(row.axes).items())
-            table.add_row(row.name, row.cell, axes, str(row.count), f"{row.load[0]:.2f}")
+            table.add_row(row.name, row.cell, axes, str(row.count))
         out_console.print(table)
         return
     if as_json:

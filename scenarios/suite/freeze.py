@@ -6,19 +6,16 @@ cell (minutes) and needs no twins.
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from fleet.job import Job
 from scenarios.job_stream import works_of
-from scenarios.prepare.fleet import ShiftFactory, prepare, world_of
-from scenarios.report.load_factor import LoadFactor, load_factor
+from scenarios.prepare.fleet import prepare, world_of
+from scenarios.report.load_factor import load_factor
 from scenarios.schema import JobStream
 from scenarios.suite.axes import Axes, scenario_of
 from scenarios.suite.cells import CELLS, SPLITS, Cell
-from scenarios.suite.splits import DIGITS, Instance, drawn_rows, instance_of, line_of
+from scenarios.suite.splits import drawn_rows, line_of
 from scenarios.suite.trades import TRADES
 
 FOLDER = Path(__file__).parent
@@ -43,33 +40,23 @@ def time_loads_of(cell: Cell) -> tuple[float, float]:
     return round(heating, 5), round(rest, 5)
 
 
-def load_of(made: Instance) -> LoadFactor:
-    """The loads of an instance's shift."""
-    fleet = prepare(made.scenario, difficulty="blind")
-    return load_factor(ShiftFactory(fleet)(np.random.SeedSequence(made.seed)).world)
-
-
 def _task_of(stream: JobStream) -> str:
     return stream.name.rpartition("_")[0]
 
 
 def main(names: list[str]) -> None:
-    """Compute the time loads of cells, and write the manifests with the loads of their instances."""
+    """Compute the time loads of cells, and write the manifests."""
     path = FOLDER / "time_loads.json"
     known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     for cell in CELLS:
         if cell.name in names or cell.name not in known:
             known[cell.name] = time_loads_of(cell)
-            path.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+            lines = ",\n".join(f' "{each}": {json.dumps(loads)}' for each, loads in known.items())
+            path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
             print(cell.name, known[cell.name], flush=True)
     for name in SPLITS:
-        rows = []
-        for row in drawn_rows(name):
-            load = load_of(instance_of(row))
-            loads = tuple(round(float(each), DIGITS) for each in (load.thermal, load.blind, load.time))
-            rows.append(replace(row, load=loads))
-            print(row.name, row.cell, *loads, flush=True)
-        (FOLDER / f"{name}.jsonl").write_text("".join(line_of(row) + "\n" for row in rows), encoding="utf-8")
+        text = "".join(line_of(row) + "\n" for row in drawn_rows(name))
+        (FOLDER / f"{name}.jsonl").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -49,8 +49,6 @@ class Row:
     """Hash of the drawn jobs, see `jobs_content`."""
     count: int
     """Jobs of the shift."""
-    load: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Thermal load factor of the best assignment and of an equal split, and time load, when the line was written."""
 
 
 @lru_cache(maxsize=len(SPLITS))
@@ -87,7 +85,7 @@ def manifest(name: str) -> tuple[Row, ...]:
     """
     file = resources.files("scenarios").joinpath(f"suite/{choose('split', name, SplitName)}.jsonl")
     lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    return tuple(Row(**{**line, "axes": Axes(**line["axes"]), "load": tuple(line["load"])}) for line in lines)
+    return tuple(Row(**{**line, "axes": Axes(**line["axes"])}) for line in lines)
 
 
 def cell_of_instance(row: Row) -> Cell:
@@ -96,7 +94,7 @@ def cell_of_instance(row: Row) -> Cell:
 
 
 def drawn_rows(name: SplitName) -> Iterator[Row]:
-    """The lines of a split, drawn anew without their loads: in turns from each of its cells."""
+    """The lines of a split, drawn anew: in turns from each of its cells."""
     cells = [cell for cell in CELLS if cell.split == name]
     turns = range(max(cell.instances for cell in cells))
     chosen = [cell for turn in turns for cell in cells if turn < cell.instances]
