@@ -35,12 +35,12 @@ class Severity(NamedTuple):
 
 
 SEVERITY: dict[Heat, Severity] = {
-    "mild": Severity(0.25, 0.75),
-    "warm": Severity(0.5, 0.6),
-    "hot": Severity(0.75, 0.45),
-    "severe": Severity(1.0, 0.3),
+    "mild": Severity(0.3, 0.5),
+    "warm": Severity(0.5, 0.5),
+    "hot": Severity(0.7, 0.5),
+    "severe": Severity(0.95, 0.5),
 }
-"""The thermal load factor that follows depends on cell and ambient temperature; it is in the manifest."""
+"""The thermal load factor that follows depends on cell and ambient temperature; `thermofleet show` tells it."""
 LEAST_JOBS = 0.25
 """Fewest expected jobs of a stream and payload, so that every task occurs."""
 DUE: dict[Due, float] = {"loose": 2.0, "usual": 1.0, "tight": 0.5, "hard": 0.75}

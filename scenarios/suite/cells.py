@@ -82,10 +82,10 @@ def _of(layout: LayoutName, arms: int, trade: TradeName, **more: object) -> Cell
 CELLS: tuple[Cell, ...] = (
     *_cells(
         "train",
-        _of("bench", 4, "machine_tending", seed=1100, stations=3),
+        _of("bench", 4, "screwdriving", seed=1100),
         _of("line", 4, "palletising", seed=101, unlike="mixed"),
         _of("ring", 4, "gluing", seed=102, stations=3),
-        _of("gantry", 4, "screwdriving", seed=103),
+        _of("gantry", 4, "machine_tending", seed=103),
         _of("wall_ceiling", 4, "polishing", seed=2104, unlike="mixed"),
         _of("line", 2, "inspection", seed=3105),
         _of("ring", 6, "kitting", seed=4106, stations=3, unlike="mixed"),
@@ -101,7 +101,7 @@ CELLS: tuple[Cell, ...] = (
         _of("line", 6, "gluing", seed=20201, pitch_m=0.78, unlike="mixed", instances=38),
         _of("ring", 5, "machine_tending", seed=10202, stations=3, unlike="mixed", instances=38),
         _of("gantry", 4, "palletising", seed=203, pitch_m=0.78, instances=38),
-        _of("wall_ceiling", 3, "kitting", seed=204, stations=3, front_m=0.42, unlike="alike", instances=38),
+        _of("wall_ceiling", 4, "kitting", seed=204, stations=3, unlike="alike", instances=38),
         _of("line", 16, "polishing", seed=5205, hours=1.0, slots=48, instances=10),
     ),
     *_cells(
