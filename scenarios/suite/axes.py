@@ -35,10 +35,10 @@ class Severity(NamedTuple):
 
 
 SEVERITY: dict[Heat, Severity] = {
-    "mild": Severity(0.3, 0.5),
-    "warm": Severity(0.5, 0.5),
-    "hot": Severity(0.7, 0.5),
-    "severe": Severity(0.95, 0.5),
+    "mild": Severity(0.4, 0.55),
+    "warm": Severity(0.55, 0.55),
+    "hot": Severity(0.75, 0.55),
+    "severe": Severity(1.0, 0.55),
 }
 """The thermal load factor that follows depends on cell and ambient temperature; `thermofleet show` tells it."""
 LEAST_JOBS = 0.25
