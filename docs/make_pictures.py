@@ -17,6 +17,11 @@ PICTURES = ROOT / "docs" / "pictures"
 FILM_RUN = ("quickstart", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "19")
 FILM = ("--size", "640x360", "--speed", "240", "--fps", "8", "--overwrite")
 REPORT_RUN = ("active_waiting", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "1")
+CELLS = (
+    *("quickstart", "active_waiting", "heat_wave", "people_near"),
+    *("machine_tending", "assembly", "palletising_line"),
+)
+"""Scenarios whose cells are drawn; others have the cell of one of them, or too many arms for a picture."""
 GRAPHICS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
@@ -53,7 +58,9 @@ def main() -> None:
         thermofleet("film", film, "--out", str(PICTURES / "shift.gif"), *FILM)
         thermofleet("run", *REPORT_RUN, "--out", report)
         screenshot(Path(report) / "report.html", PICTURES / "report.png")
-    for picture in sorted(PICTURES.iterdir()):
+    for scenario in CELLS:
+        thermofleet("layout", scenario, "--out", str(PICTURES / "library" / f"{scenario}.png"), "--overwrite")
+    for picture in sorted(PICTURES.rglob("*.*")):
         print(f"{picture.relative_to(ROOT)}: {picture.stat().st_size / 1e6:.2f} MB")
 
 

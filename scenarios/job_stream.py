@@ -145,9 +145,9 @@ class JobSampler:
         stream, number, payload, extra = job[:total].T
         return SampledJobs(stream, number, payload, extra, release_s[:total], after[:total])
 
-    def jobs(self, seed: np.random.SeedSequence) -> tuple[Job, ...]:
-        """The jobs of one shift in order of release."""
-        sampled, streams = self.sample(seed), self._streams
+    def jobs(self, seed: np.random.SeedSequence, rate: float = 1.0) -> tuple[Job, ...]:
+        """The jobs of one shift in order of release; `rate` as in `sample`."""
+        sampled, streams = self.sample(seed, rate), self._streams
         stream, number, payload, release_s = (
             getattr(sampled, name).tolist() for name in ("stream", "number", "payload", "release_s")
         )

@@ -1,6 +1,7 @@
 """Load scenario files: a `Scenario`, or an error of one sentence."""
 
 import dataclasses
+import re
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
@@ -19,6 +20,8 @@ MOST_BYTES = 10_000_000
 """Of a scenario file."""
 MOST_JOBS = 100_000
 """Largest number of expected jobs in a shift: a mistyped gap would give billions."""
+INSTANCE = re.compile(r"(train|validation|test)/\d+")
+"""Names of the suite's instances."""
 APART_M = 0.2
 """Smallest distance of two bases: a Gen3 base is 0.09 m wide, and its first joint must turn freely."""
 
@@ -30,11 +33,15 @@ def library() -> dict[str, Path]:
 
 
 def load(name_or_path: str | Path) -> Scenario:
-    """The scenario of a library name or of a .toml file.
+    """The scenario of a library name, of a .toml file, or of an instance of the suite, as `test/0017`.
 
     Raises:
         ScenarioError: file, place, what was given and what is allowed.
     """
+    if INSTANCE.fullmatch(str(name_or_path)):
+        from scenarios.suite.splits import instance  # it imports this file
+
+        return instance(str(name_or_path)).scenario
     known = library()
     path = known.get(str(name_or_path), Path(name_or_path))
     try:
@@ -142,6 +149,10 @@ def _check(scenario: Scenario, path: Path) -> None:
             if name not in streams[:i]:
                 known = nearest(name, streams[:i]) if i else "."
                 raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
+    try:
+        scenario.bus.channel().check([arm.name for arm in scenario.arms])
+    except ValueError as error:
+        raise ScenarioError(f"{file}: bus.partitions: {error}") from error
     total = sum(stream.arrivals.expected(scenario.horizon_s) for stream in scenario.jobs)
     if total > MOST_JOBS:
         raise ScenarioError(

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
+from fleet.bus.exchange.channel import Channel, Partition, TopologyName
 from fleet.engine.reward import RewardWeights
 from fleet.env.validation import Decisions
 from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
@@ -22,6 +23,8 @@ MOST_FIXTURES = 64
 MOST_EXPLORATION = 10_000
 MOST_SPREAD = 10.0
 MOST_WEIGHT = 1e9
+MOST_NOISE_K = 50.0
+_NOT_OF_ROBOT = ("position_m", "tilt_deg", "sensor_noise_k")
 _NUMBER = 8
 """Characters that the name of a job may have after that of its stream."""
 
@@ -40,13 +43,17 @@ class ArmSpec:
     cooling_factor: float = Robot.cooling_factor
     ambient_offset_k: float = Robot.ambient_offset_k
     wear: float = Robot.wear
+    sensor_noise_k: float | None = None
+    """Standard deviation of a reading of a motor temperature; None: that of the Gen3, at most 0.014 K."""
 
     def __post_init__(self) -> None:
         self.robot()
+        if self.sensor_noise_k is not None:
+            check_between(self, 0.0, MOST_NOISE_K, "sensor_noise_k")
 
     def robot(self) -> Robot:
         """The arm with its mount."""
-        own = {name: value for name, value in vars(self).items() if name not in ("position_m", "tilt_deg")}
+        own = {name: value for name, value in vars(self).items() if name not in _NOT_OF_ROBOT}
         return Robot(mount=Mount(position_m=self.position_m, tilt_deg=self.tilt_deg), **own)
 
 
@@ -179,6 +186,29 @@ class People:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BusSpec:
+    """How the arms' messages reach their peers in a simulated shift; fields as in `fleet.bus.exchange.channel.Channel`.
+
+    A channel that a command or a call is given, other than a perfect one, takes its place.
+    """
+
+    topology: TopologyName = "complete"
+    radius: float = Channel.radius
+    topology_seed: int = Channel.topology_seed
+    delay_s: float = Channel.delay_s
+    jitter_s: float = Channel.jitter_s
+    loss: float = Channel.loss
+    partitions: tuple[Partition, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.channel()
+
+    def channel(self) -> Channel:
+        """The channel between the arms."""
+        return Channel(**vars(self))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Planning:
     """Which plans each arm makes for a work."""
 
@@ -210,6 +240,8 @@ class TwinSpec:
     """Light payloads with which every motion of the scenario is also simulated for training."""
     exploration: int = 64
     """Number of further light motions for training: folded, elbow out, fast wrist, turned base; 0: none."""
+    air_c: tuple[float, float] | None = None
+    """Lowest and highest ambient temperature of the cell in the arms' past jobs; None: those of the shift."""
 
     def __post_init__(self) -> None:
         check_positive(self, "horizon_s")
@@ -217,6 +249,8 @@ class TwinSpec:
             raise ValueError(f"TwinSpec.cool_c must be above ambient_c (got {self.cool_c}, {self.ambient_c})")
         if min(self.payload_kg, default=0.0) < 0:
             raise ValueError(f"TwinSpec.payload_kg must be masses >= 0 (got {list(self.payload_kg)})")
+        if self.air_c is not None and not -40 <= self.air_c[0] <= self.air_c[1] <= 60:
+            raise ValueError(f"TwinSpec.air_c must be [lowest, highest] between -40 and 60 °C (got {list(self.air_c)})")
         if not 0 <= self.exploration <= MOST_EXPLORATION:
             raise ValueError(f"TwinSpec.exploration must be between 0 and {MOST_EXPLORATION} (got {self.exploration})")
 
@@ -277,6 +311,7 @@ class Scenario:
     planning: Planning = field(default_factory=Planning)
     twin: TwinSpec = field(default_factory=TwinSpec)
     spread: Spread = field(default_factory=Spread)
+    bus: BusSpec = field(default_factory=BusSpec)
 
     def __post_init__(self) -> None:
         check_positive(self, "horizon_s", "decision_interval_s", "telemetry_interval_s")
@@ -318,6 +353,10 @@ class Scenario:
                     f"JobStream.name must have at most {MAX_NAME - _NUMBER} characters, as its jobs have a number "
                     f"after it (got {len(stream.name)})"
                 )
+
+    def channel(self, given: Channel) -> Channel:
+        """The given channel between the arms; that of the scenario if the given one is perfect."""
+        return self.bus.channel() if given.perfect else given
 
     @property
     def ticks(self) -> int:

@@ -1,4 +1,4 @@
-"""`thermofleet list`, `thermofleet show` and `thermofleet layout`."""
+"""`thermofleet list`, `thermofleet suite`, `thermofleet show` and `thermofleet layout`."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -22,6 +22,41 @@ def list_command(as_json: JsonOption = False) -> None:
     table = plain_table("scenario", "arms", "hours", "description", numbers=False)
     for name, s in scenarios.items():
         table.add_row(name, str(len(s.arms)), f"{s.horizon_s / 3600:g}", s.description)
+    out_console.print(table)
+
+
+def suite_command(
+    split: Annotated[
+        str | None,
+        typer.Option(help="List the instances of this split: train, validation or test.", show_default=False),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the cells of the benchmark's suite, or the instances of one of its splits.
+
+    An instance is a scenario of its own with a seed: `thermofleet show test/0000` describes it.
+    """
+    from scenarios.suite.cells import CELLS
+    from scenarios.suite.splits import manifest
+
+    if split is not None:
+        rows = manifest(split)
+        if as_json:
+            print_json([asdict(row) for row in rows])
+            return
+        table = plain_table("instance", "cell", "axes", "jobs", numbers=False)
+        for row in rows:
+            axes = ", ".join(f"{name} {value}" for name, value in asdict(row.axes).items())
+            table.add_row(row.name, row.cell, axes, str(row.count))
+        out_console.print(table)
+        return
+    if as_json:
+        print_json({cell.name: {**asdict(cell), "stations_per_arm": cell.stations_per_arm} for cell in CELLS})
+        return
+    table = plain_table("split", "cell", "arms are", "stations per arm", "hours", "instances", numbers=False)
+    for cell in CELLS:
+        numbers = (f"{cell.stations_per_arm:.2g}", f"{cell.hours:g}", str(cell.instances))
+        table.add_row(cell.split, cell.name, cell.unlike, *numbers)
     out_console.print(table)
 
 

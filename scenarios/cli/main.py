@@ -44,6 +44,7 @@ COMMANDS = {
     "demo": LazyCommand(_LOOK, "run:demo_command", "Run the quickstart shift under two policies."),
     "run": LazyCommand(_LOOK, "run:run_command", "Run one shift of a scenario and record it."),
     "list": LazyCommand(_LOOK, "library:list_command", "List the scenarios that come with thermofleet."),
+    "suite": LazyCommand(_LOOK, "library:suite_command", "List the benchmark's suite of instances."),
     "show": LazyCommand(_LOOK, "library:show_command", "Show a scenario: arms, jobs, thermal load factor."),
     "layout": LazyCommand(_LOOK, "library:layout_command", "Show reach, space and problems of a cell."),
     "film": LazyCommand(_LOOK, "film:film_command", "Film a recorded shift."),

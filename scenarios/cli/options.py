@@ -47,7 +47,12 @@ def check_name(option: typer.CallbackParam, value: str) -> str:
     return value
 
 
-ScenarioArg = Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")]
+ScenarioArg = Annotated[
+    str,
+    typer.Argument(
+        help="A library name (see `thermofleet list`), a .toml file, or an instance of the suite, as test/0017."
+    ),
+]
 SeedOption = Annotated[int, number("Random seed of jobs, sensor noise and policy.", 0, MAX_SEED)]
 DifficultyOption = Annotated[
     str, typer.Option(help="Source of the difficulty scores: twin, oracle (simulator) or blind (none).")

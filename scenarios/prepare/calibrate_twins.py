@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from fleet.job import Work
 from fleet.motion import Plan
 from fleet.offered_plans import offered_plans
 from fleet.planning.random_motions import RANDOM_MOTIONS_VERSION, random_jobs
@@ -154,24 +155,28 @@ def simulate_past(scenario: Scenario, arm: PlannedArm, known: HeatModel, *, jobs
 def _own_jobs(scenario: Scenario, arm: PlannedArm, count: int, rng: np.random.Generator) -> list[tuple[Plan, int]]:
     """Plans that the arm offers for jobs of the scenario, with repetitions; none if it can do no work."""
     possible = [
-        (stream, works)
-        for stream in scenario.jobs
-        if (works := [work for work in works_of(scenario, stream) if arm.plans.get(work)])
+        (repetitions, works)
+        for repetitions, all_of_them in _kinds_of_jobs(scenario)
+        if (works := [work for work in all_of_them if arm.plans.get(work)])
     ]
     jobs = []
     for _ in range(count if possible else 0):
-        stream, works = possible[rng.integers(len(possible))]
-        fewest, most = stream.repetitions
+        (fewest, most), works = possible[rng.integers(len(possible))]
         repetitions = int(rng.integers(fewest, most + 1))
         offered = offered_plans(arm.plans[works[rng.integers(len(works))]], repetitions)
         jobs.append((offered[rng.integers(len(offered))], repetitions))
     return jobs
 
 
+def _kinds_of_jobs(scenario: Scenario) -> list[tuple[tuple[int, int], tuple[Work, ...]]]:
+    """Repetitions and works of the streams, each once: arrivals, values and due dates do not matter to past jobs."""
+    return list(dict.fromkeys((stream.repetitions, works_of(scenario, stream)) for stream in scenario.jobs))
+
+
 def _ambient_range(scenario: Scenario, index: int) -> tuple[float, float]:
     """Ambient temperatures of past jobs at one arm: those of the scenario and a margin."""
     offset_k = float(air_offsets(scenario)[index])
-    temps = [temp_c + offset_k for _, temp_c in scenario.ambient.points]
+    temps = [temp_c + offset_k for temp_c in scenario.twin.air_c or [temp_c for _, temp_c in scenario.ambient.points]]
     return min(temps) - AIR_MARGIN_K, max(temps) + AIR_MARGIN_K
 
 
@@ -179,7 +184,7 @@ def _key(scenario: Scenario, arm: PlannedArm, version: str, jobs: int) -> str:
     """Cache key of a model: the version of what it calibrates, the arm's hardware and plans, and the past jobs."""
     robot, air_c = arm.hardware.robot, _ambient_range(scenario, arm.index)
     parts = [RECIPE, RANDOM_MOTIONS_VERSION, jobs, version, scenario.spread.seed, scenario.limits, robot, air_c]
-    digest = hashlib.sha256(msgspec.json.encode([*parts, scenario.jobs]))
+    digest = hashlib.sha256(msgspec.json.encode([*parts, _kinds_of_jobs(scenario)]))
     digest.update(arm.hardware.content())
     for phase in (phase for plan in arm.all_plans for phase in plan.phases):
         digest.update(f"{phase.profile.shape}".encode())

@@ -1,7 +1,7 @@
 """From a scenario to a fleet of arms with plans and twins, and to the environment."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from dataclasses import fields as dataclass_fields
 from functools import cached_property
 from inspect import Parameter, signature
@@ -34,6 +34,7 @@ from scenarios.job_stream import JobSampler, all_works, rehearsal_works
 from scenarios.load import load, override
 from scenarios.prepare.planned_arm import PlannedArm, air_offsets, plan_arms
 from scenarios.prepare.problems import problems_of
+from scenarios.prepare.randomisation import Randomisation, Variation
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
@@ -61,6 +62,19 @@ class Fleet:
     """Work that single arms cannot do, with reasons."""
     space: SpaceTable
     """Which plans of two arms exclude each other."""
+    randomise: Randomisation = field(default_factory=Randomisation)
+    """What varies from shift to shift besides the jobs."""
+    variants: tuple["Fleet", ...] = ()
+    """The fleets of `randomise.variants`."""
+
+    @property
+    def all(self) -> tuple["Fleet", ...]:
+        """The fleet and its variants."""
+        return (self, *self.variants)
+
+    def variation(self, seed: np.random.SeedSequence) -> Variation:
+        """What was drawn for the shift of a seed; its fleet is a place in `all`."""
+        return self.randomise.drawn(seed, len(self.all))
 
 
 def prepare(
@@ -68,17 +82,33 @@ def prepare(
     *,
     difficulty: DifficultyName = "twin",
     risk: RiskName = RISK,
+    randomise: Randomisation | None = None,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Fleet:
     """Plan every work for every arm, and give each arm its difficulty model; both are cached by content.
 
+    Args:
+        randomise: Beyond what a scenario draws for a shift: ambient temperature, arrivals, fleets.
+
     Raises:
-        ScenarioError: no arm can do some work, or arms at home are too close to each other.
+        ScenarioError: no arm can do some work, arms at home are too close to each other, or a variant is no fleet of
+            the same arms and jobs.
         MissingExtra: twins are wanted, and their libraries are not installed.
     """
-    arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, risk, cache, progress, every_work=True)
-    return _fleet(scenario, arms, refused, _folder(cache))
+    if not isinstance(randomise, Randomisation | None):
+        raise ScenarioError(f"randomise must be a scenarios.run.batch.Randomisation (got {randomise!r}).")
+    randomise = randomise or Randomisation()
+    specs = randomise.scenarios_of(scenario)
+    fleets: list[Fleet] = []
+    for i, spec in enumerate(specs):
+
+        def share(stage: str, fraction: float, i: int = i) -> None:
+            progress(stage, fraction if len(specs) == 1 else (i + fraction) / len(specs))
+
+        arms, refused = _arms(spec, range(len(spec.arms)), difficulty, risk, cache, share, every_work=True)
+        fleets.append(_fleet(spec, arms, refused, _folder(cache)))
+    return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))
 
 
 def _fleet(scenario: Scenario, arms: Sequence[Arm], refused: Sequence[InfeasibleJob], folder: Path) -> Fleet:
@@ -199,11 +229,15 @@ def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
     return replace(arm, model=model, known=(arm.thermal, arm.motors))
 
 
-def world_of(fleet: Fleet, jobs: Sequence[Job]) -> tuple[World, tuple[Plan, ...]]:
-    """The world of a shift with these jobs, and the plan of each row of its plan table."""
+def world_of(fleet: Fleet, jobs: Sequence[Job], warmer_k: float = 0.0) -> tuple[World, tuple[Plan, ...]]:
+    """The world of a shift with these jobs, and the plan of each row of its plan table.
+
+    Args:
+        warmer_k: Added to every temperature of the cell, at the start and of the air.
+    """
     scenario = fleet.scenario
     times = (np.arange(scenario.ticks) + 0.5) * scenario.decision_interval_s
-    return build_world(
+    world, plans = build_world(
         fleet.arms,
         [jobs],
         limits=scenario.limits,
@@ -214,6 +248,10 @@ def world_of(fleet: Fleet, jobs: Sequence[Job]) -> tuple[World, tuple[Plan, ...]
         start_warm=scenario.start == "idle_warm",
         space=fleet.space.rows,
     )
+    if warmer_k:
+        warmed = ("ambient_c", "start_c", "start_housing_c")
+        world = replace(world, **{name: getattr(world, name) + warmer_k for name in warmed})
+    return world, plans
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,16 +262,18 @@ class ShiftFactory:
     plant: PlantName = "profile"
 
     @cached_property
-    def _sampler(self) -> JobSampler:
-        return JobSampler(self.fleet.scenario)
+    def _samplers(self) -> tuple[JobSampler, ...]:
+        return tuple(JobSampler(fleet.scenario) for fleet in self.fleet.all)
 
     def __call__(self, seed: np.random.SeedSequence) -> "Episode":
         """Draw the jobs and build the world; the same seed gives the same episode."""
         from fleet.engine.shift import Episode
 
-        scenario, arms = self.fleet.scenario, self.fleet.arms
+        chosen, warmer_k, rate = self.fleet.variation(seed)
+        fleet = self.fleet.all[chosen]
+        scenario, arms = fleet.scenario, fleet.arms
         jobs_seed, sensor_seed = shift_seeds(seed)
-        world, plans = world_of(self.fleet, self._sampler.jobs(jobs_seed))
+        world, plans = world_of(fleet, self._samplers[chosen].jobs(jobs_seed, rate), warmer_k)
         robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
         plant: Plant
         if self.plant == "mujoco":
@@ -296,6 +336,7 @@ def make_env(
     *,
     difficulty: DifficultyName = "twin",
     risk: RiskName = RISK,
+    randomise: Randomisation | None = None,
     plant: PlantName = "profile",
     bus: BusName = "memory",
     channel: Channel = PERFECT,
@@ -313,9 +354,10 @@ def make_env(
         scenario: A library name, a .toml file, or a `Scenario`.
         difficulty: Source of the scores: `twin` (from the cache, or trained), `blind` (none) or `oracle` (true values).
         risk: Model of the twins' P(saturation); see `RiskName`.
+        randomise: Beyond what a scenario draws: ambient temperature, arrivals, fleets.
         plant: Motion of the arms: `profile` (exactly as planned) or `mujoco` (closed loop).
         bus: Transport of the messages between arms.
-        channel: Topology, delay, loss and partitions of the messages.
+        channel: Topology, delay, loss and partitions of the messages; if it is perfect, those of the scenario.
         cache: Folder of plans and twins.
         max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v1.AllocationEnv`.
         peers: Number of peers in an arm's observation, the nearest ones; default: all.
@@ -329,7 +371,7 @@ def make_env(
         raise ScenarioError(f"channel must be a fleet.bus.exchange.channel.Channel (got {channel!r}).")
     chosen = scenario_with(scenario, overrides, make_env)
     near = near_of(chosen, peers)
-    fleet = prepare(chosen, difficulty=difficulty, risk=risk, cache=cache, progress=progress)
+    fleet = prepare(chosen, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
     options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in, "near": near}
     return env_of(fleet, plant=plant, bus=bus, channel=channel, **options)
 
@@ -348,7 +390,7 @@ def env_of(
 
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)
-    exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, channel)
+    exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, fleet.scenario.channel(channel))
     options = {"weights": weights_of(fleet.scenario), "cell": cell_of(fleet.scenario), **options}
     options.setdefault("decisions", fleet.scenario.decisions)
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, **options)

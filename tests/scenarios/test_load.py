@@ -57,7 +57,7 @@ def told(edit: Callable[[dict[str, Any]], None]) -> str:
 WRONG = [
     (put("ambint", 3), "heat.toml: unknown key 'ambint'; did you mean 'ambient'? Allowed: ambient, arms,"),
     (put("arms", 0, "tool", 1), "heat.toml: arms[0]: unknown key 'tool'; did you mean 'tool_kg'? Allowed: "),
-    (put("twin", "siz", "quick"), "heat.toml: twin: unknown key 'siz'; did you mean 'size'? Allowed: ambient_c,"),
+    (put("twin", "siz", "quick"), "heat.toml: twin: unknown key 'siz'; did you mean 'size'? Allowed: air_c,"),
     (put("arms", 0, "tool_kg", "heavy"), "heat.toml: arms[0].tool_kg: expected a number, got a text ('heavy')."),
     (put("arms", 1, "tool_kg", -1), "heat.toml: arms[1].tool_kg must be >= 0 and finite (got -1.0)."),
     (put("arms", 0, "position_m", [0, 0]), "heat.toml: arms[0].position_m: expected 3 values, got 2."),

@@ -1,0 +1,148 @@
+"""The frozen splits: instances with a manifest of hashes, which `scenarios.suite.freeze` writes."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
+from functools import lru_cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from fleet.errors import ScenarioError
+from fleet.seeding import shift_seeds
+from scenarios.job_stream import draw_jobs
+from scenarios.schema import Scenario
+from scenarios.schema_errors import choose
+from scenarios.suite.axes import Axes, draw_axes, scenario_of
+from scenarios.suite.cells import CELLS, SPLITS, Cell, SplitName
+
+SUITE = 17
+"""Seed of all draws of the suite."""
+DIGITS = 3
+"""Decimals of times in a hash of jobs, s: the last bits of a logarithm differ between platforms."""
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One shift of a split."""
+
+    name: str
+    """As `test/0017`."""
+    scenario: Scenario
+    seed: int
+    """Of its jobs and its sensors' noise."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a manifest."""
+
+    name: str
+    cell: str
+    axes: Axes
+    seed: int
+    scenario: str
+    """Hash of the scenario, see `scenario_content`."""
+    jobs: str
+    """Hash of the drawn jobs, see `jobs_content`."""
+    count: int
+    """Jobs of the shift."""
+
+
+@lru_cache(maxsize=len(SPLITS))
+def split(name: str) -> tuple[Instance, ...]:
+    """The instances of a split: train, validation or test.
+
+    Cells that several instances share have equal plans, space and twins. The first instances are of different cells.
+
+    Raises:
+        ScenarioError: there is no such split.
+    """
+    return tuple(instance_of(row) for row in manifest(name))
+
+
+def instance(name: str) -> Instance:
+    """The instance of a name, as `test/0017`.
+
+    Raises:
+        ScenarioError: there is no such instance.
+    """
+    rows = manifest(name.partition("/")[0])
+    for row in rows:
+        if row.name == name:
+            return instance_of(row)
+    raise ScenarioError(f"No instance '{name}' in the suite; they are {rows[0].name} to {rows[-1].name}.")
+
+
+@lru_cache(maxsize=len(SPLITS))
+def manifest(name: str) -> tuple[Row, ...]:
+    """The frozen lines of a split.
+
+    Raises:
+        ScenarioError: there is no such split.
+    """
+    file = resources.files("scenarios").joinpath(f"suite/{choose('split', name, SplitName)}.jsonl")
+    lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    return tuple(Row(**{**line, "axes": Axes(**line["axes"])}) for line in lines)
+
+
+def cell_of_instance(row: Row) -> Cell:
+    """The cell of a line of a manifest."""
+    return next(cell for cell in CELLS if cell.name == row.cell)
+
+
+def drawn_rows(name: SplitName) -> Iterator[Row]:
+    """The lines of a split, drawn anew: in turns from each of its cells."""
+    cells = [cell for cell in CELLS if cell.split == name]
+    turns = range(max(cell.instances for cell in cells))
+    chosen = [cell for turn in turns for cell in cells if turn < cell.instances]
+    for number, cell in enumerate(chosen):
+        entropy = np.random.SeedSequence([SUITE, SPLITS.index(name), number])
+        seed = int(entropy.generate_state(1)[0])
+        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]))
+        row = Row(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
+        made = instance_of(row)
+        jobs = jobs_content(made)
+        yield replace(row, scenario=_hash(scenario_content(made.scenario)), jobs=_hash(jobs), count=len(jobs))
+
+
+def line_of(row: Row) -> str:
+    """The line of a manifest file."""
+    return json.dumps(asdict(row))
+
+
+def scenario_content(value: Any) -> Any:
+    """What is no default in a dataclass, at every depth (hence Any): a new field with a default changes no hash."""
+    if isinstance(value, tuple):
+        return [scenario_content(item) for item in value]
+    if not is_dataclass(value):
+        return value
+    content: dict[str, Any] = {}
+    for field in fields(value):
+        given = getattr(value, field.name)
+        default = field.default_factory() if field.default_factory is not MISSING else field.default
+        if given != default:
+            content[field.name] = scenario_content(given)
+    return content
+
+
+def jobs_content(made: Instance) -> list[Any]:
+    """The jobs of an instance's shift as JSON values, in order of release."""
+    jobs = draw_jobs(made.scenario, shift_seeds(np.random.SeedSequence(made.seed))[0])
+    return [
+        [job.name, job.work.kind, job.work.stations, job.work.payload_kg, job.repetitions, round(job.release_s, DIGITS),
+         round(job.due_s, DIGITS), job.value, job.after, job.expires]
+        for job in jobs
+    ]  # fmt: skip
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def instance_of(row: Row) -> Instance:
+    """The instance of a line of a manifest."""
+    name = row.name.replace("/", "-")
+    return Instance(row.name, scenario_of(name, cell_of_instance(row), row.axes, row.seed), row.seed)
