@@ -1,0 +1,185 @@
+"""Schedules of one shift: who does which job, by which plan, in which order; many are simulated side by side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+
+from agents.policy import WAIT, Policy, only_choices
+from fleet.engine.batch import Engine, shifts_of
+from fleet.engine.reward import RewardWeights
+from fleet.engine.state import World
+from fleet.engine.tables import tables_of
+from fleet.env.validation import actions_of
+from fleet.observation import Layout, Observation
+
+Array = np.ndarray
+
+Claim = tuple[int, int, int]
+"""Decision interval, arm (its index) and action."""
+
+
+@dataclass(frozen=True, eq=False)
+class Schedules:
+    """Schedules of the jobs of one shift; arrays [schedule, job].
+
+    A free arm claims, of its jobs that it may claim, the one that comes first.
+    """
+
+    arm: Array
+    """int."""
+    option: Array
+    """Index of the plan among those on offer, int."""
+    order: Array
+    """Jobs with smaller numbers come first; inf for a job that is left out."""
+    not_before_s: Array
+    """No arm claims the job earlier."""
+
+    def __len__(self) -> int:
+        return len(self.arm)
+
+    def at(self, rows: Sequence[int] | Array) -> "Schedules":
+        """Copies of some schedules."""
+        chosen = np.asarray(rows, dtype=int)
+        return Schedules(*(getattr(self, name)[chosen].copy() for name in self.__dataclass_fields__))
+
+
+def stack(schedules: Sequence[Schedules]) -> Schedules:
+    """Schedules one after the other."""
+    names = Schedules.__dataclass_fields__
+    return Schedules(*(np.concatenate([getattr(each, name) for each in schedules]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """What came of schedules or of a policy."""
+
+    reward: Array
+    """[schedule]."""
+    start_s: Array
+    """When each job was last awarded, inf if never, [schedule, job]."""
+    arm: Array
+    """To which arm, int [schedule, job]."""
+    option: Array
+    """With which plan, int [schedule, job]."""
+    claims: list[list[Claim]]
+    """The claims of each schedule that were won, and jobs given back, in the order of time."""
+
+
+class ShiftSimulator:
+    """Simulates one shift many times side by side.
+
+    Args:
+        world: Its env 0.
+        rows: Number of simulations at a time.
+        noise_key: Of the sensors, which only policies notice.
+    """
+
+    def __init__(self, world: World, weights: RewardWeights, rows: int, *, noise_key: int = 0) -> None:
+        tables, drawn = tables_of(world)
+        self.world, self.rows = world, rows
+        self.jobs = int(world.jobs.exists[0].sum())
+        self.evaluations = 0
+        """Shifts simulated so far."""
+        self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+        self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
+        self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1])
+        self._vectors = np.zeros((rows, self._layout.arms, self._layout.size), np.float32)
+
+    def run(self, schedules: Schedules) -> Simulated:
+        """The results of at most `rows` schedules."""
+        given = len(schedules)
+        padded = schedules.at([*range(given), *[0] * (self.rows - given)]) if given < self.rows else schedules
+        rows, options, arms = np.arange(self.rows)[:, None], self._layout.plans, self._layout.arms
+        slots = np.arange(self._layout.slots)
+        engine, dt_s = self._engine, self.world.dt_s
+
+        def act() -> Array:
+            slot_job = engine.offers.slot_job
+            job = np.maximum(slot_job, 0)
+            arm, action = padded.arm[rows, job], 1 + slots * options + padded.option[rows, job]
+            open_ = (slot_job >= 0) & (engine.mask[rows, arm, action] > 0)
+            open_ &= padded.not_before_s[rows, job] <= engine.state.tick[:, None] * dt_s
+            order = np.where(open_, padded.order[rows, job], np.inf)
+            by_arm = np.where(arm[:, None, :] == np.arange(arms)[:, None], order[:, None, :], np.inf)
+            first = by_arm.argmin(axis=2)
+            best = np.take_along_axis(by_arm, first[..., None], axis=2)[..., 0]
+            return np.where(np.isfinite(best), np.take_along_axis(action, first, axis=1), WAIT)
+
+        return self._run(act, given, skips=True)
+
+    def follow(self, policies: Sequence[Policy]) -> Simulated:
+        """The results of at most `rows` policies, each at the beginning of its shift."""
+        engine, names = self._engine, self.world.arms
+        skips = all(only_choices(policy) for policy in policies)
+
+        def act() -> Array:
+            actions = np.zeros((self.rows, len(names)), np.int64)
+            for e, policy in enumerate(policies):
+                if skips and not engine.mask[e, :, 1:-1].any():
+                    continue
+                known = {
+                    arm: self._layout.read(self._vectors[e, a], engine.mask[e, a]) for a, arm in enumerate(names)
+                }
+                actions[e] = actions_of(names, policy.act(known))
+            return actions
+
+        return self._run(act, len(policies), skips=skips)
+
+    def _run(self, act, given: int, *, skips: bool) -> Simulated:  # noqa: ANN001
+        engine, world = self._engine, self.world
+        engine.reset(np.arange(self.rows), self._shifts)
+        engine.observe(np.arange(self.rows), self._vectors)
+        reward, running = np.zeros(self.rows), np.ones(self.rows, bool)
+        running[given:] = False
+        start_s = np.full((self.rows, self.jobs), np.inf)
+        arm_of, option_of = np.full((self.rows, self.jobs), -1), np.full((self.rows, self.jobs), -1)
+        claims: list[list[Claim]] = [[] for _ in range(self.rows)]
+        until = np.full(self.rows, world.ticks, np.int64) if skips else None
+        give_back, options = self._layout.actions - 1, self._layout.plans
+        while running.any():
+            actions = np.ascontiguousarray(act(), np.int64)
+            tick, slot_job = engine.state.tick.copy(), engine.offers.slot_job.copy()
+            legal = np.take_along_axis(engine.mask, np.clip(actions, 0, give_back)[..., None], axis=2)[..., 0] > 0
+            _, earned, finished = engine.step(actions, self._vectors, until)
+            reward += np.where(running, earned, 0.0)
+            for e, a in np.argwhere((actions > 0) & legal & running[:, None]).tolist():
+                action = int(actions[e, a])
+                if action < give_back and engine.state.last_award[e, a] != 1:
+                    continue
+                claims[e].append((int(tick[e]), a, action))
+                if action < give_back:
+                    slot, option = divmod(action - 1, options)
+                    job = slot_job[e, slot]
+                    start_s[e, job], arm_of[e, job], option_of[e, job] = tick[e] * world.dt_s, a, option
+            running &= ~finished & (engine.state.tick < world.ticks)
+        self.evaluations += given
+        return Simulated(reward[:given], start_s[:given], arm_of[:given], option_of[:given], claims[:given])
+
+
+def without_scores(world: World) -> World:
+    """The same world without predictions, which only policies read; awards do not change."""
+    unknown = np.full_like(world.offers.risk, -1)
+    offers = replace(world.offers, risk=unknown, peak=unknown, forecasts=None)
+    return replace(world, offers=offers)
+
+
+@dataclass
+class Replay:
+    """A policy that repeats the claims of a schedule; in the shift that it was made for, it has the same result."""
+
+    claims: Sequence[Claim]
+    scope: ClassVar = "central"
+    _interval: int = field(default=0, init=False)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin the shift."""
+        self._interval = 0
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of this decision interval; to be called once in each."""
+        arms = list(observations)
+        actions = dict.fromkeys(arms, WAIT) | {arms[a]: action for tick, a, action in self.claims if tick == self._interval}
+        self._interval += 1
+        return actions
