@@ -28,9 +28,9 @@ from scenarios.bounds.relaxation import Relaxation
 
 Array = np.ndarray
 
-WINDOWS_S = (900.0, 2700.0, 7200.0)
+WINDOWS_S = (2700.0, 7200.0)
 """Lengths of the windows, which begin every half of it."""
-MOST_PER_ARM = 4
+MOST_PER_ARM = 2
 """Budgets of one arm and one length of window that are added at a time, the most violated ones."""
 VIOLATED_K = 0.01
 """Smaller violations of a mean temperature do not count."""

@@ -181,7 +181,10 @@ class _Changes:
     def _swap(self, new: Schedules) -> None:
         """Two jobs that are near in time exchange their arms or their places."""
         job = self._one()
-        others = self._jobs[np.argsort(np.abs(new.order[0, self._jobs] - new.order[0, job]), kind="stable")[:12]]
+        begun = self._jobs[np.isfinite(new.order[0, self._jobs])]
+        if not np.isfinite(new.order[0, job]):
+            return
+        others = begun[np.argsort(np.abs(new.order[0, begun] - new.order[0, job]), kind="stable")[:12]]
         other = int(self._rng.choice(others))
         first, second = [job, other], [other, job]
         new.order[0, first], new.not_before_s[0, first] = new.order[0, second], 0.0

@@ -23,8 +23,9 @@ worth of the relaxation is an upper bound of the reward of every policy. The arg
   expires has no visit that begins after its due date. A job is done at most as far as those before it.
 - Energy: every motor has at least the smallest heat of resting and of all plans, at the lowest temperature, until the
   last job that waits for no other is released; each cycle adds its surplus over that. A faulted arm may have none.
-- What remains of heat: `scenarios.bounds.heat_budget`. What is left out: slots, whole jobs and whole pieces, the order
-  of pieces within a period, way and time of a retreat that does not count.
+- A job counts only if all of it is done: its shares add up to a whole number, 0 or 1.
+- What remains of heat: `scenarios.bounds.heat_budget`. What is left out: slots, the number of visits, and the
+  order within a period.
 """
 
 from dataclasses import dataclass
@@ -73,7 +74,7 @@ class Pieces:
 class Relaxation:
     """The relaxation of env 0 of a world.
 
-    Columns: the pieces, the faults of each arm, then per arm and period the seconds lost to faults and the seconds
+    Columns: the pieces, whether each job is done, the faults of each arm, then per arm and period the seconds lost to faults and the seconds
     above the warning limit.
 
     Args:
@@ -82,7 +83,7 @@ class Relaxation:
 
     world: World
     weights: RewardWeights
-    period_s: float = 60.0
+    period_s: float = 300.0
 
     def __post_init__(self) -> None:
         w = self.weights
@@ -139,7 +140,7 @@ class Relaxation:
 
     @cached_property
     def release_s(self) -> Array:
-        """When an arm can begin each job at the earliest, [job]; inf for one that cannot be done."""
+        """When an arm can begin each job at the earliest, [job]; inf for one that cannot be done within the shift."""
         world, jobs = self.world, self.world.jobs
         begin_s = np.ceil(jobs.release_s[0, : self.jobs] / world.dt_s - ROUNDING_S) * world.dt_s
         plan = world.offers.plan[0, :, : self.jobs]
@@ -152,7 +153,7 @@ class Relaxation:
             if np.array_equal(later_s, begin_s):
                 break
             begin_s = later_s
-        return np.where(np.isfinite(shortest_s), begin_s, np.inf)
+        return np.where(begin_s + shortest_s <= world.horizon_s + ROUNDING_S, begin_s, np.inf)
 
     @property
     def jobs(self) -> int:
@@ -161,7 +162,7 @@ class Relaxation:
 
     @cached_property
     def pieces(self) -> Pieces:
-        """All pieces of a positive worth."""
+        """All pieces that jobs of a positive worth can have."""
         columns = [piece for job in range(self.jobs) for piece in self._pieces_of(job)]
         if not columns:
             columns = [np.empty((8, 0))]
@@ -182,7 +183,9 @@ class Relaxation:
         start_s = np.maximum(edges_s[:-1], begin_s)
         steps = np.where(start_s >= due_s + tail_s, np.floor((start_s - due_s - tail_s) / step_s) + 1.0, 0.0)
         worth = value * (self.weights.finished_value + self.weights.tardiness / 60.0 * step_s * steps)
-        possible = (edges_s[1:] > begin_s) & (worth > 0)
+        # A job of a positive worth has no share in a period that is more than a step below zero.
+        least = value * self.weights.tardiness / 60.0 * step_s
+        possible = (edges_s[1:] > begin_s) & (worth >= least - 1e-9)
         if world.jobs.expires[0, job]:
             longest_s = (times_s[rows, 0] + count * times_s[rows, 1]).max() + tail_s
             possible &= edges_s[:-1] <= due_s + longest_s
@@ -201,28 +204,31 @@ class Relaxation:
         return found
 
     @cached_property
-    def _blocks(self) -> tuple[int, int, int, int]:
-        """Where faults, lost seconds and seconds above the warning limit begin, and the number of columns."""
+    def _blocks(self) -> list[int]:
+        """Where jobs, faults, lost seconds, seconds above the warning limit begin, and the number of columns."""
         arms, cells = len(self.world.arms), len(self.world.arms) * self.periods
-        faults = len(self.pieces)
-        return faults, faults + arms, faults + arms + cells, faults + arms + 2 * cells
+        return np.cumsum([len(self.pieces), self.jobs, arms, cells, cells]).tolist()
+
+    def job_columns(self) -> Array:
+        """Columns that say whether a job is done, 0 or 1, int [job]."""
+        return self._blocks[0] + np.arange(self.jobs)
 
     def fault_columns(self) -> Array:
         """Columns of the faults, int [arm]."""
-        return self._blocks[0] + np.arange(len(self.world.arms))
+        return self._blocks[1] + np.arange(len(self.world.arms))
 
     def lost_columns(self, arm: int) -> Array:
         """Columns of the seconds that an arm loses to faults, int [period]."""
-        return self._blocks[1] + arm * self.periods + np.arange(self.periods)
+        return self._blocks[2] + arm * self.periods + np.arange(self.periods)
 
     def above_columns(self, arm: int) -> Array:
         """Columns of the seconds of an arm above the warning limit, int [period]."""
-        return self._blocks[2] + arm * self.periods + np.arange(self.periods)
+        return self._blocks[3] + arm * self.periods + np.arange(self.periods)
 
     @property
     def columns(self) -> int:
         """Number of columns."""
-        return self._blocks[3]
+        return self._blocks[4]
 
     @cached_property
     def worth(self) -> Array:
@@ -239,7 +245,8 @@ class Relaxation:
     def most(self) -> Array:
         """Largest value of each column, [column]."""
         arms, length_s = len(self.world.arms), np.diff(self.edges_s)
-        return np.concatenate([self.pieces.most, np.full(arms, float(self.world.ticks)), np.tile(length_s, 2 * arms)])
+        jobs = np.isfinite(self.release_s).astype(float)
+        return np.concatenate([self.pieces.most, jobs, np.full(arms, float(self.world.ticks)), np.tile(length_s, 2 * arms)])
 
     @cached_property
     def constant(self) -> float:
@@ -298,13 +305,18 @@ class Relaxation:
                 np.concatenate([pieces.seconds[inside], np.full(len(every), -self.tail_s)]),
                 room_s,
             )
-        table.add(pieces.job, np.arange(count), np.ones(count), np.ones(self.jobs))
+        jobs = np.arange(self.jobs)
+        for sign in (1.0, -1.0):  # the shares of a job add up to 1, or to 0
+            table.add(
+                np.concatenate([pieces.job, jobs]),
+                np.concatenate([np.arange(count), self.job_columns()]),
+                np.concatenate([np.full(count, sign), np.full(self.jobs, -sign)]),
+                np.zeros(self.jobs),
+            )
         before = self.world.jobs.after[0, : self.jobs]
         waits = [(job, int(other)) for job in range(self.jobs) for other in before[job] if other >= 0]
-        for n, (job, other) in enumerate(waits):
-            own, theirs = np.flatnonzero(pieces.job == job), np.flatnonzero(pieces.job == other)
-            values = np.concatenate([np.ones(len(own)), -np.ones(len(theirs))])
-            table.add(np.zeros(len(values), int), np.concatenate([own, theirs]), values, np.zeros(1))
+        for job, other in waits:
+            table.add(np.zeros(2, int), self.job_columns()[[job, other]], np.array([1.0, -1.0]), np.zeros(1))
         for arm in range(arms):
             lost = self.lost_columns(arm)
             columns = np.append(lost, self.fault_columns()[arm])

@@ -8,11 +8,13 @@ import numpy as np
 
 from agents.policy import WAIT, Policy, only_choices
 from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.reward import RewardWeights
+from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
 from fleet.env.validation import actions_of
+from fleet.job import MOST_FAULTS
 from fleet.observation import Layout, Observation
+from scenarios.bounds.play import play_rows
 
 Array = np.ndarray
 
@@ -74,9 +76,18 @@ class ShiftSimulator:
         world: Its env 0.
         rows: Number of simulations at a time.
         noise_key: Of the sensors, which only policies notice.
+        compiled: As in `Engine`.
     """
 
-    def __init__(self, world: World, weights: RewardWeights, rows: int, *, noise_key: int = 0) -> None:
+    def __init__(
+        self,
+        world: World,
+        weights: RewardWeights,
+        rows: int,
+        *,
+        noise_key: int = 0,
+        compiled: bool | None = None,
+    ) -> None:
         tables, drawn = tables_of(world)
         self.world, self.rows = world, rows
         self.jobs = int(world.jobs.exists[0].sum())
@@ -84,30 +95,28 @@ class ShiftSimulator:
         """Shifts simulated so far."""
         self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
         self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
-        self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1])
+        self._engine = Engine(
+            tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled
+        )
+        self._weights, self._compiled = weights_per_unit(weights), compiled
         self._vectors = np.zeros((rows, self._layout.arms, self._layout.size), np.float32)
 
     def run(self, schedules: Schedules) -> Simulated:
         """The results of at most `rows` schedules."""
-        given = len(schedules)
-        padded = schedules.at([*range(given), *[0] * (self.rows - given)]) if given < self.rows else schedules
-        rows, options, arms = np.arange(self.rows)[:, None], self._layout.plans, self._layout.arms
-        slots = np.arange(self._layout.slots)
-        engine, dt_s = self._engine, self.world.dt_s
-
-        def act() -> Array:
-            slot_job = engine.offers.slot_job
-            job = np.maximum(slot_job, 0)
-            arm, action = padded.arm[rows, job], 1 + slots * options + padded.option[rows, job]
-            open_ = (slot_job >= 0) & (engine.mask[rows, arm, action] > 0)
-            open_ &= padded.not_before_s[rows, job] <= engine.state.tick[:, None] * dt_s
-            order = np.where(open_, padded.order[rows, job], np.inf)
-            by_arm = np.where(arm[:, None, :] == np.arange(arms)[:, None], order[:, None, :], np.inf)
-            first = by_arm.argmin(axis=2)
-            best = np.take_along_axis(by_arm, first[..., None], axis=2)[..., 0]
-            return np.where(np.isfinite(best), np.take_along_axis(action, first, axis=1), WAIT)
-
-        return self._run(act, given, skips=True)
+        given, engine = len(schedules), self._engine
+        rows, terms = np.arange(given), np.empty((self.rows, len(TERMS) + 1))
+        reward, count = np.zeros(given), np.zeros(given, np.int64)
+        start_s = np.full((given, self.jobs), np.inf)
+        claims = np.zeros((given, MOST_FAULTS * self.jobs, 3), np.int64)
+        engine.reset(rows, self._shifts[:given])
+        bundle = engine._bundle  # pyright: ignore[reportPrivateUsage]  # the arrays that all kernels share
+        play_rows.chosen(self._compiled)(
+            bundle, self._weights, terms, schedules.arm, schedules.option, schedules.order, schedules.not_before_s, rows,
+            reward, start_s, claims, count,
+        )  # fmt: skip
+        self.evaluations += given
+        lists = [[(tick, a, action) for tick, a, action in claims[e, : count[e]].tolist()] for e in range(given)]
+        return Simulated(reward, start_s, schedules.arm, schedules.option, lists)
 
     def follow(self, policies: Sequence[Policy]) -> Simulated:
         """The results of at most `rows` policies, each at the beginning of its shift."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linprog
+from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from scipy.sparse import csr_array, vstack
 
 from scenarios.bounds.heat_budget import HeatBudget
@@ -11,8 +11,16 @@ from scenarios.bounds.relaxation import Relaxation
 
 Array = np.ndarray
 
-ROUNDS = 6
+ROUNDS = 3
 """Most times that heat budgets are added."""
+
+
+MOST_NODES = 2000
+"""Most nodes of the branch and bound; what it has proved by then counts."""
+GAP = 5e-4
+"""The branch and bound ends once bound and solution differ by this share."""
+ROUNDING = 1e-6
+"""Share added to a bound that a solver computed in floating point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,32 +29,31 @@ class UpperBound:
 
     reward: float
     """No policy has more."""
-    without_heat: float
-    """The bound before heat budgets were added."""
+    linear: float
+    """The bound with parts of jobs, without heat."""
     budgets: int
-    """Number of heat budgets added."""
-    shares: Array
-    """Solution of the relaxation, [column]."""
+    """Number of heat budgets used."""
 
 
 def upper_bound(relaxation: Relaxation, *, heat: bool = True) -> UpperBound:
-    """The upper bound of a relaxation, with heat budgets as far as they are violated."""
-    rows, most = relaxation.rows
-    value, shares = _solve(relaxation, rows, most)
-    first, count, budget = value, 0, HeatBudget(relaxation)
+    """The upper bound of a relaxation: with whole jobs, and with the heat budgets that its solution in parts passes."""
+    rows, bounds = relaxation.rows
+    linear, shares = _solve(relaxation, rows, bounds)
+    value, count, budget = linear, 0, HeatBudget(relaxation)
     for _ in range(ROUNDS if heat else 0):
-        more, bounds = budget.violated(shares)
-        if not len(bounds):
+        more, limits = budget.violated(shares)
+        if not len(limits):
             break
-        rows, most = csr_array(vstack([rows, more])), np.concatenate([most, bounds])
-        count += len(bounds)
-        better, shares = _solve(relaxation, rows, most)
+        rows, bounds = csr_array(vstack([rows, more])), np.concatenate([bounds, limits])
+        count += len(limits)
+        better, shares = _solve(relaxation, rows, bounds)
         value = min(value, better)
-    return UpperBound(value + relaxation.constant, first + relaxation.constant, count, shares)
+    value = min(value, _whole(relaxation, rows, bounds))
+    return UpperBound(value + relaxation.constant, linear + relaxation.constant, count)
 
 
 def _solve(relaxation: Relaxation, rows: csr_array, bounds: Array) -> tuple[float, Array]:
-    """Bound by the dual prices of the rows, and the solution, [column].
+    """Bound with parts of jobs by the dual prices of the rows, and the solution, [column].
 
     Any prices >= 0 give a valid bound, so rounding errors of the solver make it looser and never wrong
     (Neumaier & Shcherbina, Mathematical Programming 99, 2004).
@@ -58,3 +65,19 @@ def _solve(relaxation: Relaxation, rows: csr_array, bounds: Array) -> tuple[floa
     prices = np.maximum(-result.ineqlin.marginals, 0.0)
     surplus = np.maximum(worth - rows.T @ prices, 0.0)
     return float(prices @ bounds + surplus @ most), result.x
+
+
+def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array) -> float:
+    """Bound with whole jobs; inf if branch and bound proved none."""
+    whole = np.zeros(relaxation.columns)
+    whole[relaxation.job_columns()] = 1
+    result = milp(
+        -relaxation.worth,
+        constraints=LinearConstraint(rows, -np.inf, bounds),
+        bounds=Bounds(np.zeros(relaxation.columns), relaxation.most),
+        integrality=whole,
+        options={"node_limit": MOST_NODES, "mip_rel_gap": GAP},
+    )
+    if result.mip_dual_bound is None:
+        return np.inf
+    return -result.mip_dual_bound + ROUNDING * (1.0 + abs(result.mip_dual_bound))
