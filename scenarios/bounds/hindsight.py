@@ -14,8 +14,11 @@ SIDE_BY_SIDE = 32
 """Schedules that are simulated at a time."""
 TOLERANCE = 0.004
 """At the beginning the search goes on from a schedule that is worse by at most this share of the value on offer."""
-RESTART = 40
-"""Rounds without a better schedule after which the search goes back to the best one."""
+RESTART = 30
+"""Rounds without a better schedule after which the search goes on near the best one."""
+LEAST_GAIN = 1e-9
+KICKS = 6
+"""It is changed fewer times than this before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,33 +68,35 @@ def hindsight(
     changes = _Changes(simulator, rng)
     present = changes.of_result(starts, np.argsort(-starts.reward)[: simulator.rows // 4])
     value = float(simulator.world.jobs.value[0][simulator.world.jobs.exists[0]].sum())
-    result = simulator.run(stack([present, changes.freed(present)]))
+    tried = stack([present, changes.freed(present)])
+    result = simulator.run(tried)
     at = int(result.reward.argmax())
-    current, score = stack([present, changes.freed(present)]).at([at]), float(result.reward[at])
+    current, score = changes.in_order(tried, result, at), float(result.reward[at])
     record, since, begun = current, 0, simulator.evaluations
     if score > best:
         best, best_claims = score, result.claims[at]
     joint: list[Schedules] = []
     while not stopped():
-        used = max((time.process_time() - began_s) / budget.seconds, (simulator.evaluations - begun) / budget.evaluations)
+        spent_s, spent = time.process_time() - began_s, simulator.evaluations - begun
+        used = max(spent_s / budget.seconds, spent / budget.evaluations)
         if used >= 1.0:
             break
-        started = changes.with_starts(current, result, at)
-        tried = stack([*joint, *(changes.changed(started) for _ in range(simulator.rows - len(joint)))])
+        tried = stack([*joint, *(changes.changed(current) for _ in range(simulator.rows - len(joint)))])
         result = simulator.run(tried)
-        at = int(result.reward.argmax())
-        better = np.flatnonzero(result.reward > score + 1e-9)
-        joint = changes.joined(started, tried, better[np.argsort(-result.reward[better])])
-        since += 1
-        if result.reward[at] > best + 1e-9:
-            best, best_claims, since = float(result.reward[at]), result.claims[at], 0
-        if result.reward[at] > best - TOLERANCE * value * (1.0 - used) - 1e-9:
-            current, score = tried.at([at]), float(result.reward[at])
-        if result.reward[at] >= best - 1e-9:
-            record = tried.at([at])
+        at, since = int(result.reward.argmax()), since + 1
+        top, better = float(result.reward[at]), np.flatnonzero(result.reward > score + LEAST_GAIN)
+        joint = changes.joined(current, tried, better[np.argsort(-result.reward[better])])
+        if top > best + LEAST_GAIN:
+            best, best_claims, since = top, result.claims[at], 0
+            record = changes.in_order(tried, result, at)
+        if top > min(best - TOLERANCE * value * (1.0 - used), score) - LEAST_GAIN:
+            current, score = changes.in_order(tried, result, at), top
         if since >= RESTART:
-            again = simulator.run(record)
-            current, score, result, at, since, joint = record, float(again.reward[0]), again, 0, 0, []
+            kicked = record
+            for _ in range(int(rng.integers(KICKS))):
+                kicked = changes.changed(kicked)
+            result = simulator.run(kicked)
+            current, score, since, joint = changes.in_order(kicked, result, 0), float(result.reward[0]), 0, []
     seconds = time.process_time() - began_s
     return Hindsight(best, float(starts.reward[first]), best_claims, simulator.evaluations - begun, seconds)
 
@@ -104,6 +109,7 @@ class _Changes:
         jobs = simulator.jobs
         self._release_s = world.jobs.release_s[0, :jobs]
         self._horizon_s = world.horizon_s
+        self._waits_s = world.dt_s * np.array([1.0, 5.0, 25.0, 125.0])
         can = world.offers.plan[0, :, :jobs] >= 0  # [arm, job, option]
         self._choices = [np.argwhere(can[:, job]) for job in range(jobs)]
         self._jobs = np.flatnonzero([len(each) > 0 for each in self._choices])
@@ -125,9 +131,9 @@ class _Changes:
         copy.not_before_s[:] = 0.0
         return copy
 
-    def with_starts(self, schedule: Schedules, result: Simulated, row: int) -> Schedules:
-        """The schedule with its jobs in the order in which they began in a result of it."""
-        copy, start_s = schedule.at([0]), result.start_s[row]
+    def in_order(self, schedules: Schedules, result: Simulated, row: int) -> Schedules:
+        """One of some schedules, with its jobs in the order in which they began in its result."""
+        copy, start_s = schedules.at([row]), result.start_s[row]
         begun = np.isfinite(start_s) & np.isfinite(copy.order[0])
         copy.order[0, begun] = start_s[begun]
         return copy
@@ -164,7 +170,7 @@ class _Changes:
     def _time(self, job: int, order: float) -> float:
         """A moment near that of a job, not before its release."""
         near = order if np.isfinite(order) else self._release_s[job]
-        shifted = near + self._rng.normal() * self._rng.choice([60.0, 600.0, 3600.0])
+        shifted = near + self._rng.normal() * self._rng.choice(2.0 * self._waits_s)
         return float(np.clip(shifted, self._release_s[job], self._horizon_s))
 
     def _move(self, new: Schedules) -> None:
@@ -206,7 +212,7 @@ class _Changes:
         """The arm waits before it claims a job."""
         job = self._one()
         if np.isfinite(new.order[0, job]):
-            new.not_before_s[0, job] = new.order[0, job] + self._rng.exponential(self._rng.choice([60.0, 300.0, 1200.0]))
+            new.not_before_s[0, job] = new.order[0, job] + self._rng.exponential(self._rng.choice(self._waits_s))
 
     def _leave_out(self, new: Schedules) -> None:
         """A job is left out, or taken up if it was."""
