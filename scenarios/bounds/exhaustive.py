@@ -9,6 +9,7 @@ from fleet.engine.reward import RewardWeights
 from fleet.engine.state import DONE, State, World
 from fleet.engine.tables import tables_of
 from fleet.observation import Layout
+from scenarios.bounds.relaxation import check_signs
 
 Array = np.ndarray
 
@@ -35,8 +36,7 @@ def optimum(world: World, weights: RewardWeights, at_least: float = -np.inf) -> 
     Raises:
         ValueError: the shift is too large, or a weight has the wrong sign.
     """
-    if weights.finished_value < 0 or max(weights.tardiness, weights.above_warning, weights.faults, weights.energy) > 0:
-        raise ValueError("The search needs a reward.finished_value >= 0 and all other weights <= 0.")
+    check_signs(weights)
     tables, drawn = tables_of(world)
     layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
     engine = Engine(tables, ROWS, layout, weights, jobs=world.jobs.exists.shape[1])

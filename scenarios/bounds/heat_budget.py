@@ -17,6 +17,7 @@ Nothing else about temperature enters: heat at the true temperature is larger th
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -90,6 +91,16 @@ class HeatBudget:
                 return min(world.horizon_s, (tick + 1) * world.dt_s + limits.clear_s)
             temp_c = advance(temp_c, brakes_w, air_c, world.phi, world.gamma, world.thermal.to_ambient)
         return world.horizon_s
+
+    def losses(self) -> tuple[csr_array, Array]:
+        """Rows that limit the time that faults cost an arm."""
+        relaxation, arms = self.relaxation, len(self.relaxation.world.arms)
+        columns = np.concatenate(
+            [[*relaxation.lost_columns(arm), relaxation.fault_columns()[arm]] for arm in range(arms)]
+        )
+        values = np.tile(np.append(np.ones(relaxation.periods), -self.longest_loss_s), arms)
+        row = np.repeat(np.arange(arms), relaxation.periods + 1)
+        return csr_array((values, (row, columns)), shape=(arms, relaxation.columns)), np.zeros(arms)
 
     def violated(self, shares: Array) -> tuple[csr_array, Array]:
         """Budgets that a solution [column] violates most, as rows A x <= b: A, sparse [row, column], and b, [row]."""
@@ -191,7 +202,7 @@ class HeatBudget:
         low = minimum_filter1d(effect, size, axis=0, mode="nearest") * between
         high = maximum_filter1d(effect, size, axis=0, mode="nearest") / between
         at = np.round(relaxation.edges_s / step_s).astype(int)
-        parts = list(zip(at[:-1], at[1:], strict=True))
+        parts = list(pairwise(at.tolist()))
         return (
             np.stack([low[one : other + 1].min(axis=0) for one, other in parts]),
             np.stack([high[one : other + 1].max(axis=0) for one, other in parts]),

@@ -155,7 +155,16 @@ class _Changes:
     def changed(self, schedule: Schedules) -> Schedules:
         """A random neighbour of a schedule."""
         new, rng = schedule.at([0]), self._rng
-        kinds = (self._move, self._move, self._swap, self._reorder, self._free, self._delay, self._leave_out, self._window)
+        kinds = (
+            self._move,
+            self._move,
+            self._swap,
+            self._reorder,
+            self._free,
+            self._delay,
+            self._leave_out,
+            self._window,
+        )
         for _ in range(1 + int(rng.geometric(0.6) - 1)):
             kinds[int(rng.integers(len(kinds)))](new)
         return new

@@ -24,6 +24,7 @@ worth of the relaxation is an upper bound of the reward of every policy. The arg
 - Energy: every motor has at least the smallest heat of resting and of all plans, at the lowest temperature, until the
   last job that waits for no other is released; each cycle adds its surplus over that. A faulted arm may have none.
 - A job counts only if all of it is done: its shares add up to a whole number, 0 or 1.
+- The motion is as planned (the plant `profile`).
 - What remains of heat: `scenarios.bounds.heat_budget`. What is left out: slots, the number of visits, and the
   order within a period.
 """
@@ -38,7 +39,7 @@ from scipy.sparse import csr_array
 from fleet.engine.reward import RewardWeights
 from fleet.engine.state import World
 from fleet.motor import magnet_factor
-from fleet.thermal import NODES, node_heat
+from fleet.thermal import node_heat
 
 Array = np.ndarray
 
@@ -46,6 +47,17 @@ MOST_CLIQUES = 400
 """Maximal cliques beyond this number are not used."""
 ROUNDING_S = 1e-6
 """Durations are rounded up to whole intervals but for this."""
+
+
+def check_signs(weights: RewardWeights) -> None:
+    """Check that finished jobs earn and everything else costs.
+
+    Raises:
+        ValueError: a weight has the other sign.
+    """
+    if weights.finished_value < 0 or max(weights.tardiness, weights.above_warning, weights.faults, weights.energy) > 0:
+        given = ", ".join(f"{name} = {value:g}" for name, value in vars(weights).items())
+        raise ValueError(f"Bounds need a reward.finished_value >= 0 and all other weights <= 0 (got {given}).")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +86,8 @@ class Pieces:
 class Relaxation:
     """The relaxation of env 0 of a world.
 
-    Columns: the pieces, whether each job is done, the faults of each arm, then per arm and period the seconds lost to faults and the seconds
-    above the warning limit.
+    Columns: the pieces, whether each job is done, the faults of each arm, then per arm and period the seconds lost to
+    faults and the seconds above the warning limit.
 
     Args:
         period_s: Length of a period, rounded to whole decision intervals.
@@ -86,12 +98,7 @@ class Relaxation:
     period_s: float = 300.0
 
     def __post_init__(self) -> None:
-        w = self.weights
-        if w.finished_value < 0 or max(w.tardiness, w.above_warning, w.faults, w.energy) > 0:
-            raise ValueError(
-                "An upper bound needs a reward.finished_value >= 0 and all other weights <= 0 "
-                f"(got {', '.join(f'{name} = {value:g}' for name, value in vars(w).items())})."
-            )
+        check_signs(self.weights)
 
     @cached_property
     def edges_s(self) -> Array:
@@ -132,9 +139,7 @@ class Relaxation:
         coldest_c = min(float(self.world.start_c.min()), float(self.world.ambient_c.min()))
         # The coldest magnets are the strongest: their torque constant falls with the temperature.
         assert motors.alpha_kt_per_k <= 0 <= motors.alpha_cu_per_k
-        resistance = motors.copper_w_per_a2[arm] * (
-            1.0 + motors.alpha_cu_per_k * (coldest_c - motors.reference_c)
-        )
+        resistance = motors.copper_w_per_a2[arm] * (1.0 + motors.alpha_cu_per_k * (coldest_c - motors.reference_c))
         warm_sq = current_sq / magnet_factor(coldest_c, motors) ** 2
         return node_heat(resistance * warm_sq, friction_w + motors.idle_w[arm])
 
@@ -246,7 +251,9 @@ class Relaxation:
         """Largest value of each column, [column]."""
         arms, length_s = len(self.world.arms), np.diff(self.edges_s)
         jobs = np.isfinite(self.release_s).astype(float)
-        return np.concatenate([self.pieces.most, jobs, np.full(arms, float(self.world.ticks)), np.tile(length_s, 2 * arms)])
+        return np.concatenate(
+            [self.pieces.most, jobs, np.full(arms, float(self.world.ticks)), np.tile(length_s, 2 * arms)]
+        )
 
     @cached_property
     def constant(self) -> float:
@@ -275,8 +282,7 @@ class Relaxation:
             (p, q)
             for p in arm_of
             for q in arm_of
-            if p < q
-            and (arm_of[p] == arm_of[q] or stations[p] & stations[q] or world.conflicts[volume[p], volume[q]])
+            if p < q and (arm_of[p] == arm_of[q] or stations[p] & stations[q] or world.conflicts[volume[p], volume[q]])
         )
         found = []
         for clique in nx.find_cliques(graph):
@@ -320,14 +326,9 @@ class Relaxation:
         for arm in range(arms):
             lost = self.lost_columns(arm)
             columns = np.append(lost, self.fault_columns()[arm])
-            values = np.append(np.ones(len(lost)), -self.longest_loss_s)
+            values = np.append(np.ones(len(lost)), -self.world.horizon_s)
             table.add(np.zeros(len(columns), int), columns, values, np.zeros(1))
         return table.matrix()
-
-    @cached_property
-    def longest_loss_s(self) -> float:
-        """Longest time that one fault can cost an arm: the whole shift."""
-        return self.world.horizon_s
 
 
 class _Rows:
@@ -348,6 +349,3 @@ class _Rows:
         """All rows and their right sides."""
         row, column, value = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
         return csr_array((value, (row, column)), shape=(self._count, self._columns)), np.concatenate(self._bounds)
-
-
-assert NODES % 2 == 0

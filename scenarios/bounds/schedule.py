@@ -95,9 +95,7 @@ class ShiftSimulator:
         """Shifts simulated so far."""
         self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
         self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
-        self._engine = Engine(
-            tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled
-        )
+        self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled)
         self._weights, self._compiled = weights_per_unit(weights), compiled
         self._vectors = np.zeros((rows, self._layout.arms, self._layout.size), np.float32)
 
@@ -110,34 +108,17 @@ class ShiftSimulator:
         claims = np.zeros((given, MOST_FAULTS * self.jobs, 3), np.int64)
         engine.reset(rows, self._shifts[:given])
         bundle = engine._bundle  # pyright: ignore[reportPrivateUsage]  # the arrays that all kernels share
-        play_rows.chosen(self._compiled)(
-            bundle, self._weights, terms, schedules.arm, schedules.option, schedules.order, schedules.not_before_s, rows,
-            reward, start_s, claims, count,
-        )  # fmt: skip
+        chosen = (schedules.arm, schedules.option, schedules.order, schedules.not_before_s)
+        play = play_rows.chosen(self._compiled)
+        play(bundle, self._weights, terms, *chosen, rows, reward, start_s, claims, count)
         self.evaluations += given
         lists = [[(tick, a, action) for tick, a, action in claims[e, : count[e]].tolist()] for e in range(given)]
         return Simulated(reward, start_s, schedules.arm, schedules.option, lists)
 
     def follow(self, policies: Sequence[Policy]) -> Simulated:
         """The results of at most `rows` policies, each at the beginning of its shift."""
-        engine, names = self._engine, self.world.arms
+        engine, world, given = self._engine, self.world, len(policies)
         skips = all(only_choices(policy) for policy in policies)
-
-        def act() -> Array:
-            actions = np.zeros((self.rows, len(names)), np.int64)
-            for e, policy in enumerate(policies):
-                if skips and not engine.mask[e, :, 1:-1].any():
-                    continue
-                known = {
-                    arm: self._layout.read(self._vectors[e, a], engine.mask[e, a]) for a, arm in enumerate(names)
-                }
-                actions[e] = actions_of(names, policy.act(known))
-            return actions
-
-        return self._run(act, len(policies), skips=skips)
-
-    def _run(self, act, given: int, *, skips: bool) -> Simulated:  # noqa: ANN001
-        engine, world = self._engine, self.world
         engine.reset(np.arange(self.rows), self._shifts)
         engine.observe(np.arange(self.rows), self._vectors)
         reward, running = np.zeros(self.rows), np.ones(self.rows, bool)
@@ -148,7 +129,8 @@ class ShiftSimulator:
         until = np.full(self.rows, world.ticks, np.int64) if skips else None
         give_back, options = self._layout.actions - 1, self._layout.plans
         while running.any():
-            actions = np.ascontiguousarray(act(), np.int64)
+            asked = running & engine.mask[..., 1:-1].any(axis=(1, 2)) if skips else running
+            actions = self._actions(policies, asked)
             tick, slot_job = engine.state.tick.copy(), engine.offers.slot_job.copy()
             legal = np.take_along_axis(engine.mask, np.clip(actions, 0, give_back)[..., None], axis=2)[..., 0] > 0
             _, earned, finished = engine.step(actions, self._vectors, until)
@@ -165,6 +147,15 @@ class ShiftSimulator:
             running &= ~finished & (engine.state.tick < world.ticks)
         self.evaluations += given
         return Simulated(reward[:given], start_s[:given], arm_of[:given], option_of[:given], claims[:given])
+
+    def _actions(self, policies: Sequence[Policy], asked: Array) -> Array:
+        """The actions of the policies that are asked, int64 [row, arm]; the others wait."""
+        names, mask = self.world.arms, self._engine.mask
+        actions = np.full((self.rows, len(names)), WAIT, np.int64)
+        for e in np.flatnonzero(asked).tolist():
+            known = {arm: self._layout.read(self._vectors[e, a], mask[e, a]) for a, arm in enumerate(names)}
+            actions[e] = actions_of(names, policies[e].act(known))
+        return actions
 
 
 def without_scores(world: World) -> World:
@@ -189,6 +180,8 @@ class Replay:
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The claims of this decision interval; to be called once in each."""
         arms = list(observations)
-        actions = dict.fromkeys(arms, WAIT) | {arms[a]: action for tick, a, action in self.claims if tick == self._interval}
+        actions = dict.fromkeys(arms, WAIT) | {
+            arms[a]: action for tick, a, action in self.claims if tick == self._interval
+        }
         self._interval += 1
         return actions

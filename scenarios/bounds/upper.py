@@ -44,7 +44,8 @@ def upper_bound(relaxation: Relaxation, *, heat: bool = True) -> UpperBound:
         more, limits = budget.violated(shares)
         if not len(limits):
             break
-        rows, bounds = csr_array(vstack([rows, more])), np.concatenate([bounds, limits])
+        faults, none = budget.losses()
+        rows, bounds = csr_array(vstack([rows, faults, more])), np.concatenate([bounds, none, limits])
         count += len(limits)
         better, shares = _solve(relaxation, rows, bounds)
         value = min(value, better)
