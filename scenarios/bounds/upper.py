@@ -15,6 +15,8 @@ ROUNDS = 3
 """Most times that heat budgets are added."""
 
 
+LEAST_GAIN = 1e-3
+"""No more budgets are added once they lower the bound by less than this share."""
 MOST_NODES = 2000
 """Most nodes of the branch and bound; what it has proved by then counts."""
 GAP = 5e-4
@@ -48,7 +50,9 @@ def upper_bound(relaxation: Relaxation, *, heat: bool = True) -> UpperBound:
         rows, bounds = csr_array(vstack([rows, faults, more])), np.concatenate([bounds, none, limits])
         count += len(limits)
         better, shares = _solve(relaxation, rows, bounds)
-        value = min(value, better)
+        gain, value = value - better, min(value, better)
+        if gain < LEAST_GAIN * abs(value):
+            break
     value = min(value, _whole(relaxation, rows, bounds))
     return UpperBound(value + relaxation.constant, linear + relaxation.constant, count)
 
@@ -74,8 +78,8 @@ def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array) -> float:
     whole[relaxation.job_columns()] = 1
     result = milp(
         -relaxation.worth,
-        constraints=LinearConstraint(rows, -np.inf, bounds),
-        bounds=Bounds(np.zeros(relaxation.columns), relaxation.most),
+        constraints=LinearConstraint(rows, -np.inf, bounds),  # pyright: ignore[reportArgumentType]
+        bounds=Bounds(0.0, relaxation.most),  # pyright: ignore[reportArgumentType]  # SciPy's stubs allow no arrays
         integrality=whole,
         options={"node_limit": MOST_NODES, "mip_rel_gap": GAP},
     )
