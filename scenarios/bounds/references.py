@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from fleet.errors import ScenarioError
 from fleet.seeding import child
 from scenarios.bounds.hindsight import SIDE_BY_SIDE, Budget, hindsight
 from scenarios.bounds.relaxation import Relaxation
-from scenarios.bounds.schedule import Claim, ShiftSimulator, without_scores
+from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, without_scores
 from scenarios.bounds.upper import upper_bound
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, policy_of
@@ -86,12 +86,21 @@ class Task:
     seed: int
 
 
-def reference(fleet: Fleet, task: Task, budget: Budget, *, difficulty: str = "oracle", bound: bool = True) -> Reference:
+def reference(
+    fleet: Fleet,
+    task: Task,
+    budget: Budget,
+    *,
+    difficulty: str = "oracle",
+    bound: bool = True,
+    known: Sequence[Claim] = (),
+) -> Reference:
     """The reference of one instance of a prepared fleet.
 
     Args:
         difficulty: With which the fleet was prepared.
         bound: Compute the upper bound; else it is infinite.
+        known: A schedule of an earlier search, which this one also starts from.
     """
     began_s = time.process_time()
     entropy = np.random.SeedSequence(task.seed)
@@ -99,7 +108,11 @@ def reference(fleet: Fleet, task: Task, budget: Budget, *, difficulty: str = "or
     world = episode.world
     rules = ShiftSimulator(world, weights, len(STARTS), noise_key=episode.noise_key)
     starts = rules.follow([policy_at(name, task.seed) for name in STARTS])
+    best = int(starts.reward.argmax())
+    rule, best_rule = STARTS[best], float(starts.reward[best])
     bare = without_scores(world)
+    if known:
+        starts = starts.and_(ShiftSimulator(bare, weights, 1).follow([Replay(known)]))
     drawn = [policy_of("random") for _ in range(RANDOM_SHIFTS)]
     for n, policy in enumerate(drawn):
         policy.reset(np.random.default_rng(child(np.random.SeedSequence([task.seed, 2]), n)))
@@ -116,8 +129,8 @@ def reference(fleet: Fleet, task: Task, budget: Budget, *, difficulty: str = "or
         difficulty=difficulty,
         random=float(random.mean()),
         random_se=float(random.std(ddof=1) / np.sqrt(len(random))),
-        rule=STARTS[int(starts.reward.argmax())],
-        best_rule=found.start,
+        rule=rule,
+        best_rule=best_rule,
         hindsight=found.reward,
         upper=upper.reward if upper else float("inf"),
         linear=upper.linear if upper else float("inf"),
@@ -142,8 +155,9 @@ def references(
 ) -> list[Reference]:
     """The references of instances, kept in a file of JSON lines; those in it are not computed again.
 
-    A row counts if instance, content of the scenario, seed and source of scores are the same. Another budget adds to
-    the search: the better schedule stays. A fleet is prepared once for consecutive tasks of one scenario.
+    A row counts if instance, content of the scenario, seed and source of scores are the same. With a larger budget the
+    search is repeated, and starts from the known schedule too. A fleet is prepared once for consecutive tasks of one
+    scenario.
 
     Raises:
         ScenarioError: the weights of the reward allow no bound.
@@ -159,12 +173,11 @@ def references(
             continue
         if fleet is None or fleet.scenario != task.scenario:
             fleet = prepare(task.scenario, difficulty=difficulty, cache=cache, progress=progress)
+        known = load_reference(rows.by_key[key]).claims if key in rows else ()
         try:
-            new = reference(fleet, task, budget, difficulty=difficulty)
+            new = reference(fleet, task, budget, difficulty=difficulty, known=known)
         except ValueError as error:
             raise ScenarioError(f"{task.instance}: {error}") from error
-        if key in rows:
-            new = _better(load_reference(rows.by_key[key]), new)
         rows.append(key, asdict(new))
     return load_references(path, [key_of(task, difficulty) for task in tasks])
 
@@ -187,11 +200,3 @@ def load_reference(row: dict[str, object]) -> Reference:
     assert isinstance(claims, list | tuple)
     fields["claims"] = tuple((int(tick), int(arm), int(action)) for tick, arm, action in claims)
     return Reference(**fields)  # pyright: ignore[reportArgumentType]  # as they were written
-
-
-def _better(old: Reference, new: Reference) -> Reference:
-    """The new reference with the better schedule and bound of both; valid only for the same physics."""
-    if old.code != new.code:
-        return new
-    better = old if old.hindsight > new.hindsight else new
-    return replace(new, hindsight=better.hindsight, claims=better.claims, upper=min(old.upper, new.upper))

@@ -13,6 +13,7 @@ from fleet.engine.reward import RewardWeights
 from fleet.env.random_actions import random_legal
 from fleet.robot import ThermalLimits
 from scenarios.bounds import references as stored
+from scenarios.bounds.command import markdown
 from scenarios.bounds.exhaustive import optimum
 from scenarios.bounds.heat_budget import HeatBudget
 from scenarios.bounds.hindsight import Budget, hindsight
@@ -155,14 +156,23 @@ def test_a_reference_is_between_its_parts_and_its_schedule_can_be_replayed(fleet
     assert reward == pytest.approx(found.hindsight, abs=1e-6)
 
 
-def test_references_resume_and_keep_the_better_schedule(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    calls: list[str] = []
-    first = reference(fleet, Task("three/1", fleet.scenario, 1), Budget(evaluations=1), difficulty="blind")
+def test_a_search_starts_from_a_known_schedule(fleet: Fleet):
+    task = Task("three/1", fleet.scenario, 1)
+    found = reference(fleet, task, Budget(evaluations=200), difficulty="blind", bound=False)
+    again = reference(fleet, task, Budget(evaluations=1), difficulty="blind", bound=False, known=found.claims)
+    assert again.hindsight >= found.hindsight - 1e-9 > found.best_rule
+    assert (again.rule, again.best_rule) == (found.rule, found.best_rule)
 
-    def counted(fleet, task, budget, **options):
-        calls.append(task.instance)
-        worse = first.hindsight - len(calls)
-        return replace(first, instance=task.instance, seed=task.seed, hindsight=worse, search_s=budget.seconds)
+
+def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    calls: list[tuple[str, int]] = []
+    one = reference(fleet, Task("three/1", fleet.scenario, 1), Budget(evaluations=1), difficulty="blind", bound=False)
+
+    def counted(fleet, task, budget, *, known, **options):
+        calls.append((task.instance, len(known)))
+        return replace(one, instance=task.instance, seed=task.seed, search_s=budget.seconds)
 
     monkeypatch.setattr(stored, "reference", counted)
     monkeypatch.setattr(stored, "prepare", lambda *_, **__: fleet)
@@ -170,10 +180,9 @@ def test_references_resume_and_keep_the_better_schedule(fleet: Fleet, tmp_path: 
     path = tmp_path / "bounds.jsonl"
     short = references(tasks, path, Budget(seconds=1.0), difficulty="blind")
     assert references(tasks, path, Budget(seconds=1.0), difficulty="blind") == short
-    assert calls == ["three/1", "three/2"]
+    assert calls == [("three/1", 0), ("three/2", 0)]
     longer = references(tasks, path, Budget(seconds=5.0), difficulty="blind")
-    assert [each.hindsight for each in longer] == [each.hindsight for each in short]
-    assert len(calls) == 4
+    assert calls[2:] == [("three/1", len(one.claims)), ("three/2", len(one.claims))]
     assert [asdict(each) for each in load_references(path)] == [asdict(each) for each in longer]
 
 
@@ -184,3 +193,11 @@ def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):
     scored = ShiftSimulator(world, DEAR, 4).follow(policies)
     again = ShiftSimulator(without_scores(world), DEAR, 4).follow([Replay(claims) for claims in scored.claims])
     np.testing.assert_allclose(scored.reward, again.reward, rtol=1e-12)
+
+
+def test_the_page_has_the_table_of_the_stored_rows():
+    docs = Path(__file__).parents[2] / "docs"
+    rows = load_references(docs / "results" / "bounds_library.jsonl")
+    page = (docs / "bounds.md").read_text(encoding="utf-8")
+    assert page.split("<!-- bounds -->\n")[1].split("\n<!-- end -->")[0] == markdown(rows)
+    assert all(each.random <= each.best_rule <= each.hindsight <= each.upper for each in rows)
