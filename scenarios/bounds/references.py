@@ -15,13 +15,13 @@ from scenarios.bounds.relaxation import Relaxation
 from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, without_scores
 from scenarios.bounds.upper import upper_bound
 from scenarios.fault_price import weights_of
+from scenarios.json_rows import Rows
 from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import DifficultyName, Fleet, ShiftFactory, prepare
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
 from scenarios.run.shift import scenario_hash
 from scenarios.schema import Scenario
-from scenarios.studies.sweep.rows import Rows
 
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""

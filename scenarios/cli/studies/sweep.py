@@ -48,9 +48,9 @@ def sweep_command(
     continues after an interruption, and prints the table once all rows are there.
     """
     choose("format", format_, Literal["table", "markdown", "json"])
+    from scenarios.json_rows import Rows
     from scenarios.studies.sweep.configurations import CONFIGURATIONS
     from scenarios.studies.sweep.measure import sweep
-    from scenarios.studies.sweep.rows import Rows
     from scenarios.studies.sweep.table import lines_of, table_of
 
     names = list(CONFIGURATIONS) if only is None else [name.strip() for name in only.split(",")]
@@ -103,8 +103,8 @@ def parsimony_command(
     same command continues after an interruption.
     """
     choose("format", format_, Literal["table", "markdown", "json"])
+    from scenarios.json_rows import Rows
     from scenarios.studies.sweep.parsimony import HEADS, parsimony, summary
-    from scenarios.studies.sweep.rows import Rows
 
     subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=True)
     with progress_bar(kept="Finished rows are") as progress:

@@ -6,9 +6,9 @@ from functools import reduce
 
 import numpy as np
 
+from scenarios.json_rows import Row
 from scenarios.studies.sweep.configurations import OURS, Configuration
 from scenarios.studies.sweep.measure import interval
-from scenarios.studies.sweep.rows import Row
 
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "AUROC": ("hot_60", "carrier", "auroc"),
