@@ -66,6 +66,8 @@ def hindsight(
     rng, first = np.random.default_rng(seed), int(starts.reward.argmax())
     best, best_claims = float(starts.reward[first]), starts.claims[first]
     changes = _Changes(simulator, rng)
+    if changes.none:
+        return Hindsight(best, best, best_claims, 0, 0.0)
     present = changes.of_result(starts, np.argsort(-starts.reward)[: simulator.rows // 4])
     value = float(simulator.world.jobs.value[0][simulator.world.jobs.exists[0]].sum())
     tried = stack([present, changes.freed(present)])
@@ -114,6 +116,11 @@ class _Changes:
         self._choices = [np.argwhere(can[:, job]) for job in range(jobs)]
         self._jobs = np.flatnonzero([len(each) > 0 for each in self._choices])
         self._stations = [set(row[row >= 0].tolist()) for row in world.jobs.stations[0, :jobs]]
+
+    @property
+    def none(self) -> bool:
+        """Whether no arm can do any job."""
+        return not len(self._jobs)
 
     def of_result(self, result: Simulated, rows: Sequence[int] | Array) -> Schedules:
         """Schedules that repeat some results; a job that was never awarded is left out."""

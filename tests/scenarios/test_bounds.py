@@ -128,6 +128,13 @@ def test_heat_budgets_lower_the_bound_where_heat_is_dear(small):
     assert played(world, weights, 0).reward.max() <= cool.reward
 
 
+def test_a_shift_without_jobs_has_bounds(small):
+    world, _ = small.shop([[]], arms=[small.arm(0, (small.work(),))])
+    starts = played(world, DEAR, 0)
+    found = hindsight(ShiftSimulator(world, DEAR, 4), starts, np.random.SeedSequence(0), Budget(evaluations=10))
+    assert starts.reward.max() == found.reward <= upper_bound(Relaxation(world, DEAR)).reward
+
+
 def test_weights_with_other_signs_are_refused(small):
     world, _ = small.shop([[small.job("a")]])
     with pytest.raises(ValueError, match=r"energy = 0\.1"):
