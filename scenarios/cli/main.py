@@ -52,6 +52,7 @@ COMMANDS = {
     "trace": LazyCommand(_LOOK, "scenarios.trace.command:trace_command", "Follow an event to its causes."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
     "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of scores under one policy."),
+    "bounds": LazyCommand(_POLICIES, "scenarios.bounds.command:bounds_command", "Bound the reward of shifts."),
     "cooling": LazyCommand(
         _POLICIES, "heat.cooling:cooling_command", "Compare ways of cooling motor, joint and fleet."
     ),

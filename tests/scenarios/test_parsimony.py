@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from scenarios.json_rows import Rows
 from scenarios.load import load
 from scenarios.studies.sweep import parsimony as study
-from scenarios.studies.sweep.rows import Rows
 from scenarios.studies.sweep.subjects import Sizes, Subject
 from twin.baselines.temperature import train_regressor
 from twin.vae.config import TwinConfig

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from fleet.errors import FleetError
+from scenarios.json_rows import Rows
 from scenarios.load import load
 from scenarios.studies.sweep import measure
 from scenarios.studies.sweep.configurations import CONFIGURATIONS, OURS, Configuration
-from scenarios.studies.sweep.rows import Rows
 from scenarios.studies.sweep.subjects import Sizes, subjects_of
 from scenarios.studies.sweep.table import lines_of, table_of
 

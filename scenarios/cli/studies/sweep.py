@@ -13,7 +13,7 @@ from scenarios.load import load
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
-    from scenarios.studies.sweep.rows import Row
+    from scenarios.json_rows import Row
     from scenarios.studies.sweep.subjects import Subject
 
 SCENARIOS = "quickstart,active_waiting,heat_wave"
@@ -49,9 +49,9 @@ def sweep_command(
     continues after an interruption, and prints the table once all rows are there.
     """
     choose("format", format_, Literal["table", "markdown", "json"])
+    from scenarios.json_rows import Rows
     from scenarios.studies.sweep.configurations import CONFIGURATIONS
     from scenarios.studies.sweep.measure import sweep
-    from scenarios.studies.sweep.rows import Rows
     from scenarios.studies.sweep.table import lines_of, table_of
 
     whole = {name for name, each in CONFIGURATIONS.items() if carrier_only and each.config.scope == "arm"}
@@ -115,8 +115,8 @@ def parsimony_command(
     same command continues after an interruption.
     """
     choose("format", format_, Literal["table", "markdown", "json"])
+    from scenarios.json_rows import Rows
     from scenarios.studies.sweep.parsimony import HEADS, parsimony, summary
-    from scenarios.studies.sweep.rows import Rows
 
     subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=True)
     rows = Rows(out)

@@ -8,6 +8,7 @@ from dataclasses import asdict
 import msgspec
 import numpy as np
 
+from scenarios.json_rows import Row, Rows
 from scenarios.prepare.cool_motion import records
 from scenarios.progress import Count, Progress, quiet
 from scenarios.studies.benchmark import jobs_of
@@ -15,7 +16,6 @@ from scenarios.studies.detection_metrics import detection
 from scenarios.studies.ranking import RANKING, Jobs
 from scenarios.studies.setup import Study
 from scenarios.studies.sweep.configurations import Configuration
-from scenarios.studies.sweep.rows import Row, Rows
 from scenarios.studies.sweep.subjects import Subject, carrier_of
 from twin.vae.config import TwinConfig
 from twin.vae.train import Motion, train_all

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from fleet.motion import RATE_HZ
+from scenarios.json_rows import Row, Rows
 from scenarios.prepare.cool_motion import records
 from scenarios.progress import Count, Progress, quiet
 from scenarios.statistics.means import mean_by_group
@@ -20,7 +21,6 @@ from scenarios.studies.detection_metrics import detection
 from scenarios.studies.ranking import LABELS, RANKING
 from scenarios.studies.setup import Study
 from scenarios.studies.sweep.configurations import BASE
-from scenarios.studies.sweep.rows import Row, Rows
 from scenarios.studies.sweep.subjects import Subject, arm_of, carrier_of
 from twin.baselines.temperature import train_regressor
 from twin.vae.train import train

@@ -6,9 +6,9 @@ from functools import reduce
 
 import numpy as np
 
+from scenarios.json_rows import Row
 from scenarios.statistics.means import Interval, mean_by_group
 from scenarios.studies.sweep.configurations import OURS, Configuration
-from scenarios.studies.sweep.rows import Row
 from scenarios.studies.sweep.subjects import arm_of
 
 COLUMNS: Mapping[str, tuple[str, ...]] = {

@@ -1,0 +1,202 @@
+"""Stored references of instances, a scenario and a seed each: random, hindsight and upper bound; normalised scores."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from agents.registry import RULES
+from fleet.errors import ScenarioError
+from fleet.seeding import child
+from scenarios.bounds.hindsight import SIDE_BY_SIDE, Budget, hindsight
+from scenarios.bounds.relaxation import Relaxation
+from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, without_scores
+from scenarios.bounds.upper import upper_bound
+from scenarios.fault_price import weights_of
+from scenarios.json_rows import Rows
+from scenarios.policy_loader import policy_at, policy_of
+from scenarios.prepare.fleet import DifficultyName, Fleet, ShiftFactory, prepare
+from scenarios.progress import Count, Progress, quiet
+from scenarios.run.provenance import code_hash
+from scenarios.run.shift import scenario_hash
+from scenarios.schema import Scenario
+
+RANDOM_SHIFTS = 20
+"""Draws of the policy `random` that its reward is the mean of."""
+STARTS = tuple(name for name in RULES if name != "random")
+"""Policies that the search starts from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """What the reward of one instance is measured against."""
+
+    instance: str
+    """As `heat_wave/100`, or the name of an instance of a split."""
+    scenario_hash: str
+    """Of the scenario's content."""
+    seed: int
+    difficulty: str
+    """Source of the scores of the policies that the search starts from."""
+    random: float
+    """Mean reward of the policy `random`."""
+    random_se: float
+    """Standard error of that mean."""
+    rule: str
+    """The best policy that the search starts from."""
+    best_rule: float
+    """Its reward."""
+    hindsight: float
+    upper: float
+    linear: float
+    """Upper bound before whole jobs and heat budgets."""
+    evaluations: int
+    """Shifts that the search simulated."""
+    search_s: float
+    """CPU time of the search."""
+    upper_s: float
+    """CPU time of the upper bound."""
+    seconds: float
+    """CPU time of everything but the planning of the fleet."""
+    code: str
+    """Hash of the code."""
+    claims: tuple[Claim, ...]
+    """The schedule of the hindsight: decision interval, arm and action of every claim."""
+
+    def normalised(self, reward: float) -> float:
+        """0 for random, 1 for hindsight; NaN where the search found nothing better than random."""
+        span = self.hindsight - self.random
+        return (reward - self.random) / span if span > 0 else float("nan")
+
+    @property
+    def gap(self) -> float:
+        """Share by which the hindsight could at most be below the optimum, of the span from random to upper bound."""
+        span = self.upper - self.random
+        return (self.upper - self.hindsight) / span if span > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """One instance to bound."""
+
+    instance: str
+    scenario: Scenario
+    seed: int
+
+
+def reference(
+    fleet: Fleet,
+    task: Task,
+    budget: Budget,
+    *,
+    difficulty: str = "oracle",
+    bound: bool = True,
+    known: Sequence[Claim] = (),
+) -> Reference:
+    """The reference of one instance of a prepared fleet.
+
+    Args:
+        difficulty: With which the fleet was prepared.
+        bound: Compute the upper bound; else it is infinite.
+        known: A schedule of an earlier search, which this one also starts from.
+    """
+    began_s = time.process_time()
+    entropy = np.random.SeedSequence(task.seed)
+    episode, weights = ShiftFactory(fleet)(entropy), weights_of(fleet.scenario)
+    world = episode.world
+    rules = ShiftSimulator(world, weights, len(STARTS), noise_key=episode.noise_key)
+    starts = rules.follow([policy_at(name, task.seed) for name in STARTS])
+    best = int(starts.reward.argmax())
+    rule, best_rule = STARTS[best], float(starts.reward[best])
+    bare = without_scores(world)
+    if known:
+        starts = starts.and_(ShiftSimulator(bare, weights, 1).follow([Replay(known)]))
+    drawn = [policy_of("random") for _ in range(RANDOM_SHIFTS)]
+    for n, policy in enumerate(drawn):
+        policy.reset(np.random.default_rng(child(np.random.SeedSequence([task.seed, 2]), n)))
+    random = ShiftSimulator(bare, weights, RANDOM_SHIFTS).follow(drawn).reward
+    search = ShiftSimulator(bare, weights, SIDE_BY_SIDE)
+    found = hindsight(search, starts, np.random.SeedSequence([task.seed, 3]), budget)
+    bounded_s = time.process_time()
+    upper = upper_bound(Relaxation(world, weights)) if bound else None
+    ended_s = time.process_time()
+    return Reference(
+        instance=task.instance,
+        scenario_hash=scenario_hash(task.scenario),
+        seed=task.seed,
+        difficulty=difficulty,
+        random=float(random.mean()),
+        random_se=float(random.std(ddof=1) / np.sqrt(len(random))),
+        rule=rule,
+        best_rule=best_rule,
+        hindsight=found.reward,
+        upper=upper.reward if upper else float("inf"),
+        linear=upper.linear if upper else float("inf"),
+        evaluations=found.evaluations,
+        search_s=found.seconds,
+        upper_s=ended_s - bounded_s,
+        seconds=ended_s - began_s,
+        code=code_hash(),
+        claims=tuple(found.claims),
+    )
+
+
+def references(
+    tasks: Sequence[Task],
+    path: Path,
+    budget: Budget,
+    *,
+    difficulty: DifficultyName = "oracle",
+    cache: Path | None = None,
+    progress: Progress = quiet,
+    stopped: Callable[[], bool] = lambda: False,
+) -> list[Reference]:
+    """The references of instances, kept in a file of JSON lines; those in it are not computed again.
+
+    A row counts if instance, content of the scenario, seed and source of scores are the same. With a larger budget the
+    search is repeated, and starts from the known schedule too. A fleet is prepared once for consecutive tasks of one
+    scenario.
+
+    Raises:
+        ScenarioError: the weights of the reward allow no bound.
+        FleetError: the file has other rows.
+    """
+    rows, fleet = Rows(path), None
+    for n, task in enumerate(tasks):
+        if stopped():
+            break
+        key = key_of(task, difficulty)
+        progress("bounding", Count(n, len(tasks)))
+        if key in rows and rows.by_key[key]["search_s"] >= 0.9 * budget.seconds:
+            continue
+        if fleet is None or fleet.scenario != task.scenario:
+            fleet = prepare(task.scenario, difficulty=difficulty, cache=cache, progress=progress)
+        known = load_reference(rows.by_key[key]).claims if key in rows else ()
+        try:
+            new = reference(fleet, task, budget, difficulty=difficulty, known=known)
+        except ValueError as error:
+            raise ScenarioError(f"{task.instance}: {error}") from error
+        rows.append(key, asdict(new))
+    return load_references(path, [key_of(task, difficulty) for task in tasks])
+
+
+def key_of(task: Task, difficulty: str) -> str:
+    """What a row of a file of references is found by."""
+    return f"{task.instance} {scenario_hash(task.scenario)} {task.seed} {difficulty}"
+
+
+def load_references(path: Path, keys: Iterable[str] | None = None) -> list[Reference]:
+    """The references in a file: all, or those of some keys."""
+    rows = Rows(path)
+    return [load_reference(row) for row in rows.some(rows.by_key if keys is None else keys)]
+
+
+def load_reference(row: dict[str, object]) -> Reference:
+    """A row of a file."""
+    fields = {name: row[name] for name in Reference.__dataclass_fields__}
+    claims = fields["claims"]
+    assert isinstance(claims, list | tuple)
+    fields["claims"] = tuple((int(tick), int(arm), int(action)) for tick, arm, action in claims)
+    return Reference(**fields)  # pyright: ignore[reportArgumentType]  # as they were written

@@ -1,0 +1,193 @@
+"""Schedules of one shift: who does which job, by which plan, in which order; many are simulated side by side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+
+from agents.policy import WAIT, Policy, only_choices
+from fleet.engine.batch import Engine, shifts_of
+from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
+from fleet.engine.state import World
+from fleet.engine.tables import tables_of
+from fleet.env.validation import actions_of
+from fleet.job import MOST_FAULTS
+from fleet.observation import Layout, Observation
+from scenarios.bounds.play import play_rows
+
+Array = np.ndarray
+
+Claim = tuple[int, int, int]
+"""Decision interval, arm (its index) and action."""
+
+
+@dataclass(frozen=True, eq=False)
+class Schedules:
+    """Schedules of the jobs of one shift; arrays [schedule, job].
+
+    A free arm claims, of its jobs that it may claim, the one that comes first.
+    """
+
+    arm: Array
+    """int."""
+    option: Array
+    """Index of the plan among those on offer, int."""
+    order: Array
+    """Jobs with smaller numbers come first; inf for a job that is left out."""
+    not_before_s: Array
+    """No arm claims the job earlier."""
+
+    def __len__(self) -> int:
+        return len(self.arm)
+
+    def at(self, rows: Sequence[int] | Array) -> "Schedules":
+        """Copies of some schedules."""
+        chosen = np.asarray(rows, dtype=int)
+        return Schedules(*(getattr(self, name)[chosen].copy() for name in self.__dataclass_fields__))
+
+
+def stack(schedules: Sequence[Schedules]) -> Schedules:
+    """Schedules one after the other."""
+    names = Schedules.__dataclass_fields__
+    return Schedules(*(np.concatenate([getattr(each, name) for each in schedules]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """What came of schedules or of a policy."""
+
+    reward: Array
+    """[schedule]."""
+    start_s: Array
+    """When each job was last awarded, inf if never, [schedule, job]."""
+    arm: Array
+    """To which arm, int [schedule, job]."""
+    option: Array
+    """With which plan, int [schedule, job]."""
+    claims: list[list[Claim]]
+    """The claims of each schedule that were won, and jobs given back, in the order of time."""
+
+    def and_(self, other: "Simulated") -> "Simulated":
+        """These and other results of the same shift."""
+        names = ("reward", "start_s", "arm", "option")
+        arrays = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
+        return Simulated(*arrays, claims=[*self.claims, *other.claims])
+
+
+class ShiftSimulator:
+    """Simulates one shift many times side by side.
+
+    Args:
+        world: Its env 0.
+        rows: Number of simulations at a time.
+        noise_key: Of the sensors, which only policies notice.
+        compiled: As in `Engine`.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        weights: RewardWeights,
+        rows: int,
+        *,
+        noise_key: int = 0,
+        compiled: bool | None = None,
+    ) -> None:
+        tables, drawn = tables_of(world)
+        self.world, self.rows = world, rows
+        self.jobs = int(world.jobs.exists[0].sum())
+        self.evaluations = 0
+        """Shifts simulated so far."""
+        self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+        self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
+        self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled)
+        self._weights, self._compiled = weights_per_unit(weights), compiled
+        self._vectors = np.zeros((rows, self._layout.arms, self._layout.size), np.float32)
+
+    def run(self, schedules: Schedules) -> Simulated:
+        """The results of at most `rows` schedules."""
+        given, engine = len(schedules), self._engine
+        rows, terms = np.arange(given), np.empty((self.rows, len(TERMS) + 1))
+        reward, count = np.zeros(given), np.zeros(given, np.int64)
+        start_s = np.full((given, self.jobs), np.inf)
+        claims = np.zeros((given, MOST_FAULTS * self.jobs, 3), np.int64)
+        engine.reset(rows, self._shifts[:given])
+        bundle = engine._bundle  # pyright: ignore[reportPrivateUsage]  # the arrays that all kernels share
+        chosen = (schedules.arm, schedules.option, schedules.order, schedules.not_before_s)
+        play = play_rows.chosen(self._compiled)
+        play(bundle, self._weights, terms, *chosen, rows, reward, start_s, claims, count)
+        self.evaluations += given
+        lists = [[(tick, a, action) for tick, a, action in claims[e, : count[e]].tolist()] for e in range(given)]
+        return Simulated(reward, start_s, schedules.arm, schedules.option, lists)
+
+    def follow(self, policies: Sequence[Policy]) -> Simulated:
+        """The results of at most `rows` policies, each at the beginning of its shift."""
+        engine, world, given = self._engine, self.world, len(policies)
+        skips = all(only_choices(policy) for policy in policies)
+        engine.reset(np.arange(self.rows), self._shifts)
+        engine.observe(np.arange(self.rows), self._vectors)
+        reward, running = np.zeros(self.rows), np.ones(self.rows, bool)
+        running[given:] = False
+        start_s = np.full((self.rows, self.jobs), np.inf)
+        arm_of, option_of = np.full((self.rows, self.jobs), -1), np.full((self.rows, self.jobs), -1)
+        claims: list[list[Claim]] = [[] for _ in range(self.rows)]
+        until = np.full(self.rows, world.ticks, np.int64) if skips else None
+        give_back, options = self._layout.actions - 1, self._layout.plans
+        while running.any():
+            asked = running & engine.mask[..., 1:-1].any(axis=(1, 2)) if skips else running
+            actions = self._actions(policies, asked)
+            tick, slot_job = engine.state.tick.copy(), engine.offers.slot_job.copy()
+            legal = np.take_along_axis(engine.mask, np.clip(actions, 0, give_back)[..., None], axis=2)[..., 0] > 0
+            _, earned, finished = engine.step(actions, self._vectors, until)
+            reward += np.where(running, earned, 0.0)
+            for e, a in np.argwhere((actions > 0) & legal & running[:, None]).tolist():
+                action = int(actions[e, a])
+                if action < give_back and engine.state.last_award[e, a] != 1:
+                    continue
+                claims[e].append((int(tick[e]), a, action))
+                if action < give_back:
+                    slot, option = divmod(action - 1, options)
+                    job = slot_job[e, slot]
+                    start_s[e, job], arm_of[e, job], option_of[e, job] = tick[e] * world.dt_s, a, option
+            running &= ~finished & (engine.state.tick < world.ticks)
+        self.evaluations += given
+        return Simulated(reward[:given], start_s[:given], arm_of[:given], option_of[:given], claims[:given])
+
+    def _actions(self, policies: Sequence[Policy], asked: Array) -> Array:
+        """The actions of the policies that are asked, int64 [row, arm]; the others wait."""
+        names, mask = self.world.arms, self._engine.mask
+        actions = np.full((self.rows, len(names)), WAIT, np.int64)
+        for e in np.flatnonzero(asked).tolist():
+            known = {arm: self._layout.read(self._vectors[e, a], mask[e, a]) for a, arm in enumerate(names)}
+            actions[e] = actions_of(names, policies[e].act(known))
+        return actions
+
+
+def without_scores(world: World) -> World:
+    """The same world without predictions, which only policies read; awards do not change."""
+    unknown = np.full_like(world.offers.risk, -1)
+    offers = replace(world.offers, risk=unknown, peak=unknown, forecasts=None)
+    return replace(world, offers=offers)
+
+
+@dataclass
+class Replay:
+    """A policy that repeats the claims of a schedule; in the shift that it was made for, it has the same result."""
+
+    claims: Sequence[Claim]
+    scope: ClassVar = "central"
+    _interval: int = field(default=0, init=False)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin the shift."""
+        self._interval = 0
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of this decision interval; to be called once in each."""
+        arms = list(observations)
+        actions = dict.fromkeys(arms, WAIT) | {
+            arms[a]: action for tick, a, action in self.claims if tick == self._interval
+        }
+        self._interval += 1
+        return actions

@@ -1,0 +1,210 @@
+"""Bounds of the reward: no play exceeds the upper one, the search is between its start and the proven optimum."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.registry import RULES
+from fleet.engine.reward import RewardWeights
+from fleet.env.random_actions import random_legal
+from fleet.robot import ThermalLimits
+from scenarios.bounds import references as stored
+from scenarios.bounds.command import markdown
+from scenarios.bounds.exhaustive import optimum
+from scenarios.bounds.heat_budget import HeatBudget
+from scenarios.bounds.hindsight import Budget, hindsight
+from scenarios.bounds.references import Task, load_references, reference, references
+from scenarios.bounds.relaxation import Relaxation
+from scenarios.bounds.schedule import Replay, Schedules, ShiftSimulator, without_scores
+from scenarios.bounds.upper import upper_bound
+from scenarios.load import parse_scenario
+from scenarios.policy_loader import policy_at
+from scenarios.prepare.fleet import Fleet, env_of, prepare
+from scenarios.run.evaluate import outcomes
+
+HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
+DEAR = RewardWeights(tardiness=-0.5, above_warning=-2.0, faults=-1.5, energy=-0.05)
+PLAYERS = ("wspt", "round_robin", "coolest_first", "random")
+
+
+class Restless:
+    """Every arm takes any legal action, waiting and giving back included."""
+
+    scope = "central"
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+
+    def reset(self, rng) -> None:
+        pass
+
+    def act(self, observations):
+        masks = np.stack([seen.action_mask for seen in observations.values()])
+        return dict(zip(observations, random_legal(masks, self._rng).tolist(), strict=True))
+
+
+def played(world, weights, seed):
+    policies = [*(policy_at(name, seed) for name in PLAYERS), *map(Restless, range(seed, seed + 4))]
+    return ShiftSimulator(world, weights, len(policies)).follow(policies)
+
+
+@settings(max_examples=12)
+@given(seed=st.integers(0, 10_000), crowding=st.sampled_from([0.0, 0.5]), hot=st.booleans(), period_s=st.just(30.0))
+def test_no_play_exceeds_the_upper_bound(small, seed, crowding, hot, period_s):
+    limits = HOT if hot else ThermalLimits()
+    shifts = small.Shifts(arms=3, jobs=8, ticks=50, limits=limits, crowding=crowding, hard_due=0.3)
+    world, _ = shifts.shop(shifts.drawn(np.random.SeedSequence(seed))[0])
+    bound = upper_bound(Relaxation(world, DEAR, period_s))
+    assert played(world, DEAR, seed).reward.max() <= bound.reward <= bound.linear + 1e-4
+    assert upper_bound(Relaxation(world, DEAR, 1e9), heat=False).reward >= bound.reward - 1e-3
+
+
+TINY = ((0, 3), (0, 4), (2, 4), (6, 3), (7, 3))
+"""Seeds and numbers of jobs of shifts with at most 100 000 states."""
+
+
+@pytest.mark.parametrize(("seed", "jobs"), TINY)
+def test_search_finds_the_proven_optimum_of_tiny_shifts(small, seed, jobs):
+    shifts = small.Shifts(arms=2, jobs=jobs, ticks=10)
+    drawn = [
+        replace(job, repetitions=min(job.repetitions, 3), due_s=job.release_s + 15.0)
+        for job in shifts.drawn(np.random.SeedSequence(seed))[0]
+    ]
+    world, _ = shifts.shop(drawn)
+    weights = RewardWeights(tardiness=-0.5, faults=-10.0)
+    best = optimum(world, weights)
+    starts = played(world, weights, seed)
+    found = hindsight(
+        ShiftSimulator(world, weights, 16), starts, np.random.SeedSequence(seed), Budget(evaluations=1500)
+    )
+    assert starts.reward.max() <= found.reward <= best + 1e-9
+    assert found.reward == pytest.approx(best, abs=1e-9)
+    assert best <= upper_bound(Relaxation(world, weights, 10.0)).reward
+
+
+def test_a_schedule_runs_the_same_compiled_and_not(small):
+    shifts = small.Shifts(arms=2, jobs=4, ticks=12, limits=HOT)
+    world, _ = shifts.shop(shifts.drawn(np.random.SeedSequence(1))[0])
+    rng = np.random.default_rng(0)
+    shape = (6, 4)
+    schedules = Schedules(
+        rng.integers(2, size=shape), np.zeros(shape, int), rng.random(shape), 10.0 * rng.integers(4, size=shape)
+    )
+    both = [ShiftSimulator(world, DEAR, 6, compiled=compiled).run(schedules) for compiled in (True, False)]
+    assert both[0].claims == both[1].claims
+    np.testing.assert_allclose(both[0].reward, both[1].reward, rtol=1e-12)
+
+
+def test_the_effect_of_heat_on_a_motor_is_that_of_a_simulated_joule(small):
+    shifts = small.Shifts(arms=1, jobs=3, ticks=120)
+    world, _ = shifts.shop(shifts.drawn(np.random.SeedSequence(3))[0])
+    relaxation = Relaxation(world, DEAR, 60.0)
+    budget = HeatBudget(relaxation)
+    low, high = budget._effect(0, 1, 600.0, 1200.0)
+    for node, tick in ((1, 12), (8, 40), (1, 70), (9, 95)):
+        heat_w = np.repeat(relaxation.base_w[:, None], world.ticks, axis=1)
+        heat_w[0, tick, node] += 1000.0 / world.dt_s
+        change = budget._simulated(heat_w)[1] - budget.base_c[1]
+        true = change[0, 60:120, 1].sum() / 1000.0
+        period = tick // 6
+        assert low[period, node] <= true <= high[period, node]
+        assert true == pytest.approx((low[period, node] + high[period, node]) / 2, rel=0.5)
+
+
+def test_heat_budgets_lower_the_bound_where_heat_is_dear(small):
+    """One arm, and holds that bring it past the warning limit in minutes, which costs more than they earn."""
+    hold = small.work("bench", small.HOT)
+    jobs = [small.job(f"job_{i}", hold, repetitions=12, release_s=0.0, value=1.0) for i in range(12)]
+    world, _ = small.shop([jobs], arms=1, ticks=200, limits=ThermalLimits())
+    weights = RewardWeights(above_warning=-5.0, faults=-50.0)
+    relaxation = Relaxation(world, weights, 100.0)
+    cool = upper_bound(relaxation)
+    assert cool.budgets > 0
+    assert cool.reward < 0.8 * upper_bound(relaxation, heat=False).reward
+    assert played(world, weights, 0).reward.max() <= cool.reward
+
+
+def test_a_shift_without_jobs_has_bounds(small):
+    world, _ = small.shop([[]], arms=[small.arm(0, (small.work(),))])
+    starts = played(world, DEAR, 0)
+    found = hindsight(ShiftSimulator(world, DEAR, 4), starts, np.random.SeedSequence(0), Budget(evaluations=10))
+    assert starts.reward.max() == found.reward <= upper_bound(Relaxation(world, DEAR)).reward
+
+
+def test_weights_with_other_signs_are_refused(small):
+    world, _ = small.shop([[small.job("a")]])
+    with pytest.raises(ValueError, match=r"energy = 0\.1"):
+        Relaxation(world, RewardWeights(energy=0.1))
+
+
+@pytest.fixture(scope="module")
+def fleet(three_arms, job_streams, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    streams = list(job_streams(300.0, None, 200.0).values())
+    scenario = parse_scenario(three_arms | {"name": "three", "jobs": streams, "horizon_s": 600.0}, Path("three.toml"))
+    return prepare(scenario, difficulty="blind", cache=tmp_path_factory.mktemp("plans"))
+
+
+def test_a_reference_is_between_its_parts_and_its_schedule_can_be_replayed(fleet: Fleet):
+    task = Task("three/4", fleet.scenario, 4)
+    found = reference(fleet, task, Budget(evaluations=64), difficulty="blind")
+    shipped = {name: outcomes(fleet, name, [4])[0].reward for name in RULES if name != "random"}
+    assert found.best_rule == pytest.approx(max(shipped.values()), abs=1e-9)
+    assert shipped[found.rule] == pytest.approx(found.best_rule, abs=1e-9)
+    assert found.best_rule <= found.hindsight <= found.upper <= found.linear + 1e-3
+    assert (found.normalised(found.random), found.normalised(found.hindsight)) == (0.0, 1.0)
+    env, policy, reward = env_of(fleet, bus="memory"), Replay(found.claims), 0.0
+    env.reset(seed=4)
+    while env.agents:
+        reward += next(iter(env.step(policy.act(env.knowledge()))[1].values()))
+    assert reward == pytest.approx(found.hindsight, abs=1e-6)
+
+
+def test_a_search_starts_from_a_known_schedule(fleet: Fleet):
+    task = Task("three/1", fleet.scenario, 1)
+    found = reference(fleet, task, Budget(evaluations=200), difficulty="blind", bound=False)
+    again = reference(fleet, task, Budget(evaluations=1), difficulty="blind", bound=False, known=found.claims)
+    assert again.hindsight >= found.hindsight - 1e-9 > found.best_rule
+    assert (again.rule, again.best_rule) == (found.rule, found.best_rule)
+
+
+def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    calls: list[tuple[str, int]] = []
+    one = reference(fleet, Task("three/1", fleet.scenario, 1), Budget(evaluations=1), difficulty="blind", bound=False)
+
+    def counted(fleet, task, budget, *, known, **options):
+        calls.append((task.instance, len(known)))
+        return replace(one, instance=task.instance, seed=task.seed, search_s=budget.seconds)
+
+    monkeypatch.setattr(stored, "reference", counted)
+    monkeypatch.setattr(stored, "prepare", lambda *_, **__: fleet)
+    tasks = [Task(f"three/{seed}", fleet.scenario, seed) for seed in (1, 2)]
+    path = tmp_path / "bounds.jsonl"
+    short = references(tasks, path, Budget(seconds=1.0), difficulty="blind")
+    assert references(tasks, path, Budget(seconds=1.0), difficulty="blind") == short
+    assert calls == [("three/1", 0), ("three/2", 0)]
+    longer = references(tasks, path, Budget(seconds=5.0), difficulty="blind")
+    assert calls[2:] == [("three/1", len(one.claims)), ("three/2", len(one.claims))]
+    assert [asdict(each) for each in load_references(path)] == [asdict(each) for each in longer]
+
+
+def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):
+    shifts = small.Shifts(arms=3, jobs=8, ticks=40, crowding=0.3)
+    world, _ = shifts.shop(shifts.drawn(np.random.SeedSequence(5))[0])
+    policies = [policy_at(name, 5) for name in PLAYERS]
+    scored = ShiftSimulator(world, DEAR, 4).follow(policies)
+    again = ShiftSimulator(without_scores(world), DEAR, 4).follow([Replay(claims) for claims in scored.claims])
+    np.testing.assert_allclose(scored.reward, again.reward, rtol=1e-12)
+
+
+def test_the_page_has_the_table_of_the_stored_rows():
+    docs = Path(__file__).parents[2] / "docs"
+    rows = load_references(docs / "results" / "bounds_library.jsonl")
+    page = (docs / "bounds.md").read_text(encoding="utf-8")
+    assert page.split("<!-- bounds -->\n")[1].split("\n<!-- end -->")[0] == markdown(rows)
+    assert all(each.random <= each.best_rule <= each.hindsight <= each.upper for each in rows)
