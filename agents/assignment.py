@@ -78,10 +78,11 @@ class Ahead:
     """Base of assignments in which arms that are home soon take part, by the time until they would finish.
 
     A pair of such an arm claims nothing: its job waits for it, and the next decision finds it free or makes another
-    plan. The arm's predicted peak is that from its present temperatures.
+    plan. The arm's predicted peak is that from its present temperatures. Whether its space will be free is unknown:
+    `space_free` of an arm at work is always 0.
     """
 
-    soon_s: ClassVar = 300.0
+    soon_s: ClassVar = 120.0
     """Longest time until such an arm is home."""
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
@@ -96,7 +97,7 @@ class Ahead:
         if not (seen.working and seen.busy_s <= self.soon_s):
             return seen
         mask = seen.action_mask.copy()
-        mask[1:-1] = (seen.feasible > 0) & (seen.space_free > 0) & (per_option(seen, seen.station_free) > 0)
+        mask[1:-1] = (seen.feasible > 0) & (per_option(seen, seen.station_free) > 0)
         late_s = float(seen.busy_s)
         return replace(seen, action_mask=mask, duration_s=seen.duration_s + late_s, slack_s=seen.slack_s - late_s)
 

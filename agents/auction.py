@@ -27,8 +27,7 @@ def auction(benefit: Array, epsilon: float) -> list[tuple[int, int]]:
     """
     if not epsilon > 0:
         raise ValueError(f"epsilon must be > 0 (got {epsilon}).")
-    arms, jobs = benefit.shape
-    owner, price = np.full(jobs, NOBODY), np.zeros(jobs)
+    owner, price = np.full(benefit.shape[1], NOBODY), np.zeros(benefit.shape[1])
     bidders = np.flatnonzero((benefit > 0).any(axis=1))
     while bidders.size:
         profit = benefit[bidders] - price

@@ -4,17 +4,21 @@ Each arm, also a busy one from the moment it is home, gets a sequence of at most
 most one sequence. The program chooses among the enumerated sequences (set packing, a mixed-integer program, solved by
 HiGHS within a time limit). A sequence earns, for each of its jobs,
 
-- the expected worth of `wsept`, in the share of the plan that lies within the horizon, and
-- the cost of tardiness that it avoids, compared with a start at the end of the horizon.
+- the expected worth of `wsept`, discounted until the finish by exp(−time / 30 min): jobs that arrive later need the
+  arm too, so time has a price, without which plans wait for ever cooler arms, and
+- a fifth of the cost of tardiness that it avoids, compared with a start at the end of the horizon; a job that is not in
+  the plan is seldom so late.
 
 The heat of a plan that begins later follows from its predicted peak, which the arm computes by its identified thermal
 network for a start now. Of a network with one time constant τ, the temperature at the end of a plan of duration d is
-linear in that at its beginning, with the factor exp(−d / τ); an idle arm approaches the ambient temperature with τ.
+linear in that at its beginning, with the factor exp(−d / τ). Cooling below the present temperature does not count.
 
 A job whose station or space is taken now can begin when the last arm at work is home: the observation does not say
-which arm is in its way. Two sequences may disagree about a station or a space that is free now; as with any claims, one
-of the arms then gets its job, and the other chooses again. Precedence is that of the offers: a job is offered when those
-before it are done.
+which arm is in its way. Two sequences may disagree about a station or a space that is free now. As with any claims, one
+of the arms then gets its job, and the other chooses again. Precedence is that of the offers: a job is offered when
+those before it are done.
+
+Source: Ovacik & Uzsoy, International Journal of Production Research 32, 1994 (rolling horizons).
 """
 
 import time
@@ -73,8 +77,11 @@ class RollingHorizon(Wsept):
     """For the solver, at each decision."""
     tau_s: ClassVar = 1800.0
     """Time constant of a motor with its housing: a nominal joint 2 cools from 75 to 42 °C in 1900 s at 30 °C."""
+    discount_s: ClassVar = 1800.0
+    """Time in which the worth of a later finish falls to 1/e."""
     tardiness_price: ClassVar = 0.01
     """Price of a minute of tardiness for each unit of a job's value, as in the default reward."""
+    tardiness_share: ClassVar = 0.2
     firsts: ClassVar = 16
     """Plans per arm with the most worth that may be the first of a sequence; half as many may be the second."""
 
@@ -108,7 +115,7 @@ class RollingHorizon(Wsept):
         hottest_c = float(seen.temp_c.max())
         free_c = max(hottest_c, float(seen.job_peak_c)) if seen.working else hottest_c
         legal = seen.action_mask[1:-1] > 0
-        open_now = (seen.space_free > 0) & (per_option(seen, seen.station_free) > 0)
+        open_now = ((seen.space_free > 0) | (seen.working > 0)) & (per_option(seen, seen.station_free) > 0)
         begin_s = np.maximum(free_s, np.where(open_now, 0.0, home_s))
         can = (seen.feasible > 0) & (per_option(seen, seen.offered) > 0) & (seen.faulted == 0)
         peak_c, d = self.predicted_peak_c(seen).astype(float), seen.duration_s.astype(float)
@@ -155,11 +162,12 @@ class RollingHorizon(Wsept):
         d = np.maximum(seen.duration_s.astype(float), 1.0)[options]
         value = per_option(seen, seen.value).astype(float)[options]
         due_s = seen.slack_s.astype(float)[options] + d
-        later_c = np.maximum(peak_c[options] + (start_c - hottest_c) * np.exp(-d / self.tau_s), start_c)
+        warmer_k = np.maximum(start_c - hottest_c, 0.0)
+        later_c = np.maximum(peak_c[options] + warmer_k * np.exp(-d / self.tau_s), start_c)
         worth = self.worth_of(value, d, later_c, start_c, warning_of(seen))
-        share = np.clip((self.horizon_s - begin_s) / d, 0.0, 1.0)
         late_s = np.maximum(self.horizon_s + d - due_s, 0.0) - np.maximum(begin_s + d - due_s, 0.0)
-        earned = worth * share + self.tardiness_price * value * late_s / 60.0
+        late = self.tardiness_share * self.tardiness_price * value * late_s / 60.0
+        earned = worth * np.exp(-(begin_s + d) / self.discount_s) + late
         return np.where(worth > 0, earned, -np.inf), later_c
 
 
