@@ -162,17 +162,14 @@ def cheapest_pairs(cost: Array, plans: int = 1) -> list[tuple[int, int]]:
     option, then to the first arm. This is the outcome of a sequential single-item auction with one job per arm
     (Lagoudakis et al. 2005, Robotics: Science and Systems; Koenig et al. 2006, AAAI).
     """
-    options, pairs = cost.T, list[tuple[int, int]]()
-    arms_left, slots_left = set(range(len(cost))), set(range(len(options) // plans))
-    # By option, then by arm: a stable sort leaves ties in that order.
-    for place in np.argsort(options, axis=None, kind="stable").tolist():
-        option, arm = divmod(place, len(cost))
-        if not arms_left or not slots_left or np.isinf(options[option, arm]):
+    left, pairs = cost.T.astype(float), list[tuple[int, int]]()  # by option, then by arm: the order of ties
+    while left.size:
+        option, arm = divmod(int(left.argmin()), len(cost))
+        if left[option, arm] == np.inf:
             break
-        if arm in arms_left and option // plans in slots_left:
-            arms_left.remove(arm)
-            slots_left.remove(option // plans)
-            pairs.append((arm, option))
+        pairs.append((arm, option))
+        first = option - option % plans
+        left[:, arm] = left[first : first + plans] = np.inf
     return pairs
 
 
