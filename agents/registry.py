@@ -81,7 +81,8 @@ def names_of(scope: str) -> str:
     return ", ".join(name for name, rule in RULES.items() if rule.scope == scope)
 
 
-WRAPPERS_HELP = " or ".join(f"{name}:POLICY" for name in WRAPPERS) + " limits one by temperature"
+WRAPPERS_HELP = " or ".join(f"{name}:POLICY" for name in WRAPPERS).replace(" or ", ", ", len(WRAPPERS) - 2)
+WRAPPERS_HELP += " limits one by temperature"
 NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}."
 """Allowed names of a policy, for `--help`."""
 

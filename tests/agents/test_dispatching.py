@@ -25,7 +25,8 @@ def sequence(name: str, duration_s, due_s, value) -> list[int]:
     """Jobs in the order in which one arm does them by a rule."""
     policy, left, done, now_s = make_policy(name), list(range(len(duration_s))), [], 0.0
     while left:
-        seen = queue(*([row[job] for job in left] for row in (duration_s, due_s, value)), now_s)
+        durations, dues, values = ([row[job] for job in left] for row in (duration_s, due_s, value))
+        seen = queue(durations, dues, values, now_s)
         done.append(left.pop(policy.act({"arm": seen})["arm"] - 1))
         now_s += duration_s[done[-1]]
     return done

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from agents.policy import WAIT
 from agents.rolling_horizon import NONE, RollingHorizon, Sequences, pack
@@ -15,7 +16,17 @@ from fleet.observation import Layout, Observation
 WARNING_C = 60.0
 
 
-def seen(duration_s, value, peak_c=0.0, *, due_s=9e4, temp_c=40.0, station_free=1.0, busy_s=0.0, **fields):
+def seen(
+    duration_s,
+    value,
+    peak_c: ArrayLike = 0.0,
+    *,
+    due_s: ArrayLike = 9e4,
+    temp_c=40.0,
+    station_free=1.0,
+    busy_s=0.0,
+    **fields,
+):
     """What an arm knows that has one plan for each job."""
     d = np.array(duration_s, dtype=float)
     layout, idle = Layout(1, len(d)), busy_s == 0.0

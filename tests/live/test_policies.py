@@ -79,9 +79,17 @@ def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
         facts = {"mode": mode, "headroom_k": float(o.headroom_k), "capacity": int(bool(o.idle))}
         quotes[arm] = quote(arm, *offers, **facts)
         temp_c = tuple(o.temp_c.tolist())
-        now = {"headroom_k": float(o.headroom_k), "busy_s": float(o.busy_s), "ambient_c": float(o.ambient_c)}
-        peak = {"job_peak_c": float(o.job_peak_c)}
-        states[arm] = State(arm=arm, tick=0, time_s=time_s, mode=mode, temp_c=temp_c, **now, **peak)
+        states[arm] = State(
+            arm=arm,
+            tick=0,
+            time_s=time_s,
+            mode=mode,
+            temp_c=temp_c,
+            headroom_k=float(o.headroom_k),
+            busy_s=float(o.busy_s),
+            ambient_c=float(o.ambient_c),
+            job_peak_c=float(o.job_peak_c),
+        )
     return Bidding(
         auction="r",
         time_s=time_s,
