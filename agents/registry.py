@@ -49,7 +49,7 @@ RULES: dict[str, Rule] = {
     "wsept": Rule(Wsept, "time per expected worth", "Rothkopf 1966"),
     "wsept_ahead": Rule(WseptAhead, "time per expected worth, with arms that are home soon", "Rothkopf 1966"),
     "auction": Rule(Auction, "time per expected worth, within n · ε", "Bertsekas 1988"),
-    "rolling_horizon": Rule(RollingHorizon, "expected worth and tardiness of the next hour", "Ovacik & Uzsoy 1994"),
+    "rolling_horizon": Rule(RollingHorizon, "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"),
     "ssi": Rule(Ssi, _THERMAL, _SSI),
     "matching": Rule(Matching, _THERMAL, _KUHN),
     "matching_ahead": Rule(MatchingAhead, "thermal, with arms that are home soon", _KUHN),
