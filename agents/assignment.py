@@ -5,12 +5,13 @@ the lower difficulty then gets its job, and the other arm chooses again.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
 from agents.costs import quickest, thermal
-from agents.policy import WAIT, plans_of
+from agents.policy import WAIT, per_option, plans_of
 from agents.rules import Stateless, cheapest_pairs, claims_of
 from fleet.observation import Observation
 
@@ -69,6 +70,40 @@ class QuickestSsi(Ssi):
 
 class QuickestMatching(QuickestSsi, Matching):
     """As `matching`, by the time until the finish alone. Scope central."""
+
+    only_choices = True
+
+
+class Ahead:
+    """Base of assignments in which arms that are home soon take part, by the time until they would finish.
+
+    A pair of such an arm claims nothing: its job waits for it, and the next decision finds it free or makes another
+    plan. The arm's predicted peak is that from its present temperatures. Whether its space will be free is unknown:
+    `space_free` of an arm at work is always 0.
+    """
+
+    soon_s: ClassVar = 120.0
+    """Longest time until such an arm is home."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of the pairs whose arm is free."""
+        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
+            return dict.fromkeys(observations, WAIT)
+        actions = super().act({arm: self._soon(seen) for arm, seen in observations.items()})  # pyright: ignore
+        return {arm: action if observations[arm].action_mask[action] else WAIT for arm, action in actions.items()}
+
+    def _soon(self, seen: Observation) -> Observation:
+        """The observation of an arm that is home soon, with the claims that it could make and their times then."""
+        if not (seen.working and seen.busy_s <= self.soon_s):
+            return seen
+        mask = seen.action_mask.copy()
+        mask[1:-1] = (seen.feasible > 0) & (per_option(seen, seen.station_free) > 0)
+        late_s = float(seen.busy_s)
+        return replace(seen, action_mask=mask, duration_s=seen.duration_s + late_s, slack_s=seen.slack_s - late_s)
+
+
+class MatchingAhead(Ahead, Matching):
+    """As `matching`, and an arm that is home soon takes part. Scope central, as `matching`."""
 
     only_choices = True
 

@@ -1,4 +1,4 @@
-"""Reactive control of heat as a wrapper round any policy: a torque limiter and a fuzzy speed control.
+"""Reactive control of heat as a wrapper round any policy: a torque limiter, a thermal switch and a fuzzy speed control.
 
 Both react to measured temperatures, and need neither a twin nor a thermal model. On a real arm they act on torque and
 speed within a motion. An allocation policy has no such command, so they act by what the environment allows: they close
@@ -111,6 +111,30 @@ class FuzzySpeed:
         return self._speed_of(seen) < self.stop
 
 
+class Shutdown:
+    """Thermal switch: an arm above a temperature claims nothing until it has cooled by the hysteresis.
+
+    It finishes its present job. The switch opens at the warning limit.
+
+    Source: thermal protection of motors by a switch that resets at a lower temperature (IEC 60034-11).
+    """
+
+    hysteresis_k: ClassVar = 10.0
+
+    def __init__(self) -> None:
+        self._open = False
+
+    def claims(self, seen: Observation) -> Array:
+        """All claims of an arm whose switch is closed, else none, bool [option]; to be called at every step."""
+        headroom_k = float(seen.headroom_k)
+        self._open = headroom_k < (self.hysteresis_k if self._open else 0.0)
+        return np.full(len(seen.action_mask) - 2, not self._open)
+
+    def gives_back(self, seen: Observation, payload_kg: float) -> bool:
+        """Never: the arm finishes its job."""
+        return False
+
+
 class _GuardOfArm:
     """A guard of one arm, with the payload of its present job."""
 
@@ -119,11 +143,11 @@ class _GuardOfArm:
 
     def narrow(self, seen: Observation) -> Observation:
         """The observation with the claims that the guard allows."""
-        mask = seen.action_mask
-        if not mask[1:-1].any():
+        allowed = self._guard.claims(seen)  # also without a legal claim: a guard may remember temperatures
+        if not seen.action_mask[1:-1].any():
             return seen
-        narrower = mask.copy()
-        narrower[1:-1] &= self._guard.claims(seen)
+        narrower = seen.action_mask.copy()
+        narrower[1:-1] &= allowed
         return replace(seen, action_mask=narrower)
 
     def decide(self, seen: Observation, action: int) -> int:

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.assignment import Matching
+from agents.assignment import Ahead, Matching
 from agents.policy import per_option
 from fleet.observation import Observation
 from fleet.robot import ThermalLimits
@@ -36,7 +36,7 @@ class Thermometer(Matching):
     def _rate(self, seen: Observation) -> Array:
         """Value per second of every option, [option]; −inf for those that must not be claimed."""
         needed_k = per_option(seen, seen.payload_kg) * np.minimum(seen.duration_s, QUARTER_S) / QUARTER_S
-        cool = _warning_c(seen) - seen.temp_c[:LARGE].max() >= needed_k
+        cool = warning_of(seen) - seen.temp_c[:LARGE].max() >= needed_k
         return _per_second(seen, per_option(seen, seen.value), cool)
 
 
@@ -69,24 +69,50 @@ class Wsept(Thermometer):
 
     def _rate(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
-        from scipy.special import logit, ndtr  # slow import that few processes need
+        value, hottest_c = per_option(seen, seen.value), float(seen.temp_c.max())
+        worth = self.worth_of(value, seen.duration_s, self.predicted_peak_c(seen), hottest_c, warning_of(seen))
+        return _per_second(seen, worth, worth > 0)
 
-        warning_c, hottest_c = _warning_c(seen), float(seen.temp_c.max())
+    def predicted_peak_c(self, seen: Observation) -> Array:
+        """Predicted peak of every option begun now, or the one that P(saturation) gives, °C, [option]."""
+        from scipy.special import logit  # slow import that few processes need
+
         # An unknown peak is placed so far from the limit that its error gives P(saturation).
         margin_k = self.peak_sd_k * logit(np.clip(seen.p_saturation, LEAST_P, 1.0 - LEAST_P))
-        peak_c = np.where(seen.peak_c > 0, seen.peak_c, warning_c + margin_k)
+        return np.where(seen.peak_c > 0, seen.peak_c, warning_of(seen) + margin_k)
+
+    def worth_of(
+        self, value: Array, duration_s: Array, peak_c: Array, hottest_c: Array | float, warning_c: float
+    ) -> Array:
+        """Expected value of jobs less the expected cost of heat, [n].
+
+        Args:
+            value, duration_s, peak_c: Of each job, [n], with the predicted peak.
+            hottest_c: Hottest motor at the beginning, [n] or one for all.
+            warning_c: The warning limit.
+        """
+        from scipy.special import ndtr  # slow import that few processes need
+
         p_fault = ndtr((peak_c - warning_c - ERROR_ABOVE_WARNING_K) / self.peak_sd_k)
         # Approximation: the temperature rises linearly to its peak.
         above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
-        heat = p_fault * self.fault_price + self.minute_price * above_share * seen.duration_s / 60.0
-        worth = (1.0 - p_fault) * per_option(seen, seen.value) - heat
-        return _per_second(seen, worth, worth > 0)
+        heat = p_fault * self.fault_price + self.minute_price * above_share * duration_s / 60.0
+        return (1.0 - p_fault) * value - heat
+
+
+class WseptAhead(Ahead, Wsept):
+    """As `wsept`, and an arm that is home soon takes part: a job waits for it where that is worth more per time.
+
+    Scope central, as `wsept`.
+    """
+
+    only_choices = True
 
 
 LEAST_P = 1e-3
 
 
-def _warning_c(seen: Observation) -> float:
+def warning_of(seen: Observation) -> float:
     """The warning limit, °C."""
     return float(seen.headroom_k) + float(seen.temp_c.max())
 

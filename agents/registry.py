@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 
-from agents.assignment import Matching, QuickestMatching, QuickestSsi, Ssi
+from agents.assignment import Matching, MatchingAhead, QuickestMatching, QuickestSsi, Ssi
+from agents.auction import Auction
 from agents.consensus import Consensus
-from agents.heat_guards import FuzzySpeed, Guard, TorqueLimiter
-from agents.heat_rules import Thermometer, Wsept
+from agents.dispatching import Atc, Edd, Fifo, LeastLoaded, Spt
+from agents.heat_guards import FuzzySpeed, Guard, Shutdown, TorqueLimiter
+from agents.heat_rules import Thermometer, Wsept, WseptAhead
 from agents.policy import ArmPolicy, Policy, for_all_arms
+from agents.rolling_horizon import RollingHorizon
 from agents.rules import CoolestFirst, LeastDifficulty, RandomLegal, RoundRobin, Wspt, WsptCool
 from fleet.errors import nearest
 
@@ -32,6 +35,11 @@ _SSI, _KUHN = "Koenig et al. 2006", "Kuhn 1955"
 RULES: dict[str, Rule] = {
     "random": Rule(RandomLegal, "none"),
     "round_robin": Rule(RoundRobin, "none"),
+    "fifo": Rule(Fifo, "release, then duration", "Pinedo 2022"),
+    "edd": Rule(Edd, "due date, then duration", "Jackson 1955"),
+    "spt": Rule(Spt, "duration", "Smith 1956"),
+    "atc": Rule(Atc, "time per value, later due dates discounted", "Vepsalainen & Morton 1987"),
+    "least_loaded": Rule(LeastLoaded, "work of the arm in the shift", "Pinedo 2022"),
     "coolest_first": Rule(CoolestFirst, "hottest motor"),
     "least_difficulty": Rule(LeastDifficulty, _RELATIVE),
     "consensus": Rule(Consensus, _RELATIVE, "Choi, Brunet & How 2009"),
@@ -39,8 +47,12 @@ RULES: dict[str, Rule] = {
     "wspt_cool": Rule(WsptCool, "time per value, P(saturation) ≤ 0.5", "Smith 1956"),
     "thermometer": Rule(Thermometer, "time per value, headroom suits the load", _KUHN),
     "wsept": Rule(Wsept, "time per expected worth", "Rothkopf 1966"),
+    "wsept_ahead": Rule(WseptAhead, "time per expected worth, with arms that are home soon", "Rothkopf 1966"),
+    "auction": Rule(Auction, "time per expected worth, within n · ε", "Bertsekas 1988"),
+    "rolling_horizon": Rule(RollingHorizon, "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"),
     "ssi": Rule(Ssi, _THERMAL, _SSI),
     "matching": Rule(Matching, _THERMAL, _KUHN),
+    "matching_ahead": Rule(MatchingAhead, "thermal, with arms that are home soon", _KUHN),
     "quickest_ssi": Rule(QuickestSsi, _TIME, _SSI),
     "quickest_matching": Rule(QuickestMatching, _TIME, _KUHN),
 }
@@ -59,6 +71,7 @@ class Wrapper:
 
 WRAPPERS: dict[str, Wrapper] = {
     "limited": Wrapper(TorqueLimiter, "torque limit that falls with the temperature", "Singh et al. 2021"),
+    "shutdown": Wrapper(Shutdown, "no claims from the warning limit until the arm has cooled by 10 K", "IEC 60034-11"),
     "fuzzy": Wrapper(FuzzySpeed, "speed by fuzzy rules about temperature and its tendency", "Afaq et al."),
 }
 
@@ -68,7 +81,8 @@ def names_of(scope: str) -> str:
     return ", ".join(name for name, rule in RULES.items() if rule.scope == scope)
 
 
-WRAPPERS_HELP = " or ".join(f"{name}:POLICY" for name in WRAPPERS) + " limits one by temperature"
+WRAPPERS_HELP = " or ".join(f"{name}:POLICY" for name in WRAPPERS).replace(" or ", ", ", len(WRAPPERS) - 2)
+WRAPPERS_HELP += " limits one by temperature"
 NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}."
 """Allowed names of a policy, for `--help`."""
 

@@ -1,6 +1,6 @@
 """Dispatching rules. Except `wspt_cool` they are non-idling: a free arm that may claim a job does so."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -72,13 +72,7 @@ class CoolestFirst(Stateless):
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """One pass over the slots from the oldest job; each goes to the coolest able arm."""
-        coolest = sorted(observations, key=lambda arm: -float(observations[arm].headroom_k))
-        actions = dict.fromkeys(observations, WAIT)
-        for slot in range(_slots(observations)):
-            arm, option = _first_able(coolest, slot, observations, actions)
-            if arm is not None:
-                actions[arm] = option + 1
-        return actions
+        return oldest_jobs_to(sorted(observations, key=lambda arm: -float(observations[arm].headroom_k)), observations)
 
 
 class LeastDifficulty(Stateless):
@@ -114,28 +108,41 @@ class LeastDifficulty(Stateless):
         return least_difficult(observation, slots[min(before, len(slots) - 1)]) + 1
 
 
-class Wspt(Stateless):
+class IndexRule(Stateless):
+    """The pair of free arm and job with the highest index first; ties go to the older job, then to the first arm."""
+
+    scope: ClassVar = "central"
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of the pairs."""
+        cost = np.stack(
+            [
+                np.where(seen.action_mask[1:-1] > 0, -self.index(seen).astype(float), np.inf)
+                for seen in observations.values()
+            ]
+        )
+        return claims_of(observations, cheapest_pairs(cost, _plans(observations)))
+
+    def index(self, seen: Observation) -> Array:
+        """Index of every option, legal or not, [option]; −inf for those that must not be claimed."""
+        raise NotImplementedError
+
+
+class Wspt(IndexRule):
     """The pair of free arm and job with the highest value per time first: weighted shortest processing time.
 
     Optimal for the weighted sum of completion times on one machine (W. E. Smith, Naval Research Logistics Quarterly 3,
     1956), a strong rule on unrelated machines. It ignores temperatures. Scope central: it compares the arms' times.
     """
 
-    scope: ClassVar = "central"
     only_choices = True
     most_p = 1.0
     """Largest P(saturation) of a claim."""
 
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """The claims; ties go to the older job, then to the first arm."""
-        cost = np.stack([-self._rate(seen) for seen in observations.values()])  # [arm, option]
-        return claims_of(observations, cheapest_pairs(cost, _plans(observations)))
-
-    def _rate(self, seen: Observation) -> Array:
+    def index(self, seen: Observation) -> Array:
         """Value per second of every option, [option]; −inf for those that must not be claimed."""
-        allowed = seen.action_mask[1:-1].astype(bool) & (seen.p_saturation <= self.most_p)
         rate = per_option(seen, seen.value) / np.maximum(seen.duration_s, 1.0)
-        return np.where(allowed, rate, -np.inf).astype(float)
+        return np.where(seen.p_saturation <= self.most_p, rate, -np.inf)
 
 
 class WsptCool(Wspt):
@@ -155,17 +162,14 @@ def cheapest_pairs(cost: Array, plans: int = 1) -> list[tuple[int, int]]:
     option, then to the first arm. This is the outcome of a sequential single-item auction with one job per arm
     (Lagoudakis et al. 2005, Robotics: Science and Systems; Koenig et al. 2006, AAAI).
     """
-    options, pairs = cost.T, list[tuple[int, int]]()
-    arms_left, slots_left = set(range(len(cost))), set(range(len(options) // plans))
-    # By option, then by arm: a stable sort leaves ties in that order.
-    for place in np.argsort(options, axis=None, kind="stable").tolist():
-        option, arm = divmod(place, len(cost))
-        if not arms_left or not slots_left or np.isinf(options[option, arm]):
+    left, pairs = cost.T.astype(float), list[tuple[int, int]]()  # by option, then by arm: the order of ties
+    while left.size:
+        option, arm = divmod(int(left.argmin()), len(cost))
+        if left[option, arm] == np.inf:
             break
-        if arm in arms_left and option // plans in slots_left:
-            arms_left.remove(arm)
-            slots_left.remove(option // plans)
-            pairs.append((arm, option))
+        pairs.append((arm, option))
+        first = option - option % plans
+        left[:, arm] = left[first : first + plans] = np.inf
     return pairs
 
 
@@ -173,6 +177,16 @@ def claims_of(observations: Mapping[str, Observation], pairs: list[tuple[int, in
     """The actions of pairs of arm and option, each by its index; arms in no pair wait."""
     arms = list(observations)
     return dict.fromkeys(arms, WAIT) | {arms[arm]: option + 1 for arm, option in pairs}
+
+
+def oldest_jobs_to(order: Sequence[str], observations: Mapping[str, Observation]) -> dict[str, int]:
+    """Actions after one pass over the slots from the oldest job; each goes to the first able arm of an order."""
+    actions = dict.fromkeys(observations, WAIT)
+    for slot in range(_slots(observations)):
+        arm, option = _first_able(order, slot, observations, actions)
+        if arm is not None:
+            actions[arm] = option + 1
+    return actions
 
 
 def least_difficult(observation: Observation, slot: int) -> int:
@@ -198,7 +212,7 @@ def _plans(observations: Mapping[str, Observation]) -> int:
 
 
 def _first_able(
-    arms: list[str], slot: int, observations: Mapping[str, Observation], actions: Mapping[str, int]
+    arms: Sequence[str], slot: int, observations: Mapping[str, Observation], actions: Mapping[str, int]
 ) -> tuple[str | None, int]:
     """The first of the arms that may claim the slot and has no claim yet, and its fastest legal option."""
     plans = _plans(observations)

@@ -1,7 +1,6 @@
-"""One shift of every policy, simulated and live: jobs finished and faults, and the list of policies.
+"""One shift of every policy, simulated and live: jobs finished and faults.
 
     python benchmarks/bench_policies.py [quickstart] [--speed 240] [--seed 0] [--policies a,b]
-    python benchmarks/bench_policies.py --list
     python benchmarks/bench_policies.py --steps [--difficulty oracle]
 
 Prints Markdown for docs/policies.md. A live shift is `thermofleet up` with a process for every participant; a shift of
@@ -23,7 +22,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 import pyarrow.parquet as pq
 
-from agents.registry import RULES, WRAPPERS
+from agents.registry import RULES
 from fleet.env.validation import Decisions
 from scenarios.load import library, load
 from scenarios.policy_loader import label, policy_at, scope_of
@@ -51,14 +50,6 @@ def live(scenario: str, policy: str, seed: int, speed: float, shift_s: float) ->
         for part in (Path(folder) / "recording").glob("events-*.parquet"):
             kinds.update(pq.read_table(part)["kind"].to_pylist())
     return kinds["finish"], kinds["fault"]
-
-
-def listed() -> str:
-    """Return the built-in policies and wrappers as two Markdown tables."""
-    rows = [f"| `{name}` | {rule.scope} | {rule.cost} | {rule.source} |" for name, rule in RULES.items()]
-    policies = ["| policy | scope | minimises | source |", "|---|---|---|---|", *rows]
-    wraps = [f"| `{name}:POLICY` | {wrapper.effect} | {wrapper.source} |" for name, wrapper in WRAPPERS.items()]
-    return "\n".join([*policies, "", "| wrapper | effect | source |", "|---|---|---|", *wraps])
 
 
 class Steps(NamedTuple):
@@ -132,14 +123,10 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=240.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--policies", default=",".join(RULES))
-    parser.add_argument("--list", action="store_true")
     parser.add_argument("--steps", action="store_true")
     parser.add_argument("--difficulty", choices=get_args(DifficultyName), default="blind", help="with --steps")
     options = parser.parse_args()
     policies = options.policies.split(",")
-    if options.list:
-        print(listed())
-        return
     if options.steps:
         scenarios = [options.scenario] if options.scenario else list(library())
         print_steps(scenarios, policies, options.seed, options.difficulty)

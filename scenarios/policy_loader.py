@@ -1,5 +1,5 @@
-"""Policies by name: one of `agents.registry`, a class of your own as `FILE.py:CLASS` or `MODULE:CLASS`, the folder of a
-trained one, or any of these in a wrapper, as `WRAPPER:POLICY`."""
+"""Policies by name: one of `agents.registry`, your own as `FILE.py:OBJECT` or `MODULE:OBJECT`, the folder of a trained
+one, or any of these in a wrapper, as `WRAPPER:POLICY`. An object is a class or a function that returns a new policy."""
 
 import importlib
 import importlib.util
@@ -55,7 +55,7 @@ def scope_of(name: str) -> str:
     """
     if wrapped := _wrapped(name):
         return scope_of(wrapped[1])
-    return "arm" if _is_folder(name) else _class_of(name).scope
+    return "arm" if _is_folder(name) else _made_by(name)[1]
 
 
 def policy_at(name: str, seed: int) -> Policy:
@@ -98,36 +98,38 @@ def _maker(name: str, depth: int = 0) -> Callable[[], Policy] | Callable[[], Arm
         from agents.learned.policy import load_policy  # loads torch
 
         return lambda: load_policy(Path(name))
-    return _class_of(name)
+    return _made_by(name)[0]
 
 
-def _class_of(name: str) -> type[Policy] | type[ArmPolicy]:
+def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy], str]:
+    """What makes the policy of a name that is no folder, and its scope."""
     if ":" not in name:
         try:
-            return rule_of(name).kind
+            return rule_of(name).kind, rule_of(name).scope
         except ValueError as error:
             raise FleetError(f"{error} Or name your own as FILE.py:CLASS, or the folder of a trained one.") from error
     where, _, kind = name.rpartition(":")
     module = _module(where, name)
     found = getattr(module, kind, None)
-    if not isinstance(found, type):
+    if not callable(found):
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
         raise FleetError(f"No class '{kind}' in '{where}'{nearest(kind, classes)}")
-    scope = getattr(found, "scope", None)
+    try:
+        signature(found).bind()
+    except TypeError as error:
+        raise FleetError(f"'{name}' must be a class or function that is called without arguments ({error}).") from error
+    example = found if isinstance(found, type) else found()
+    scope = getattr(example, "scope", None)
     if scope not in SCOPES:
         raise FleetError(
             f"The policy '{name}' has no scope (got {scope!r}). Add to the class: scope = \"central\" if its "
             'act(observations) sees all arms, or scope = "arm" if its choose(observation, place) sees one.'
         )
-    missing = [method for method in METHODS[scope] if not callable(getattr(found, method, None))]
+    missing = [method for method in METHODS[scope] if not callable(getattr(example, method, None))]
     if missing:
         needed = " and ".join(f"{method}({arguments})" for method, arguments in METHODS[scope].items())
         raise FleetError(f"'{name}' is no policy: of scope {scope} it needs the methods {needed}.")
-    try:
-        signature(found).bind()
-    except TypeError as error:
-        raise FleetError(f"'{name}' must be a class that is created without arguments ({error}).") from error
-    return found
+    return found, scope  # pyright: ignore[reportReturnType]  # by its scope and methods
 
 
 def _module(where: str, name: str) -> ModuleType:

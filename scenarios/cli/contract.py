@@ -1,4 +1,4 @@
-"""`thermofleet contract`: schemas and AsyncAPI document of the bus, and the tables of bus.md, env.md and cli.md."""
+"""`thermofleet contract`: schemas and AsyncAPI document of the bus, and the generated tables of the pages."""
 
 import json
 import re
@@ -10,7 +10,7 @@ import typer
 from fleet.errors import FleetError
 from scenarios.cli.terminal import out_console, say
 
-PAGES = ("bus.md", "cli.md", "env.md")
+PAGES = ("bus.md", "cli.md", "env.md", "policies.md")
 """Pages with generated tables."""
 
 
@@ -18,7 +18,7 @@ def contract_command(
     out: Annotated[Path, typer.Option(help="Folder for the documents.")] = Path("docs/contract"),
     check: Annotated[bool, typer.Option("--check", help="Only check whether the documents are current.")] = False,
 ) -> None:
-    """Write JSON schemas and AsyncAPI 3 document of all bus messages, and the tables of bus.md, cli.md and env.md."""
+    """Write JSON schemas and AsyncAPI 3 document of all bus messages, and the generated tables of pages."""
     made = documents(out)
     stale = [path for path, text in made.items() if not path.is_file() or path.read_text(encoding="utf-8") != text]
     if check:
@@ -37,11 +37,13 @@ def documents(out: Path) -> dict[Path, str]:
     from fleet.bus.protocol.asyncapi import asyncapi
     from fleet.bus.protocol.schemas import schema_document
     from scenarios.doc_tables import fill_tables
+    from scenarios.policy_tables import policy_tables
 
+    more = {"commands": _command_tables, **policy_tables(out.parent / "results" / "ladder")}
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}
     for page in (out.parent / name for name in PAGES):
         if page.is_file():
-            made[page] = fill_tables(page.read_text(encoding="utf-8"), {"commands": _command_tables})
+            made[page] = fill_tables(page.read_text(encoding="utf-8"), more)
     return made
 
 

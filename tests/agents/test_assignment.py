@@ -183,6 +183,23 @@ def test_the_arm_that_would_get_hot_does_not_get_the_job():
         assert make_policy(f"quickest_{name}").act(seen) == {"h": 1, "c": 0}
 
 
+def test_a_job_waits_for_the_arm_that_is_home_soon_and_finishes_it_first() -> None:
+    """A free arm needs 900 s; another one 100 s, once it is home."""
+    free, busy = fleet([[1.0], [1.0]], duration_s=[[900.0], [100.0]], value=[4.0], feasible=1.0, offered=1.0)
+    free, busy = replace(free, idle=np.array(1.0)), replace(busy, working=np.array(1.0))
+    none, stations = np.array([1, 0, 0], np.int8), np.ones(1)
+
+    def claim(name: str, busy_s: float, station_free=stations, **changes) -> dict[str, int]:
+        other = replace(busy, action_mask=none, busy_s=np.array(busy_s), station_free=station_free, **changes)
+        return make_policy(name).act({"free": free, "busy": other})
+
+    assert claim("wsept_ahead", 60.0) == {"free": 0, "busy": 0}
+    assert claim("wsept_ahead", 900.0) == {"free": 1, "busy": 0}
+    assert claim("wsept_ahead", 60.0, duration_s=np.array([850.0])) == {"free": 1, "busy": 0}
+    assert claim("wsept_ahead", 60.0, np.zeros(1)) == {"free": 1, "busy": 0}
+    assert claim("wsept", 60.0) == {"free": 1, "busy": 0}
+
+
 @pytest.mark.parametrize("name", [name for name, rule in RULES.items() if rule.scope == "central"])
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.heat_guards import FuzzySpeed, GuardedArm, GuardedFleet, TorqueLimiter
+from agents.heat_guards import FuzzySpeed, GuardedArm, GuardedFleet, Shutdown, TorqueLimiter
 from agents.policy import WAIT, for_all_arms
 from agents.registry import RULES, WRAPPERS
 from fleet.env.allocation_v1 import parallel_env
@@ -58,6 +58,31 @@ def test_a_warm_arm_claims_light_jobs_only_and_puts_a_heavy_one_down() -> None:
     assert guard.claims(seen(58.0)).tolist() == [True, True, False, False]
     assert guard.claims(seen(70.0)).tolist() == [False] * 4
     assert [guard.gives_back(seen(58.0), kg) for kg in (0.5, 3.5)] == [False, True]
+
+
+@pytest.mark.parametrize("scope", ["arm", "central"])
+def test_a_switch_opens_at_the_warning_limit_and_closes_after_cooling_by_the_hysteresis(scope) -> None:
+    """Also when the arm was at work or had no choice while it was hot."""
+    policy = policy_of("shutdown:wspt" if scope == "central" else "shutdown:random")
+    policy.reset(np.random.default_rng(0))
+
+    def claims(temp_c: float, idle: bool = True) -> bool:
+        return policy.act({"arm": seen(temp_c, idle=idle)})["arm"] != WAIT
+
+    assert [claims(c) for c in (40.0, 59.9, 60.1, 55.0, 50.1, 49.9, 59.0)] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        True,
+        True,
+    ]
+    assert not claims(61.0, idle=False)
+    assert not claims(55.0)
+    policy.reset(np.random.default_rng(0))
+    assert claims(55.0)
+    assert not Shutdown().gives_back(seen(90.0), 4.0)
 
 
 temperatures = st.floats(-20.0, 40.0)

@@ -22,10 +22,12 @@ from scenarios.live.allocation import CentralAllocation
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central"]
 SIMULATED_ONLY = {
-    *("last_award", "clock", "busy_s", "station_free", "space_free", "housing_c", "ambient_c", "too_heavy"),
-    *("job_value", "job_cycles", "job_peak_c", "job_p", "peer_busy_s", "peer_blocks"),
+    *("last_award", "clock", "station_free", "space_free", "housing_c", "too_heavy"),
+    *("job_value", "job_cycles", "job_p", "peer_blocks"),
 }
-"""Fields that quotes of a working arm do not contain, and that no rule reads."""
+"""Fields that quotes of a working arm do not contain."""
+GIVEN = ("station_free", "space_free")
+"""Of these, those that rules read: taken over as they are."""
 
 
 def quote(arm: str, *offers: Estimate, **changes) -> Quote:
@@ -77,7 +79,17 @@ def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
         facts = {"mode": mode, "headroom_k": float(o.headroom_k), "capacity": int(bool(o.idle))}
         quotes[arm] = quote(arm, *offers, **facts)
         temp_c = tuple(o.temp_c.tolist())
-        states[arm] = State(arm=arm, tick=0, time_s=time_s, mode=mode, temp_c=temp_c, headroom_k=float(o.headroom_k))
+        states[arm] = State(
+            arm=arm,
+            tick=0,
+            time_s=time_s,
+            mode=mode,
+            temp_c=temp_c,
+            headroom_k=float(o.headroom_k),
+            busy_s=float(o.busy_s),
+            ambient_c=float(o.ambient_c),
+            job_peak_c=float(o.job_peak_c),
+        )
     return Bidding(
         auction="r",
         time_s=time_s,
@@ -112,7 +124,9 @@ def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, na
             for arm, o in seen.items():
                 # A quote does not contain busy stations, and no job is given back.
                 mask = np.append(o.action_mask[: len(open_slots) * PLANS + 1], 0)
-                live_seen[arm] = replace(live_seen[arm], action_mask=mask)
+                options = {"station_free": len(open_slots), "space_free": len(open_slots) * PLANS}
+                given = {name: getattr(o, name)[: options[name]] for name in GIVEN}
+                live_seen[arm] = replace(live_seen[arm], action_mask=mask, **given)
                 for field in FIELDS:
                     if field.name not in SIMULATED_ONLY:
                         expected = getattr(o, field.name)

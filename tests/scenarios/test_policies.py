@@ -20,6 +20,7 @@ def own(tmp_path):
         "class Lone:\n scope = 'arm'\n def reset(self, rng): ...\n def choose(self, o, place): return place\n"
         "class Old:\n def reset(self, rng): ...\n def act(self, o): return dict.fromkeys(o, 0)\n"
         "class No:\n scope = 'central'\n"
+        "def make(): return Idle()\n"
         "class Needy(Idle):\n def __init__(self, size): ...\n"
     )
     return file
@@ -66,6 +67,10 @@ def test_an_own_class_from_a_file_or_a_module(own):
     found = policy_of(f"{own}:Idle")
     assert found.act({"arm_0": None}) == {"arm_0": 0}  # pyright: ignore[reportArgumentType]  # it never looks
     assert label(f"{own}:Idle") == "Idle"
+    made = [policy_of(f"{own}:make") for _ in range(2)]
+    assert made[0] is not made[1]
+    assert type(made[0]).__name__ == "Idle"
+    assert scope_of(f"{own}:make") == "central"
     assert isinstance(arm_policy_of("agents.rules:LeastDifficulty"), LeastDifficulty)
 
 
@@ -79,7 +84,10 @@ def test_an_own_class_from_a_file_or_a_module(own):
             "{own}:Old",
             r"Old' has no scope \(got None\). Add to the class: scope = .central. if its act",
         ),
-        ("{own}:Needy", r"must be a class that is created without arguments \(missing a required argument: 'size'\)"),
+        (
+            "{own}:Needy",
+            r"must be a class or function that is called without arguments \(missing a required argument: 'size'\)",
+        ),
         ("nowhere.py:Idle", "there is no file 'nowhere.py'"),
         ("no_such_module:Idle", "cannot import 'no_such_module'"),
     ],

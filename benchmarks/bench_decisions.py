@@ -1,0 +1,117 @@
+"""Time of a decision of every built-in policy, for 16 arms and 50 open jobs with two plans each.
+
+    python benchmarks/bench_decisions.py [--arms 16] [--jobs 50] [--decisions 30] [--policies a,b] [--out FILE]
+
+Prints Markdown for docs/policies.md and writes JSON to FILE. The observations are drawn: jobs of 2 to 30 min, values of
+1 to 4 and predicted peaks of 35 to 75 °C. Each arm can do 60 % of them, and half of the arms are free. The time is CPU
+time, which other programs on the machine hardly change. That of a policy of scope `arm` is for one free arm. For
+`rolling_horizon` the largest gap that the solver left is added. Exits with an error if a median exceeds its limit.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from agents.assignment import Ssi
+from agents.consensus import Consensus
+from agents.registry import RULES
+from agents.rolling_horizon import RollingHorizon
+from fleet.observation import Layout, Observation
+from scenarios.policy_loader import policy_at, scope_of
+
+PLANS = 2
+WARNING_C = 60.0
+RULE_MS, MATCHING_MS, HORIZON_MS = 1.0, 5.0, 1000.0
+"""Largest median of a rule, of a matching, an auction or a policy that calls one, and of the rolling horizon."""
+
+
+def limit_ms(name: str) -> float:
+    """The largest median of a policy."""
+    kind = RULES[name].kind if name in RULES else None
+    if kind is None or issubclass(kind, RollingHorizon):
+        return HORIZON_MS
+    return MATCHING_MS if issubclass(kind, Ssi | Consensus) else RULE_MS
+
+
+def draw(rng: np.random.Generator, arms: int, jobs: int) -> dict[str, Observation]:
+    """What the arms of a fleet know at one moment."""
+    layout, options = Layout(arms, jobs, plans=PLANS), jobs * PLANS
+    age_s, due_s = np.sort(rng.uniform(0, 1800, jobs))[::-1], rng.uniform(-600, 3600, jobs)
+    value, payload_kg, station = rng.integers(1, 5, jobs), rng.uniform(0, 4, jobs), rng.random(jobs) < 0.7
+    difficulty = rng.uniform(0, 3, (arms, options))
+    free = np.arange(arms) % 2 == 0
+    least = difficulty.reshape(arms, jobs, PLANS).min(axis=2)
+    headroom_k, busy_s = rng.uniform(0, 35, arms), np.where(free, 0.0, rng.uniform(0, 1200, arms))
+    seen = {}
+    for arm in range(arms):
+        peers = np.arange(arms) != arm
+        feasible = np.repeat(rng.random(jobs) < 0.6, PLANS)
+        space = feasible & (rng.random(options) < 0.8) & free[arm]
+        duration_s = np.sort(rng.uniform(120, 1800, (jobs, PLANS)), axis=1).ravel()
+        legal = space & np.repeat(station, PLANS)
+        temp_c = WARNING_C - headroom_k[arm] - np.append(0.0, rng.uniform(0, 10, 6))
+        known = {
+            "idle": float(free[arm]), "working": float(not free[arm]), "busy_s": busy_s[arm], "temp_c": temp_c,
+            "housing_c": temp_c - 3.0, "ambient_c": 25.0, "headroom_k": headroom_k[arm], "offered": np.ones(jobs),
+            "station_free": station, "feasible": feasible, "space_free": space, "known": feasible,
+            "difficulty": difficulty[arm], "peak_c": rng.uniform(35, 75, options),
+            "p_saturation": rng.uniform(0, 0.8, options), "duration_s": duration_s,
+            "slack_s": np.repeat(due_s, PLANS) - duration_s, "age_s": age_s, "payload_kg": payload_kg, "value": value,
+            "peer_heard": np.ones(arms - 1), "peer_working": ~free[peers], "peer_headroom_k": headroom_k[peers],
+            "peer_busy_s": busy_s[peers], "peer_known": np.ones((arms - 1, jobs)), "peer_difficulty": least[peers],
+        }  # fmt: skip
+        mask = np.pad(legal, 1, constant_values=(1, 0)).astype(np.int8)
+        blank = layout.read(np.zeros(layout.size, np.float32), mask)
+        fields = {name: np.asarray(each, np.float32) for name, each in known.items()}
+        seen[f"arm_{arm}"] = replace(blank, **fields)
+    return seen
+
+
+def measure(name: str, moments: list[dict[str, Observation]]) -> dict[str, float | str]:
+    """Median and largest time of a decision in ms, and the largest gap of the solver."""
+    policy, times_ms, gaps = policy_at(name, 0), [], []
+    policy.act(moments[0])  # imports
+    for seen in moments:
+        began_s = time.process_time()
+        policy.act(seen)
+        times_ms.append((time.process_time() - began_s) * 1e3)
+        if isinstance(policy, RollingHorizon) and policy.solution:
+            gaps.append(policy.solution.gap)
+    arms = len(moments[0]) / 2 if scope_of(name) == "arm" else 1  # those that are free
+    row = {"policy": name, "scope": scope_of(name), "median_ms": statistics.median(times_ms) / arms}
+    return row | {"largest_ms": max(times_ms) / arms} | ({"largest_gap": max(gaps)} if gaps else {})
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--arms", type=int, default=16)
+    parser.add_argument("--jobs", type=int, default=50)
+    parser.add_argument("--decisions", type=int, default=30)
+    parser.add_argument("--policies", default=",".join(RULES))
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    rng = np.random.default_rng(0)
+    moments = [draw(rng, options.arms, options.jobs) for _ in range(options.decisions)]
+    rows = [measure(name, moments) for name in options.policies.split(",")]
+    print("| policy | scope | median ms | largest ms |\n|---|---|---|---|")
+    for row in rows:
+        print(f"| `{row['policy']}` | {row['scope']} | {row['median_ms']:.2f} | {row['largest_ms']:.2f} |")
+    for row in rows:
+        if "largest_gap" in row:
+            print(f"\n`{row['policy']}`: largest gap {row['largest_gap']:.1%}")
+    slow = [str(row["policy"]) for row in rows if float(row["median_ms"]) > limit_ms(str(row["policy"]))]
+    if options.out:
+        sizes = {"arms": options.arms, "jobs": options.jobs, "decisions": options.decisions}
+        options.out.write_text(json.dumps(sizes | {"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    if slow:
+        raise SystemExit(f"Slower than allowed: {', '.join(slow)}.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Tables of docs/policies.md: policies and wrappers from their registry, and measured results from files."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from agents.registry import RULES, WRAPPERS
+from scenarios.doc_tables import table
+
+SOURCES = {"oracle": "true state", "twin": "identified network"}
+"""Score sources of the measured table, by the end of the file's name."""
+
+
+def policy_tables(results: Path) -> dict[str, Callable[[], str]]:
+    """Text of each table by the name in its mark.
+
+    Args:
+        results: Folder with `SCENARIO_SOURCE.json` of `thermofleet compare --json`, and `decisions.json` of
+            `benchmarks/bench_decisions.py`.
+    """
+    return {
+        "policies": _policies,
+        "wrappers": _wrappers,
+        "ladder": lambda: _ladder(results),
+        "decisions": lambda: _decisions(json.loads((results / "decisions.json").read_text(encoding="utf-8"))),
+    }
+
+
+def _policies() -> str:
+    rows = [(f"`{name}`", rule.scope, rule.cost, rule.source) for name, rule in RULES.items()]
+    return table(("policy", "scope", "minimises", "source"), rows)
+
+
+def _wrappers() -> str:
+    rows = [(f"`{name}:POLICY`", wrapper.effect, wrapper.source) for name, wrapper in WRAPPERS.items()]
+    return table(("wrapper", "effect", "source"), rows)
+
+
+def _ladder(results: Path) -> str:
+    """Rewards and their differences to the baseline, a column for each file, the best mean of the first file first."""
+    files = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob("*_*.json"))}
+    head = ["policy"]
+    for stem, one in files.items():
+        scores = SOURCES[stem.removeprefix(f"{one['scenario']}_")]
+        head.append(f"`{one['scenario']}`, {scores}")
+    first = next(iter(files.values()))["figures"]
+    order = sorted(first, key=lambda policy: -first[policy]["reward"]["mean"])
+    rows = [(f"`{name}`", *(_cell(one, name) for one in files.values())) for name in order]
+    return table(tuple(head), rows)
+
+
+def _cell(comparison: dict[str, Any], policy: str) -> str:
+    figures = comparison["figures"][policy]
+    reward, faults = figures["reward"], figures["faults"]["mean"]
+    some = f"; {faults:.2f} faults" if faults else ""
+    if policy == comparison["baseline"]:
+        return f"{reward['mean']:.1f}{some}"
+    low, high = reward["difference_low"], reward["difference_high"]
+    text = f"{reward['difference']:+.1f} ({low:+.1f} … {high:+.1f})".replace("-", "−")
+    return (f"**{text}**" if low > 0 or high < 0 else text) + some
+
+
+def _decisions(measured: dict[str, Any]) -> str:
+    rows = [(f"`{row['policy']}`", row["scope"], f"{row['median_ms']:.2f}") for row in measured["rows"]]
+    return table(("policy", "scope", "median, ms of CPU time"), rows)
