@@ -25,11 +25,16 @@ METHODS = {
 """Methods, and their arguments, that a policy of each scope must have."""
 
 
+class Unusable(FleetError):
+    """The class of a policy that cannot be made without arguments."""
+
+
 def policy_of(name: str) -> Policy:
     """A fresh policy for all arms.
 
     Raises:
         FleetError: no such rule, file, module, class or folder, or one that is not a policy.
+        Unusable: its class needs arguments.
     """
     return for_all_arms(_maker(name))
 
@@ -65,6 +70,23 @@ def policy_at(name: str, seed: int) -> Policy:
     policy = policy_of(name)
     policy.reset(np.random.default_rng(child(np.random.SeedSequence([seed, 1]), 0)))
     return policy
+
+
+def source_of(name: str) -> Path | None:
+    """The file or folder of a policy of one's own; None for a rule.
+
+    Raises:
+        FleetError: there is no such module.
+    """
+    if wrapped := _wrapped(name):
+        return source_of(wrapped[1])
+    if _is_folder(name):
+        return Path(name)
+    where = name.rpartition(":")[0]
+    if not where or where.endswith(".py"):
+        return Path(where) if where else None
+    file = getattr(_module(where, name), "__file__", None)
+    return Path(file) if file else None
 
 
 def label(name: str) -> str:
@@ -122,7 +144,7 @@ def _class_of(name: str) -> type[Policy] | type[ArmPolicy]:
     try:
         signature(found).bind()
     except TypeError as error:
-        raise FleetError(f"'{name}' must be a class that is created without arguments ({error}).") from error
+        raise Unusable(f"'{name}' must be a class that is created without arguments ({error}).") from error
     return found
 
 

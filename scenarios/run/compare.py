@@ -1,33 +1,25 @@
 """Several policies on the same seeds, with paired differences."""
 
-import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 from scipy.stats import bootstrap, trim_mean
 
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.errors import FleetError
-from fleet.files import cache_folder
-from scenarios.policy_loader import label, policy_of, scope_of
-from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare
-from scenarios.progress import Count, Progress, quiet
+from scenarios.policy_loader import label
+from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
+from scenarios.progress import Progress, quiet
 from scenarios.report.page import table
-from scenarios.run.evaluate import FIGURES, Outcome, outcomes
+from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.schema import Scenario
 
 Array = np.ndarray
-Models = tuple[DifficultyName, RiskName]
-Part = tuple[str, Sequence[int]]
-"""A policy, and some of the seeds."""
 
 HEADINGS = {
     "reward": "reward",
@@ -47,10 +39,6 @@ LEAST_DIGITS = {"availability": 3, "tool_drift_mm": 2}
 """Decimals of a figure; 1 for others."""
 MORE_DIGITS = 3
 RESAMPLES = 2000
-TOGETHER = 16
-"""Shifts of a policy that are stepped side by side."""
-HERE_S = 5.0
-"""About the time that a worker process takes to start; until then this process does the work."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +63,20 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Failed:
+    """A shift in which a policy failed."""
+
+    policy: str
+    instance: str
+    fleet: int
+    training: int
+    seed: int
+    error: str
+    trace: str
+    """Last lines of the traceback."""
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Policies on the same seeds."""
 
@@ -88,6 +90,10 @@ class Comparison:
     channel: dict[str, Any]
     """`Channel.described`."""
     channel_text: str
+    illegal: dict[str, int] = field(default_factory=dict)
+    """By policy: illegal actions in all its shifts."""
+    failures: tuple[Failed, ...] = ()
+    """Shifts in which a policy failed. A policy with one has no figures."""
 
     def _repr_html_(self) -> str:
         head = ("policy", *(HEADINGS[name] for name in FIGURES))
@@ -124,53 +130,15 @@ def compare(
     Raises:
         FleetError: unknown policy, one given twice, or a baseline that is not among the policies.
     """
-    for i, policy in enumerate(policies):
-        policy_of(policy)
-        if policy in policies[:i]:
-            raise FleetError(f"The policy '{policy}' is given twice; names must be unique.")
-    if baseline not in policies:
-        raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
-    folder = cache_dir or cache_folder()  # here: a worker may have started with another one
-    fleet = prepare(scenario, difficulty=difficulty, risk=risk, cache=folder, progress=progress)
-    together = TOGETHER if channel.perfect else 1
-    parts = [(policy, seeds[i : i + together]) for policy in policies for i in range(0, len(seeds), together)]
-    by_policy: dict[str, list[Outcome]] = {policy: [] for policy in policies}
-    results = _run_parts(fleet, (difficulty, risk), channel, folder, parts, workers)
-    for n, ((policy, _), result) in enumerate(zip(parts, results, strict=True)):
-        by_policy[policy] += result
-        progress("comparing", Count((n + 1) * len(seeds) * len(policies) // len(parts), len(seeds) * len(policies)))
-    figures = {
-        p: {name: figure_of(name, rows, by_policy[baseline]) for name in FIGURES} for p, rows in by_policy.items()
-    }
-    scopes = {policy: scope_of(policy) for policy in policies}
-    return Comparison(scenario.name, tuple(seeds), baseline, figures, scopes, channel.described(), channel.text)
+    from scenarios.trials.contest import run_study
+    from scenarios.trials.plan import Case, Study
+    from scenarios.trials.summary import check_baseline, comparison_of
 
-
-def _run_parts(
-    fleet: Fleet, models: Models, channel: Channel, folder: Path, parts: Sequence[Part], workers: int
-) -> Iterator[list[Outcome]]:
-    """The outcomes of each part in order, from this process in the first seconds, then from workers."""
-    began_s, todo = time.monotonic(), list(parts)
-    while todo and (workers == 1 or time.monotonic() - began_s < HERE_S):
-        yield outcomes(fleet, *todo.pop(0), channel)
-    if not todo:
-        return
-    with Parallel(n_jobs=workers, return_as="generator") as pool:
-        for result in pool(delayed(_run_in_worker)(fleet.scenario, models, folder, *part, channel) for part in todo):
-            assert result is not None
-            yield result
-
-
-@cache
-def _fleet(scenario: Scenario, models: Models, folder: Path) -> Fleet:
-    difficulty, risk = models
-    return prepare(scenario, difficulty=difficulty, risk=risk, cache=folder)
-
-
-def _run_in_worker(
-    scenario: Scenario, models: Models, folder: Path, policy: str, seeds: Sequence[int], channel: Channel
-) -> list[Outcome]:
-    return outcomes(_fleet(scenario, models, folder), policy, seeds, channel)
+    case = Case(name=scenario.name, scenario=scenario, seeds=tuple(seeds))
+    study = Study(policies=policies, cases=[case], difficulties=[difficulty], risk=risk, channel=channel)
+    check_baseline(study, baseline)
+    rows = run_study(study, cache_dir=cache_dir, workers=workers, progress=progress)
+    return comparison_of(study, rows, baseline)
 
 
 def figure_of(name: str, rows: Sequence[Outcome], base: Sequence[Outcome]) -> Figure:

@@ -1,0 +1,88 @@
+"""Workers on a Ray cluster: one actor per CPU."""
+
+from concurrent.futures import Future
+from typing import Any
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+
+from fleet.errors import FleetError
+from scenarios.trials.plan import Row, Unit
+from scenarios.trials.run_unit import Settings, run_unit
+
+
+@ray.remote(num_cpus=1, max_restarts=0)
+class _Runner:
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+
+    def run(self, unit: Unit) -> list[Row]:
+        return run_unit(unit, self._settings)
+
+
+class Cluster:
+    """A Ray cluster, and how many actors of ours it has."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings, self._actors = ray.put(settings), 0
+
+    def start(self) -> Any:  # Ray makes the class of an actor's handle
+        """A new actor; None if every CPU has one."""
+        if self._actors >= int(ray.cluster_resources().get("CPU", 0)):
+            return None
+        self._actors += 1
+        return _Runner.options(scheduling_strategy="SPREAD").remote(self._settings)
+
+    def stop(self, actor: Any) -> None:
+        """End an actor, dead or not."""
+        ray.kill(actor)
+        self._actors -= 1
+
+
+class RayWorker:
+    """One actor."""
+
+    def __init__(self, cluster: Cluster) -> None:
+        self._cluster = cluster
+        self._actor = cluster.start()
+
+    def submit(self, unit: Unit) -> "Future[list[Row]]":
+        """Begin a unit."""
+        return self._actor.run.remote(unit).future()
+
+    def died(self, error: BaseException) -> bool:
+        """Whether an error of a unit says that the actor died, or its machine."""
+        return isinstance(error, RayError) and not isinstance(error, RayTaskError)
+
+    def renew(self) -> bool:
+        """Replace an actor that died; False if its machine is gone, too."""
+        self.close()
+        self._actor = self._cluster.start()
+        return self._actor is not None
+
+    def close(self) -> None:
+        """End the actor."""
+        if self._actor is not None:
+            self._cluster.stop(self._actor)
+            self._actor = None
+
+
+def ray_workers(address: str, settings: Settings) -> list[RayWorker]:
+    """An actor for each free CPU of a cluster.
+
+    Raises:
+        FleetError: there is no cluster at this address, or it has no free CPU.
+    """
+    if not ray.is_initialized():
+        try:
+            ray.init(address=address, log_to_driver=False)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise FleetError(
+                f"There is no Ray cluster at '{address}' ({reason}). Start one with `ray start --head`, or give --jobs."
+            ) from error
+    count = int(ray.available_resources().get("CPU", 0))
+    if not count:
+        raise FleetError(f"The Ray cluster at '{address}' has no free CPU.")
+    cluster = Cluster(settings)
+    return [RayWorker(cluster) for _ in range(count)]
