@@ -41,6 +41,8 @@ err_console = SafeConsole(stderr=True)
 
 EVERY_S, AFTER_S = 30.0, 2.0
 """Without a terminal: time between two lines of one stage, and time that a stage must last to have a line."""
+KEPT = "Plans and twins already made are"
+"""What an interruption leaves in the cache."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
@@ -50,9 +52,7 @@ class Interrupted(FleetError):
 
 
 @contextmanager
-def progress_bar(
-    *, kept: str = "Plans and twins already made are", every_s: float = EVERY_S, after_s: float = AFTER_S
-) -> Iterator[Progress]:
+def progress_bar(*, kept: str = KEPT, every_s: float = EVERY_S, after_s: float = AFTER_S) -> Iterator[Progress]:
     """Show a bar on standard error: what is going on, count and time left. Without a terminal, print lines.
 
     Lines are printed when a stage begins that lasts longer than `after_s`, and every `every_s` in it.

@@ -3,7 +3,7 @@
 import hashlib
 import platform
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
@@ -130,9 +130,7 @@ class Study:
                             of = (policy, case.name, fleet, training, difficulty)
                             left = [seed for seed in case.seeds if Key(*of, seed) not in done]
                             for i in range(0, len(left), together):
-                                part = Case(
-                                    name=case.name, scenario=case.scenario, seeds=tuple(left[i : i + together])
-                                )
+                                part = Case(name=case.name, scenario=case.scenario, seeds=tuple(left[i : i + together]))
                                 yield Unit(policy, part, fleet, training, difficulty)
 
     def trainings_of(self, difficulty: DifficultyName) -> int:

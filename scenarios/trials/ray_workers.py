@@ -1,5 +1,7 @@
 """Workers on a Ray cluster: one actor per CPU."""
 
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+
 from concurrent.futures import Future
 from typing import Any
 
@@ -44,7 +46,7 @@ class RayWorker:
 
     def __init__(self, cluster: Cluster) -> None:
         self._cluster = cluster
-        self._actor = cluster.start()
+        self._actor: Any = cluster.start()
 
     def submit(self, unit: Unit) -> "Future[list[Row]]":
         """Begin a unit."""

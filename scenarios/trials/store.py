@@ -67,6 +67,7 @@ class Store:
         """Write the last state: one file of rows, and a card that says so."""
         with disk_errors(self.out):
             self.compact()
+            (self.out / PARTS).rmdir()
             write_card(self.out, {**self._card, "status": "finished"})
 
 

@@ -25,7 +25,7 @@ def test_actions_may_be_numpy_integers(make, play) -> None:
     assert play.plain(env.step(arrays)) == play.plain(other.step({"arm_0": 1, "arm_1": 2, "arm_2": 0}))
 
 
-@pytest.mark.parametrize("action", [1.0, np.array(0.0), "1", None, True, np.array([0, 1]), 2**70, [], {}])
+@pytest.mark.parametrize("action", [1.0, np.array(0.0), "1", None, True, np.array([0, 1]), [], {}])
 def test_non_integer_actions_are_refused_without_effect(make, play, action) -> None:
     env, other = make(), make()
     env.reset(seed=1)
@@ -35,15 +35,10 @@ def test_non_integer_actions_are_refused_without_effect(make, play, action) -> N
     assert play.plain(env.step({"arm_0": 1})) == play.plain(other.step({"arm_0": 1}))
 
 
-@pytest.mark.parametrize("action", [2**63, 2**64, -(2**63) - 1, 10**30, np.uint64(2**64 - 1), np.array(2**63)])
-def test_actions_beyond_int64_are_refused(make, action) -> None:
-    env = make()
-    env.reset(seed=1)
-    with pytest.raises(ValueError, match=r"The action of 'arm_1' must be one integer of 64 bits with sign \(got "):
-        env.step({"arm_1": action})
-
-
-@pytest.mark.parametrize("action", [2**63 - 1, -(2**63), np.int64(-1), np.uint8(200)])
+@pytest.mark.parametrize(
+    "action",
+    [2**63 - 1, -(2**63), np.int64(-1), np.uint8(200), 2**64, 10**30, -(10**30), np.uint64(2**64 - 1), np.array(2**63)],
+)
 def test_integers_outside_the_space_are_waits(make, action) -> None:
     env = make()
     env.reset(seed=1)
