@@ -34,7 +34,7 @@ from scenarios.job_stream import JobSampler, all_works, rehearsal_works
 from scenarios.load import load, override
 from scenarios.prepare.planned_arm import PlannedArm, air_offsets, plan_arms
 from scenarios.prepare.problems import problems_of
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Progress, check_progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
 
@@ -68,16 +68,21 @@ def prepare(
     *,
     difficulty: DifficultyName = "twin",
     risk: RiskName = RISK,
+    training: int = 0,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Fleet:
     """Plan every work for every arm, and give each arm its difficulty model; both are cached by content.
 
+    Args:
+        training: Which training of the twins, from 0.
+
     Raises:
         ScenarioError: no arm can do some work, or arms at home are too close to each other.
         MissingExtra: twins are wanted, and their libraries are not installed.
     """
-    arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, risk, cache, progress, every_work=True)
+    every = range(len(scenario.arms))
+    arms, refused = _arms(scenario, every, difficulty, risk, cache, progress, every_work=True, training=training)
     return _fleet(scenario, arms, refused, _folder(cache))
 
 
@@ -118,12 +123,14 @@ def _arms(
     progress: Progress,
     *,
     every_work: bool,
+    training: int = 0,
 ) -> tuple[list[Arm], list[InfeasibleJob]]:
     """The arms at these places of the scenario, and the work that single arms cannot do.
 
     Args:
         every_work: Raise if none of the arms can do some work.
     """
+    check_progress(progress)
     if choose("difficulty", difficulty, DifficultyName) == "twin":
         require_extra("twin")
     choose("risk", risk, RiskName)
@@ -136,11 +143,11 @@ def _arms(
     arms = [_blind_arm(arm, asked, folder) for arm in planned]
     if difficulty == "twin":
         from scenarios.prepare.calibrate_twins import calibrate_twins  # both need the extra `twin`
-        from scenarios.prepare.train_twins import train_twins
+        from scenarios.prepare.train_twins import train_twins, training_seed
 
         if every_work:
             _compile_meanwhile(scenario, arms, folder)
-        twins = train_twins(scenario, planned, folder, progress)
+        twins = train_twins(scenario, planned, folder, progress, seed=training_seed(scenario, training))
         models = calibrate_twins(scenario, planned, twins, folder, progress, risk=risk)
         arms = [
             replace(arm, model=model, known=(model.heat.thermal, model.heat.motors))

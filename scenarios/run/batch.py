@@ -20,7 +20,7 @@ from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, works_of
 from scenarios.load import override
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare, scenario_with, world_of
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Progress, check_progress, quiet
 from scenarios.schema import Ambient, Scenario
 
 Array = np.ndarray
@@ -92,6 +92,7 @@ def make_batch(
         raise ScenarioError(f"make_batch() takes no {single[0]}; only make_env() does.")
     if not isinstance(randomise, Randomisation | None):
         raise ScenarioError(f"randomise must be a scenarios.run.batch.Randomisation (got {randomise!r}).")
+    check_progress(progress)
     chosen = scenario_with(scenario, overrides, make_batch)
     randomise, near = randomise or Randomisation(), near_of(chosen, peers)
     specs = [chosen, *(override(chosen, **variant) for variant in randomise.variants)]

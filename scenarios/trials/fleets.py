@@ -58,30 +58,20 @@ class Fleets:
             return self._last[1]
         cell = (prepared_content(scenario, unit.difficulty), *asked[1:])
         if cell not in self._cells:
-            self._cells[cell] = make_fleet(scenario, unit.training, unit.difficulty, risk, folder, progress)
+            self._cells[cell] = prepare(
+                scenario,
+                difficulty=unit.difficulty,
+                risk=risk,
+                training=unit.training,
+                cache=folder,
+                progress=progress,
+            )
             while len(self._cells) > MOST_FLEETS:
                 self._cells.popitem(last=False)
         self._cells.move_to_end(cell)
         found = replace(self._cells[cell], scenario=scenario)
         self._last = asked, found
         return found
-
-
-def make_fleet(
-    scenario: Scenario, training: int, difficulty: DifficultyName, risk: RiskName, folder: Path, progress: Progress
-) -> Fleet:
-    """The fleet of a drawn scenario, with the k-th training of its twins."""
-    if difficulty != "twin" or not training:
-        return prepare(scenario, difficulty=difficulty, risk=risk, cache=folder, progress=progress)
-    from scenarios.studies.score_sources import DrawnFleet  # needs the extra `twin`
-
-    draw = DrawnFleet(scenario, folder, progress)
-    models = draw.calibrated(training, risk)
-    arms = [
-        replace(arm, known=(model.heat.thermal, model.heat.motors))
-        for arm, model in zip(draw.scored(models).arms, models, strict=True)
-    ]
-    return replace(draw.blind, arms=tuple(arms))
 
 
 def warm(units: Sequence[Unit], risk: RiskName, folder: Path, fleets: Fleets, progress: Progress) -> None:

@@ -13,10 +13,17 @@ from scenarios.trials.plan import Row, Unit
 from scenarios.trials.run_unit import Settings, run_unit
 
 
+START_S = 60.0
+"""So long a CPU that another program uses is waited for."""
+
+
 @ray.remote(num_cpus=1, max_restarts=0)
 class _Runner:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+
+    def ready(self) -> None:
+        """Return when it runs."""
 
     def run(self, unit: Unit) -> list[Row]:
         return run_unit(unit, self._settings)
@@ -47,6 +54,16 @@ class RayWorker:
     def __init__(self, cluster: Cluster) -> None:
         self._cluster = cluster
         self._actor: Any = cluster.start()
+
+    @property
+    def started(self) -> bool:
+        """Whether there was a CPU without an actor of ours."""
+        return self._actor is not None
+
+    @property
+    def ready(self) -> Any:
+        """What ends when the actor begins to run."""
+        return self._actor.ready.remote()
 
     def submit(self, unit: Unit) -> "Future[list[Row]]":
         """Begin a unit."""
@@ -83,8 +100,14 @@ def ray_workers(address: str, settings: Settings) -> list[RayWorker]:
             raise FleetError(
                 f"There is no Ray cluster at '{address}' ({reason}). Start one with `ray start --head`, or give --jobs."
             ) from error
-    count = int(ray.available_resources().get("CPU", 0))
-    if not count:
-        raise FleetError(f"The Ray cluster at '{address}' has no free CPU.")
     cluster = Cluster(settings)
-    return [RayWorker(cluster) for _ in range(count)]
+    workers: list[RayWorker] = []
+    while (worker := RayWorker(cluster)).started:
+        workers.append(worker)
+    begun = {each.ready: each for each in workers}
+    ready, waiting = ray.wait(list(begun), num_returns=len(begun), timeout=START_S) if begun else ([], [])
+    for each in waiting:
+        begun[each].close()  # its CPU is in use
+    if not ready:
+        raise FleetError(f"The Ray cluster at '{address}' had no free CPU for {START_S:g} s.")
+    return [begun[each] for each in ready]

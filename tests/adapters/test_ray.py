@@ -9,6 +9,7 @@ from threading import Thread
 import pytest
 
 from fleet.errors import FleetError
+from fleet.files import user_cache_folder
 from scenarios.load import load
 from scenarios.trials.contest import run_study
 from scenarios.trials.plan import Case, Row, Study
@@ -20,6 +21,8 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
+COMPILED = user_cache_folder()
+"""Before the tests get a home of their own: the nodes need not compile the engine again."""
 OWN = """
 import os, pathlib, time
 class Idle:
@@ -57,11 +60,13 @@ def cluster(home, tmp_path_factory) -> Iterator:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("THERMOFLEET_CACHE", str(tmp_path_factory.mktemp("plans")))
         patch.setenv("PYTHONPATH", f"{Path(__file__).parents[2]}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+        patch.setenv("XDG_CACHE_HOME", str(COMPILED.parent))
         import ray
         from ray.cluster_utils import Cluster
 
         nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
         nodes.add_node(num_cpus=1)
+        ray.init(nodes.address, log_to_driver=False)  # here, as it takes the signals of this process
         yield nodes
         ray.shutdown()
         nodes.shutdown()
@@ -104,8 +109,13 @@ def test_other_files_of_a_policy_are_refused(cluster, study, tmp_path, monkeypat
         run_study(study, ray=cluster.address)
 
 
-def test_a_study_outlives_a_node(cluster, study, tmp_path):
-    node = cluster.add_node(num_cpus=1)
+@pytest.fixture(scope="module")
+def node(cluster):
+    """One more node."""
+    return cluster.add_node(num_cpus=1)
+
+
+def test_a_study_outlives_a_node(cluster, node, study, tmp_path):
     waits = own(study, tmp_path, "Waits")
 
     def take_it_away() -> None:

@@ -269,6 +269,34 @@ def test_a_seed_override_is_refused_with_where_it_belongs(cell, folder) -> None:
         make_env(cell, difficulty="blind", cache=folder, seed=3)
 
 
+def test_overrides_may_be_numpy_numbers(cell, folder) -> None:
+    own, numpys = (
+        make_env(cell, difficulty="blind", cache=folder, horizon_s=horizon_s, slots=slots, ambient={"points": points})
+        for horizon_s, slots, points in (
+            (60, 3, [[0.0, 30.0]]),
+            (np.int64(60), np.uint8(3), np.array([[0.0, 30.0]])),
+        )
+    )
+    for env in (own, numpys):
+        env.reset(seed=0)
+    assert own.episode.world.ticks == numpys.episode.world.ticks == 6
+    assert own.observation_space("left") == numpys.observation_space("left")
+    with pytest.raises(ScenarioError, match="expected numbers, texts, lists and tables, got <object"):
+        make_env(cell, difficulty="blind", cache=folder, horizon_s=object())
+
+
+def test_progress_must_be_a_function(cell, folder) -> None:
+    wrong: Any = 3
+    for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
+        with pytest.raises(ScenarioError, match=r"progress must be a function of .* \(got 3\)"):
+            make(cell, difficulty="blind", cache=folder, progress=wrong)
+
+
+def test_a_batch_that_cannot_fit_is_refused_before_it_is_made(cell, folder) -> None:
+    with pytest.raises(ValueError, match=r"num_envs must be at most \d+, as this machine has \d+ GB: the observations"):
+        make_batch(cell, 10**9, difficulty="blind", cache=folder)
+
+
 def test_a_cache_folder_may_be_a_string(cell, folder) -> None:
     make_env(cell, difficulty="blind", cache=str(folder)).reset(seed=0)
     make_batch(cell, 1, difficulty="blind", cache=str(folder)).reset()
