@@ -12,7 +12,6 @@ from fleet.errors import FleetError
 from scenarios.trials.plan import Row, Unit
 from scenarios.trials.run_unit import Settings, run_unit
 
-
 START_S = 60.0
 """So long a CPU that another program uses is waited for."""
 
