@@ -44,5 +44,5 @@ def suite_of(name: str, seeds: int, first_seed: int = 0) -> list[Case]:
         return cases_of([each.strip() for each in name.split(",")], seeds, first_seed)
     if find_spec("scenarios.suite") is None:
         raise FleetError(f"This version has no suite '{name}'; name scenarios, separated by commas.")
-    instances: Sequence[Instance] = import_module("scenarios.suite").split(name)
+    instances: Sequence[Instance] = import_module("scenarios.suite.splits").split(name)
     return [Case(name=i.name, scenario=i.scenario, seeds=seeds_of_instance(i.seed, seeds)) for i in instances]

@@ -133,6 +133,11 @@ class Study:
                                 part = Case(name=case.name, scenario=case.scenario, seeds=tuple(left[i : i + together]))
                                 yield Unit(policy, part, fleet, training, difficulty)
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Fleets, trainings and seeds of an instance: the order of a policy's rows."""
+        return self.fleets, max(map(self.trainings_of, self.difficulties)), len(self.cases[0].seeds)
+
     def trainings_of(self, difficulty: DifficultyName) -> int:
         """How many trainings a source of scores has."""
         return self.trainings if difficulty == "twin" else 1

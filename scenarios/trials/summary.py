@@ -1,6 +1,6 @@
 """From rows to figures and differences, and what a table says of policies that failed."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -55,12 +55,11 @@ def comparison_of(study: Study, rows: Sequence[Row], baseline: str, name: str | 
     ]
     failed = {each.policy for each in failures}
     whole = {each: repeated(study, of) for each, of in shifts.items() if each not in failed}
-    base = whole.get(baseline)
     return Comparison(
         scenario=name or rows[0].key.instance,
         seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
         baseline=baseline,
-        figures={} if base is None else {each: figures_of(of, base) for each, of in whole.items()},
+        figures=figures_of(whole, baseline),
         scopes={names[p, d]: scope_of(p) if names[p, d] in whole else "failed" for p, d in names},
         channel=study.channel.described(),
         channel_text=study.channel.text,
@@ -70,21 +69,24 @@ def comparison_of(study: Study, rows: Sequence[Row], baseline: str, name: str | 
 
 
 def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:
-    """The outcomes of one policy, those without trainings once for each training, so that all have as many."""
+    """The outcomes of one policy, those without trainings once for each training: in the order of `Study.shape`."""
     of: dict[tuple[str, int, int], list[Outcome]] = {}
     for row in rows:
         assert row.outcome is not None
         of.setdefault((row.key.instance, row.key.fleet, row.key.training), []).append(row.outcome)
     found: list[Outcome] = []
     for instance, fleet in dict.fromkeys((instance, fleet) for instance, fleet, _ in of):
-        for training in range(study.trainings if "twin" in study.difficulties else 1):
+        for training in range(study.shape[1]):
             found += of.get((instance, fleet, training), of[instance, fleet, 0])
     return found
 
 
-def figures_of(outcomes: Sequence[Outcome], base: Sequence[Outcome]) -> dict[str, Figure]:
-    """Every figure of a policy, paired with the baseline's."""
-    return {figure: figure_of(figure, outcomes, base) for figure in FIGURES}
+def figures_of(by_policy: Mapping[str, Sequence[Outcome]], baseline: str) -> dict[str, dict[str, Figure]]:
+    """Every figure of every policy, paired with the baseline's; none if the baseline failed."""
+    base = by_policy.get(baseline)
+    if base is None:
+        return {}
+    return {each: {name: figure_of(name, of, base) for name in FIGURES} for each, of in by_policy.items()}
 
 
 def comparisons(study: Study, rows: Sequence[Row], baseline: str, suite: str | None = None) -> list[Comparison]:
