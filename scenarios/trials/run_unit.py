@@ -86,7 +86,10 @@ def _check(policy: str, settings: Settings) -> None:
         return
     here = f"process {os.getpid()} on {socket.gethostname()}"
     if code_hash() != settings.code_hash:
-        raise FleetError(f"The {here} runs another version of thermofleet: install the same one on every machine.")
+        raise FleetError(
+            f"The {here} runs other code of thermofleet than this command began with: install the same on every "
+            "machine, and change no code while it runs."
+        )
     try:
         found = policy_hash(policy)
     except OSError as error:

@@ -284,8 +284,8 @@ def test_the_example_of_the_page_discounts_by_elapsed_time(example) -> None:
         torch.testing.assert_close(frames["advantage"][now].double(), advantage, rtol=1e-3, atol=1e-2)
 
 
-def test_flags_of_the_arms_are_those_of_the_env(example, home) -> None:
-    """The second example of the page: GAE refuses flags of another shape than the reward, and takes the expanded ones."""
+def test_flags_of_the_arms_are_those_of_the_env(example) -> None:
+    """The second example of the page: GAE wants flags in the shape of the reward, and takes the expanded ones."""
     told = example("TorchRL")
     page = (Path(__file__).parents[2] / "docs" / "trainers.md").read_text(encoding="utf-8")
     second = page.partition("## TorchRL\n")[2].split("```python\n")[2].split("```")[0]
