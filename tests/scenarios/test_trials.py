@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -275,3 +276,25 @@ def test_a_row_without_outcome_has_a_sentence():
     from scenarios.trials.store import row_of
 
     assert row_of(columns(row)) == row
+
+
+def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet, small_toml, bad, tmp_path):
+    out = tmp_path / "study"
+    how = ("--difficulty", "blind", "--seeds", "2", "--jobs", "1", "--out", out)
+    said = thermofleet("compare", small_toml, "--policies", f"round_robin,{bad}:Raises,{bad}:Illegal", *how)
+    assert said.code == 0
+    assert "Raises: KeyError: 'nobody' (at 30 s of the shift)" in said.out
+    assert "Illegal actions, which count as waits: Illegal 72." in said.out
+    assert len(read_rows(out)) == 6
+    told = thermofleet("compare", "--suite", small_toml, "--policies", "wspt,random", *how, "--fleets", "2", "--json")
+    assert msgspec.json.decode(told.out)["scenario"] == f"{small_toml}, 1 instance"
+    assert len(read_rows(out)) == 14
+    for wrong, sentence in (
+        ((), "Give either scenarios or --suite."),
+        ((small_toml, "--suite", "test"), "Give either scenarios or --suite."),
+        ((small_toml, "--jobs", "2", "--ray", "auto"), "Give either --jobs or --ray."),
+        ((small_toml, "--difficulty", "blind,oracel"), "No difficulty 'oracel'; did you mean 'oracle'?"),
+    ):
+        said = thermofleet("compare", *wrong)
+        assert said.code != 0
+        assert sentence in said.err
