@@ -16,6 +16,7 @@ EXTRAS = {
     "mcap": ("mcap",),
     "meshes": ("mujoco_menagerie",),
     "onnx": ("onnx", "onnxruntime"),
+    "ray": ("ray",),
     "rerun": ("rerun",),
     "ros2": ("rosbags",),
     "vda5050": ("paho",),

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
+import numpy as np
 
 from fleet.errors import ScenarioError, nearest, printable
 from scenarios.schema import Scenario
@@ -97,10 +98,17 @@ def override(scenario: Scenario, **changes: object) -> Scenario:
     """
     where = f"{scenario.name} with overrides"
     try:
-        plain = msgspec.to_builtins(changes)
+        plain = msgspec.to_builtins(changes, enc_hook=_plain)
     except TypeError as error:
         raise ScenarioError(f"{where}: {error}.") from error
     return parse_scenario({**msgspec.to_builtins(scenario), **plain}, Path(where))
+
+
+def _plain(value: object) -> object:
+    """A NumPy scalar or array as Python's own."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"expected numbers, texts, lists and tables, got {value!r}")
 
 
 def _known_keys(raw: object, kind: Any, file: str, place: str) -> None:

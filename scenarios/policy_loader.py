@@ -27,11 +27,16 @@ METHODS = {
 """Methods, and their arguments, that a policy of each scope must have."""
 
 
+class Unusable(FleetError):
+    """The class of a policy that cannot be made without arguments."""
+
+
 def policy_of(name: str) -> Policy:
     """A fresh policy for all arms.
 
     Raises:
         FleetError: no such rule, file, module, class or folder, or one that is not a policy.
+        Unusable: its class needs arguments.
     """
     return for_all_arms(_maker(name))
 
@@ -67,6 +72,23 @@ def policy_at(name: str, seed: int) -> Policy:
     policy = policy_of(name)
     policy.reset(np.random.default_rng(child(np.random.SeedSequence([seed, 1]), 0)))
     return policy
+
+
+def source_of(name: str) -> Path | None:
+    """The file or folder of a policy of one's own; None for a rule.
+
+    Raises:
+        FleetError: there is no such module.
+    """
+    if wrapped := _wrapped(name):
+        return source_of(wrapped[1])
+    if _is_folder(name):
+        return Path(name)
+    where = name.rpartition(":")[0]
+    if not where or where.endswith(".py"):
+        return Path(where) if where else None
+    file = getattr(_module(where, name), "__file__", None)
+    return Path(file) if file else None
 
 
 def label(name: str) -> str:
@@ -117,7 +139,7 @@ def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy],
     try:
         signature(found).bind()
     except TypeError as error:
-        raise FleetError(f"'{name}' must be a class or function that is called without arguments ({error}).") from error
+        raise Unusable(f"'{name}' must be a class or function that is called without arguments ({error}).") from error
     example = found if isinstance(found, type) else found()
     scope = getattr(example, "scope", None)
     if scope not in SCOPES:

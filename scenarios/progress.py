@@ -3,6 +3,8 @@
 import re
 from collections.abc import Callable
 
+from fleet.errors import ScenarioError
+
 Progress = Callable[[str, float], None]
 """Called with the name of the present stage and the fraction of it that is done, 0 to 1; a `Count` tells how many."""
 
@@ -87,6 +89,19 @@ class StageClock:
         left_s = self.left_s(now_s)
         left = f"about {brief(left_s)} left" if left_s is not None else f"for {brief(self.elapsed_s(now_s))}"
         return f"{self.label}: {self.fraction:.0%}, {left}."
+
+
+def check_progress(progress: object) -> None:
+    """Check that progress can be told.
+
+    Raises:
+        ScenarioError: it is no function.
+    """
+    if not callable(progress):
+        raise ScenarioError(
+            f"progress must be a function of the name of a stage and the fraction done, as "
+            f"lambda stage, done: print(stage, done) (got {progress!r})."
+        )
 
 
 def brief(time_s: float) -> str:

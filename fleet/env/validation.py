@@ -9,7 +9,6 @@ Decisions = Literal["interval", "events"]
 """Length of a step: one decision interval, or until an arm may claim a job."""
 
 _LARGEST = 2**62
-_INT64 = np.iinfo(np.int64)
 
 
 def seed_of(seed: object) -> np.random.SeedSequence:
@@ -103,21 +102,14 @@ def agent_of(agents: Sequence[str], agent: object) -> str:
 
 
 def _integer(agent: str, action: object) -> int:
-    if type(action) is int and abs(action) <= _LARGEST:
-        return action
-    value = np.asarray(action)
-    if value.size != 1 or not np.issubdtype(value.dtype, np.integer):
-        if isinstance(action, int) and not isinstance(action, bool):
-            raise ValueError(_too_large(agent, action))
-        raise ValueError(f"The action of '{agent}' must be one integer (got {action!r}).")
-    number = int(value.reshape(()))
-    if number > _INT64.max:
-        raise ValueError(_too_large(agent, action))
-    return number
-
-
-def _too_large(agent: str, action: object) -> str:
-    return f"The action of '{agent}' must be one integer of 64 bits with sign (got {action!r})."
+    """One integer; those beyond 64 bits stand for one that no action space has, so their agents wait."""
+    if type(action) is not int:
+        value = np.asarray(action)
+        if value.size == 1 and np.issubdtype(value.dtype, np.integer):
+            action = int(value.reshape(()))
+        elif not isinstance(action, int) or isinstance(action, bool):
+            raise ValueError(f"The action of '{agent}' must be one integer (got {action!r}).")
+    return max(-_LARGEST, min(_LARGEST, int(action)))
 
 
 def _whole(value: object) -> TypeGuard[int]:

@@ -4,6 +4,7 @@ The same engine as the single environment, `fleet.env.allocation_v1`, with a lea
 for bit, whatever the number of rows.
 """
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -76,6 +77,10 @@ class BatchEnv:
         decisions: Decisions = "interval",
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
+        self.agents = library.arms
+        """Names of the arms, in the order of the arm axis."""
+        self.layout = Layout(len(library.arms), library.slots, library.near, library.tables.work.shape[3])
+        _check_memory(num_envs, self.layout)
         autoreset, stagger = switch("autoreset", autoreset), switch("stagger", stagger)
         ticks = library.tables.ticks
         self._whole = ticks if max_cycles is None else min(ticks, at_least_one("max_cycles", max_cycles))
@@ -83,9 +88,6 @@ class BatchEnv:
         share = (np.arange(num_envs) + 1) / num_envs if stagger else np.ones(num_envs)
         self._last_tick = np.ceil(self._whole * share).astype(int)
         """Of the present shift of each env."""
-        self.agents = library.arms
-        """Names of the arms, in the order of the arm axis."""
-        self.layout = Layout(len(library.arms), library.slots, library.near, library.tables.work.shape[3])
         self.single_observation_space, self.single_action_space = arm_spaces(self.layout)
         """Of one arm."""
         self.autoreset = autoreset
@@ -288,3 +290,14 @@ class BatchEnv:
     def _check_begun(self, what: str) -> None:
         if not self._begun:
             raise RuntimeError(f"No episode has started: call reset() before {what}.")
+
+
+def _check_memory(num_envs: int, layout: Layout) -> None:
+    """Refuse a batch whose observations alone do not fit: it would be killed."""
+    needed = num_envs * layout.arms * (layout.size * np.dtype(np.float32).itemsize + layout.actions)
+    held = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > held:
+        raise ValueError(
+            f"num_envs must be at most {held * num_envs // needed}, as this machine has {held / 1e9:.0f} GB: the "
+            f"observations of {num_envs} envs need {needed / 1e9:.0f} GB."
+        )

@@ -6,14 +6,20 @@ from typing import Annotated
 import typer
 
 from agents.registry import RULES, WRAPPERS_HELP
+from fleet.errors import FleetError
 from scenarios.cli import options
-from scenarios.cli.terminal import out_console, print_json, progress_bar, say
+from scenarios.cli.terminal import KEPT, out_console, print_json, progress_bar, say
 from scenarios.load import load
 from scenarios.schema_errors import choose
 
 
 def compare_command(
-    scenario: options.ScenarioArg,
+    scenario: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Library names (see `thermofleet list`) or .toml files; or use --suite.", show_default=False
+        ),
+    ] = None,
     policies: Annotated[
         str,
         typer.Option(
@@ -22,10 +28,26 @@ def compare_command(
             show_default=False,
         ),
     ] = ",".join(RULES),
-    seeds: Annotated[int, options.number("Number of seeds; intervals need several shifts.", 2, 10_000)] = 10,
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="Instances that are judged together: train, validation or test, or library names and .toml files, "
+            "separated by commas.",
+            show_default=False,
+        ),
+    ] = None,
+    seeds: Annotated[
+        int | None,
+        options.number("Number of seeds of each instance; default: 10, with --suite 1.", 1, 10_000, show_default=False),
+    ] = None,
     first_seed: Annotated[
-        int, options.number("First seed. Compare on seeds that you did not tune on.", 0, options.MAX_SEED)
+        int,
+        options.number("First seed of a scenario. Compare on seeds that you did not tune on.", 0, options.MAX_SEED),
     ] = 0,
+    fleets: Annotated[
+        int, options.number("Number of fleets: draws of the arms' deviations (spread.seed).", 1, 100)
+    ] = 1,
+    trainings: Annotated[int, options.number("Number of trainings of the twins of each fleet.", 1, 20)] = 1,
     baseline: Annotated[
         str | None,
         typer.Option(
@@ -33,8 +55,31 @@ def compare_command(
             show_default=False,
         ),
     ] = None,
-    difficulty: options.DifficultyOption = "twin",
+    difficulty: Annotated[
+        str,
+        typer.Option(
+            help="Sources of the difficulty scores, separated by commas: twin, oracle (simulator) or blind (none). "
+            "With several, POLICY@SOURCE names a policy."
+        ),
+    ] = "twin",
     risk: options.RiskOption = "rc",
+    decision_limit: Annotated[
+        float, options.number("Longest time for one decision of a policy, s. A slower policy fails.", 0.001, 86_400)
+    ] = 60.0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the results, one row per shift. The same command goes on after an interruption.",
+            show_default=False,
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None, options.number("Number of processes; default: one per core.", 1, 1024, show_default=False)
+    ] = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(help="Run on a Ray cluster: its address, `auto` for the one of this machine.", show_default=False),
+    ] = None,
     as_json: options.JsonOption = False,
     topology: options.TopologyOption = "complete",
     radius: options.RadiusOption = 0.5,
@@ -44,31 +89,52 @@ def compare_command(
     loss: options.LossOption = 0.0,
     partition: options.PartitionOption = None,
 ) -> None:
-    """Compare policies on the same seeds, with confidence intervals."""
-    from scenarios.prepare.fleet import DifficultyName, RiskName
-    from scenarios.run.compare import compare, comparison_table
+    """Compare policies on the same seeds, with confidence intervals.
 
-    chosen = load(scenario)
-    channel = options.channel_of(
-        chosen, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
-        jitter_s=jitter_s, loss=loss,
-    )  # fmt: skip
-    names = [name.strip() for name in policies.split(",")]
-    with progress_bar() as progress:
-        result = compare(
-            chosen,
-            names,
-            seeds=range(first_seed, first_seed + seeds),
-            baseline=baseline or ("round_robin" if "round_robin" in names else names[0]),
-            difficulty=choose("difficulty", difficulty, DifficultyName),
-            risk=choose("risk", risk, RiskName),
-            channel=channel,
-            progress=progress,
+    With several scenarios every one has a table, with --suite all have one. A
+    policy that fails is told with instance, seed and traceback; the others go on.
+    """
+    from scenarios.prepare.fleet import DifficultyName, RiskName
+    from scenarios.trials.cases import cases_of, suite_of
+    from scenarios.trials.contest import run_study
+    from scenarios.trials.plan import Study
+    from scenarios.trials.summary import check_baseline, comparisons, competitors, result_page
+
+    if bool(scenario) == bool(suite):
+        raise FleetError("Give either scenarios or --suite.")
+    if jobs is not None and ray is not None:
+        raise FleetError("Give either --jobs or --ray.")
+    cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
+    channels = [
+        options.channel_of(
+            case.scenario, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
+            jitter_s=jitter_s, loss=loss,
         )
+        for case in cases
+    ]  # fmt: skip
+    study = Study(
+        policies=[name.strip() for name in policies.split(",")],
+        cases=cases,
+        fleets=fleets,
+        trainings=trainings,
+        difficulties=[choose("difficulty", name.strip(), DifficultyName) for name in difficulty.split(",")],
+        risk=choose("risk", risk, RiskName),
+        channel=channels[0],  # the same of all; each scenario has the arms that it names
+        decision_limit_s=decision_limit,
+    )
+    names = list(competitors(study).values())
+    base = baseline or next((name for name in names if name.partition("@")[0] == "round_robin"), names[0])
+    check_baseline(study, base)
+    with progress_bar(kept="Finished shifts, plans and twins are" if out else KEPT) as progress:
+        rows = run_study(study, out=out, workers=jobs or -1, ray=ray, progress=progress, tell=say)
+    results = comparisons(study, rows, base, suite)
     if as_json:
-        print_json(result)
-    else:
-        out_console.print(comparison_table(result))
+        print_json(results[0] if len(results) == 1 else results)
+        return
+    for result in results:
+        out_console.print(result_page(result))
+    if out:
+        say(f"Written to {out}.")
 
 
 def ablate_command(

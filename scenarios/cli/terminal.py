@@ -43,6 +43,8 @@ err_console = SafeConsole(stderr=True)
 
 EVERY_S, AFTER_S = 30.0, 2.0
 """Without a terminal: time between two lines of one stage, and time that a stage must last to have a line."""
+KEPT = "Plans and twins already made are"
+"""What an interruption leaves in the cache."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
@@ -54,7 +56,7 @@ class Interrupted(FleetError):
 @contextmanager
 def progress_bar(
     *,
-    kept: str = "Plans and twins already made are",
+    kept: str = KEPT,
     file: Path | None = None,
     every_s: float = EVERY_S,
     after_s: float = AFTER_S,

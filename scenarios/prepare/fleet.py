@@ -35,7 +35,7 @@ from scenarios.load import load, override
 from scenarios.prepare.planned_arm import PlannedArm, air_offsets, plan_arms
 from scenarios.prepare.problems import problems_of
 from scenarios.prepare.randomisation import Randomisation, Variation
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Progress, check_progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
 
@@ -83,6 +83,7 @@ def prepare(
     difficulty: DifficultyName = "twin",
     risk: RiskName = RISK,
     randomise: Randomisation | None = None,
+    training: int = 0,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Fleet:
@@ -90,6 +91,7 @@ def prepare(
 
     Args:
         randomise: Beyond what a scenario draws for a shift: ambient temperature, arrivals, fleets.
+        training: Which training of the twins, from 0.
 
     Raises:
         ScenarioError: no arm can do some work, arms at home are too close to each other, or a variant is no fleet of
@@ -106,7 +108,8 @@ def prepare(
         def share(stage: str, fraction: float, i: int = i) -> None:
             progress(stage, fraction if len(specs) == 1 else (i + fraction) / len(specs))
 
-        arms, refused = _arms(spec, range(len(spec.arms)), difficulty, risk, cache, share, every_work=True)
+        every = range(len(spec.arms))
+        arms, refused = _arms(spec, every, difficulty, risk, cache, share, every_work=True, training=training)
         fleets.append(_fleet(spec, arms, refused, _folder(cache)))
     return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))
 
@@ -148,12 +151,14 @@ def _arms(
     progress: Progress,
     *,
     every_work: bool,
+    training: int = 0,
 ) -> tuple[list[Arm], list[InfeasibleJob]]:
     """The arms at these places of the scenario, and the work that single arms cannot do.
 
     Args:
         every_work: Raise if none of the arms can do some work.
     """
+    check_progress(progress)
     if choose("difficulty", difficulty, DifficultyName) == "twin":
         require_extra("twin")
     choose("risk", risk, RiskName)
@@ -166,11 +171,11 @@ def _arms(
     arms = [_blind_arm(arm, asked, folder) for arm in planned]
     if difficulty == "twin":
         from scenarios.prepare.calibrate_twins import calibrate_twins  # both need the extra `twin`
-        from scenarios.prepare.train_twins import train_twins
+        from scenarios.prepare.train_twins import train_twins, training_seed
 
         if every_work:
             _compile_meanwhile(scenario, arms, folder)
-        twins = train_twins(scenario, planned, folder, progress)
+        twins = train_twins(scenario, planned, folder, progress, seed=training_seed(scenario, training))
         models = calibrate_twins(scenario, planned, twins, folder, progress, risk=risk)
         arms = [
             replace(arm, model=model, known=(model.heat.thermal, model.heat.motors))

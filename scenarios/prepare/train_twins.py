@@ -38,6 +38,15 @@ MOST_DRAWS = 12
 """Most draws of work per held-out job: little work of an arm in a hot place stays cool."""
 
 
+TRAINING_STEP = 1000
+"""Between the seeds of two trainings; the first one is the scenario's own."""
+
+
+def training_seed(scenario: Scenario, training: int) -> int:
+    """Seed of the twins' k-th training, from 0."""
+    return scenario.spread.seed + TRAINING_STEP * training
+
+
 def train_twins(
     scenario: Scenario,
     arms: Sequence[PlannedArm],

@@ -18,7 +18,7 @@ from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, works_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare, scenario_with, world_of
 from scenarios.prepare.randomisation import Randomisation as Randomisation
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Progress, check_progress, quiet
 from scenarios.schema import Scenario
 
 Array = np.ndarray
@@ -56,6 +56,7 @@ def make_batch(
     """
     if single := sorted(_SINGLE & set(overrides)):
         raise ScenarioError(f"make_batch() takes no {single[0]}; only make_env() does.")
+    check_progress(progress)
     chosen = scenario_with(scenario, overrides, make_batch)
     near = near_of(chosen, peers)
     fleet = prepare(chosen, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)

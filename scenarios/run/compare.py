@@ -1,34 +1,25 @@
 """Several policies on the same seeds, with paired differences."""
 
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
 from rich.console import Group
 from rich.text import Text
 
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.errors import FleetError
-from fleet.files import cache_folder
-from scenarios.policy_loader import label, policy_of, scope_of
-from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare
+from scenarios.policy_loader import label
+from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.progress import Count, Progress, quiet
+from scenarios.progress import Progress, quiet
 from scenarios.report.page import table
-from scenarios.run.evaluate import COUNTS, FIGURES, POSSIBLE, Outcome, outcomes
+from scenarios.run.evaluate import COUNTS, FIGURES, POSSIBLE, Outcome
 from scenarios.schema import Scenario
-from scenarios.statistics.means import unit
 from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
 
 Array = np.ndarray
-Models = tuple[DifficultyName, RiskName, Randomisation | None]
-Part = tuple[str, Sequence[int]]
-"""A policy, and some of the seeds."""
 
 HEADINGS = {
     "reward": "reward",
@@ -46,10 +37,20 @@ HEADINGS = {
 """Headings of the figures in the table, with units."""
 LEAST_DIGITS = {"availability": 3, "tool_drift_mm": 2}
 """Decimals of a figure; 1 for others."""
-TOGETHER = 16
-"""Shifts of a policy that are stepped side by side."""
-HERE_S = 5.0
-"""About the time that a worker process takes to start; until then this process does the work."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A shift in which a policy failed."""
+
+    policy: str
+    instance: str
+    fleet: int
+    training: int
+    seed: int
+    error: str
+    trace: str
+    """Last lines of the traceback."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ class Comparison:
 
     scenario: str
     seeds: tuple[int, ...]
+    unit: str
+    """What the intervals speak about."""
     baseline: str
     figures: dict[str, dict[str, Figure]]
     """By policy and name of the figure."""
@@ -66,11 +69,10 @@ class Comparison:
     channel: dict[str, Any]
     """`Channel.described`."""
     channel_text: str
-
-    @property
-    def unit(self) -> str:
-        """What the intervals speak about."""
-        return unit((1, 1, len(self.seeds)))
+    illegal: dict[str, int] = field(default_factory=dict)
+    """By policy: illegal actions in all its shifts."""
+    failures: tuple[Failed, ...] = ()
+    """Shifts in which a policy failed. A policy with one has no figures."""
 
     def _repr_html_(self) -> str:
         head = ("policy", *(HEADINGS[name] for name in FIGURES))
@@ -111,70 +113,39 @@ def compare(
     Raises:
         FleetError: unknown policy, one given twice, or a baseline that is not among the policies.
     """
-    for i, policy in enumerate(policies):
-        policy_of(policy)
-        if policy in policies[:i]:
-            raise FleetError(f"The policy '{policy}' is given twice; names must be unique.")
-    if baseline not in policies:
-        raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
-    folder = cache_dir or cache_folder()  # here: a worker may have started with another one
-    models = (difficulty, risk, randomise)
-    fleet = _prepared(scenario, models, folder, progress)
-    channel = scenario.channel(channel)
-    together = TOGETHER if channel.perfect else 1
-    parts = [(policy, seeds[i : i + together]) for policy in policies for i in range(0, len(seeds), together)]
-    by_policy: dict[str, list[Outcome]] = {policy: [] for policy in policies}
-    results = _run_parts(fleet, models, channel, folder, parts, workers)
-    for n, ((policy, _), result) in enumerate(zip(parts, results, strict=True)):
-        by_policy[policy] += result
-        progress("comparing", Count((n + 1) * len(seeds) * len(policies) // len(parts), len(seeds) * len(policies)))
-    figures = figures_of_shifts(by_policy, baseline)
-    scopes = {policy: scope_of(policy) for policy in policies}
-    return Comparison(scenario.name, tuple(seeds), baseline, figures, scopes, channel.described(), channel.text)
+    from scenarios.trials.contest import run_study
+    from scenarios.trials.plan import Case, Study
+    from scenarios.trials.summary import check_baseline, comparison_of
+
+    study = Study(
+        policies=policies,
+        cases=[Case(name=scenario.name, scenario=scenario, seeds=tuple(seeds))],
+        difficulties=[difficulty],
+        risk=risk,
+        randomise=randomise,
+        channel=scenario.channel(channel),
+    )
+    check_baseline(study, baseline)
+    rows = run_study(study, cache_dir=cache_dir, workers=workers, progress=progress)
+    return comparison_of(study, rows, baseline)
 
 
-def _run_parts(
-    fleet: Fleet, models: Models, channel: Channel, folder: Path, parts: Sequence[Part], workers: int
-) -> Iterator[list[Outcome]]:
-    """The outcomes of each part in order, from this process in the first seconds, then from workers."""
-    began_s, todo = time.monotonic(), list(parts)
-    while todo and (workers == 1 or time.monotonic() - began_s < HERE_S):
-        yield outcomes(fleet, *todo.pop(0), channel)
-    if not todo:
-        return
-    with Parallel(n_jobs=workers, return_as="generator") as pool:
-        for result in pool(delayed(_run_in_worker)(fleet.scenario, models, folder, *part, channel) for part in todo):
-            assert result is not None
-            yield result
-
-
-@cache
-def _fleet(scenario: Scenario, models: Models, folder: Path) -> Fleet:
-    return _prepared(scenario, models, folder)
-
-
-def _prepared(scenario: Scenario, models: Models, folder: Path, progress: Progress = quiet) -> Fleet:
-    difficulty, risk, randomise = models
-    return prepare(scenario, difficulty=difficulty, risk=risk, randomise=randomise, cache=folder, progress=progress)
-
-
-def _run_in_worker(
-    scenario: Scenario, models: Models, folder: Path, policy: str, seeds: Sequence[int], channel: Channel
-) -> list[Outcome]:
-    return outcomes(_fleet(scenario, models, folder), policy, seeds, channel)
-
-
-def figures_of_shifts(by_policy: Mapping[str, Sequence[Outcome]], baseline: str) -> dict[str, dict[str, Figure]]:
+def figures_of_shifts(
+    by_policy: Mapping[str, Sequence[Outcome]], baseline: str, shape: tuple[int, int, int, int] = (1, 1, 1, -1)
+) -> dict[str, dict[str, Figure]]:
     """The compared figures of several policies, or of other variants, by its name and that of the figure.
 
     Args:
         by_policy: On the same seeds, in the same order.
         baseline: The one that differences refer to.
+        shape: Instances, fleets, trainings and seeds. Of several instances each counts once, by its mean.
     """
-    values = {
-        policy: {name: np.array([getattr(row, name) for row in rows], dtype=float) for name in FIGURES}
-        for policy, rows in by_policy.items()
-    }
+
+    def values_of(rows: Sequence[Outcome], name: str) -> Array:
+        values = np.array([getattr(row, name) for row in rows], dtype=float).reshape(shape)
+        return values[0] if shape[0] == 1 else values.mean(axis=(1, 2, 3))
+
+    values = {policy: {name: values_of(rows, name) for name in FIGURES} for policy, rows in by_policy.items()}
     return figures_of(values, baseline, counts=COUNTS, possible=POSSIBLE)
 
 

@@ -1,13 +1,14 @@
 """A policy on several seeds, and the figures of each of its shifts."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
 
-from agents.policy import WAIT, only_choices
+from agents.policy import WAIT, Policy, only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.env.validation import actions_of
@@ -16,6 +17,7 @@ from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet
 from scenarios.run.batch import library_of
+from scenarios.run.decision_limit import DecisionLimit, TooSlow
 from scenarios.run.heat_use import HeatUse
 from scenarios.run.outcome import common_figures
 
@@ -43,6 +45,8 @@ class Outcome:
     hot_surface_min: float
 
 
+FAULTS = (Exception, SystemExit, TooSlow)
+"""What a policy may raise without ending the shifts of others."""
 FIGURES = tuple(field.name for field in fields(Outcome))
 """Names of the compared figures."""
 COUNTS = ("finished", "on_time", "faults")
@@ -53,56 +57,112 @@ POSSIBLE = {name: (0.0, math.inf) for name in FIGURES if name not in ("reward", 
 """Smallest and largest possible value of a figure."""
 
 
+@dataclass(frozen=True)
+class Played:
+    """One shift under a policy."""
+
+    outcome: Outcome | None
+    """None after an error."""
+    illegal: int
+    """Illegal actions of all arms; 0 after an error."""
+    error: BaseException | None = None
+    """What the policy raised, or why its actions could not be taken."""
+    time_s: float = 0.0
+    """Time of the error in the shift."""
+
+
 def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel = PERFECT) -> list[Outcome]:
     """The figures of a policy on each seed, independent of the other seeds.
 
+    Raises:
+        Exception: whatever the policy raises.
+    """
+    results: list[Outcome] = []
+    for played in play(fleet, policy, seeds, channel):
+        if played.error is not None:
+            raise played.error
+        assert played.outcome is not None
+        results.append(played.outcome)
+    return results
+
+
+def play(
+    fleet: Fleet,
+    policy: str,
+    seeds: Sequence[int],
+    channel: Channel = PERFECT,
+    limit_s: float | None = None,
+) -> list[Played]:
+    """The shift of each seed under a policy; an error of the policy ends its shift alone.
+
     The shifts are one batch, with an env, an exchange and a policy for each seed.
+
+    Args:
+        limit_s: Most time for a decision, s of real time.
     """
     library, channel = _library(fleet), fleet.scenario.channel(channel)
     exchanges = None if channel.perfect else [MemoryExchange(library.arms, channel) for _ in seeds]
-    weights = weights_of(fleet.scenario)
-    policies = [policy_at(policy, seed) for seed in seeds]
-    only_when_asked = only_choices(policies[0])
     env = BatchEnv(
         library,
         len(seeds),
         seed=list(seeds),
-        weights=weights,
+        weights=weights_of(fleet.scenario),
         autoreset=False,
         exchanges=exchanges,
     )
     obs, _ = env.reset()
     heat = HeatUse(env.temp_c, fleet.scenario.people.burn_c)
     reward, running = np.zeros(len(seeds)), np.ones(len(seeds), dtype=bool)
-    results: dict[int, Outcome] = {}
-    while running.any():
-        vectors, mask = obs["observation"], obs["action_mask"]
-        asked = running & mask[..., 1:-1].any(axis=(1, 2)) if only_when_asked else running
-        actions = np.full(mask.shape[:2], WAIT)
-        for e in np.flatnonzero(asked).tolist():
-            known = {arm: env.layout.read(vectors[e, a], mask[e, a]) for a, arm in enumerate(env.agents)}
-            actions[e] = actions_of(env.agents, policies[e].act(known))
-        obs, earned, finished, cut, _ = env.step(actions)
-        reward += earned
-        heat.add(env.temp_c, library.tables.dt_s)
-        over = finished | cut
-        if not over.any():
-            continue
-        state = env.state
-        for e in np.flatnonzero(over & running).tolist():
-            shift = library.draw(np.random.SeedSequence(int(seeds[e])))
-            value, dt_s = library.tables.value[shift.fleet, shift.kind], library.tables.dt_s
-            results[e] = Outcome(
-                **common_figures(state, e, value, shift.due_s, dt_s),
-                reward=float(reward[e]),
-                peak_c=float(state.peak_c[e].max()),
-                insulation_ppb=float(heat.insulation_ppb[e].max()),
-                tool_drift_mm=float(heat.tool_drift_mm[e].max()),
-                hot_surface_min=float(heat.hot_surface_min[e].sum()),
-            )
-        running &= ~over
-        if running.any():
-            obs, _ = env.reset(rows=over)  # the policy is not called for these envs any more
+    results: dict[int, Played] = {}
+    policies: dict[int, Policy] = {}
+    limit, dt_s = DecisionLimit(limit_s), library.tables.dt_s
+
+    @contextmanager
+    def guarded(e: int, time_s: float) -> Iterator[None]:
+        """End the shift of an env whose policy fails."""
+        try:
+            with limit.decision():
+                yield
+        except FAULTS as error:
+            results[e], running[e] = Played(None, 0, error, time_s), False
+
+    with limit.watching():
+        for e, seed in enumerate(seeds):
+            with guarded(e, 0.0):
+                policies[e] = policy_at(policy, seed)
+        only_when_asked = bool(policies) and only_choices(next(iter(policies.values())))
+        tick = 0
+        while running.any():
+            vectors, mask = obs["observation"], obs["action_mask"]
+            asked = running & mask[..., 1:-1].any(axis=(1, 2)) if only_when_asked else running
+            actions = np.full(mask.shape[:2], WAIT)
+            for e in np.flatnonzero(asked).tolist():
+                known = {arm: env.layout.read(vectors[e, a], mask[e, a]) for a, arm in enumerate(env.agents)}
+                with guarded(e, tick * dt_s):
+                    actions[e] = actions_of(env.agents, policies[e].act(known))
+            obs, earned, finished, cut, _ = env.step(actions)
+            tick += 1
+            reward += earned
+            heat.add(env.temp_c, dt_s)
+            over = finished | cut
+            if not over.any():
+                continue
+            state = env.state
+            for e in np.flatnonzero(over & running).tolist():
+                shift = library.draw(np.random.SeedSequence(int(seeds[e])))
+                value = library.tables.value[shift.fleet, shift.kind]
+                found = Outcome(
+                    **common_figures(state, e, value, shift.due_s, dt_s),
+                    reward=float(reward[e]),
+                    peak_c=float(state.peak_c[e].max()),
+                    insulation_ppb=float(heat.insulation_ppb[e].max()),
+                    tool_drift_mm=float(heat.tool_drift_mm[e].max()),
+                    hot_surface_min=float(heat.hot_surface_min[e].sum()),
+                )
+                results[e] = Played(found, int(state.illegal[e].sum()))
+            running &= ~over
+            if running.any():
+                obs, _ = env.reset(rows=over)  # the policy is not called for these envs any more
     return [results[e] for e in range(len(seeds))]
 
 

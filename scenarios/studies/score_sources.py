@@ -20,7 +20,7 @@ from scenarios.prepare.calibrate_twins import calibrate_networks, calibrate_twin
 from scenarios.prepare.cool_motion import records, require_cool_plans
 from scenarios.prepare.fleet import Fleet, RiskName, prepare
 from scenarios.prepare.planned_arm import PlannedArm, plan_arms
-from scenarios.prepare.train_twins import exploration_records, train_twins
+from scenarios.prepare.train_twins import exploration_records, train_twins, training_seed
 from scenarios.progress import Progress
 from scenarios.schema import Scenario
 from twin.baselines.reconstruction import untrained_config
@@ -31,8 +31,6 @@ from twin.vae.config import TwinConfig
 Array = np.ndarray
 
 BELOW_ONE = 1.0 - 1e-9
-TRAINING_STEP = 1000
-"""Between the seeds of two trainings; the first one is the scenario's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,7 @@ class DrawnFleet:
         """
         spec = self.scenario.twin
         config = (TwinConfig.quick() if spec.size == "quick" else TwinConfig()).changed(**changes or {})
-        seed = self.scenario.spread.seed + TRAINING_STEP * training
+        seed = training_seed(self.scenario, training)
         twins = train_twins(
             self.scenario,
             self.planned,
@@ -216,7 +214,7 @@ def _network(drawn: DrawnFleet, risk: RiskName) -> Fleet:
 
 
 def _random(drawn: DrawnFleet, training: int) -> Fleet:
-    return drawn.scored([_Random(drawn.scenario.spread.seed + TRAINING_STEP * training)] * len(drawn.planned))
+    return drawn.scored([_Random(training_seed(drawn.scenario, training))] * len(drawn.planned))
 
 
 SOURCES: dict[str, Source] = {

@@ -1,5 +1,7 @@
 """TorchRL takes the batch: specs, masks, seeds, resets and ends, against the batch itself."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, TransformedEnv, check_env_specs
 from torchrl.modules import MaskedCategorical
+from torchrl.objectives.value import GAE
 
 from fleet.engine.reward import TERMS
 from fleet.env.adapters.torchrl import TorchRLEnv
@@ -279,3 +282,20 @@ def test_the_example_of_the_page_discounts_by_elapsed_time(example) -> None:
         td = each["reward"][now] + gamma[now] * (1 - terminated[now]) * after[now] - value[now]
         advantage = td + 0.95 * gamma[now] * (1 - done[now]) * advantage
         torch.testing.assert_close(frames["advantage"][now].double(), advantage, rtol=1e-3, atol=1e-2)
+
+
+def test_flags_of_the_arms_are_those_of_the_env(example) -> None:
+    """The second example of the page: GAE wants flags in the shape of the reward, and takes the expanded ones."""
+    told = example("TorchRL")
+    page = (Path(__file__).parents[2] / "docs" / "trainers.md").read_text(encoding="utf-8")
+    second = page.partition("## TorchRL\n")[2].split("```python\n")[2].split("```")[0]
+    keys = {"value": told["value"], "reward": ("arms", "reward")}
+    plain = GAE(gamma=0.99, lmbda=0.95, value_network=told["critic"])
+    plain.set_keys(**keys)
+    with pytest.raises(RuntimeError, match="must share a unique shape"):
+        plain(told["frames"].clone())
+    exec(second, told)
+    frames = told["frames"]
+    for flag in ("done", "terminated"):
+        assert (frames["next", "arms", flag] == frames["next", flag][..., None, :]).all()
+    assert frames["advantage"].shape == frames["next", "arms", "reward"].shape

@@ -33,14 +33,14 @@ def compared(scenario: Scenario, plans: Path, workers: int, **changes) -> Compar
 def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, monkeypatch, channel):
     how = {"seeds": range(6), "channel": channel}
     alone = compared(scenario, plans, workers=1, **how)
-    monkeypatch.setattr("scenarios.run.compare.TOGETHER", 4)
+    monkeypatch.setattr("scenarios.trials.plan.TOGETHER", 4)
     assert compared(scenario, plans, workers=1, **how) == alone
-    monkeypatch.setattr("scenarios.run.compare.HERE_S", 0.0)
+    monkeypatch.setattr("scenarios.trials.contest.HERE_S", 0.0)
     assert compared(scenario, plans, workers=2, **how) == alone
 
 
 def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
-    monkeypatch.setattr("scenarios.run.compare.Parallel", None)
+    monkeypatch.setattr("scenarios.trials.contest.LocalWorker", None)
     told: list[tuple[str, float]] = []
     compared(scenario, plans, workers=2, progress=lambda stage, share: told.append((stage, share)))
     assert [share for stage, share in told if stage == "comparing"] == [0.5, 1.0]

@@ -1,0 +1,202 @@
+"""What a study runs: every policy on every instance, fleet, training and seed, with every source of scores."""
+
+import hashlib
+import platform
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.errors import FleetError
+from fleet.seeding import child
+from scenarios.policy_loader import Unusable, policy_of, source_of
+from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
+from scenarios.prepare.randomisation import Randomisation
+from scenarios.run.evaluate import FIGURES, Outcome
+from scenarios.run.provenance import code_hash
+from scenarios.run.shift import scenario_hash
+from scenarios.schema import Scenario
+
+TOGETHER = 16
+"""Shifts of a policy that are stepped side by side."""
+DECISION_LIMIT_S = 60.0
+_LIBRARIES = ("thermofleet", "numpy", "numba", "scipy", "mujoco", "torch")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """An instance: one scenario, and the seeds of its shifts."""
+
+    name: str
+    scenario: Scenario
+    seeds: tuple[int, ...]
+
+
+def seeds_of_instance(seed: int, count: int) -> tuple[int, ...]:
+    """The seed of an instance of a suite, and others made of it, so that no two instances share a draw by accident."""
+    more = [int(child(np.random.SeedSequence([seed, 2]), k).generate_state(1)[0]) for k in range(1, count)]
+    return (seed, *more)
+
+
+class Key(NamedTuple):
+    """Which shift a row is of."""
+
+    policy: str
+    instance: str
+    fleet: int
+    """Draw of the arms: `spread.seed` of the scenario plus this."""
+    training: int
+    """Training of the twins, from 0."""
+    difficulty: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """The result of one shift."""
+
+    key: Key
+    outcome: Outcome | None
+    """None if the policy failed."""
+    illegal: int = 0
+    """Illegal actions of all arms."""
+    error: str | None = None
+    """What went wrong, in a sentence."""
+    trace: str | None = None
+    """Last lines of the traceback."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Some shifts that one process runs at once."""
+
+    policy: str
+    case: Case
+    """With the seeds of this unit only."""
+    fleet: int
+    training: int
+    difficulty: DifficultyName
+    deaths: int = field(default=0, compare=False)
+    """How many processes died while they ran it."""
+
+    @property
+    def keys(self) -> list[Key]:
+        """The rows it gives."""
+        of = (self.policy, self.case.name, self.fleet, self.training, self.difficulty)
+        return [Key(*of, seed) for seed in self.case.seeds]
+
+    @property
+    def group(self) -> tuple[str, int, int, str]:
+        """Units of one group share a prepared fleet."""
+        return self.case.name, self.fleet, self.training, self.difficulty
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Policies, instances and everything that they are run with."""
+
+    policies: Sequence[str]
+    cases: Sequence[Case]
+    fleets: int = 1
+    trainings: int = 1
+    """Only difficulty `twin` has trainings; the others have one."""
+    difficulties: Sequence[DifficultyName] = ("twin",)
+    risk: RiskName = RISK
+    randomise: Randomisation | None = None
+    channel: Channel = PERFECT
+    """Of scenarios that have no channel of their own."""
+    decision_limit_s: float | None = DECISION_LIMIT_S
+
+    def __post_init__(self) -> None:
+        for what, given in (
+            ("policy", self.policies),
+            ("instance", [case.name for case in self.cases]),
+            ("difficulty", self.difficulties),
+        ):
+            for i, name in enumerate(given):
+                if name in given[:i]:
+                    raise FleetError(f"The {what} '{name}' is given twice; names must be unique.")
+        for policy in self.policies:
+            check_policy(policy)
+
+    def units(self, done: set[Key]) -> Iterator[Unit]:
+        """What is left to run, in order: units of one group follow each other."""
+        together = TOGETHER if self.channel.perfect else 1
+        for case in self.cases:
+            for difficulty in self.difficulties:
+                for fleet in range(self.fleets):
+                    for training in range(self.trainings_of(difficulty)):
+                        for policy in self.policies:
+                            of = (policy, case.name, fleet, training, difficulty)
+                            left = [seed for seed in case.seeds if Key(*of, seed) not in done]
+                            for i in range(0, len(left), together):
+                                part = Case(name=case.name, scenario=case.scenario, seeds=tuple(left[i : i + together]))
+                                yield Unit(policy, part, fleet, training, difficulty)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Fleets, trainings and seeds of an instance: the order of a policy's rows."""
+        return self.fleets, max(map(self.trainings_of, self.difficulties)), len(self.cases[0].seeds)
+
+    def trainings_of(self, difficulty: DifficultyName) -> int:
+        """How many trainings a source of scores has."""
+        return self.trainings if difficulty == "twin" else 1
+
+    def card(self) -> dict[str, object]:
+        """What makes two results comparable: hashes of code, scenarios and policies, versions, settings."""
+        return {
+            "code_hash": code_hash(),
+            "versions": {"python": platform.python_version()} | dict(_versions()),
+            "risk": self.risk,
+            "randomise": asdict(self.randomise or Randomisation()),
+            "channel": self.channel.described(),
+            "decision_limit_s": self.decision_limit_s,
+            "figures": list(FIGURES),
+            "instances": {case.name: scenario_hash(case.scenario) for case in self.cases},
+            "policies": {policy: policy_hash(policy) for policy in self.policies},
+        }
+
+
+def _versions() -> Iterator[tuple[str, str | None]]:
+    for name in _LIBRARIES:
+        try:
+            yield name, version(name)
+        except PackageNotFoundError:
+            yield name, None
+
+
+def check_policy(name: str) -> None:
+    """Check that there is such a policy. One that is there and cannot be made fails later, shift by shift.
+
+    Raises:
+        FleetError: no such rule, file, module, class or folder, or one that is no policy.
+    """
+    try:
+        policy_of(name)
+    except Unusable:
+        return
+    except FleetError:
+        raise
+    except Exception:  # whatever its own code raises
+        return
+
+
+def policy_hash(name: str) -> str:
+    """Hash of the files of a policy; "" of a rule, which belongs to the code."""
+    source = source_of(name)
+    if source is None:
+        return ""
+    digest = hashlib.sha256()
+    files = sorted(path for path in source.rglob("*") if path.is_file()) if source.is_dir() else [source]
+    for path in files:
+        digest.update(f"{path.relative_to(source) if source.is_dir() else path.name}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def columns(row: Row) -> dict[str, object]:
+    """A row as columns: key, figures, illegal, error, trace."""
+    figures = dict.fromkeys(FIGURES) if row.outcome is None else asdict(row.outcome)
+    return {**row.key._asdict(), **figures, "illegal": row.illegal, "error": row.error, "trace": row.trace}

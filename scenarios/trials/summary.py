@@ -1,0 +1,126 @@
+"""From rows to figures and differences, and what a table says of policies that failed."""
+
+from collections.abc import Iterable, Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from fleet.errors import FleetError
+from scenarios.policy_loader import label, scope_of
+from scenarios.run.compare import Comparison, Failed, comparison_table, figures_of_shifts
+from scenarios.run.evaluate import Outcome
+from scenarios.statistics.means import unit
+from scenarios.trials.plan import Case, Row, Study
+
+MOST_FAILURES = 8
+"""Failed policies whose first failure a table tells."""
+
+
+def competitors(study: Study) -> dict[tuple[str, str], str]:
+    """What a table calls each policy with each source of scores: POLICY, or POLICY@SOURCE if there are several."""
+    several = len(study.difficulties) > 1
+    return {(p, d): f"{p}@{d}" if several else p for d in study.difficulties for p in study.policies}
+
+
+def check_baseline(study: Study, baseline: str) -> None:
+    """Check that the baseline is compared.
+
+    Raises:
+        FleetError: it is not; names what is.
+    """
+    names = competitors(study).values()
+    if baseline not in names:
+        raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(names)}.")
+
+
+def comparison_of(study: Study, rows: Sequence[Row], baseline: str, name: str | None = None) -> Comparison:
+    """The figures of each policy over the fleets, trainings and seeds of all instances of the rows, and its differences
+    to the baseline.
+
+    Args:
+        rows: In the order of the study.
+        baseline: One of `competitors`.
+        name: Of the instances together; default: that of the only one.
+    """
+    names = competitors(study)
+    shifts: dict[str, list[Row]] = {each: [] for each in names.values()}
+    for row in rows:
+        shifts[names[row.key.policy, row.key.difficulty]].append(row)
+    failures = [
+        Failed(each, k.instance, k.fleet, k.training, k.seed, row.error, row.trace or "")
+        for each, of in shifts.items()
+        for row in of
+        if row.error is not None
+        for k in [row.key]
+    ]
+    failed, count = {each.policy for each in failures}, len({row.key.instance for row in rows})
+    whole = {each: repeated(study, of) for each, of in shifts.items() if each not in failed}
+    return Comparison(
+        scenario=name or rows[0].key.instance,
+        seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
+        unit=unit(study.shape) if count == 1 else f"{count} instances",
+        baseline=baseline,
+        figures=figures_of_shifts(whole, baseline, (count, *study.shape)) if baseline in whole else {},
+        scopes={names[p, d]: scope_of(p) if names[p, d] in whole else "failed" for p, d in names},
+        channel=study.channel.described(),
+        channel_text=study.channel.text,
+        illegal={each: sum(row.illegal for row in of) for each, of in shifts.items()},
+        failures=tuple(failures),
+    )
+
+
+def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:
+    """The outcomes of one policy, those without trainings once for each training: in the order of `Study.shape`."""
+    of: dict[tuple[str, int, int], list[Outcome]] = {}
+    for row in rows:
+        assert row.outcome is not None
+        of.setdefault((row.key.instance, row.key.fleet, row.key.training), []).append(row.outcome)
+    found: list[Outcome] = []
+    for instance, fleet in dict.fromkeys((instance, fleet) for instance, fleet, _ in of):
+        for training in range(study.shape[1]):
+            found += of.get((instance, fleet, training), of[instance, fleet, 0])
+    return found
+
+
+def comparisons(study: Study, rows: Sequence[Row], baseline: str, suite: str | None = None) -> list[Comparison]:
+    """One comparison of all instances of a suite, or one for each instance."""
+    check_baseline(study, baseline)
+    if suite:
+        return [comparison_of(study, rows, baseline, f"{suite}, {counted(study.cases)}")]
+    of = {case.name: [row for row in rows if row.key.instance == case.name] for case in study.cases}
+    return [comparison_of(study, own, baseline) for own in of.values()]
+
+
+def counted(cases: Sequence[Case]) -> str:
+    """How many instances there are."""
+    return f"{len(cases)} instance{'s' if len(cases) > 1 else ''}"
+
+
+def result_page(result: Comparison) -> Group:
+    """The table of a comparison, then its illegal actions and failures."""
+    parts: list[RenderableType] = [comparison_table(result)] if result.figures else []
+    if any(result.illegal.values()):
+        told = ", ".join(f"{label(policy)} {count}" for policy, count in result.illegal.items() if count)
+        parts.append(Text(f"Illegal actions, which count as waits: {told}."))
+    if result.failures:
+        parts.append(failure_table(result.failures))
+    if not result.figures:
+        parts.append(Text(f"No differences: the baseline {label(result.baseline)} failed. Give another --baseline."))
+    return Group(*parts)
+
+
+def failure_table(failures: Sequence[Failed]) -> Group:
+    """How often each policy failed, with its first failure."""
+    first: dict[str, Failed] = {}
+    for each in failures:
+        first.setdefault(each.policy, each)
+    table = Table(box=None, pad_edge=False)
+    for head in ("failed policy", "shifts", "first in", "seed"):
+        table.add_column(head, justify="right" if head in ("shifts", "seed") else "left", overflow="fold")
+    for policy, each in first.items():
+        count = sum(other.policy == policy for other in failures)
+        table.add_row(label(policy), str(count), each.instance, str(each.seed))
+    shown = list(first.values())[:MOST_FAILURES]
+    texts = [Text(f"\n{label(each.policy)}: {each.error}\n{each.trace}".rstrip()) for each in shown]
+    return Group(table, *texts)

@@ -1,0 +1,300 @@
+"""Studies: the same rows on any number of processes and after any interruption; failures are told, the rest goes on."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from fleet.errors import FleetError
+from scenarios.load import load, override
+from scenarios.prepare import fleet as preparing
+from scenarios.prepare.fleet import prepare
+from scenarios.run.evaluate import FIGURES, outcomes
+from scenarios.schema import Scenario
+from scenarios.trials import contest, fleets, run_unit
+from scenarios.trials.plan import Case, Key, Row, Study, Unit, seeds_of_instance
+from scenarios.trials.store import RESULTS, opened, read_rows
+from scenarios.trials.summary import comparison_of, comparisons, result_page
+
+BAD = """
+import os, pathlib
+class Idle:
+    scope = "central"
+    def reset(self, rng): self.asked, self.drawn = 0, rng.random()
+    def act(self, seen): return {}
+class Raises(Idle):
+    def act(self, seen):
+        self.asked += 1
+        return seen["nobody"] if self.asked == 4 else {}
+class Nonsense(Idle):
+    def act(self, seen): return dict.fromkeys(seen, "wait")
+class Needs(Idle):
+    def __init__(self, weight): pass
+class Stuck(Idle):
+    def act(self, seen):
+        while True:
+            try:
+                while True: pass
+            except Exception: pass
+class Illegal(Idle):
+    def act(self, seen): return dict.fromkeys(seen, 10**30)
+class DiesOnce(Idle):
+    def act(self, seen):
+        mark = pathlib.Path(__file__).with_name("died")
+        if not mark.exists():
+            mark.touch()
+            os._exit(3)
+        return {}
+class DiesInOne(Idle):
+    def act(self, seen):
+        if abs(self.drawn - DRAWN) < 1e-12: os._exit(3)
+        return {}
+"""
+
+
+@pytest.fixture
+def scenario(small_toml: Path) -> Scenario:
+    return load(small_toml)
+
+
+@pytest.fixture
+def bad(tmp_path: Path) -> Path:
+    from scenarios.policy_loader import policy_at
+
+    path = tmp_path / "bad.py"
+    path.write_text(BAD.replace("DRAWN", "0.0"), encoding="utf-8")
+    drawn = policy_at(f"{path}:Idle", 1).drawn  # pyright: ignore[reportAttributeAccessIssue]  # of the file
+    path.write_text(BAD.replace("DRAWN", repr(drawn)), encoding="utf-8")
+    return path
+
+
+def study_of(scenario: Scenario, *policies: str, seeds: int = 3, **more) -> Study:
+    case = Case(name=scenario.name, scenario=scenario, seeds=tuple(range(seeds)))
+    how = {"policies": policies or ("random", "round_robin"), "cases": [case], "difficulties": ["blind"]}
+    return Study(**(how | more))
+
+
+def test_rows_do_not_depend_on_processes_folders_and_blocks(scenario, plans, tmp_path, monkeypatch):
+    study = study_of(scenario, seeds=5, fleets=2)
+    alone = contest.run_study(study, cache_dir=plans, workers=1)
+    assert [row.key for row in alone] == [
+        Key(policy, "heat", fleet, 0, "blind", seed)
+        for fleet in range(2)
+        for policy in ("random", "round_robin")
+        for seed in range(5)
+    ]
+    fleet = prepare(replace(scenario, spread=replace(scenario.spread, seed=1)), difficulty="blind", cache=plans)
+    assert [row.outcome for row in alone[10:15]] == outcomes(fleet, "random", range(5))
+    assert alone[0].outcome != alone[10].outcome
+    assert contest.run_study(study, out=tmp_path / "one", cache_dir=plans, workers=1) == alone
+    monkeypatch.setattr("scenarios.trials.plan.TOGETHER", 2)
+    monkeypatch.setattr(contest, "HERE_S", 0.0)
+    assert contest.run_study(study, out=tmp_path / "two", cache_dir=plans, workers=2) == alone
+    one, two = ((tmp_path / name / RESULTS).read_bytes() for name in ("one", "two"))
+    assert one == two
+    columns = ["policy", "instance", "fleet", "training", "difficulty", "seed", *FIGURES, "illegal", "error", "trace"]
+    assert pq.read_table(tmp_path / "two" / RESULTS).column_names == columns
+
+
+def test_an_interrupted_study_goes_on_where_it_was(scenario, plans, tmp_path, monkeypatch):
+    monkeypatch.setattr("scenarios.trials.plan.TOGETHER", 2)
+    study = study_of(scenario, seeds=5)
+    whole = contest.run_study(study, out=tmp_path / "whole", cache_dir=plans, workers=1)
+    out, ran = tmp_path / "out", []
+
+    def stop_at(count: int):
+        def run(unit, settings):
+            if len(ran) == count:
+                raise KeyboardInterrupt
+            ran.append(unit)
+            return run_unit.run_unit(unit, settings)
+
+        return run
+
+    for most in (1, 1, 4, 5, 6):
+        monkeypatch.setattr(contest, "run_unit", stop_at(most))
+        if most < 6:
+            with pytest.raises(KeyboardInterrupt):
+                contest.run_study(study, out=out, cache_dir=plans, workers=1)
+            (out / "parts" / ".draft.parquet").write_bytes(b"PAR1")  # as a killed process may leave
+            assert len(read_rows(out)) == sum(len(unit.case.seeds) for unit in ran)
+        else:
+            (out / "parts" / ".draft.parquet").unlink()
+            assert contest.run_study(study, out=out, cache_dir=plans, workers=1) == whole
+    assert len(ran) == 6
+    assert (out / RESULTS).read_bytes() == (tmp_path / "whole" / RESULTS).read_bytes()
+    assert contest.run_study(study, out=out, cache_dir=plans, workers=1) == whole  # nothing runs: it would stop
+    more = study_of(scenario, "random", "wspt", seeds=5)
+    monkeypatch.setattr(contest, "run_unit", run_unit.run_unit)
+    added = contest.run_study(more, out=out, cache_dir=plans, workers=1)
+    assert added == contest.run_study(more, cache_dir=plans, workers=1)
+    assert {row.key.policy for row in read_rows(out)} == {"random", "round_robin", "wspt"}
+
+
+def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
+    out = tmp_path / "out"
+    own = f"{bad}:Idle"
+    study = study_of(scenario, own, "random")
+    contest.run_study(study, out=out, cache_dir=plans, workers=1)
+    hot = override(scenario, horizon_s=120.0)
+    cases = [
+        (study_of(hot, own, "random"), "holds a study in which instance 'heat' was another one"),
+        (replace(study, decision_limit_s=5.0), r"holds a study with decision_limit_s 60\.0, not 5\.0; give another"),
+    ]
+    for other, said in cases:
+        with pytest.raises(FleetError, match=said):
+            contest.run_study(other, out=out, cache_dir=plans, workers=1)
+    bad.write_text(bad.read_text() + "\n", encoding="utf-8")
+    with pytest.raises(FleetError, match=f"in which policy '{own}' was another one"):
+        contest.run_study(study, out=out, cache_dir=plans, workers=1)
+    with opened(tmp_path / "busy", study.card()), pytest.raises(FleetError, match="Another process writes to"):
+        contest.run_study(study, out=tmp_path / "busy", cache_dir=plans, workers=1)
+    with pytest.raises(FleetError, match="holds other files"):
+        contest.run_study(study, out=tmp_path, cache_dir=plans, workers=1)
+
+
+def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, tmp_path):
+    names = {name: f"{bad}:{name}" for name in ("Raises", "Nonsense", "Needs", "Stuck", "Illegal", "Idle")}
+    study = study_of(scenario, "round_robin", *names.values(), seeds=2, decision_limit_s=0.2)
+    rows = contest.run_study(study, out=tmp_path / "out", cache_dir=plans, workers=1)
+    by_policy = {policy: [row for row in rows if row.key.policy == policy] for policy in study.policies}
+    alone = contest.run_study(study_of(scenario, "round_robin", seeds=2), cache_dir=plans, workers=1)
+    assert by_policy["round_robin"] == alone
+    said = {
+        "Raises": ("KeyError: 'nobody' (at 30 s of the shift)", 'return seen["nobody"]'),
+        "Nonsense": ("ValueError: The action of 'left' must be one integer (got 'wait').", "validation.py"),
+        "Needs": ("must be a class that is created without arguments", "policy_loader.py"),
+        "Stuck": ("TooSlow: a decision took longer than 0.2 s", "while True: pass"),
+    }
+    for name, (error, trace) in said.items():
+        for seed, row in enumerate(by_policy[names[name]]):
+            assert row.key.seed == seed
+            assert row.outcome is None
+            assert error in (row.error or "")
+            assert trace in (row.trace or "")
+    idle, illegal = (by_policy[names[name]] for name in ("Idle", "Illegal"))
+    assert [row.outcome for row in idle] == [row.outcome for row in illegal]  # what is illegal is a wait
+    assert [row.illegal for row in idle] == [0, 0]
+    assert [row.illegal for row in illegal] == [36, 36]  # two arms, 18 decisions
+    assert read_rows(tmp_path / "out") == sorted(rows, key=lambda row: row.key)
+
+    result = comparison_of(study, rows, "round_robin")
+    assert set(result.figures) == {"round_robin", names["Illegal"], names["Idle"]}
+    assert {(each.policy, each.seed) for each in result.failures} == {(names[n], s) for n in said for s in (0, 1)}
+    failed = comparison_of(study, rows, names["Raises"])
+    assert not failed.figures
+    assert result_page(failed)
+
+
+def test_shifts_of_a_process_that_dies_are_run_again(scenario, plans, bad, monkeypatch):
+    monkeypatch.setattr(contest, "HERE_S", 0.0)
+    told: list[str] = []
+    study = study_of(scenario, f"{bad}:DiesOnce", f"{bad}:DiesInOne", f"{bad}:Idle")
+    rows = contest.run_study(study, cache_dir=plans, workers=2, tell=told.append)
+    once, one, idle = ([row.outcome for row in rows[i : i + 3]] for i in (0, 3, 6))
+    assert once == idle
+    assert one == [idle[0], None, idle[2]]
+    assert rows[4].error == "The process that ran it died 3 times."
+    assert len(told) == 4
+    assert sum(sentence.endswith("seed 1: given up.") for sentence in told) == 1
+
+
+def test_instances_of_one_cell_share_a_prepared_fleet(scenario, plans, monkeypatch):
+    """And have the outcomes of fleets that are prepared for each."""
+    hold, sort = scenario.jobs
+    scenarios = [
+        scenario,
+        replace(scenario, name="late", jobs=(replace(hold, due_s=30.0), replace(sort, value=3.0, repetitions=(2, 4)))),
+        replace(scenario, name="paid", reward=replace(scenario.reward, tardiness=-0.1), slots=3),
+        replace(scenario, name="warm", ambient=replace(scenario.ambient, points=((0.0, 45.0),))),
+    ]
+    made: list[str] = []
+
+    def counted(scenario, **more):
+        made.append(scenario.name)
+        return preparing.prepare(scenario, **more)
+
+    monkeypatch.setattr(fleets, "prepare", counted)
+    monkeypatch.setattr(run_unit, "fleets", fleets.Fleets())
+    monkeypatch.setattr(contest.here, "fleets", run_unit.fleets)
+    cases = [Case(name=each.name, scenario=each, seeds=(7,)) for each in scenarios]
+    for difficulty in ("blind", "oracle"):
+        made.clear()
+        study = Study(policies=["round_robin"], cases=cases, difficulties=[difficulty])
+        rows = contest.run_study(study, cache_dir=plans, workers=1)
+        assert made == ["heat", "warm"]
+        alone = [prepare(each, difficulty=difficulty, cache=plans) for each in scenarios]
+        assert [row.outcome for row in rows] == [outcomes(fleet, "round_robin", [7])[0] for fleet in alone]
+
+
+def test_several_instances_are_told_apart_or_together(scenario, plans):
+    warm = replace(scenario, name="warm", ambient=replace(scenario.ambient, points=((0.0, 45.0),)))
+    cases = [Case(name=each.name, scenario=each, seeds=(0, 1)) for each in (scenario, warm)]
+    study = Study(policies=["random", "round_robin"], cases=cases, difficulties=["blind", "oracle"])
+    rows = contest.run_study(study, cache_dir=plans, workers=1)
+    apart = comparisons(study, rows, "random@oracle")
+    assert [each.scenario for each in apart] == ["heat", "warm"]
+    (together,) = comparisons(study, rows, "random@oracle", "both")
+    names = ["random@blind", "round_robin@blind", "random@oracle", "round_robin@oracle"]
+    assert list(together.figures) == names
+    for name in names:
+        means = [each.figures[name]["peak_c"].mean for each in apart]
+        assert together.figures[name]["peak_c"].mean == pytest.approx(np.mean(means))
+    with pytest.raises(FleetError, match="'random' is not among the policies compared: random@blind, "):
+        comparisons(study, rows, "random")
+
+
+def test_seeds_of_instances_are_their_own():
+    drawn = [seed for instance in range(50) for seed in seeds_of_instance(instance, 20)]
+    assert len(set(drawn)) == 1000
+    assert seeds_of_instance(7, 3)[0] == 7
+    assert seeds_of_instance(7, 3) == seeds_of_instance(7, 20)[:3]
+
+
+def test_a_worker_stays_with_its_group_and_helps_others_at_the_end(scenario):
+    from scenarios.trials.workers import Queue
+
+    def units(name: str, count: int) -> list[Unit]:
+        return [Unit(str(i), Case(name=name, scenario=scenario, seeds=(0,)), 0, 0, "blind") for i in range(count)]
+
+    queue = Queue([*units("a", 4), *units("b", 2)])
+    first, second = queue.take(), queue.take()
+    assert (first.case.name, second.case.name) == ("a", "b")
+    assert queue.take(second.group).group == second.group
+    assert queue.take(second.group).group == first.group
+    queue.put_back(replace(first, case=replace(first.case, seeds=(5, 6))))
+    assert [queue.take(first.group).case.seeds for _ in range(4)] == [(5,), (6,), (0,), (0,)]
+    assert not queue
+
+
+def test_a_row_without_outcome_has_a_sentence():
+    row = Row(Key("p", "i", 0, 0, "blind", 1), None, error="It died.")
+    from scenarios.trials.plan import columns
+    from scenarios.trials.store import row_of
+
+    assert row_of(columns(row)) == row
+
+
+def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet, small_toml, bad, tmp_path):
+    out = tmp_path / "study"
+    how = ("--difficulty", "blind", "--seeds", "2", "--jobs", "1", "--out", out)
+    said = thermofleet("compare", small_toml, "--policies", f"round_robin,{bad}:Raises,{bad}:Illegal", *how)
+    assert said.code == 0
+    assert "Raises: KeyError: 'nobody' (at 30 s of the shift)" in said.out
+    assert "Illegal actions, which count as waits: Illegal 72." in said.out
+    assert len(read_rows(out)) == 6
+    told = thermofleet("compare", "--suite", small_toml, "--policies", "wspt,random", *how, "--fleets", "2", "--json")
+    assert msgspec.json.decode(told.out)["scenario"] == f"{small_toml}, 1 instance"
+    assert len(read_rows(out)) == 14
+    for wrong, sentence in (
+        ((), "Give either scenarios or --suite."),
+        ((small_toml, "--suite", "test"), "Give either scenarios or --suite."),
+        ((small_toml, "--jobs", "2", "--ray", "auto"), "Give either --jobs or --ray."),
+        ((small_toml, "--difficulty", "blind,oracel"), "No difficulty 'oracel'; did you mean 'oracle'?"),
+    ):
+        said = thermofleet("compare", *wrong)
+        assert said.code != 0
+        assert sentence in said.err
