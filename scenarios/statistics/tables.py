@@ -77,10 +77,7 @@ def figures_of(
             made[policy, name] = own, Interval(0.0, 0.0, 0.0) if policy == baseline else to_base
     adjusted = dict(zip(made, holm([to_base.p for _, to_base in made.values()]).tolist(), strict=True))
     return {
-        policy: {
-            name: _figure(*made[policy, name], x, adjusted[policy, name] if policy != baseline else math.nan)
-            for name, x in figures.items()
-        }
+        policy: {name: _figure(*made[policy, name], x, adjusted[policy, name]) for name, x in figures.items()}
         for policy, figures in values.items()
     }
 

@@ -50,6 +50,13 @@ def test_without_differences_between_seeds_the_interval_is_that_of_fleets() -> N
     assert (found.low, found.high) == pytest.approx(student(fleets), rel=0.01)
 
 
+def test_fleets_and_seeds_that_differ_as_much_add_their_variances() -> None:
+    effect = np.linspace(-1.0, 1.0, 41)
+    found = interval(effect[:, None, None] + effect)
+    variance = 2 * effect.var(ddof=1) / 41
+    assert found.margin == pytest.approx(stats.t.ppf(0.975, 40) * np.sqrt(variance), rel=0.02)
+
+
 def test_trainings_are_the_sample_within_a_single_fleet_unless_they_change_nothing() -> None:
     trainings = np.array([1.0, 4.0, 7.0])
     found = interval(np.tile(trainings[None, :, None], (1, 1, 500)))
