@@ -47,7 +47,7 @@ def test_every_work_can_be_done_by_two_arms_or_more(fleet):
 
 
 def test_a_scenario_says_what_it_is(fleet):
-    assert fleet.scenario.description.endswith(".")
+    assert fleet.scenario.description.endswith((".", "?"))
     assert len(fleet.scenario.arms) >= 2
 
 
