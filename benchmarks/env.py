@@ -80,8 +80,8 @@ def library(difficulty: DifficultyName, arms: int = 4, peers: int | None = None)
     """
     scenario = load("quickstart")
     times = arms // len(scenario.arms)
-    one = library_of([prepare(scenario, difficulty=difficulty)], Randomisation(arrivals=(times, times)))
-    fewer = library_of([prepare(replace(scenario, arms=scenario.arms[:-1]), difficulty="blind")])
+    one = library_of(prepare(scenario, difficulty=difficulty, randomise=Randomisation(arrivals=(times, times))))
+    fewer = library_of(prepare(replace(scenario, arms=scenario.arms[:-1]), difficulty="blind"))
     repeated = {}
     for name, table, shorter in zip(Tables._fields, one.tables, fewer.tables, strict=True):
         axes = list(zip(np.shape(table), np.shape(shorter), strict=True))

@@ -87,7 +87,8 @@ def large_cell(arms: int, difficulty: DifficultyName, arrivals: float = 1.0) -> 
     if arms % 4 or arms < 4:
         raise ValueError(f"The number of arms must be a multiple of four (got {arms}).")
     times, rate = arms // 4, arms / 4 * arrivals
-    one = library_of([prepare(load("quickstart"), difficulty=difficulty)], Randomisation(arrivals=(rate, rate)))
+    randomise = Randomisation(arrivals=(rate, rate))
+    one = library_of(prepare(load("quickstart"), difficulty=difficulty, randomise=randomise))
     tables = one.tables._replace(
         ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),
         feasible=np.tile(one.tables.feasible, (1, 1, times)),
