@@ -66,6 +66,13 @@ def compare_command(
     decision_limit: Annotated[
         float, options.number("Longest time for one decision of a policy, s. A slower policy fails.", 0.001, 86_400)
     ] = 60.0,
+    references: Annotated[
+        Path | None,
+        typer.Option(
+            help="Rows of `thermofleet bounds`, for normalised scores; the splits validation and test have their own.",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -98,12 +105,15 @@ def compare_command(
     from scenarios.trials.cases import cases_of, suite_of
     from scenarios.trials.contest import run_study
     from scenarios.trials.plan import Study
+    from scenarios.trials.scores import references_of
     from scenarios.trials.summary import check_baseline, comparisons, competitors, result_page
 
     if bool(scenario) == bool(suite):
         raise FleetError("Give either scenarios or --suite.")
     if jobs is not None and ray is not None:
         raise FleetError("Give either --jobs or --ray.")
+    if references is not None and not references.is_file():
+        raise FleetError(f"There is no file of references '{references}'; make it with `thermofleet bounds`.")
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
     channels = [
         options.channel_of(
@@ -125,9 +135,10 @@ def compare_command(
     names = list(competitors(study).values())
     base = baseline or next((name for name in names if name.partition("@")[0] == "round_robin"), names[0])
     check_baseline(study, base)
+    known = references_of(cases, references)
     with progress_bar(kept="Finished shifts, plans and twins are" if out else KEPT) as progress:
         rows = run_study(study, out=out, workers=jobs or -1, ray=ray, progress=progress, tell=say)
-    results = comparisons(study, rows, base, suite)
+    results = comparisons(study, rows, base, suite, known)
     if as_json:
         print_json(results[0] if len(results) == 1 else results)
         return
