@@ -4,6 +4,7 @@ import re
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from functools import reduce
 from math import isfinite
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from fleet.files import cache_folder
 from fleet.seeding import child
 from scenarios.bounds.hindsight import SIDE_BY_SIDE, Budget, hindsight
 from scenarios.bounds.relaxation import Relaxation
-from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, without_scores
+from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, Simulated, without_scores
 from scenarios.bounds.upper import upper_bound
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
@@ -112,8 +113,10 @@ def reference(
     entropy = np.random.SeedSequence(task.seed)
     episode, weights = ShiftFactory(fleet)(entropy), weights_of(fleet.scenario)
     world = episode.world
-    rules = ShiftSimulator(world, weights, len(STARTS), noise_key=episode.noise_key)
-    starts = rules.follow([policy_at(name, task.seed) for name in STARTS])
+    rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key)
+    # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
+    each = [rules.follow([policy_at(name, task.seed)]) for name in STARTS]
+    starts = reduce(Simulated.and_, each)
     best = int(starts.reward.argmax())
     rule, best_rule = STARTS[best], float(starts.reward[best])
     bare = without_scores(world)
