@@ -12,7 +12,7 @@ from scenarios.policy_loader import label, scope_of
 from scenarios.run.compare import Comparison, Failed, comparison_table, figures_of_shifts
 from scenarios.run.evaluate import Outcome
 from scenarios.statistics.means import unit
-from scenarios.statistics.scores import FEWEST, score_tables, scores_of
+from scenarios.statistics.scores import FEWEST, Normalised, score_tables, scores_of
 from scenarios.statistics.tables import LEGEND
 from scenarios.trials.plan import Case, Row, Study
 from scenarios.trials.scores import Shift, normalised
@@ -94,6 +94,12 @@ def rows_of_competitors(study: Study, rows: Iterable[Row]) -> dict[str, list[Row
     for row in rows:
         shifts[names[row.key.policy, row.key.difficulty]].append(row)
     return shifts
+
+
+def scores_over_all(study: Study, rows: Sequence[Row], references: "Mapping[Shift, Reference]") -> Normalised | None:
+    """Scores of the policies without a failure over all instances; None without references."""
+    shifts = rows_of_competitors(study, rows)
+    return normalised({each: of for each, of in shifts.items() if not any(row.error for row in of)}, references)
 
 
 def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:

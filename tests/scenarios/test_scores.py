@@ -28,6 +28,10 @@ REFERENCES = {
 }
 
 
+def scored(by_policy: dict[str, list[Row]], known: dict[tuple[str, int], Known], **more: bool):
+    return normalised(by_policy, known, **more)  # pyright: ignore[reportArgumentType]  # a stand-in
+
+
 def rows_of(policy: str, rewards: dict[int, float | None], trainings: int = 1) -> list[Row]:
     """A row for each shift and training; training k has k more reward, None is a failure."""
     blank = Outcome(**dict.fromkeys(FIGURES, 0.0))
@@ -40,7 +44,7 @@ def rows_of(policy: str, rewards: dict[int, float | None], trainings: int = 1) -
 
 def test_scores_are_shares_of_the_way_from_random_to_hindsight():
     by_policy = {"a": rows_of("a", {0: 15.0, 1: 50.0, 2: 5.0}), "b": rows_of("b", {0: 7.0, 1: 24.0, 2: 0.0}, 3)}
-    values = normalised(by_policy, REFERENCES)
+    values = scored(by_policy, REFERENCES)
     assert values is not None
     assert values.instances == ("test/0000", "test/0001")
     assert values.flat == ("test/0002",)
@@ -58,10 +62,10 @@ def test_scores_are_shares_of_the_way_from_random_to_hindsight():
 def test_shifts_without_a_reference_are_counted_and_failures_can_count_as_random():
     rows = rows_of("a", {0: None, 1: 50.0, 2: 0.0})
     known = {shift: REFERENCES[shift] for shift in SHIFTS[:2]}
-    values = normalised({"a": rows}, known, failed_as_random=True)
+    values = scored({"a": rows}, known, failed_as_random=True)
     assert values is not None
     assert (values.missing, values.score["a"].tolist()) == (1, [0.0, 1.0])
-    assert normalised({"a": rows}, {}) is None
+    assert scored({"a": rows}, {}) is None
     with pytest.raises(ValueError, match="2 instances"):
         scores_of(replace(values, instances=("x",)), "a")
 
