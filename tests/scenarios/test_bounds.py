@@ -13,7 +13,6 @@ from fleet.engine.reward import RewardWeights
 from fleet.env.random_actions import random_legal
 from fleet.robot import ThermalLimits
 from scenarios.bounds import references as stored
-from scenarios.bounds.command import markdown
 from scenarios.bounds.exhaustive import optimum
 from scenarios.bounds.heat_budget import HeatBudget
 from scenarios.bounds.hindsight import Budget, hindsight
@@ -212,9 +211,7 @@ def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):
     np.testing.assert_allclose(scored.reward, again.reward, rtol=1e-12)
 
 
-def test_the_page_has_the_table_of_the_stored_rows():
-    docs = Path(__file__).parents[2] / "docs"
-    rows = load_references(docs / "results" / "bounds_library.jsonl")
-    page = (docs / "bounds.md").read_text(encoding="utf-8")
-    assert page.split("<!-- bounds -->\n")[1].split("\n<!-- end -->")[0] == markdown(rows)
+def test_the_stored_rows_are_in_order_of_what_they_bound():
+    rows = load_references(Path(__file__).parents[2] / "docs" / "results" / "bounds_library.jsonl")
+    assert len(rows) == 20
     assert all(each.random <= each.best_rule <= each.hindsight <= each.upper for each in rows)
