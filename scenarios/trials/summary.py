@@ -21,8 +21,8 @@ if TYPE_CHECKING:  # slow to import
     from scenarios.bounds.references import Reference
 
 NO_SCORES = (
-    f"No normalised scores: fewer than {FEWEST} of these shifts have references. The splits validation and test have; "
-    "others: thermofleet bounds, then compare --references FILE."
+    f"No normalised scores: fewer than {FEWEST} of these shifts have references. Make them with thermofleet "
+    "bounds, then compare with --references FILE."
 )
 MOST_FAILURES = 8
 """Failed policies whose first failure a table tells."""
