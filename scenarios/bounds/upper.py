@@ -17,6 +17,8 @@ ROUNDS = 3
 
 LEAST_GAIN = 1e-3
 """No more budgets are added once they lower the bound by less than this share."""
+MOST_COLUMNS = 12_000
+"""Programs with more columns, of some 40 arms, keep the bound with parts of jobs: whole ones take minutes."""
 GAP = 5e-4
 """The branch and bound ends once bound and solution differ by this share."""
 ROUNDING = 1e-6
@@ -76,7 +78,9 @@ def _solve(relaxation: Relaxation, rows: csr_array, bounds: Array) -> tuple[floa
 
 
 def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array, nodes: int) -> float:
-    """Bound with whole jobs; inf if branch and bound proved none."""
+    """Bound with whole jobs; inf if branch and bound proved none, or if the program is too large."""
+    if relaxation.columns > MOST_COLUMNS:
+        return np.inf
     whole = np.zeros(relaxation.columns)
     whole[relaxation.job_columns()] = 1
     result = milp(
