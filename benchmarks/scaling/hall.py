@@ -9,7 +9,9 @@ from scenarios.suite.layouts import layout_of
 SHOWN = ("name", "position_m", "tilt_deg", "home")
 
 
-def hall(arms: int, *, hours: float = 1.0, jobs: float | None = None, slots: int = 64, cycles: tuple[int, int] = (5, 15)) -> Scenario:
+def hall(
+    arms: int, *, hours: float = 1.0, jobs: float | None = None, slots: int = 64, cycles: tuple[int, int] = (5, 15)
+) -> Scenario:
     """The scenario of a hall, in which neighbours sort parts between their stations.
 
     Args:
@@ -45,7 +47,11 @@ def hall(arms: int, *, hours: float = 1.0, jobs: float | None = None, slots: int
 
 def toml_of(scenario: Scenario) -> str:
     """The scenario file of a hall."""
-    lines = [f'description = "{scenario.description}"', f"horizon_s = {scenario.horizon_s}", f"slots = {scenario.slots}"]
+    lines = [
+        f'description = "{scenario.description}"',
+        f"horizon_s = {scenario.horizon_s}",
+        f"slots = {scenario.slots}",
+    ]
     lines += ["[spread]", f"scale = {scenario.spread.scale}", f"seed = {scenario.spread.seed}"]
     lines += ["[twin]", f'size = "{scenario.twin.size}"', f"exploration = {scenario.twin.exploration}"]
     for arm in scenario.arms:
