@@ -1,11 +1,12 @@
 """Evolution strategy with antithetic samples: a gradient of ranked fitness, followed by Adam.
 
 Sources: Salimans et al., arXiv 1703.03864 (antithetic samples, ranked fitness, common random numbers); Kingma & Ba,
-ICLR 2015 (Adam).
+ICLR 2015 (Adam); Polyak & Juditsky, SIAM Journal on Control and Optimization 30, 1992 (average of the iterates).
 """
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,12 +27,14 @@ class EvolutionConfig:
     learning_rate: float = 0.04
     decay: int = 60
     """Iterations after which the learning rate is halved, then a third, and so on."""
+    averaged: int = 8
+    """Iterations in the running average, about."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.samples < 2 or self.samples % 2:
             raise ValueError(f"samples must be even and >= 2 (got {self.samples}).")
-        for name in ("deviation", "learning_rate", "decay"):
+        for name in ("deviation", "learning_rate", "decay", "averaged"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be > 0 (got {getattr(self, name)}).")
 
@@ -41,6 +44,8 @@ class Evolution:
 
     def __init__(self, first: Array, config: EvolutionConfig) -> None:
         self.config, self.mean = config, np.array(first, dtype=float)
+        self.average = self.mean.copy()
+        """Running average of the mean, which has less noise: the result."""
         self.done = 0
         """Finished iterations."""
         self._first_moment, self._second_moment = np.zeros_like(self.mean), np.zeros_like(self.mean)
@@ -60,6 +65,7 @@ class Evolution:
         second = self._second_moment / (1.0 - 0.99**self.done)
         rate = self.config.learning_rate / (1.0 + self.done / self.config.decay)
         self.mean = self.mean + rate * first / (np.sqrt(second) + 1e-8)
+        self.average += (self.mean - self.average) / min(self.done, self.config.averaged)
 
     def _noise(self) -> Array:
         rng = np.random.default_rng(np.random.SeedSequence([self.config.seed, 1, self.done]))
@@ -69,7 +75,9 @@ class Evolution:
     def save(self, path: Path, **numbers: float) -> None:
         """Write the state of the search and some numbers atomically."""
         with atomic_path(path) as draft, draft.open("wb") as file:
-            np.savez(file, mean=self.mean, moments=[self._first_moment, self._second_moment], done=self.done, **numbers)  # pyright: ignore[reportArgumentType]
+            state = [self.mean, self.average, self._first_moment, self._second_moment]
+            arrays: dict[str, Any] = {name: np.array(value) for name, value in numbers.items()}
+            np.savez(file, state=np.array(state), done=np.array(self.done), **arrays)
 
     def load(self, path: Path) -> dict[str, float]:
         """Restore what `save` wrote, and return the numbers.
@@ -80,10 +88,10 @@ class Evolution:
         try:
             with np.load(path, allow_pickle=False) as saved:
                 found = {name: saved[name] for name in saved.files}
-            mean, moments, done = found.pop("mean"), found.pop("moments"), int(found.pop("done"))
+            state, done = found.pop("state"), int(found.pop("done"))
         except (OSError, ValueError, KeyError) as error:
             raise CheckpointError(f"{path}: the training cannot be resumed ({error}).") from error
-        if mean.shape != self.mean.shape or moments.shape != (2, len(mean)):
-            raise CheckpointError(f"{path}: the training cannot be resumed: it has {len(mean)} parameters.")
-        self.mean, (self._first_moment, self._second_moment), self.done = mean, moments, done
+        if state.shape != (4, len(self.mean)):
+            raise CheckpointError(f"{path}: the training cannot be resumed: it has another number of parameters.")
+        (self.mean, self.average, self._first_moment, self._second_moment), self.done = state, done
         return {name: float(value) for name, value in found.items()}

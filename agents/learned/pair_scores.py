@@ -8,6 +8,7 @@ vector; zeros of the prices and of the last layers give `wsept` exactly.
 import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -23,7 +24,7 @@ from fleet.observation import FIELDS, Observation
 Array = np.ndarray
 
 PAIRS, PAIRS_CARD = "pairs.npy", "pairs.json"
-HIDDEN, OUTPUTS = 8, 2
+HIDDEN, OUTPUTS = 6, 2
 _SHAPES: dict[str, tuple[int, ...]] = {
     "worth": (len(Worth._fields),),
     "direct": (PAIR_FEATURES, OUTPUTS),
@@ -58,13 +59,16 @@ def scores(seen: Observation, left_s: Array, parameters: Array) -> Array:
     worth, direct, output, hidden, bias = (
         part.reshape(-1, *shape) for part, shape in zip(parts, _SHAPES.values(), strict=True)
     )
-    pairs = pairs_of(seen, left_s, Worth(*worth.T))
+    every = seen.duration_s.shape[-1]
+    pairs = pairs_of(_without_empty(seen), left_s, Worth(*worth.T))
     envs, arms, options = pairs.legal.shape
     inputs = pairs.features.reshape(envs, arms * options, PAIR_FEATURES)
     found = inputs @ direct + np.tanh(inputs @ hidden + bias[:, None]) @ output
     found = np.clip(found, -3.0, 3.0).reshape(envs, arms, options, OUTPUTS)
     score = pairs.rate * np.exp(found[..., 0]) + found[..., 1] * pairs.scale
-    return np.where(pairs.legal & (score > 0), score, -np.inf)
+    result = np.full((envs, arms, every), -np.inf)
+    result[..., :options] = np.where(pairs.legal & (score > 0), score, -np.inf)
+    return result
 
 
 def claims(score: Array, plans: int) -> Array:
@@ -169,6 +173,18 @@ def load_pairs(folder: Path) -> PairPolicy:
     if parameters.shape != (PARAMETERS,) or not np.isfinite(parameters).all():
         raise CheckpointError(f"{folder / PAIRS}: must be {PARAMETERS} finite numbers (shape {parameters.shape}).")
     return PairPolicy(parameters)
+
+
+def _without_empty(seen: Observation) -> Observation:
+    """The observation without the last slots that hold a job in no env: usually most of them."""
+    plans = plans_of(seen)
+    used = np.flatnonzero(seen.offered.any(axis=tuple(range(seen.offered.ndim - 1))))
+    slots = int(used[-1]) + 1 if len(used) else 1
+    if slots == seen.offered.shape[-1]:
+        return seen
+    ends: dict[tuple[str, ...], int] = {("slot",): slots, ("option",): slots * plans}
+    short = {f.name: getattr(seen, f.name)[..., : ends[f.axes]] for f in FIELDS if f.axes in ends}
+    return replace(seen, **short, action_mask=seen.action_mask[..., [*range(1 + slots * plans), -1]])
 
 
 def _stacked(seen: Sequence[Observation]) -> Observation:

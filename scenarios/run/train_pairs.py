@@ -13,10 +13,11 @@ from agents.learned.pair_scores import PARAMETERS, first_parameters, save_pairs
 from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.run.suite_batches import Ground, rewards
+from scenarios.run.training_log import TrainingLog, read_log
 
 Array = np.ndarray
 
-STATE, LOG, CURVE = "training.npz", "progress.jsonl", "curve.png"
+STATE, CURVE = "training.npz", "curve.png"
 SHIFTS = 4
 """Shifts of each validation instance: that of its own seed, and others."""
 
@@ -28,7 +29,7 @@ class PairPlan:
     minutes: float = 30.0
     iterations: int | None = None
     """Most iterations, those before a resume included."""
-    instances: int = 8
+    instances: int = 10
     """Instances of an iteration, of different cells; all samples have the same shifts."""
     validate_every: int = 5
 
@@ -85,23 +86,24 @@ def train_pairs(
     began_s, interrupted, shifts = time.monotonic(), False, 0
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    log = TrainingLog(out)
     if resume:
         numbers = search.load(out / STATE)
         teacher, best = numbers["teacher"], numbers["best"]
     else:
         teacher = best = validation(judges, wsept)
-        save_pairs(search.mean, out, **card, iterations=0, validation=best, teacher=teacher)
-        _append(out / LOG, {"iteration": 0, "validation": best, "teacher": teacher})
+        save_pairs(search.average, out, **card, iterations=0, validation=best, teacher=teacher)
+        log.add(0, {"iteration": 0, "validation": best, "teacher": teacher})
         tell(f"Iteration 0: wsept has {teacher:.4f} of the value on the validation shifts.")
 
     def validate() -> None:
         nonlocal best
-        found = validation(judges, search.mean)
+        found = validation(judges, search.average)
         if found > best:
             best = found
-            save_pairs(search.mean, out, **card, iterations=search.done, validation=best, teacher=teacher)
+            save_pairs(search.average, out, **card, iterations=search.done, validation=best, teacher=teacher)
         search.save(out / STATE, teacher=teacher, best=best)
-        _append(out / LOG, {"iteration": search.done, "validation": found, "teacher": teacher})
+        log.add(search.done, {"iteration": search.done, "validation": found, "teacher": teacher})
         tell(f"Iteration {search.done}: {found:.4f}, best {best:.4f}, wsept {teacher:.4f}.")
 
     validated = search.done
@@ -115,7 +117,7 @@ def train_pairs(
             shifts += config.samples * min(plan.instances, len(grounds))
             search.tell(fitness)
             row = {"number": search.done, "fitness": float(fitness.mean()), "spread": float(fitness.std())}
-            _append(out / LOG, {**row, "seconds": time.monotonic() - began_iteration_s})
+            log.add(search.done, {**row, "seconds": time.monotonic() - began_iteration_s})
             if search.done % plan.validate_every == 0:
                 validate()
                 validated = search.done
@@ -156,8 +158,7 @@ def draw_curves(folder: Path) -> None:
     """Plot validation, and the fitness of the samples, against the iteration."""
     from matplotlib.figure import Figure  # without a display
 
-    rows = [json.loads(line) for line in (folder / LOG).read_text(encoding="utf-8").splitlines()]
-    judged = [row for row in rows if "validation" in row]
+    judged = [row for row in read_log(folder) if "validation" in row]
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
     axes.plot([row["iteration"] for row in judged], [row["validation"] for row in judged], "o-", ms=3, label="learned")
@@ -182,8 +183,3 @@ def _check_folder(out: Path, card: dict[str, object], *, resume: bool) -> None:
     for name, value in json.loads(json.dumps(card)).items():
         if before.get(name) != value:
             raise FleetError(f"The training in '{out}' has {name} = {before.get(name)} (got {value}).")
-
-
-def _append(path: Path, row: dict[str, object]) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")

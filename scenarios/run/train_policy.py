@@ -12,26 +12,27 @@ import numpy as np
 
 from agents.learned.imitation import imitate
 from agents.learned.policy import CARD, save_policy
-from agents.learned.ppo import Iteration, PpoConfig, Trainer
-from agents.policy import Policy
+from agents.learned.ppo import PpoConfig, Trainer
+from agents.policy import WAIT, Policy, only_choices
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Obs
 from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.fault_price import weights_of
-from scenarios.policy_loader import policy_of
+from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.run.shift import scenario_hash
+from scenarios.run.training_log import TrainingLog, read_log
 from scenarios.schema import Scenario
 
 Array = np.ndarray
 
 VALIDATION_SEED = 2_000_000
 """First validation seed; far from the seeds of comparisons."""
-STATE, LOG, CURVE = "training.pt", "progress.jsonl", "curve.png"
+STATE, CURVE = "training.pt", "curve.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,31 +127,37 @@ def train(
         imitate(trainer.actor, judge.layout, _demonstrations(teacher, config.warm_start, progress), rng)
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-    began_s, interrupted = time.monotonic(), False
+    log, began_s, interrupted = TrainingLog(out), time.monotonic(), False
     seeds = [VALIDATION_SEED + i for i in range(plan.validation_envs)]
 
-    def validate(iteration: Iteration) -> None:
+    def validate(number: int, env_steps: int) -> None:
         nonlocal best
-        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, iteration.number]))
+        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, number]))
         act = partial(trainer.act, rng=rng)
         reward = float(returns(judge, lambda obs: act(obs["observation"], obs["action_mask"]), seeds).mean())
         if reward > best:
             best = reward
-            details = {"algorithm": config.algorithm, "iterations": iteration.number, "env_steps": iteration.env_steps}
+            details = {"algorithm": config.algorithm, "iterations": number, "env_steps": env_steps}
             save_policy(trainer.actor, config.size, out, **card, **details, validation_reward=reward)
         trainer.save(out / STATE, best=best)
-        _append(out / LOG, {"iteration": iteration.number, "validation_reward": reward})
-        tell(f"Iteration {iteration.number}: {reward:.1f} per shift on the validation seeds, best {best:.1f}.")
+        log.add(number, {"iteration": number, "validation_reward": reward})
+        tell(f"Iteration {number}: {reward:.1f} per shift on the validation seeds, best {best:.1f}.")
 
     iteration, validated = None, 0
     try:
+        if not resume:
+            if config.warm_start:
+                teacher = float(returns(judge, _rule_actions(config.warm_start, judge, seeds), seeds).mean())
+                log.add(0, {"teacher": teacher})
+                tell(f"Teacher {config.warm_start}: {teacher:.1f} per shift on the validation seeds.")
+            validate(0, 0)
         for iteration in trainer.iterate():
-            _append(out / LOG, asdict(iteration))
+            log.add(iteration.number, asdict(iteration))
             spent_s = time.monotonic() - began_s
             share = max(spent_s / (60.0 * plan.minutes), iteration.number / (plan.iterations or np.inf))
             progress(f"iteration {iteration.number}, best {best:.1f}", min(share, 1.0))
             if iteration.number % plan.validate_every == 0 or share >= 1.0:
-                validate(iteration)
+                validate(iteration.number, iteration.env_steps)
                 validated = iteration.number
             if share >= 1.0:
                 break
@@ -159,7 +166,7 @@ def train(
         if iteration is None:
             raise
         if validated < iteration.number:
-            validate(iteration)
+            validate(iteration.number, iteration.env_steps)
     draw_curves(out)
     return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
 
@@ -194,6 +201,21 @@ def _actions_of(policy: Policy, env: BatchEnv, obs: Obs, e: int) -> list[int]:
     return [actions[arm] for arm in env.agents]
 
 
+def _rule_actions(rule: str, env: BatchEnv, seeds: Sequence[int]) -> Callable[[Obs], Array]:
+    """Actions of a rule, one instance for each env, [env, arm]."""
+    policies = [policy_at(rule, seed) for seed in seeds]
+    when_asked = only_choices(policies[0])
+
+    def act(obs: Obs) -> Array:
+        actions = np.full(obs["action_mask"].shape[:2], WAIT)
+        for e, policy in enumerate(policies):
+            if not when_asked or obs["action_mask"][e, :, 1:-1].any():
+                actions[e] = _actions_of(policy, env, obs, e)
+        return actions
+
+    return act
+
+
 def returns(env: BatchEnv, act: Callable[[Obs], Array], seeds: Sequence[int]) -> Array:
     """Total reward of the shift of each seed, [env]."""
     obs, _ = env.reset(seed=list(seeds))
@@ -209,12 +231,16 @@ def draw_curves(folder: Path) -> None:
     """Plot validation reward, entropy, clipped share and value loss against the iteration."""
     from matplotlib.figure import Figure  # without a display
 
-    rows = [json.loads(line) for line in (folder / LOG).read_text(encoding="utf-8").splitlines()]
+    rows = read_log(folder)
     iterations = [row for row in rows if "env_steps" in row]
     validations = [row for row in rows if "validation_reward" in row]
     figure = Figure(figsize=(9, 6), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.plot([r["iteration"] for r in validations], [r["validation_reward"] for r in validations], "o-", ms=3)
+    for row in rows:
+        if "teacher" in row:
+            top.axhline(row["teacher"], color="k", lw=1, ls="--", label="the rule that was imitated")
+            top.legend(frameon=False)
     top.set_ylabel("reward of a shift, validation seeds")
     labels = {"entropy": "entropy of choices, nat", "clipped": "share of clipped ratios", "value_loss": "value loss"}
     for name, label in labels.items():
@@ -243,8 +269,3 @@ def _check_folder(out: Path, card: dict[str, Any], *, resume: bool) -> None:
     for name, value in now.items():
         if was.get(name) != value:
             raise FleetError(f"The training in '{out}' has {name} = {was.get(name)} (got {value}).")
-
-
-def _append(path: Path, row: dict[str, Any]) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")
