@@ -9,6 +9,8 @@ import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import ClassVar
 
@@ -175,10 +177,28 @@ def load_pairs(folder: Path) -> PairPolicy:
     return PairPolicy(parameters)
 
 
+@cache
+def shipped_parameters() -> Array:
+    """The parameters that come with the project: the best on the validation split of several trainings."""
+    file = resources.files("agents").joinpath(f"learned/weights/{PAIRS}")
+    with file.open("rb") as opened:
+        return np.load(opened, allow_pickle=False)
+
+
+class WseptLearned(PairPolicy):
+    """As `wsept`, by scores that were learned on the training split of the suite with the true state. Scope central."""
+
+    only_choices = True
+
+    def __init__(self) -> None:
+        super().__init__(shipped_parameters())
+
+
 def _without_empty(seen: Observation) -> Observation:
     """The observation without the last slots that hold a job in no env: usually most of them."""
     plans = plans_of(seen)
-    used = np.flatnonzero(seen.offered.any(axis=tuple(range(seen.offered.ndim - 1))))
+    legal = seen.action_mask[..., 1:-1].any(axis=(0, 1)).reshape(-1, plans).any(axis=-1)
+    used = np.flatnonzero(legal | seen.offered.any(axis=(0, 1)))
     slots = int(used[-1]) + 1 if len(used) else 1
     if slots == seen.offered.shape[-1]:
         return seen

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.heat_rules import ERROR_ABOVE_WARNING_K, Wsept
+from agents.heat_rules import ERROR_ABOVE_WARNING_K, LEAST_P, Wsept
 from agents.policy import per_option, plans_of
 from fleet.observation import Observation
 
@@ -66,7 +66,7 @@ def worth_per_second(seen: Observation, left_s: Array, learned: Worth) -> Array:
         seen: Observations [env, arm].
         left_s: Time until the end of the shift, [env].
     """
-    from scipy.special import ndtr  # slow import that few processes need
+    from scipy.special import logit, ndtr  # slow import that few processes need
 
     def each(values: Array) -> Array:
         return values[:, None, None]
@@ -74,7 +74,11 @@ def worth_per_second(seen: Observation, left_s: Array, learned: Worth) -> Array:
     value, duration_s = per_option(seen, seen.value), seen.duration_s
     hottest_c = seen.temp_c.max(axis=-1)[..., None]
     warning_c = seen.headroom_k[..., None] + hottest_c
-    peak_c = np.where(seen.peak_c > 0, seen.peak_c, Wsept().predicted_peak_c(seen)) if _unknown(seen) else seen.peak_c
+    peak_c = seen.peak_c
+    if (peak_c <= 0).any():
+        # As `Wsept.predicted_peak_c` of one arm.
+        margin_k = Wsept.peak_sd_k * logit(np.clip(seen.p_saturation, LEAST_P, 1.0 - LEAST_P))
+        peak_c = np.where(peak_c > 0, peak_c, warning_c + margin_k)
     limit_c = warning_c + ERROR_ABOVE_WARNING_K - 20.0 * each(learned.error_limit)
     p_fault = ndtr((peak_c - limit_c) / (Wsept.peak_sd_k * np.exp(each(learned.spread))))
     above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
@@ -113,7 +117,7 @@ def _features(seen: Observation, left_s: Array, legal: Array, rate: Array, scale
     other_arm = of_slots(_best_of_others(best, axis=1))
     other_job = of_slots(_best_of_others(best, axis=2))
     working, busy_s = seen.working[..., None] > 0, seen.busy_s[..., None]
-    soon = working & (busy_s <= SOON_S) & (seen.feasible > 0) & (seen.space_free >= 0)
+    soon = working & (busy_s <= SOON_S) & (seen.feasible > 0)
     later = np.where(soon, np.maximum(rate, 0.0) * duration_s / (duration_s + busy_s) / scale, 0.0)
     soonest = of_slots(later.reshape(envs, arms, -1, plans).max(axis=(1, 3))[:, None, :])
     can = (seen.feasible > 0).reshape(envs, arms, -1, plans).any(axis=-1)
@@ -155,11 +159,6 @@ def _features(seen: Observation, left_s: Array, legal: Array, rate: Array, scale
     np.clip(features, -MOST, MOST, out=features)
     features[~legal] = 0.0
     return features
-
-
-def _unknown(seen: Observation) -> bool:
-    """Whether some peak is unknown."""
-    return bool(((seen.peak_c <= 0) & (seen.action_mask[..., 1:-1] > 0)).any())
 
 
 def _best_of_others(values: Array, axis: int) -> Array:

@@ -37,10 +37,10 @@ def drawn(rng: np.random.Generator) -> Observation:
     options = {
         "duration_s": rng.uniform(60.0, 900.0, (5, 12)),
         "slack_s": rng.uniform(-300.0, 900.0, (5, 12)),
-        "peak_c": rng.uniform(40.0, 80.0, (5, 12)),
+        "peak_c": rng.uniform(40.0, 80.0, (5, 12)) * (rng.random((5, 12)) < 0.8),
         "difficulty": rng.uniform(0.0, 1.0, (5, 12)),
         "feasible": np.ones((5, 12)),
-        "p_saturation": np.full((5, 12), 0.5),
+        "p_saturation": rng.random((5, 12)),
     }
     temp_c = rng.uniform(30.0, 50.0, (5, 7))
     free, working = np.array([1, 1, 1, 0, 0]), np.array([0, 0, 0, 1, 0])
