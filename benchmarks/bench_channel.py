@@ -1,16 +1,17 @@
 """Performance of a fleet when messages between its arms are late, lost or restricted.
 
     python benchmarks/bench_channel.py [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
+        [--out docs/results/channels/SCENARIO.json]
 
-Means over the seeds; in brackets the mean paired difference to the same policy and seed on a perfect channel, with *
-if its 95 % interval excludes zero. `heard`: share of messages delivered, over all pairs of arms. `lost`: claims for a
-job or station that another arm won. Policies that use no peer messages (round_robin) are equal on every channel. In
-memory, with the profile plant and the arms' twins, on all cores. The defaults are 130 shifts: some eight minutes of CPU
-time, half of that on two idle cores, and a few minutes more if the twins are not cached. `heat_wave` takes three times
-as long.
+Writes the figures of every shift, and prints them as the table of docs/exchange.md that `thermofleet contract` makes of
+the file. `heard`: share of messages delivered, over all pairs of arms. `lost`: claims for a job or station that another
+arm won. Policies that use no peer messages (round_robin) are equal on every channel. In memory, with the profile plant
+and the arms' twins, on all cores. The defaults are 130 shifts: some eight minutes of CPU time, half of that on two idle
+cores, and a few minutes more if the twins are not cached. `heat_wave` takes three times as long.
 """
 
 import argparse
+import json
 import os
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -23,15 +24,14 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from fleet.bus.exchange.channel import Channel, Partition
-from fleet.files import cache_folder
+from fleet.files import atomic_path, cache_folder
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.shift import RunSpec, run
 from scenarios.schema import Scenario
-from scenarios.statistics.means import interval
+from scenarios.studies.channel_table import channel_table
 
 FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "heard")
-DIGITS = {"value": 1, "on_time": 1, "faults": 2, "above_warning_min": 0, "lost": 1}
 
 
 def channels(scenario: Scenario) -> dict[str, Channel]:
@@ -70,18 +70,6 @@ def shifts(scenario: Scenario, cache: Path, policy: str, channel: Channel, seeds
     return np.array(rows)
 
 
-def row(values: np.ndarray, base: np.ndarray) -> str:
-    """One line of the table: figures [seed, figure] beside those of the perfect channel."""
-    cells = []
-    for i, (name, digits) in enumerate(DIGITS.items()):
-        gap = values[:, i] - base[:, i]
-        star = "*" if interval(gap).excludes_zero else ""
-        more = f" ({gap.mean():+.{digits}f}{star})" if gap.any() else ""
-        cells.append(f"{values[:, i].mean():.{digits}f}{more} | ")
-        assert FIGURES[i] == name
-    return "".join(cells) + f"{100 * values[:, -1].mean():.0f} %"
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -89,6 +77,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=100)
     parser.add_argument("--policies", default="least_difficulty,consensus")
+    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     scenario, cache = load(options.scenario), cache_folder()
     start_s = time.perf_counter()
@@ -99,13 +88,20 @@ def main() -> None:
     found: Any = Parallel(n_jobs=-1)(
         delayed(shifts)(scenario, cache, policy, between[name], seeds) for policy, name in cells
     )
-    figures = dict(zip(cells, found, strict=True))
-    print(f"{scenario.name}, seeds {seeds[0]} to {seeds[-1]}\n")
-    print("| policy | channel | value | on time | faults | min above warning | lost | heard |\n|" + "---|" * 8)
-    for policy in policies:
-        base = figures[policy, next(iter(between))]
-        for name in between:
-            print(f"| {policy} | {name} | {row(figures[policy, name], base)} |")
+    result = {
+        "scenario": scenario.name,
+        "seeds": list(seeds),
+        "figures": FIGURES,
+        "rows": [
+            {"policy": policy, "channel": name, "values": np.round(values, 4).tolist()}
+            for (policy, name), values in zip(cells, found, strict=True)
+        ],
+    }
+    out = options.out or Path(f"docs/results/channels/{scenario.name}.json")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(out) as partial:
+        partial.write_text(json.dumps(result) + "\n", encoding="utf-8")
+    print(channel_table(result))
     print(f"\n{len(cells) * len(seeds)} shifts in {time.perf_counter() - start_s:.0f} s on {os.cpu_count()} cores.")
 
 

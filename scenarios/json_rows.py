@@ -1,12 +1,13 @@
 """Results of a long study as JSON lines: each row is appended when it is known, so a stopped study goes on."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any  # JSON values
 
 from fleet.errors import FleetError
+from fleet.files import atomic_path
 from scenarios.result_folder import disk_errors
 
 Row = dict[str, Any]
@@ -53,12 +54,26 @@ class Rows:
     def append(self, key: str, row: Mapping[str, Any]) -> None:
         """Add a row to the file; an unfinished line at its end is removed."""
         whole = {KEY: key, **row}
-        self._write(json.dumps(whole, ensure_ascii=False) + "\n")
+        self._write(_line(whole))
         self.by_key[key] = whole
 
     def check_writable(self) -> None:
         """Raise a FleetError if rows cannot be appended."""
         self._write("")
+
+    def sort(self, by: Callable[[Row], Any]) -> None:
+        """Write the file anew, in order and without replaced rows, unless it is so already (Any: what can be sorted).
+
+        Raises:
+            FleetError: as `check_writable`.
+        """
+        self.by_key = dict(sorted(self.by_key.items(), key=lambda item: by(item[1])))
+        data = "".join(map(_line, self.by_key.values())).encode()
+        with disk_errors(self.path):
+            if data and data != self.path.read_bytes():
+                with atomic_path(self.path) as draft:
+                    draft.write_bytes(data)
+                self._size, self._unfinished = len(data), 0
 
     def _write(self, text: str) -> None:
         with disk_errors(self.path):
@@ -78,3 +93,7 @@ class Rows:
             raise FleetError(
                 f"A row of '{self.path}' has a missing or odd value ({type(error).__name__}: {error}); remove the row."
             ) from error
+
+
+def _line(row: Row) -> str:
+    return json.dumps(row, ensure_ascii=False) + "\n"

@@ -2,28 +2,47 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
-from scenarios.load import load
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
-    from scenarios.bounds.references import Reference
+    from scenarios.bounds.references import Reference, Task
 
 
 def bounds_command(
     scenarios: Annotated[
-        str,
-        typer.Argument(help="Scenarios, separated by commas: library names (see `thermofleet list`) or .toml files."),
-    ],
+        str | None,
+        typer.Argument(
+            help="Separated by commas: library names (see `thermofleet list`), .toml files, or instances of the suite, "
+            "as test/0017.",
+            show_default=False,
+        ),
+    ] = None,
+    suite: Annotated[
+        str | None, typer.Option(help="All instances of a split: train, validation or test.", show_default=False)
+    ] = None,
     seeds: Annotated[int, options.number("Number of seeds of each scenario.", 1, 10_000)] = 5,
     first_seed: Annotated[int, options.number("First seed.", 0, options.MAX_SEED)] = 0,
     budget: Annotated[float, options.number("CPU seconds of the search for each shift.", 0, 86_400, above=True)] = 30.0,
+    evaluations: Annotated[
+        int | None,
+        options.number(
+            "End the search after so many simulated shifts instead: the file does not depend on the machine's load.",
+            1,
+            10**9,
+            show_default=False,
+        ),
+    ] = None,
+    nodes: Annotated[int, options.number("Most nodes of the branch and bound of the upper bound.", 1, 10**6)] = 2000,
+    jobs: Annotated[int, options.number("Number of processes.", 1, 1024)] = 1,
     difficulty: options.DifficultyOption = "oracle",
     out: Annotated[Path, typer.Option(help="File of the rows; finished ones are not computed again.")] = Path(
         "runs/bounds.jsonl"
@@ -37,24 +56,25 @@ def bounds_command(
     schedule that a search finds with all jobs known (hindsight). Above: an upper
     bound that no policy can exceed. Every row is kept as soon as it is known; the
     same command continues after an interruption. A larger budget searches again.
+    A budget of --evaluations gives the same file whenever it is repeated.
     """
     choose("format", format_, Literal["table", "markdown", "json"])
     from scenarios.bounds.hindsight import Budget
-    from scenarios.bounds.references import Task, load_references, references
+    from scenarios.bounds.references import load_references, references
     from scenarios.prepare.fleet import DifficultyName
 
     if show_only:
         found = load_references(out)
     else:
-        chosen = [load(name.strip()) for name in scenarios.split(",")]
-        tasks = [
-            Task(f"{scenario.name}/{seed}", scenario, seed)
-            for scenario in chosen
-            for seed in range(first_seed, first_seed + seeds)
-        ]
+        if bool(scenarios) == bool(suite):
+            raise FleetError("Give either scenarios or --suite.")
+        tasks = tasks_of(suite or scenarios or "", seeds, first_seed)
+        limit = Budget(seconds=budget, nodes=nodes)
+        if evaluations is not None:
+            limit = Budget(seconds=inf, evaluations=evaluations, nodes=nodes)
         source = choose("difficulty", difficulty, DifficultyName)
-        with progress_bar(kept="Plans are") as progress:
-            found = references(tasks, out, Budget(seconds=budget), difficulty=source, progress=progress)
+        with progress_bar(kept="Finished rows and plans are") as progress:
+            found = references(tasks, out, limit, difficulty=source, jobs=jobs, progress=progress)
     if format_ == "json":
         print_json([asdict(each) | {"gap": each.gap, "rule_score": each.normalised(each.best_rule)} for each in found])
         return
@@ -69,6 +89,20 @@ def bounds_command(
         say(f"Written to {out}.")
 
 
+def tasks_of(names: str, seeds: int, first_seed: int) -> "list[Task]":
+    """What is to be bounded: a split, or names separated by commas. An instance has one seed."""
+    from scenarios.bounds.references import Task
+    from scenarios.trials.cases import suite_of
+
+    tasks: list[Task] = []
+    for case in suite_of(names, seeds, first_seed):
+        if "/" in case.name:
+            tasks.append(Task(case.name, case.scenario, case.seeds[0]))
+        else:
+            tasks += [Task(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
+    return tasks
+
+
 HEADS = ("instance", "random", "best rule", "reward", "hindsight", "upper bound", "score of the rule", "gap", "CPU s")
 
 
@@ -76,7 +110,8 @@ def cells(each: "Reference") -> tuple[str, ...]:
     """One line of the table."""
     rewards = [f"{value:.1f}" for value in (each.best_rule, each.hindsight, each.upper)]
     score = f"{each.normalised(each.best_rule):.3f}"
-    return each.instance, f"{each.random:.1f}", each.rule, *rewards, score, f"{each.gap:.3f}", f"{each.seconds:.0f}"
+    seconds = "" if each.seconds is None else f"{each.seconds:.0f}"
+    return each.instance, f"{each.random:.1f}", each.rule, *rewards, score, f"{each.gap:.3f}", seconds
 
 
 def markdown(references: "Sequence[Reference]") -> str:
@@ -90,10 +125,8 @@ def markdown(references: "Sequence[Reference]") -> str:
         figures = ("random", "best_rule", "hindsight", "upper")
         random, *rewards = (f"**{sum(getattr(each, name) for each in own) / len(own):.1f}**" for name in figures)
         score = sum(each.normalised(each.best_rule) for each in own) / len(own)
-        gap, seconds = (
-            sum(values) / len(own) for values in zip(*((each.gap, each.seconds) for each in own), strict=True)
-        )
-        lines.append(
-            (f"**{scenario}**, mean", random, "", *rewards, f"**{score:.3f}**", f"**{gap:.3f}**", f"{seconds:.0f}")
-        )
+        gap = sum(each.gap for each in own) / len(own)
+        times = [each.seconds for each in own if each.seconds is not None]
+        seconds = f"{sum(times) / len(times):.0f}" if times else ""
+        lines.append((f"**{scenario}**, mean", random, "", *rewards, f"**{score:.3f}**", f"**{gap:.3f}**", seconds))
     return table(HEADS, lines)

@@ -37,11 +37,17 @@ class Hindsight:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """When the search ends: at the first of both."""
+    """When the search ends, at the first of both, and the proof of the upper bound.
+
+    Without a limit of seconds the result depends on nothing but the instance, the code and its libraries.
+    """
 
     seconds: float = 30.0
-    """CPU time."""
+    """CPU time; inf for no limit."""
     evaluations: int = 1_000_000
+    """Simulated shifts."""
+    nodes: int = 2000
+    """Most nodes of the branch and bound of the upper bound; what it has proved by then counts."""
 
 
 def hindsight(

@@ -1,27 +1,33 @@
 """Stored references of instances, a scenario and a seed each: random, hindsight and upper bound; normalised scores."""
 
+import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
+from joblib import Parallel, delayed
 
 from agents.registry import RULES
 from fleet.errors import ScenarioError
+from fleet.files import cache_folder
 from fleet.seeding import child
 from scenarios.bounds.hindsight import SIDE_BY_SIDE, Budget, hindsight
 from scenarios.bounds.relaxation import Relaxation
 from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, without_scores
 from scenarios.bounds.upper import upper_bound
 from scenarios.fault_price import weights_of
-from scenarios.json_rows import Rows
+from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import policy_at, policy_of
-from scenarios.prepare.fleet import DifficultyName, Fleet, ShiftFactory, prepare
+from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
 from scenarios.run.shift import scenario_hash
 from scenarios.schema import Scenario
+from scenarios.trials.fleets import Fleets, plan_content
+from scenarios.trials.plan import Case, Unit
 
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""
@@ -54,11 +60,11 @@ class Reference:
     """Upper bound before whole jobs and heat budgets."""
     evaluations: int
     """Shifts that the search simulated."""
-    search_s: float
-    """CPU time of the search."""
-    upper_s: float
+    search_s: float | None
+    """CPU time of the search; this and the other times are None if the budget counts evaluations only."""
+    upper_s: float | None
     """CPU time of the upper bound."""
-    seconds: float
+    seconds: float | None
     """CPU time of everything but the planning of the fleet."""
     code: str
     """Hash of the code."""
@@ -120,8 +126,8 @@ def reference(
     search = ShiftSimulator(bare, weights, SIDE_BY_SIDE)
     found = hindsight(search, starts, np.random.SeedSequence([task.seed, 3]), budget)
     bounded_s = time.process_time()
-    upper = upper_bound(Relaxation(world, weights)) if bound else None
-    ended_s = time.process_time()
+    upper = upper_bound(Relaxation(world, weights), nodes=budget.nodes) if bound else None
+    ended_s, timed = time.process_time(), isfinite(budget.seconds)
     return Reference(
         instance=task.instance,
         scenario_hash=scenario_hash(task.scenario),
@@ -135,9 +141,9 @@ def reference(
         upper=upper.reward if upper else float("inf"),
         linear=upper.linear if upper else float("inf"),
         evaluations=found.evaluations,
-        search_s=found.seconds,
-        upper_s=ended_s - bounded_s,
-        seconds=ended_s - began_s,
+        search_s=found.seconds if timed else None,
+        upper_s=ended_s - bounded_s if timed else None,
+        seconds=ended_s - began_s if timed else None,
         code=code_hash(),
         claims=tuple(found.claims),
     )
@@ -150,41 +156,86 @@ def references(
     *,
     difficulty: DifficultyName = "oracle",
     cache: Path | None = None,
+    jobs: int = 1,
     progress: Progress = quiet,
-    stopped: Callable[[], bool] = lambda: False,
 ) -> list[Reference]:
     """The references of instances, kept in a file of JSON lines; those in it are not computed again.
 
     A row counts if instance, content of the scenario, seed and source of scores are the same. With a larger budget the
-    search is repeated, and starts from the known schedule too. A fleet is prepared once for consecutive tasks of one
-    scenario.
+    search is repeated, and starts from the known schedule too. At the end the rows are in the order of the instances'
+    names, whatever was computed first.
+
+    Args:
+        jobs: Processes.
 
     Raises:
         ScenarioError: the weights of the reward allow no bound.
         FleetError: the file has other rows.
     """
-    rows, fleet = Rows(path), None
-    for n, task in enumerate(tasks):
-        if stopped():
-            break
-        key = key_of(task, difficulty)
-        progress("bounding", Count(n, len(tasks)))
-        if key in rows and rows.by_key[key]["search_s"] >= 0.9 * budget.seconds:
-            continue
-        if fleet is None or fleet.scenario != task.scenario:
-            fleet = prepare(task.scenario, difficulty=difficulty, cache=cache, progress=progress)
-        known = load_reference(rows.by_key[key]).claims if key in rows else ()
-        try:
-            new = reference(fleet, task, budget, difficulty=difficulty, known=known)
-        except ValueError as error:
-            raise ScenarioError(f"{task.instance}: {error}") from error
-        rows.append(key, asdict(new))
+    rows, folder = Rows(path), cache or cache_folder()
+    rows.check_writable()
+    left = [task for task in tasks if not _enough(rows.by_key.get(key_of(task, difficulty)), budget)]
+    first: dict[object, Task] = {}
+    cells = [first.setdefault(plan_content(task.scenario), task) for task in left]
+    order = [task for cell in first.values() for task, own in zip(left, cells, strict=True) if own is cell]
+    if jobs > 1:
+        for task in first.values():
+            _fleet_of(task, difficulty, folder, progress)  # so that no two processes plan the same motions
+    work = (
+        delayed(_bounded)(task, budget, difficulty, rows.by_key.get(key_of(task, difficulty)), folder) for task in order
+    )
+    done = len(tasks) - len(left)
+    progress("bounding", Count(done, max(1, len(tasks))))
+    with Parallel(n_jobs=max(1, min(jobs, len(left))), return_as="generator_unordered") as pool:
+        for new in pool(work):
+            assert isinstance(new, Reference)
+            rows.append(_key(new.instance, new.scenario_hash, new.seed, difficulty), asdict(new))
+            done += 1
+            progress("bounding", Count(done, len(tasks)))
+    rows.sort(_place)
     return load_references(path, [key_of(task, difficulty) for task in tasks])
+
+
+_fleets = Fleets()
+
+
+def _fleet_of(task: Task, difficulty: DifficultyName, folder: Path, progress: Progress = quiet) -> Fleet:
+    """The prepared fleet of an instance; instances of one cell share it."""
+    case = Case(name=task.instance, scenario=task.scenario, seeds=(task.seed,))
+    return _fleets.of(Unit("", case, 0, 0, difficulty), RISK, folder, progress)
+
+
+def _bounded(task: Task, budget: Budget, difficulty: DifficultyName, known: Row | None, folder: Path) -> Reference:
+    """The reference of a task, in whichever process this is."""
+    fleet = _fleet_of(task, difficulty, folder)
+    try:
+        claims = load_reference(known).claims if known else ()
+        return reference(fleet, task, budget, difficulty=difficulty, known=claims)
+    except ValueError as error:
+        raise ScenarioError(f"{task.instance}: {error}") from error
+
+
+def _enough(row: Row | None, budget: Budget) -> bool:
+    """Whether a row is of at least this budget."""
+    if row is None:
+        return False
+    if isfinite(budget.seconds):
+        return (row["search_s"] or 0.0) >= 0.9 * budget.seconds
+    return row["evaluations"] >= budget.evaluations
+
+
+def _place(row: Row) -> list[object]:
+    """Sorts names of instances by their numbers."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", row["instance"])]
 
 
 def key_of(task: Task, difficulty: str) -> str:
     """What a row of a file of references is found by."""
-    return f"{task.instance} {scenario_hash(task.scenario)} {task.seed} {difficulty}"
+    return _key(task.instance, scenario_hash(task.scenario), task.seed, difficulty)
+
+
+def _key(instance: str, scenario: str, seed: int, difficulty: str) -> str:
+    return f"{instance} {scenario} {seed} {difficulty}"
 
 
 def load_references(path: Path, keys: Iterable[str] | None = None) -> list[Reference]:

@@ -17,8 +17,6 @@ ROUNDS = 3
 
 LEAST_GAIN = 1e-3
 """No more budgets are added once they lower the bound by less than this share."""
-MOST_NODES = 2000
-"""Most nodes of the branch and bound; what it has proved by then counts."""
 GAP = 5e-4
 """The branch and bound ends once bound and solution differ by this share."""
 ROUNDING = 1e-6
@@ -37,8 +35,12 @@ class UpperBound:
     """Number of heat budgets used."""
 
 
-def upper_bound(relaxation: Relaxation, *, heat: bool = True) -> UpperBound:
-    """The upper bound of a relaxation: with whole jobs, and with the heat budgets that its solution in parts passes."""
+def upper_bound(relaxation: Relaxation, *, heat: bool = True, nodes: int = 2000) -> UpperBound:
+    """The upper bound of a relaxation: with whole jobs, and with the heat budgets that its solution in parts passes.
+
+    Args:
+        nodes: Most nodes of the branch and bound; what it has proved by then counts.
+    """
     rows, bounds = relaxation.rows
     linear, shares = _solve(relaxation, rows, bounds)
     value, count, budget = linear, 0, HeatBudget(relaxation)
@@ -53,7 +55,7 @@ def upper_bound(relaxation: Relaxation, *, heat: bool = True) -> UpperBound:
         gain, value = value - better, min(value, better)
         if gain < LEAST_GAIN * abs(value):
             break
-    value = min(value, _whole(relaxation, rows, bounds))
+    value = min(value, _whole(relaxation, rows, bounds, nodes))
     return UpperBound(value + relaxation.constant, linear + relaxation.constant, count)
 
 
@@ -72,7 +74,7 @@ def _solve(relaxation: Relaxation, rows: csr_array, bounds: Array) -> tuple[floa
     return float(prices @ bounds + surplus @ most), result.x
 
 
-def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array) -> float:
+def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array, nodes: int) -> float:
     """Bound with whole jobs; inf if branch and bound proved none."""
     whole = np.zeros(relaxation.columns)
     whole[relaxation.job_columns()] = 1
@@ -81,7 +83,7 @@ def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array) -> float:
         constraints=LinearConstraint(rows, -np.inf, bounds),  # pyright: ignore[reportArgumentType]
         bounds=Bounds(0.0, relaxation.most),  # pyright: ignore[reportArgumentType]  # SciPy's stubs allow no arrays
         integrality=whole,
-        options={"node_limit": MOST_NODES, "mip_rel_gap": GAP},
+        options={"node_limit": nodes, "mip_rel_gap": GAP},
     )
     if result.mip_dual_bound is None:
         return np.inf

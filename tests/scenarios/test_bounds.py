@@ -182,7 +182,7 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
         return replace(one, instance=task.instance, seed=task.seed, search_s=budget.seconds)
 
     monkeypatch.setattr(stored, "reference", counted)
-    monkeypatch.setattr(stored, "prepare", lambda *_, **__: fleet)
+    monkeypatch.setattr(stored, "_fleet_of", lambda *_: fleet)
     tasks = [Task(f"three/{seed}", fleet.scenario, seed) for seed in (1, 2)]
     path = tmp_path / "bounds.jsonl"
     short = references(tasks, path, Budget(seconds=1.0), difficulty="blind")
@@ -191,6 +191,16 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
     longer = references(tasks, path, Budget(seconds=5.0), difficulty="blind")
     assert calls[2:] == [("three/1", len(one.claims)), ("three/2", len(one.claims))]
     assert [asdict(each) for each in load_references(path)] == [asdict(each) for each in longer]
+
+
+def test_a_budget_of_evaluations_gives_the_same_file_in_any_order(fleet: Fleet, tmp_path: Path):
+    tasks = [Task(f"three/{seed}", fleet.scenario, seed) for seed in (2, 10)]
+    budget, plans = Budget(seconds=np.inf, evaluations=64, nodes=5), tmp_path / "plans"
+    once = references(tasks, tmp_path / "once.jsonl", budget, difficulty="blind", cache=plans)
+    for task in reversed(tasks):  # as of a run that was stopped
+        references([task], tmp_path / "twice.jsonl", budget, difficulty="blind", cache=plans)
+    assert (tmp_path / "once.jsonl").read_bytes() == (tmp_path / "twice.jsonl").read_bytes()
+    assert [each.instance for each in once] == ["three/2", "three/10"]
 
 
 def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):

@@ -1,0 +1,49 @@
+"""The tables of docs/exchange.md: figures of shifts on several channels, beside those on a perfect one."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from scenarios.doc_tables import table
+from scenarios.statistics.counts import paired_counts
+from scenarios.statistics.means import paired
+
+COLUMNS = {
+    "value": ("value", 1),
+    "on_time": ("on time", 1),
+    "faults": ("faults", 2),
+    "above_warning_min": ("minutes above the warning limit", 0),
+    "lost": ("rejected", 1),
+}
+"""Heading and decimals of a figure."""
+
+
+def channel_table(measured: Mapping[str, Any]) -> str:
+    """Means, and paired differences to the first channel with 95 % intervals, of each policy and channel.
+
+    Args:
+        measured: A result of `benchmarks/bench_channel.py`.
+    """
+    names: list[str] = list(measured["figures"])
+    values = {(row["policy"], row["channel"]): np.array(row["values"]) for row in measured["rows"]}
+    policies = dict.fromkeys(policy for policy, _ in values)
+    rows: list[tuple[str, ...]] = []
+    for (policy, channel), x in values.items():
+        base = next(each for (other, _), each in values.items() if other == policy)
+        cells = [_cell(name, x[:, names.index(name)], base[:, names.index(name)]) for name in COLUMNS]
+        who = (f"`{policy}`",) if len(policies) > 1 else ()
+        rows.append((*who, channel, *cells, f"{100 * x[:, names.index('heard')].mean():.0f} %"))
+    who = ("policy",) if len(policies) > 1 else ()
+    return table((*who, "channel", *(heading for heading, _ in COLUMNS.values()), "received"), rows)
+
+
+def _cell(name: str, x: np.ndarray, base: np.ndarray) -> str:
+    digits = COLUMNS[name][1]
+    mean = f"{x.mean():.{digits}f}"
+    if np.array_equal(x, base):
+        return mean
+    d = (paired_counts if name == "faults" else paired)(x, base)
+    text = f"{d.mean:+z.{digits}f} [{d.low:z.{digits}f}, {d.high:z.{digits}f}]"
+    text = text if np.isfinite(d.low) else f"{d.mean:+z.{digits}f}"
+    return f"{mean} ({f'**{text}**' if d.excludes_zero else text})"
