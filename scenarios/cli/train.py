@@ -1,8 +1,7 @@
 """`thermofleet train`."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -22,14 +21,18 @@ def train_command(
     suite: Annotated[
         str | None,
         typer.Option(
-            help="Train scores of arm-job pairs over the instances of this split by evolution, and validate them on "
-            "the split validation. Iteration 0 is the rule wsept.",
+            help="Train over the instances of this split, and validate on the split validation.",
             show_default=False,
         ),
     ] = None,
     algo: Annotated[
-        str, typer.Option(help="mappo (one critic for the whole fleet) or ippo (one critic per arm); not with --suite.")
-    ] = "mappo",
+        str | None,
+        typer.Option(
+            help="mappo (one critic for the whole fleet), ippo (one critic per arm), or pairs (scores of arm-job pairs "
+            "by evolution, only with --suite); default: mappo, with --suite pairs.",
+            show_default=False,
+        ),
+    ] = None,
     minutes: Annotated[float, number("Training time excluding the twins, min.", 0, 100_000, above=True)] = 30.0,
     iterations: Annotated[
         int | None, number("Stop earlier, after this many iterations in total.", 1, 1_000_000)
@@ -46,10 +49,13 @@ def train_command(
     ] = 2.0,
     lr: Annotated[
         float | None,
-        number("Learning rate; default: 0.0003, with --suite 0.04.", 0, 10, above=True, show_default=False),
+        number("Learning rate; default: 0.0003, of pairs 0.04.", 0, 10, above=True, show_default=False),
     ] = None,
-    entropy: Annotated[float, number("Weight of the entropy bonus; not with --suite.", 0, 10)] = 0.002,
-    instances: Annotated[int, number("Prepared training instances of --suite.", 1, 200)] = 48,
+    entropy: Annotated[float, number("Weight of the entropy bonus; not of pairs.", 0, 10)] = 0.002,
+    instances: Annotated[
+        int | None,
+        number("Prepared training instances of --suite; default: 12, of pairs 48.", 1, 200, show_default=False),
+    ] = None,
     judges: Annotated[int, number("Validation instances of --suite, four shifts each.", 1, 200)] = 24,
     seed: Annotated[int, number("Seed for shifts, initialisation and minibatches.", 0, MAX_SEED)] = 0,
     seeds: Annotated[int, number("Number of trainings, from --seed on, one after another.", 1, 100)] = 1,
@@ -76,82 +82,75 @@ def train_command(
         "difficulty": choose("difficulty", difficulty, DifficultyName),
         "risk": choose("risk", risk, RiskName),
     }
-    plan = {"minutes": minutes, "iterations": iterations}
+    algorithm = choose("algorithm", algo or ("mappo" if suite is None else "pairs"), Algorithm)
+    if algorithm == "pairs" and suite is None:
+        raise FleetError("--algo pairs trains over a split: give --suite, not a scenario.")
     chosen = load(scenario) if scenario is not None else None
-    name = f"{suite}-pairs" if chosen is None else f"{chosen.name}-{algo}"
-    places = [out or Path("runs") / f"{name}-{seed + k}" for k in range(seeds)]
-    if suite is not None:
-        _train_suite(suite, places, seed, lr, plan, models, instances, judges, resume=resume)
-        return
-    assert chosen is not None
     if warm_start:
         policy_of(warm_start)
-    require_extra("learn")
-    from agents.learned.ppo import Algorithm, PpoConfig, use_threads
-    from scenarios.run.train_policy import CURVE, TrainingPlan, train
+    places = [
+        out or Path("runs") / f"{suite if chosen is None else chosen.name}-{algorithm}-{seed + k}" for k in range(seeds)
+    ]
+    length: Any = {"minutes": minutes, "iterations": iterations}
+    grounds, judging, card = [], [], {"suite": suite, **models}
+    if algorithm != "pairs":
+        require_extra("learn")
+        from scenarios.run.train_policy import TrainingPlan
 
-    use_threads(threads)
-    for k, where in enumerate(places):
-        try:
-            config = PpoConfig(
-                algorithm=choose("algorithm", algo, Algorithm),
-                envs=envs,
-                decisions=choose("kind of step", decisions, Decisions),
-                discount_s=3600.0 * discount_hours,
-                learning_rate=3e-4 if lr is None else lr,
-                entropy=entropy,
-                seed=seed + k,
-                warm_start=warm_start,
-            )
-        except ValueError as error:
-            raise FleetError(str(error)) from error
+        length = TrainingPlan(**length)
+    else:
+        from scenarios.run.train_pairs import PairPlan
+
+        length = PairPlan(**length)
+    if suite is not None:
+        from scenarios.run.suite_batches import grounds_of
+
+        count = instances or (48 if algorithm == "pairs" else 12)
         with progress_bar() as progress:
-            done = train(
-                chosen, config, where, TrainingPlan(**plan), **models, resume=resume, progress=progress, tell=say
-            )
-        stopped = "Interrupted after" if done.interrupted else "Trained"
-        say(
-            f"{stopped} {done.iterations} iterations, {done.env_steps} env steps, {done.seconds:.0f} s; the best "
-            f"network has a mean reward of {done.best:.1f} a shift on the validation seeds.",
-            out_console,
-        )
-        say(f"Curves: {where / CURVE}. Try it: thermofleet compare {scenario} --policies random,{where}", out_console)
-
-
-def _train_suite(
-    suite: str,
-    places: Sequence[Path],
-    seed: int,
-    lr: float | None,
-    plan: Mapping[str, Any],
-    models: Mapping[str, Any],
-    instances: int,
-    judges: int,
-    *,
-    resume: bool,
-) -> None:
-    """Trainings of scores of pairs, one for each folder."""
-    from agents.learned.evolution import EvolutionConfig
-    from scenarios.run.suite_batches import grounds_of
-    from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs
-
-    length = PairPlan(**plan)
-    with progress_bar() as progress:
-        grounds = grounds_of(suite, instances, **models, progress=progress)
-        judging = grounds_of("validation", judges, **models, progress=progress)
-    card = {"suite": suite, **models, "prepared": len(grounds), "judges": len(judging)}
+            grounds = grounds_of(suite, count, **models, progress=progress)
+            judging = grounds_of("validation", judges, **models, progress=progress)
+        card |= {"prepared": len(grounds), "judges": len(judging)}
     for k, where in enumerate(places):
-        config = EvolutionConfig(seed=seed + k, learning_rate=0.04 if lr is None else lr)
-        done = train_pairs(grounds, judging, config, where, length, card=card, resume=resume, tell=say)
-        stopped = "Interrupted after" if done.interrupted else "Trained"
+        if algorithm == "pairs":
+            from agents.learned.evolution import EvolutionConfig
+            from scenarios.run.train_pairs import train_pairs
+
+            search = EvolutionConfig(seed=seed + k, learning_rate=0.04 if lr is None else lr)
+            done = train_pairs(grounds, judging, search, where, length, card=card, resume=resume, tell=say)
+        else:
+            from agents.learned.ppo import PpoConfig, use_threads
+            from scenarios.run.train_policy import train, train_on_split
+
+            use_threads(threads)
+            try:
+                config = PpoConfig(
+                    algorithm=algorithm,
+                    envs=envs,
+                    decisions=choose("kind of step", decisions, Decisions),
+                    discount_s=3600.0 * discount_hours,
+                    learning_rate=3e-4 if lr is None else lr,
+                    entropy=entropy,
+                    seed=seed + k,
+                    warm_start=warm_start,
+                )
+            except ValueError as error:
+                raise FleetError(str(error)) from error
+            with progress_bar() as progress:
+                told: Any = {"resume": resume, "progress": progress, "tell": say}
+                if chosen is not None:
+                    done = train(chosen, config, where, length, **models, **told)
+                else:
+                    done = train_on_split(grounds, judging, config, where, length, card=card, **told)
         say(
-            f"{stopped} {done.iterations} iterations, {done.shifts} shifts, {done.seconds:.0f} s; the best parameters "
-            f"have {done.best:.3f} of the value on the validation shifts, wsept {done.teacher:.3f}.",
+            f"{'Interrupted after' if done.interrupted else 'Trained'} {done.iterations} iterations, {done.seconds:.0f}"
+            f" s; best reward {done.best:.4g}: {'a shift' if chosen else 'of the value of all jobs'} in validation.",
             out_console,
         )
-        say(
-            f"Curves: {where / CURVE}. Try it: thermofleet compare --suite validation --policies wsept,{where}",
-            out_console,
-        )
+        target = scenario if suite is None else "--suite validation"
+        say(f"Curves: {where / CURVE}. Try it: thermofleet compare {target} --policies random,{where}", out_console)
         if done.interrupted:
             return
+
+
+Algorithm = Literal["mappo", "ippo", "pairs"]
+CURVE = "curve.png"

@@ -18,6 +18,9 @@ from scenarios.suite.splits import Instance, split
 
 Array = np.ndarray
 
+SHIFTS = 4
+"""Shifts of a validation instance: that of its own seed, and others."""
+
 
 @dataclass(frozen=True, eq=False)
 class Ground:
@@ -29,6 +32,11 @@ class Ground:
     horizon_s: float
     library: Library
     weights: RewardWeights
+
+    @property
+    def shifts(self) -> list[int]:
+        """Seeds of its shifts in validation: its own, and the next ones."""
+        return [*range(self.seed, self.seed + SHIFTS)]
 
     @property
     def arms(self) -> int:

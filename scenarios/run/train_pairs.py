@@ -18,8 +18,6 @@ from scenarios.run.training_log import TrainingLog, read_log
 Array = np.ndarray
 
 STATE, CURVE = "training.npz", "curve.png"
-SHIFTS = 4
-"""Shifts of each validation instance: that of its own seed, and others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +131,7 @@ def validation(judges: Sequence[Ground], parameters: Array) -> float:
     """Mean reward of the validation shifts over the value of their jobs."""
     means: list[float] = []
     for judge in judges:
-        seeds = [judge.seed, *range(judge.seed + 1, judge.seed + SHIFTS)]
+        seeds = judge.shifts
         found = rewards(judge, np.tile(parameters, (len(seeds), 1)), seeds)
         means.append(float(np.mean([reward / judge.value(seed) for reward, seed in zip(found, seeds, strict=True)])))
     return float(np.mean(means))

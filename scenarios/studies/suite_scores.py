@@ -110,6 +110,31 @@ def difference(
     return interval(table[:, None, :] if len(table) > 1 else table[0]), len(names)
 
 
+def table(rows: Sequence[Row], trainings: Sequence[str], base: str) -> str:
+    """Markdown: every policy and the trainings together against a baseline, on all sizes of fleets and on new ones."""
+    policies = list(dict.fromkeys(str(row["policy"]) for row in rows))
+    sizes = {"all": (0, LARGEST), f"up to {TRAINED_ARMS} arms": (0, TRAINED_ARMS), "more": (TRAINED_ARMS + 1, LARGEST)}
+    lines = ["| policy | " + " | ".join(f"{name}: share of the value | reward" for name in sizes) + " | faults |"]
+    lines.append("|---" * (2 * len(sizes) + 2) + "|")
+    groups = {"learned, all trainings": list(trainings), **{name: [name] for name in policies if name != base}}
+    for label_, names in groups.items():
+        cells: list[str] = []
+        for low, high in sizes.values():
+            some = [row for row in rows if low <= float(row["arms"]) <= high]  # pyright: ignore[reportArgumentType]
+            for relative in (True, False):
+                found, _ = difference(some, names, base, relative=relative)
+                digits = 3 if relative else 1
+                text = f"{found.mean:+.{digits}f} ({found.low:+.{digits}f} … {found.high:+.{digits}f})"
+                cells.append(f"**{text}**" if found.excludes_zero else text)
+        faults = np.mean([float(row["faults"]) for row in rows if row["policy"] in names])  # pyright: ignore[reportArgumentType]
+        lines.append(f"| `{label_}` | " + " | ".join(cells) + f" | {faults:.2f} |")
+    return "\n".join(lines)
+
+
+TRAINED_ARMS, LARGEST = 16, 10_000
+"""Most arms of the fleets of the training split, and more than any fleet has."""
+
+
 def main() -> None:
     """The command of this module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -118,7 +143,13 @@ def main() -> None:
     parser.add_argument("--difficulty", default="oracle", help="twin, oracle or blind")
     parser.add_argument("--count", type=int, help="only the first instances, which are of all cells in turns")
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument(
+        "--table", help="print differences to this policy instead; --policies are then trainings of one"
+    )
     given = parser.parse_args()
+    if given.table:
+        print(table(read(given.out), given.policies.split(","), given.table))
+        return
     difficulty = choose("difficulty", given.difficulty, DifficultyName)
     write_rows(given.split, given.policies.split(","), given.out, count=given.count, difficulty=difficulty)
 

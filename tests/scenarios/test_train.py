@@ -65,7 +65,7 @@ def test_validation_seeds_are_nobody_elses() -> None:
 
 def test_what_cannot_be_is_refused(tmp_path, capsys) -> None:
     for words, reason in (
-        (["--algo", "dqn"], "No algorithm 'dqn'. Allowed: ippo, mappo."),
+        (["--algo", "dqn"], "No algorithm 'dqn'. Allowed: ippo, mappo, pairs."),
         (["--minutes", "0"], "minutes must be > 0"),
         (["--envs", "0"], "--envs must be 1 to 65536 (got 0)."),
         (["--threads", "0"], "--threads must be 1 to 1024 (got 0)."),

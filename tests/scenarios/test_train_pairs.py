@@ -1,12 +1,14 @@
 """Training over a split of the suite: rewards of batches, the folder that is left, going on, and what is refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from agents.learned.evolution import EvolutionConfig
 from agents.learned.pair_scores import PARAMETERS, first_parameters
+from agents.learned.ppo import PpoConfig
 from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.load import load, override
@@ -15,6 +17,7 @@ from scenarios.prepare.fleet import prepare
 from scenarios.run.evaluate import outcomes
 from scenarios.run.suite_batches import ground_of, rewards
 from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs
+from scenarios.run.train_policy import TrainingPlan, train_on_split
 from scenarios.run.training_log import LOG
 from scenarios.studies.suite_scores import difference, row_of
 from scenarios.suite.splits import Instance
@@ -65,11 +68,26 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
         trained(4, resume=True, samples=6)
 
 
+def test_a_split_is_trained_by_ppo_in_turns_of_its_cells(tmp_path, ground) -> None:
+    small = replace(ground, name="train/9998", seed=5)
+    config = PpoConfig(envs=2, steps=8, epochs=1)
+    plan = TrainingPlan(minutes=5.0, iterations=2, validate_every=2)
+    card: dict[str, object] = {"suite": "train"}
+    done = train_on_split([ground, small], [ground], config, tmp_path / "ppo", plan, card=card)
+    assert (done.iterations, done.env_steps) == (2, 32)
+    rows = [json.loads(line) for line in (tmp_path / "ppo" / LOG).read_text().splitlines()]
+    judged = {row["iteration"]: row["validation_reward"] for row in rows if "validation_reward" in row}
+    assert list(judged) == [0, 2]
+    assert done.best == max(judged.values())
+    assert 0.0 < max(judged.values()) < 1.0, "shares of the value of all jobs"
+
+
 def test_what_cannot_be_is_refused(capsys) -> None:
     for words, reason in (
         ([], "Give either a scenario or --suite SPLIT."),
         (["quickstart", "--suite", "train"], "Give either a scenario or --suite SPLIT."),
         (["--suite", "trian"], "No split 'trian'; did you mean 'train'?"),
+        (["quickstart", "--algo", "pairs"], "give --suite, not a scenario"),
         (["quickstart", "--seeds", "2", "--out", "x"], "leave --out away"),
         (["quickstart", "--lr", "0"], "--lr must be > 0 and at most 10 (got 0)."),
         (["--suite", "train", "--minutes", "0"], "minutes must be > 0"),
