@@ -100,8 +100,10 @@ class ShiftLength:
         clock, ages, kinds = float(seen.clock), np.array(seen.age_s), np.stack([seen.value, seen.payload_kg])
         if self._before is not None and clock > self._before[0]:
             then, ages_then, kinds_then = self._before
-            same = (seen.offered > 0) & (kinds == kinds_then).all(axis=0) & (ages > ages_then) & (ages_then > 0)
-            for length in ((ages - ages_then)[same] / (clock - then)).tolist():
+            n = min(len(ages), len(ages_then))  # a live queue has as many slots as jobs
+            same = (kinds[:, :n] == kinds_then[:, :n]).all(axis=0) & (ages_then[:n] > 0) & (seen.offered[:n] > 0)
+            aged_s = (ages[:n] - ages_then[:n])[same]
+            for length in (aged_s[aged_s > 0] / (clock - then)).tolist():
                 place = round(50.0 * np.log(length))
                 self._counts[place] += 1
                 self._sums[place] += length
