@@ -41,12 +41,12 @@ def upper_bound(relaxation: Relaxation, *, heat: bool = True, nodes: int = 2000)
     """The upper bound of a relaxation: with whole jobs, and with the heat budgets that its solution in parts passes.
 
     Args:
-        nodes: Most nodes of the branch and bound; what it has proved by then counts.
+        nodes: Most nodes of the branch and bound; what it has proved by then counts. 0: the linear program alone.
     """
     rows, bounds = relaxation.rows
     linear, shares = _solve(relaxation, rows, bounds)
     value, count, budget = linear, 0, HeatBudget(relaxation)
-    for _ in range(ROUNDS if heat else 0):
+    for _ in range(ROUNDS if heat and nodes else 0):
         more, limits = budget.violated(shares)
         if not len(limits):
             break
@@ -57,7 +57,8 @@ def upper_bound(relaxation: Relaxation, *, heat: bool = True, nodes: int = 2000)
         gain, value = value - better, min(value, better)
         if gain < LEAST_GAIN * abs(value):
             break
-    value = min(value, _whole(relaxation, rows, bounds, nodes))
+    if nodes:
+        value = min(value, _whole(relaxation, rows, bounds, nodes))
     return UpperBound(value + relaxation.constant, linear + relaxation.constant, count)
 
 
