@@ -102,14 +102,12 @@ def prepare(
     """
     if not isinstance(randomise, Randomisation | None):
         raise ScenarioError(f"randomise must be a scenarios.run.batch.Randomisation (got {randomise!r}).")
+    check_progress(progress)
     randomise = randomise or Randomisation()
     specs = randomise.scenarios_of(scenario)
     fleets: list[Fleet] = []
     for i, spec in enumerate(specs):
-
-        def share(stage: str, fraction: float, i: int = i) -> None:
-            progress(stage, fraction if len(specs) == 1 else (i + fraction) / len(specs))
-
+        share = progress if len(specs) == 1 else lambda stage, s, i=i: progress(stage, (i + s) / len(specs))
         every = range(len(spec.arms))
         made = like and like.all[i]
         arms, planned = _arms(
