@@ -7,7 +7,8 @@ Each size is a process of its own with an empty cache of plans. Costs are CPU se
 the machine matters little; the load average is in the file. Arms observe their eight nearest peers, in 64 slots.
 
 - plans: planning every work for every arm that reaches it, from nothing.
-- conflicts: which plans of two arms exclude each other, from nothing.
+- conflicts: which plans of two arms exclude each other, from nothing. From 129 arms on these two are those of one of
+  several equal halls, multiplied; in the other costs the arms of all halls share one shift, all jobs and one matching.
 - engine: a simulated shift of an hour, steps only. - matching: its decisions. - scores: the twins score two plans of
 each of the eight jobs that an arm gets in an hour; the four twins of quickstart stand for all.
 """
@@ -31,6 +32,8 @@ ONCE = ("plans", "conflicts")
 OUT = Path("docs/results/scaling/arms.jsonl")
 PICTURE = Path("docs/pictures/scaling_arms.png")
 HOURS, JOBS, PEERS = 1.0, 8, 8
+MOST_IN_HALL = 128
+"""A hall is at most 20 m wide; more arms are several halls."""
 SHIFTS = 3
 """Engine and matching: the median of these."""
 
@@ -38,31 +41,31 @@ SHIFTS = 3
 def measure(arms: int) -> dict[str, object]:
     """The costs of a hall of so many arms, CPU s in all, and the most memory, MB."""
     import numpy as np
+    from ask import repeated
     from hall import hall
 
     from agents.registry import make_policy
     from fleet.env.vector import BatchEnv
     from fleet.planning.space import space_table
-    from scenarios.cell_layout import near_of
     from scenarios.load import load
     from scenarios.prepare.fleet import prepare
-    from scenarios.run.batch import library_of
+    from scenarios.run.batch import Randomisation, library_of
 
-    scenario, costs = hall(arms, hours=HOURS, jobs=JOBS * arms * HOURS), dict[str, float]()
+    halls = -(-arms // MOST_IN_HALL)
+    own_arms, costs = arms // halls, dict[str, float]()
+    scenario = hall(own_arms, hours=HOURS, jobs=JOBS * own_arms * HOURS)
+    randomise = Randomisation(arrivals=(halls, halls))
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as empty:
         began = process_time()
-        fleet = prepare(scenario, difficulty="blind", cache=folder)
+        fleet = prepare(scenario, difficulty="blind", cache=folder, randomise=randomise)
         plans = [plan for arm in fleet.arms for variants in arm.plans.values() for plan in variants]
         prepared = process_time() - began
         began = process_time()
         space_table([arm.robot for arm in fleet.arms], plans, scenario.clearance_m, Path(empty))
-        costs["conflicts"] = process_time() - began
-        costs["plans"] = prepared - costs["conflicts"]
+        conflicts = process_time() - began
+        costs["conflicts"], costs["plans"] = halls * conflicts, halls * (prepared - conflicts)
 
-    library = library_of(fleet)
-    library = type(library)(
-        library.arms, library.slots, library.tables, library.draw, near_of(scenario, min(PEERS, arms - 1))
-    )
+    library = repeated(library_of(fleet), halls, min(PEERS, arms - 1))
     env, policy = BatchEnv(library, 1, seed=[0], autoreset=False), make_policy("matching")
     env.reset()
     env.step(np.zeros((1, arms), int))  # compiled now
@@ -79,7 +82,7 @@ def measure(arms: int) -> dict[str, object]:
             twins[a % len(twins)].model.score(own[a % len(own)][n % len(own[a % len(own)])], 10)
     costs["scores"] = process_time() - began
     most_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    shift = {"arms": arms, "hours": HOURS, "jobs": JOBS * arms, "plans_in_all": len(plans)}
+    shift = {"arms": arms, "halls": halls, "hours": HOURS, "jobs": JOBS * arms, "plans_in_all": halls * len(plans)}
     return {**shift, "cpu_s": {name: round(costs[name], 4) for name in COSTS}, "most_mb": round(most_mb)}
 
 
