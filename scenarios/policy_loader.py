@@ -13,6 +13,7 @@ from types import ModuleType
 import numpy as np
 
 from agents.heat_guards import guarded
+from agents.learned.pair_scores import PAIRS, load_pairs
 from agents.policy import SCOPES, ArmPolicy, Policy, for_all_arms
 from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
 from fleet.errors import FleetError, nearest
@@ -60,7 +61,9 @@ def scope_of(name: str) -> str:
     """
     if wrapped := _wrapped(name):
         return scope_of(wrapped[1])
-    return "arm" if _is_folder(name) else _made_by(name)[1]
+    if _is_folder(name):
+        return "central" if _has_pairs(name) else "arm"
+    return _made_by(name)[1]
 
 
 def policy_at(name: str, seed: int) -> Policy:
@@ -110,12 +113,18 @@ def _is_folder(name: str) -> bool:
     return bool(name) and Path(name).is_dir()
 
 
+def _has_pairs(name: str) -> bool:
+    return (Path(name) / PAIRS).is_file()
+
+
 def _maker(name: str, depth: int = 0) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
     if depth > MOST_WRAPPERS:
         raise FleetError(f"A policy has at most {MOST_WRAPPERS} wrappers round it ({', '.join(WRAPPERS)}).")
     if wrapped := _wrapped(name):
         wrapper, inner = wrapped[0], _maker(wrapped[1], depth + 1)
         return lambda: guarded(wrapper.kind, inner())  # pyright: ignore[reportReturnType]  # as the policy in it
+    if _is_folder(name) and _has_pairs(name):
+        return lambda: load_pairs(Path(name))
     if _is_folder(name):
         from agents.learned.policy import load_policy  # loads torch
 

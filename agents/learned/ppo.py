@@ -10,7 +10,8 @@ Duff, NeurIPS 1994; Sutton, Precup & Singh, Artificial Intelligence 1999).
 
 import pickle
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -176,16 +177,12 @@ def advantages(
     return estimate(gamma, lmbda, values, next_values, reward, done, done)
 
 
-class Trainer:
-    """Trains an actor and a critic."""
+class TrainingCell:
+    """One environment of a training, with what learns in it; all of them share actor and critic."""
 
-    def __init__(self, make_env: EnvFactory, layout: Layout, config: PpoConfig) -> None:
-        self.config, self.layout = config, layout
-        self.done = 0
-        """Number of finished iterations."""
-        torch.manual_seed(self._seed_of(0))
-        self.actor, self.critic = Actor(config.size), Critic(config.size, central=config.algorithm == "mappo")
-        chooser = TensorDictModule(Chooser(self.actor, layout), in_keys=[SEEN, MASK], out_keys=[("arms", "logits")])
+    def __init__(self, make_env: EnvFactory, layout: Layout, actor: Actor, config: PpoConfig) -> None:
+        self.make_env, self.layout = make_env, layout
+        chooser = TensorDictModule(Chooser(actor, layout), in_keys=[SEEN, MASK], out_keys=[("arms", "logits")])
         keys: Any = {"logits": ("arms", "logits"), "mask": MASK}  # TorchRL accepts a dict, its annotation does not
         self.policy = ProbabilisticActor(
             chooser,
@@ -195,13 +192,39 @@ class Trainer:
             return_log_prob=True,
             log_prob_key=("arms", LIKELIHOOD),
         )
-        self._loss = ClipPPOLoss(
+        self.loss = ClipPPOLoss(
             self.policy, None, clip_epsilon=config.clip, entropy_coeff=config.entropy, critic_coeff=None
         )
-        self._loss.set_keys(action=ACTION, sample_log_prob=("arms", LIKELIHOOD), advantage="advantage")
+        self.loss.set_keys(action=ACTION, sample_log_prob=("arms", LIKELIHOOD), advantage="advantage")
+
+    def collect(self, config: PpoConfig, seed: int) -> Collector:
+        """Endless rollouts of an iteration each."""
+        return Collector(
+            self.make_env(config.envs, seed),
+            self.policy,
+            frames_per_batch=config.envs * config.length,
+            total_frames=-1,
+            use_buffers=False,
+            auto_register_policy_transforms=False,
+        )
+
+
+class Trainer:
+    """Trains an actor and a critic.
+
+    Args:
+        cells: Environments with their layouts; iterations take them in turns.
+    """
+
+    def __init__(self, cells: Sequence[tuple[EnvFactory, Layout]], config: PpoConfig) -> None:
+        self.config = config
+        self.done = 0
+        """Number of finished iterations."""
+        torch.manual_seed(self._seed_of(0))
+        self.actor, self.critic = Actor(config.size), Critic(config.size, central=config.algorithm == "mappo")
+        self._cells = [TrainingCell(make_env, layout, self.actor, config) for make_env, layout in cells]
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(self._parameters, lr=config.learning_rate, eps=1e-5)
-        self._make_env = make_env
 
     @property
     def env_steps(self) -> int:
@@ -210,33 +233,29 @@ class Trainer:
 
     def iterate(self) -> Iterator[Iteration]:
         """Endless iterations of collecting and learning; random draws depend on the number of finished iterations."""
-        frames = self.config.envs * self.config.length
         torch.manual_seed(self._seed_of(1))
         self._order = np.random.default_rng(self._seed_of(2))
-        collector = Collector(
-            self._make_env(self.config.envs, self._seed_of(3)),
-            self.policy,
-            frames_per_batch=frames,
-            total_frames=-1,
-            use_buffers=False,
-            auto_register_policy_transforms=False,
-        )
-        try:
-            for rollout in collector:
-                yield self._learn(rollout)
-        finally:
-            collector.shutdown()
+        seed = self._seed_of(3)
+        with ExitStack() as stack:
+            collectors: dict[int, Iterator[TensorDictBase]] = {}
+            while True:
+                turn = self.done % len(self._cells)
+                if turn not in collectors:
+                    collector = self._cells[turn].collect(self.config, seed + turn)
+                    stack.callback(collector.shutdown)
+                    collectors[turn] = iter(collector)
+                yield self._learn(next(collectors[turn]), self._cells[turn])
 
     def _seed_of(self, purpose: int) -> int:
         """Seed of the initial weights (0), the actions (1), the minibatches (2) and the episodes (3)."""
         seed = np.random.SeedSequence([self.config.seed, purpose, self.done])
         return int(seed.generate_state(1)[0])
 
-    def _learn(self, rollout: TensorDictBase) -> Iteration:
+    def _learn(self, rollout: TensorDictBase, cell: TrainingCell) -> Iteration:
         config = self.config
-        advantage, target = self._advantages(rollout)
+        advantage, target = self._advantages(rollout, cell.layout)
         seen: Any = rollout[SEEN]  # a tensor; the stub allows any entry
-        choice = choices(self.layout, seen, rollout[MASK])
+        choice = choices(cell.layout, seen, rollout[MASK])
         at_choices = advantage[choice]
         advantage = (advantage - at_choices.mean()) / (at_choices.std() + 1e-6)
         count = int(choice.sum())
@@ -251,17 +270,19 @@ class Trainer:
             moments = np.array_split(self._order.permutation(len(vectors))[: len(vectors) // config.epochs], batches)
             for row, moment in zip(rows, moments, strict=True):
                 at = torch.from_numpy(moment)
-                statistics.append(self._step(chosen[torch.from_numpy(row)], vectors[at], target[at]))
+                statistics.append(self._step(cell, chosen[torch.from_numpy(row)], vectors[at], target[at]))
         self.done += 1
         entropy, clipped, value_loss = np.mean(statistics, axis=0).tolist()
         hours = float(rollout["next", "arms", "elapsed_s"][:, :, 0].double().sum()) / 3600.0
         reward = float(rollout["next", "arms", "reward"][:, :, 0].double().sum()) / hours
         return Iteration(self.done, self.env_steps, hours, reward, count, entropy, clipped, value_loss)
 
-    def _step(self, choices: TensorDictBase, vectors: Tensor, target: Tensor) -> tuple[float, float, float]:
+    def _step(
+        self, cell: TrainingCell, choices: TensorDictBase, vectors: Tensor, target: Tensor
+    ) -> tuple[float, float, float]:
         """One step of the optimiser; entropy, clipped share and value loss."""
-        losses: Any = self._loss(choices)  # a TensorDict of tensors
-        value_loss = nn.functional.smooth_l1_loss(self.critic(self.layout, vectors), target)
+        losses: Any = cell.loss(choices)  # a TensorDict of tensors
+        value_loss = nn.functional.smooth_l1_loss(self.critic(cell.layout, vectors), target)
         loss = losses["loss_objective"] + losses["loss_entropy"] + value_loss
         self.optimizer.zero_grad()
         loss.backward()
@@ -270,14 +291,14 @@ class Trainer:
         return float(losses["entropy"]), float(losses["clip_fraction"]), float(value_loss.detach())
 
     @torch.no_grad()
-    def _advantages(self, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def _advantages(self, rollout: TensorDictBase, layout: Layout) -> tuple[Tensor, Tensor]:
         """Advantages and value targets, [env, time, arm].
 
         The horizon terminates an episode too, because the clock is in the observation.
         """
-        values = self.critic(self.layout, rollout[SEEN])
+        values = self.critic(layout, rollout[SEEN])
         next_seen: Any = rollout["next", *SEEN]  # a tensor; the stub allows any entry
-        next_values = torch.cat([values[:, 1:], self.critic(self.layout, next_seen[:, -1:])], dim=1)  # ignored at ends
+        next_values = torch.cat([values[:, 1:], self.critic(layout, next_seen[:, -1:])], dim=1)  # ignored at ends
         done = rollout["next", "done"].expand(*values.shape)
         reward = rollout["next", "arms", "reward"][..., 0] * self.config.reward_scale
         elapsed_s = rollout["next", "arms", "elapsed_s"][..., 0]
@@ -285,11 +306,11 @@ class Trainer:
             elapsed_s, reward, values, next_values, done, discount_s=self.config.discount_s, trace_s=self.config.trace_s
         )
 
-    def act(self, vectors: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def act(self, layout: Layout, vectors: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Actions of the present actor, int [...], at vectors float32 [..., size] and masks."""
         legal = torch.from_numpy(mask)
         with torch.inference_mode():
-            logits = Chooser(self.actor, self.layout)(torch.from_numpy(vectors), legal)
+            logits = Chooser(self.actor, layout)(torch.from_numpy(vectors), legal)
             return draw(masked(logits, legal).numpy(), rng)
 
     def save(self, path: Path, **numbers: float) -> None:

@@ -1,12 +1,12 @@
 """`thermofleet train`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import typer
 
 from fleet.errors import FleetError
-from scenarios.cli.options import MAX_SEED, DifficultyOption, RiskOption, ScenarioArg, number
+from scenarios.cli.options import MAX_SEED, DifficultyOption, RiskOption, number
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.load import load
@@ -15,10 +15,24 @@ from scenarios.schema_errors import choose
 
 
 def train_command(
-    scenario: ScenarioArg,
+    scenario: Annotated[
+        str | None, typer.Argument(help="A library name, a .toml file or an instance of the suite; or use --suite.")
+    ] = None,
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="Train over the instances of this split, and validate on the split validation.",
+            show_default=False,
+        ),
+    ] = None,
     algo: Annotated[
-        str, typer.Option(help="mappo (one critic for the whole fleet) or ippo (one critic per arm).")
-    ] = "mappo",
+        str | None,
+        typer.Option(
+            help="mappo (one critic for the whole fleet), ippo (one critic per arm), or pairs (scores of arm-job pairs "
+            "by evolution, only with --suite); default: mappo, with --suite pairs.",
+            show_default=False,
+        ),
+    ] = None,
     minutes: Annotated[float, number("Training time excluding the twins, min.", 0, 100_000, above=True)] = 30.0,
     iterations: Annotated[
         int | None, number("Stop earlier, after this many iterations in total.", 1, 1_000_000)
@@ -33,8 +47,21 @@ def train_command(
     discount_hours: Annotated[
         float, number("Horizon of the discount: a reward this much later counts 1/e.", 0.01, 1000)
     ] = 2.0,
+    lr: Annotated[
+        float | None,
+        number("Learning rate; default: 0.0003, of pairs 0.04.", 0, 10, above=True, show_default=False),
+    ] = None,
+    entropy: Annotated[float, number("Weight of the entropy bonus; not of pairs.", 0, 10)] = 0.002,
+    instances: Annotated[
+        int | None,
+        number("Prepared training instances of --suite; default: 12, of pairs 48.", 1, 200, show_default=False),
+    ] = None,
+    judges: Annotated[int, number("Validation instances of --suite, four shifts each.", 1, 200)] = 24,
     seed: Annotated[int, number("Seed for shifts, initialisation and minibatches.", 0, MAX_SEED)] = 0,
-    out: Annotated[Path | None, typer.Option(help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED.")] = None,
+    seeds: Annotated[int, number("Number of trainings, from --seed on, one after another.", 1, 100)] = 1,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED. Not with --seeds.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in --out.")] = False,
     threads: Annotated[int, number("Threads of the network's computations.", 1, 1024)] = 1,
     difficulty: DifficultyOption = "twin",
@@ -44,37 +71,86 @@ def train_command(
 
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """
-    chosen = load(scenario)
-    if warm_start:
-        policy_of(warm_start)
-    where = out or Path("runs") / f"{chosen.name}-{algo}-{seed}"
-    require_extra("learn")
-    from agents.learned.ppo import Algorithm, PpoConfig, use_threads
+    if (scenario is None) == (suite is None):
+        raise FleetError("Give either a scenario or --suite SPLIT.")
+    if seeds > 1 and out is not None:
+        raise FleetError("--seeds makes several trainings: they go to runs/, leave --out away.")
     from fleet.env.validation import Decisions
     from scenarios.prepare.fleet import DifficultyName, RiskName
-    from scenarios.run.train_policy import CURVE, TrainingPlan, train
 
-    use_threads(threads)
-    algorithm = choose("algorithm", algo, Algorithm)
-    try:
-        config = PpoConfig(
-            algorithm=algorithm,
-            envs=envs,
-            decisions=choose("kind of step", decisions, Decisions),
-            discount_s=3600.0 * discount_hours,
-            seed=seed,
-            warm_start=warm_start,
+    models: Any = {
+        "difficulty": choose("difficulty", difficulty, DifficultyName),
+        "risk": choose("risk", risk, RiskName),
+    }
+    algorithm = choose("algorithm", algo or ("mappo" if suite is None else "pairs"), Algorithm)
+    if algorithm == "pairs" and suite is None:
+        raise FleetError("--algo pairs trains over a split: give --suite, not a scenario.")
+    chosen = load(scenario) if scenario is not None else None
+    if warm_start:
+        policy_of(warm_start)
+    places = [
+        out or Path("runs") / f"{suite if chosen is None else chosen.name}-{algorithm}-{seed + k}" for k in range(seeds)
+    ]
+    length: Any = {"minutes": minutes, "iterations": iterations}
+    grounds, judging, card = [], [], {"suite": suite, **models}
+    if algorithm != "pairs":
+        require_extra("learn")
+        from scenarios.run.train_policy import TrainingPlan
+
+        length = TrainingPlan(**length)
+    else:
+        from scenarios.run.train_pairs import PairPlan
+
+        length = PairPlan(**length)
+    if suite is not None:
+        from scenarios.run.suite_batches import grounds_of
+
+        count = instances or (48 if algorithm == "pairs" else 12)
+        with progress_bar() as progress:
+            grounds = grounds_of(suite, count, **models, progress=progress)
+            judging = grounds_of("validation", judges, **models, progress=progress)
+        card |= {"prepared": len(grounds), "judges": len(judging)}
+    for k, where in enumerate(places):
+        if algorithm == "pairs":
+            from agents.learned.evolution import EvolutionConfig
+            from scenarios.run.train_pairs import train_pairs
+
+            search = EvolutionConfig(seed=seed + k, learning_rate=0.04 if lr is None else lr)
+            done = train_pairs(grounds, judging, search, where, length, card=card, resume=resume, tell=say)
+        else:
+            from agents.learned.ppo import PpoConfig, use_threads
+            from scenarios.run.train_policy import train, train_on_split
+
+            use_threads(threads)
+            try:
+                config = PpoConfig(
+                    algorithm=algorithm,
+                    envs=envs,
+                    decisions=choose("kind of step", decisions, Decisions),
+                    discount_s=3600.0 * discount_hours,
+                    learning_rate=3e-4 if lr is None else lr,
+                    entropy=entropy,
+                    seed=seed + k,
+                    warm_start=warm_start,
+                )
+            except ValueError as error:
+                raise FleetError(str(error)) from error
+            with progress_bar() as progress:
+                told: Any = {"resume": resume, "progress": progress, "tell": say}
+                if chosen is not None:
+                    done = train(chosen, config, where, length, **models, **told)
+                else:
+                    done = train_on_split(grounds, judging, config, where, length, card=card, **told)
+        say(
+            f"{'Interrupted after' if done.interrupted else 'Trained'} {done.iterations} iterations, {done.seconds:.0f}"
+            f" s; best reward {done.best:.4g}: {'a shift' if chosen else 'of the value of all jobs'} in validation.",
+            out_console,
         )
-    except ValueError as error:
-        raise FleetError(str(error)) from error
-    plan = TrainingPlan(minutes=minutes, iterations=iterations)
-    models = {"difficulty": choose("difficulty", difficulty, DifficultyName), "risk": choose("risk", risk, RiskName)}
-    with progress_bar() as progress:
-        done = train(chosen, config, where, plan, **models, resume=resume, progress=progress, tell=say)
-    stopped = "Interrupted after" if done.interrupted else "Trained"
-    say(
-        f"{stopped} {done.iterations} iterations, {done.env_steps} env steps, {done.seconds:.0f} s; the best network "
-        f"has a mean reward of {done.best:.1f} a shift on the validation seeds.",
-        out_console,
-    )
-    say(f"Curves: {where / CURVE}. Try it: thermofleet compare {scenario} --policies random,{where}", out_console)
+        target = scenario if suite is None else "--suite validation"
+        say(f"Curves: {where / CURVE}. Try it: thermofleet compare {target} --policies random,{where}", out_console)
+        if done.interrupted:
+            return
+
+
+Algorithm = Literal["mappo", "ippo", "pairs"]
+CURVE = "curve.png"

@@ -12,26 +12,29 @@ import numpy as np
 
 from agents.learned.imitation import imitate
 from agents.learned.policy import CARD, save_policy
-from agents.learned.ppo import Iteration, PpoConfig, Trainer
-from agents.policy import Policy
+from agents.learned.ppo import PpoConfig, Trainer
+from agents.policy import WAIT, Policy, only_choices
+from fleet.engine.reward import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
-from fleet.env.vector import BatchEnv, Obs
+from fleet.env.vector import BatchEnv, Library, Obs
 from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.fault_price import weights_of
-from scenarios.policy_loader import policy_of
+from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.run.shift import scenario_hash
+from scenarios.run.suite_batches import Ground
+from scenarios.run.training_log import TrainingLog, read_log
 from scenarios.schema import Scenario
 
 Array = np.ndarray
 
 VALIDATION_SEED = 2_000_000
 """First validation seed; far from the seeds of comparisons."""
-STATE, LOG, CURVE = "training.pt", "progress.jsonl", "curve.png"
+STATE, CURVE = "training.pt", "curve.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,14 +108,74 @@ def train(
     _check_folder(out, card, resume=resume)
     fleet = prepare(scenario, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
     library, weights = library_of(fleet), weights_of(scenario)
-
-    def make_env(envs: int, seed: int) -> TorchRLEnv:
-        options = {"weights": weights, "decisions": config.decisions, "stagger": True}
-        return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, **options))
-
     # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in training.
-    judge = BatchEnv(library, plan.validation_envs, weights=weights)
-    trainer = Trainer(make_env, judge.layout, config)
+    env = BatchEnv(library, plan.validation_envs, weights=weights)
+    judge = Judge(env, [VALIDATION_SEED + i for i in range(plan.validation_envs)], np.ones(plan.validation_envs))
+    return _train([(library, weights)], [judge], config, out, plan, card, resume, progress, tell)
+
+
+def train_on_split(
+    grounds: Sequence[Ground],
+    judges: Sequence[Ground],
+    config: PpoConfig,
+    out: Path,
+    plan: TrainingPlan,
+    *,
+    card: dict[str, Any],
+    resume: bool = False,
+    progress: Progress = quiet,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> Trained:
+    """As `train`, on instances in turns: an iteration for each. Rewards of validation are shares of the value of all
+    jobs.
+
+    Args:
+        grounds, judges: Instances of training and of validation.
+        card: What else the card says; a resume must have the same.
+    """
+    card = {**card, "config": asdict(config)}
+    _check_folder(out, card, resume=resume)
+    judging = [
+        Judge(BatchEnv(judge.library, len(seeds), weights=judge.weights), seeds, np.array([*map(judge.value, seeds)]))
+        for judge in judges
+        for seeds in [judge.shifts]
+    ]
+    cells = [(ground.library, ground.weights) for ground in grounds]
+    return _train(cells, judging, config, out, plan, card, resume, progress, tell)
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Validation shifts of one environment."""
+
+    env: BatchEnv
+    seeds: Sequence[int]
+    units: Array
+    """What the reward of each shift is divided by, [env]."""
+
+    def reward(self, act: Callable[[Obs], Array]) -> float:
+        """Mean reward of a shift, in its unit."""
+        return float((returns(self.env, act, self.seeds) / self.units).mean())
+
+
+def _train(
+    cells: Sequence[tuple[Library, RewardWeights]],
+    judges: Sequence[Judge],
+    config: PpoConfig,
+    out: Path,
+    plan: TrainingPlan,
+    card: dict[str, Any],
+    resume: bool,
+    progress: Progress,
+    tell: Callable[[str], None],
+) -> Trained:
+    options: Any = {"autoreset": False, "decisions": config.decisions, "stagger": True}  # two kinds of values
+
+    def factory(library: Library, weights: RewardWeights) -> Callable[[int, int], TorchRLEnv]:
+        return lambda envs, seed: TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=weights, **options))
+
+    layouts = [BatchEnv(library, 1).layout for library, _ in cells]
+    trainer = Trainer([(factory(*cell), layout) for cell, layout in zip(cells, layouts, strict=True)], config)
     best = -np.inf
     if resume:
         best = trainer.load(out / STATE)["best"]
@@ -120,37 +183,47 @@ def train(
             raise FleetError(f"The training in '{out}' has {trainer.done} iterations: --iterations must be more.")
     elif config.warm_start:
         rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
-        teacher = BatchEnv(
-            library, 16, seed=int(rng.integers(2**31)), weights=weights, stagger=True, decisions="events"
-        )
-        imitate(trainer.actor, judge.layout, _demonstrations(teacher, config.warm_start, progress), rng)
+        for (library, weights), layout in zip(cells, layouts, strict=True):
+            seed = int(rng.integers(2**31))
+            teacher = BatchEnv(library, 16, seed=seed, weights=weights, stagger=True, decisions="events")
+            batches = max(1, DEMONSTRATIONS // len(cells))
+            imitate(trainer.actor, layout, _demonstrations(teacher, config.warm_start, batches, progress), rng)
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-    began_s, interrupted = time.monotonic(), False
-    seeds = [VALIDATION_SEED + i for i in range(plan.validation_envs)]
+    log, began_s, interrupted = TrainingLog(out), time.monotonic(), False
 
-    def validate(iteration: Iteration) -> None:
+    def validate(number: int, env_steps: int) -> None:
         nonlocal best
-        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, iteration.number]))
-        act = partial(trainer.act, rng=rng)
-        reward = float(returns(judge, lambda obs: act(obs["observation"], obs["action_mask"]), seeds).mean())
+        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, number]))
+
+        def reward_of(judge: Judge) -> float:
+            act = partial(trainer.act, judge.env.layout, rng=rng)
+            return judge.reward(lambda obs: act(obs["observation"], obs["action_mask"]))
+
+        reward = float(np.mean([reward_of(judge) for judge in judges]))
         if reward > best:
             best = reward
-            details = {"algorithm": config.algorithm, "iterations": iteration.number, "env_steps": iteration.env_steps}
+            details = {"algorithm": config.algorithm, "iterations": number, "env_steps": env_steps}
             save_policy(trainer.actor, config.size, out, **card, **details, validation_reward=reward)
         trainer.save(out / STATE, best=best)
-        _append(out / LOG, {"iteration": iteration.number, "validation_reward": reward})
-        tell(f"Iteration {iteration.number}: {reward:.1f} per shift on the validation seeds, best {best:.1f}.")
+        log.add(number, {"iteration": number, "validation_reward": reward})
+        tell(f"Iteration {number}: {reward:.4g} per shift on the validation seeds, best {best:.4g}.")
 
     iteration, validated = None, 0
     try:
+        if not resume:
+            if rule := config.warm_start:
+                found = [judge.reward(_rule_actions(rule, judge.env, judge.seeds)) for judge in judges]
+                log.add(0, {"teacher": float(np.mean(found))})
+                tell(f"Teacher {rule}: {np.mean(found):.4g} per shift on the validation seeds.")
+            validate(0, 0)
         for iteration in trainer.iterate():
-            _append(out / LOG, asdict(iteration))
+            log.add(iteration.number, asdict(iteration))
             spent_s = time.monotonic() - began_s
             share = max(spent_s / (60.0 * plan.minutes), iteration.number / (plan.iterations or np.inf))
-            progress(f"iteration {iteration.number}, best {best:.1f}", min(share, 1.0))
+            progress(f"iteration {iteration.number}, best {best:.4g}", min(share, 1.0))
             if iteration.number % plan.validate_every == 0 or share >= 1.0:
-                validate(iteration)
+                validate(iteration.number, iteration.env_steps)
                 validated = iteration.number
             if share >= 1.0:
                 break
@@ -159,25 +232,25 @@ def train(
         if iteration is None:
             raise
         if validated < iteration.number:
-            validate(iteration)
+            validate(iteration.number, iteration.env_steps)
     draw_curves(out)
     return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
 
 
 DEMONSTRATIONS = 60
-"""Batches of a rule's decisions for a warm start."""
+"""Batches of a rule's decisions for a warm start, of all cells together."""
 STEPS = 16
 """Steps of every env in a batch."""
 
 
-def _demonstrations(env: BatchEnv, rule: str, progress: Progress) -> Iterator[tuple[Array, Array, Array]]:
+def _demonstrations(env: BatchEnv, rule: str, count: int, progress: Progress) -> Iterator[tuple[Array, Array, Array]]:
     """Batches of a rule's decisions: vectors, masks and actions, [row, …], one row per step, env and arm."""
     policies = [policy_of(rule) for _ in range(env.num_envs)]
     for policy, child in zip(policies, np.random.SeedSequence(0).spawn(env.num_envs), strict=True):
         policy.reset(np.random.default_rng(child))
     obs, _ = env.reset()
-    for number in range(DEMONSTRATIONS):
-        progress(f"imitating {rule}", Count(number, DEMONSTRATIONS))
+    for number in range(count):
+        progress(f"imitating {rule}", Count(number, count))
         rows: list[tuple[Array, Array, Array]] = []
         for _ in range(STEPS):
             actions = np.array([_actions_of(policy, env, obs, e) for e, policy in enumerate(policies)])
@@ -192,6 +265,21 @@ def _actions_of(policy: Policy, env: BatchEnv, obs: Obs, e: int) -> list[int]:
     vectors, masks, read = obs["observation"][e], obs["action_mask"][e], env.layout.read
     actions = policy.act({arm: read(vectors[a], masks[a]) for a, arm in enumerate(env.agents)})
     return [actions[arm] for arm in env.agents]
+
+
+def _rule_actions(rule: str, env: BatchEnv, seeds: Sequence[int]) -> Callable[[Obs], Array]:
+    """Actions of a rule, one instance for each env, [env, arm]."""
+    policies = [policy_at(rule, seed) for seed in seeds]
+    when_asked = only_choices(policies[0])
+
+    def act(obs: Obs) -> Array:
+        actions = np.full(obs["action_mask"].shape[:2], WAIT)
+        for e, policy in enumerate(policies):
+            if not when_asked or obs["action_mask"][e, :, 1:-1].any():
+                actions[e] = _actions_of(policy, env, obs, e)
+        return actions
+
+    return act
 
 
 def returns(env: BatchEnv, act: Callable[[Obs], Array], seeds: Sequence[int]) -> Array:
@@ -209,12 +297,16 @@ def draw_curves(folder: Path) -> None:
     """Plot validation reward, entropy, clipped share and value loss against the iteration."""
     from matplotlib.figure import Figure  # without a display
 
-    rows = [json.loads(line) for line in (folder / LOG).read_text(encoding="utf-8").splitlines()]
+    rows = read_log(folder)
     iterations = [row for row in rows if "env_steps" in row]
     validations = [row for row in rows if "validation_reward" in row]
     figure = Figure(figsize=(9, 6), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.plot([r["iteration"] for r in validations], [r["validation_reward"] for r in validations], "o-", ms=3)
+    for row in rows:
+        if "teacher" in row:
+            top.axhline(row["teacher"], color="k", lw=1, ls="--", label="the rule that was imitated")
+            top.legend(frameon=False)
     top.set_ylabel("reward of a shift, validation seeds")
     labels = {"entropy": "entropy of choices, nat", "clipped": "share of clipped ratios", "value_loss": "value loss"}
     for name, label in labels.items():
@@ -243,8 +335,3 @@ def _check_folder(out: Path, card: dict[str, Any], *, resume: bool) -> None:
     for name, value in now.items():
         if was.get(name) != value:
             raise FleetError(f"The training in '{out}' has {name} = {was.get(name)} (got {value}).")
-
-
-def _append(path: Path, row: dict[str, Any]) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")

@@ -10,7 +10,8 @@ from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.load import load, override
 from scenarios.policy_loader import label, policy_of
-from scenarios.run.train_policy import CURVE, LOG, STATE, VALIDATION_SEED, TrainingPlan, train
+from scenarios.run.train_policy import CURVE, STATE, VALIDATION_SEED, TrainingPlan, train
+from scenarios.run.training_log import LOG
 
 SMALL = {"horizon_s": 300.0}
 
@@ -38,7 +39,7 @@ def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> N
     out = tmp_path / "learned"
     done, told = trained(out, cache)
     assert (done.iterations, done.env_steps, done.interrupted) == (2, 2 * 4 * 16, False)
-    assert len(told) == 2
+    assert len(told) == 3, "of iteration 0, too"
     rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
     judged = [row["validation_reward"] for row in rows if "validation_reward" in row]
     assert done.best == max(judged)
@@ -64,7 +65,7 @@ def test_validation_seeds_are_nobody_elses() -> None:
 
 def test_what_cannot_be_is_refused(tmp_path, capsys) -> None:
     for words, reason in (
-        (["--algo", "dqn"], "No algorithm 'dqn'. Allowed: ippo, mappo."),
+        (["--algo", "dqn"], "No algorithm 'dqn'. Allowed: ippo, mappo, pairs."),
         (["--minutes", "0"], "minutes must be > 0"),
         (["--envs", "0"], "--envs must be 1 to 65536 (got 0)."),
         (["--threads", "0"], "--threads must be 1 to 1024 (got 0)."),

@@ -1,0 +1,217 @@
+"""A learned score of pairs of arm and option: `wsept` with a small network, matched as `wsept` matches.
+
+score = rate · exp(f) + g · mean rate, where `rate` is the expected worth per time with learned prices
+(`agents.learned.pairs.Worth`), and f and g are outputs of a network of the pair's numbers. All parameters are one
+vector; zeros of the prices and of the last layers give `wsept` exactly.
+"""
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from agents.assignment import matching
+from agents.learned.pairs import PAIR_FEATURES, Worth, pairs_of
+from agents.policy import WAIT, plans_of
+from fleet.errors import CheckpointError
+from fleet.files import atomic_path
+from fleet.observation import FIELDS, Observation
+
+Array = np.ndarray
+
+PAIRS, PAIRS_CARD = "pairs.npy", "pairs.json"
+HIDDEN, OUTPUTS = 6, 2
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "worth": (len(Worth._fields),),
+    "direct": (PAIR_FEATURES, OUTPUTS),
+    "output": (HIDDEN, OUTPUTS),
+    "hidden": (PAIR_FEATURES, HIDDEN),
+    "bias": (HIDDEN,),
+}
+_ENDS = np.cumsum([int(np.prod(shape)) for shape in _SHAPES.values()])
+PARAMETERS = int(_ENDS[-1])
+"""Length of the vector of parameters."""
+USUAL_S = 7200.0
+"""Length of a shift until two observations have shown it; before that, its end is far in any case."""
+
+
+def first_parameters(rng: np.random.Generator) -> Array:
+    """Parameters that are `wsept`, with random hidden units, float [PARAMETERS]."""
+    parameters = np.zeros(PARAMETERS)
+    hidden = slice(_ENDS[2], _ENDS[3])
+    parameters[hidden] = rng.standard_normal(_ENDS[3] - _ENDS[2]) / np.sqrt(PAIR_FEATURES)
+    return parameters
+
+
+def scores(seen: Observation, left_s: Array, parameters: Array) -> Array:
+    """Scores of all options, [env, arm, option]; −inf where a claim is not legal or not wanted.
+
+    Args:
+        seen: Observations [env, arm].
+        left_s: Time until the end of the shift, [env].
+        parameters: [env, PARAMETERS].
+    """
+    parts = np.split(parameters, _ENDS[:-1], axis=-1)
+    worth, direct, output, hidden, bias = (
+        part.reshape(-1, *shape) for part, shape in zip(parts, _SHAPES.values(), strict=True)
+    )
+    every = seen.duration_s.shape[-1]
+    pairs = pairs_of(_without_empty(seen), left_s, Worth(*worth.T))
+    envs, arms, options = pairs.legal.shape
+    inputs = pairs.features.reshape(envs, arms * options, PAIR_FEATURES)
+    found = inputs @ direct + np.tanh(inputs @ hidden + bias[:, None]) @ output
+    found = np.clip(found, -3.0, 3.0).reshape(envs, arms, options, OUTPUTS)
+    score = pairs.rate * np.exp(found[..., 0]) + found[..., 1] * pairs.scale
+    result = np.full((envs, arms, every), -np.inf)
+    result[..., :options] = np.where(pairs.legal & (score > 0), score, -np.inf)
+    return result
+
+
+def claims(score: Array, plans: int) -> Array:
+    """Actions int [arm] of scores [arm, option]: as many jobs as possible with the largest total score."""
+    actions = np.full(len(score), WAIT)
+    by_slot = score.reshape(len(score), -1, plans)
+    best = by_slot.argmax(axis=2)
+    for arm, slot in matching(-by_slot.max(axis=2)):
+        actions[arm] = 1 + slot * plans + best[arm, slot]
+    return actions
+
+
+class ShiftLength:
+    """Length of a shift, from how the clock moves between two observations while jobs age.
+
+    The clock is a share of the shift and the age of a job is a time, so each job that still waits gives a quotient.
+    Jobs that moved to another slot give wrong ones, which scatter: the most frequent quotient counts.
+    """
+
+    def __init__(self) -> None:
+        self._before: tuple[float, Array, Array] | None = None
+        self._counts: dict[int, int] = defaultdict(int)
+        self._sums: dict[int, float] = defaultdict(float)
+
+    def seen(self, seen: Observation) -> float:
+        """The length, s, after one more observation of any arm."""
+        clock, ages, kinds = float(seen.clock), np.array(seen.age_s), np.stack([seen.value, seen.payload_kg])
+        if self._before is not None and clock > self._before[0]:
+            then, ages_then, kinds_then = self._before
+            n = min(len(ages), len(ages_then))  # a live queue has as many slots as jobs
+            same = (kinds[:, :n] == kinds_then[:, :n]).all(axis=0) & (ages_then[:n] > 0) & (seen.offered[:n] > 0)
+            aged_s = (ages[:n] - ages_then[:n])[same]
+            for length in (aged_s[aged_s > 0] / (clock - then)).tolist():
+                place = round(50.0 * np.log(length))
+                self._counts[place] += 1
+                self._sums[place] += length
+        self._before = clock, ages, kinds
+        if not self._counts:
+            return USUAL_S
+        place = max(self._counts, key=self._counts.__getitem__)
+        return self._sums[place] / self._counts[place]
+
+
+class PairPolicy:
+    """Matching by learned scores of arms and jobs. Scope central: it compares all pairs.
+
+    Args:
+        parameters: float [PARAMETERS], as a training found them.
+    """
+
+    scope: ClassVar = "central"
+    only_choices = True
+
+    def __init__(self, parameters: Array) -> None:
+        self._parameters = np.asarray(parameters, dtype=float)[None]
+        self._length = ShiftLength()
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+        self._length = ShiftLength()
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of the matched pairs."""
+        seen = list(observations.values())
+        if not any(each.action_mask[1:-1].any() for each in seen):
+            return dict.fromkeys(observations, WAIT)
+        length_s = self._length.seen(seen[0])
+        left_s = np.array([(1.0 - float(seen[0].clock)) * length_s])
+        score = scores(_stacked(seen), left_s, self._parameters)[0]
+        return dict(zip(observations, claims(score, plans_of(seen[0])).tolist(), strict=True))
+
+
+PAIRS_FORMAT = 1
+"""Increase it when the numbers of a pair or the network change."""
+
+
+def save_pairs(parameters: Array, folder: Path, **details: object) -> None:
+    """Write parameters as a policy into a folder, made if need be; each file is written atomically.
+
+    Args:
+        details: Additional JSON values of the card.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder / PAIRS) as draft, draft.open("wb") as file:
+        np.save(file, parameters.astype(np.float32))
+    with atomic_path(folder / PAIRS_CARD) as draft:
+        card = {"format": PAIRS_FORMAT, **details}
+        draft.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+
+
+def load_pairs(folder: Path) -> PairPolicy:
+    """The policy that `save_pairs` wrote.
+
+    Raises:
+        CheckpointError: a file is missing, damaged or of another format.
+    """
+    try:
+        found = json.loads((folder / PAIRS_CARD).read_text(encoding="utf-8"))["format"]
+        parameters = np.load(folder / PAIRS, allow_pickle=False)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"There is no policy over pairs in '{folder}' ({error}).") from error
+    if found != PAIRS_FORMAT:
+        raise CheckpointError(f"{folder / PAIRS_CARD}: format {found} is not {PAIRS_FORMAT}. Train the policy again.")
+    if parameters.shape != (PARAMETERS,) or not np.isfinite(parameters).all():
+        raise CheckpointError(f"{folder / PAIRS}: must be {PARAMETERS} finite numbers (shape {parameters.shape}).")
+    return PairPolicy(parameters)
+
+
+@cache
+def shipped_parameters() -> Array:
+    """The parameters that come with the project: the best on the validation split of several trainings."""
+    file = resources.files("agents").joinpath(f"learned/weights/{PAIRS}")
+    with file.open("rb") as opened:
+        return np.load(opened, allow_pickle=False)
+
+
+class WseptLearned(PairPolicy):
+    """As `wsept`, by scores that were learned on the training split of the suite with the true state. Scope central."""
+
+    only_choices = True
+
+    def __init__(self) -> None:
+        super().__init__(shipped_parameters())
+
+
+def _without_empty(seen: Observation) -> Observation:
+    """The observation without the last slots that hold a job in no env: usually most of them."""
+    plans = plans_of(seen)
+    legal = seen.action_mask[..., 1:-1].any(axis=(0, 1)).reshape(-1, plans).any(axis=-1)
+    used = np.flatnonzero(legal | seen.offered.any(axis=(0, 1)))
+    slots = int(used[-1]) + 1 if len(used) else 1
+    if slots == seen.offered.shape[-1]:
+        return seen
+    ends: dict[tuple[str, ...], int] = {("slot",): slots, ("option",): slots * plans}
+    short = {f.name: getattr(seen, f.name)[..., : ends[f.axes]] for f in FIELDS if f.axes in ends}
+    return replace(seen, **short, action_mask=seen.action_mask[..., [*range(1 + slots * plans), -1]])
+
+
+def _stacked(seen: Sequence[Observation]) -> Observation:
+    """Observations of arms as one with the axes [1, arm]."""
+    names = [*(field.name for field in FIELDS if not field.name.startswith("peer_")), "action_mask"]
+    stacked = {name: np.stack([getattr(each, name) for each in seen])[None] for name in names}
+    peers = {field.name: np.zeros(0) for field in FIELDS if field.name.startswith("peer_")}
+    return Observation(**stacked, **peers)

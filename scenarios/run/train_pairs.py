@@ -1,0 +1,183 @@
+"""Train scores of arm–job pairs over a split of the suite by evolution, with validation on another split."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from agents.learned.evolution import Evolution, EvolutionConfig
+from agents.learned.pair_scores import PARAMETERS, first_parameters, save_pairs
+from fleet.errors import FleetError
+from fleet.files import atomic_path
+from scenarios.run.suite_batches import Ground, rewards
+from scenarios.run.training_log import TrainingLog, read_log
+
+Array = np.ndarray
+
+STATE, CURVE = "training.npz", "curve.png"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairPlan:
+    """Length of a training, and its validation."""
+
+    minutes: float = 30.0
+    iterations: int | None = None
+    """Most iterations, those before a resume included."""
+    instances: int = 10
+    """Instances of an iteration, of different cells; all samples have the same shifts."""
+    validate_every: int = 5
+
+    def __post_init__(self) -> None:
+        if not self.minutes > 0:
+            raise FleetError(f"minutes must be > 0 (got {self.minutes}).")
+        for name in ("iterations", "instances", "validate_every"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise FleetError(f"{name} must be >= 1 (got {value}).")
+
+
+@dataclass(frozen=True)
+class TrainedPairs:
+    """Result of a training; rewards are shares of the value of all jobs."""
+
+    iterations: int
+    shifts: int
+    teacher: float
+    """Of `wsept` on the validation shifts."""
+    best: float
+    """Of the kept parameters."""
+    seconds: float
+    interrupted: bool
+
+
+def train_pairs(
+    grounds: Sequence[Ground],
+    judges: Sequence[Ground],
+    config: EvolutionConfig,
+    out: Path,
+    plan: PairPlan,
+    *,
+    card: dict[str, object],
+    resume: bool = False,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> TrainedPairs:
+    """Write into a folder the parameters with the best validation as a policy, the last state, and the curves.
+
+    Iteration 0 is `wsept`. Ctrl-C ends the training early and keeps its result.
+
+    Args:
+        grounds, judges: Instances of training and of validation.
+        card: What else `policy.json` says; a resume must have the same.
+
+    Raises:
+        FleetError: a training in the folder without `resume`, `resume` without a training, or another training.
+    """
+    card = {**card, "config": asdict(config), "instances": plan.instances}
+    _check_folder(out, card, resume=resume)
+    rng = np.random.default_rng(np.random.SeedSequence([config.seed, 0]))
+    search = Evolution(first_parameters(rng), config)
+    wsept = np.zeros(PARAMETERS)
+    began_s, interrupted, shifts = time.monotonic(), False, 0
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    log = TrainingLog(out)
+    if resume:
+        numbers = search.load(out / STATE)
+        teacher, best = numbers["teacher"], numbers["best"]
+    else:
+        teacher = best = validation(judges, wsept)
+        save_pairs(search.average, out, **card, iterations=0, validation=best, teacher=teacher)
+        log.add(0, {"iteration": 0, "validation": best, "teacher": teacher})
+        tell(f"Iteration 0: wsept has {teacher:.4f} of the value on the validation shifts.")
+
+    def validate() -> None:
+        nonlocal best
+        found = validation(judges, search.average)
+        if found > best:
+            best = found
+            save_pairs(search.average, out, **card, iterations=search.done, validation=best, teacher=teacher)
+        search.save(out / STATE, teacher=teacher, best=best)
+        log.add(search.done, {"iteration": search.done, "validation": found, "teacher": teacher})
+        tell(f"Iteration {search.done}: {found:.4f}, best {best:.4f}, wsept {teacher:.4f}.")
+
+    validated = search.done
+    try:
+        while True:
+            spent = (time.monotonic() - began_s) / (60.0 * plan.minutes)
+            if max(spent, search.done / (plan.iterations or np.inf)) >= 1.0:
+                break
+            began_iteration_s = time.monotonic()
+            fitness = _fitness(grounds, search, plan.instances)
+            shifts += config.samples * min(plan.instances, len(grounds))
+            search.tell(fitness)
+            row = {"number": search.done, "fitness": float(fitness.mean()), "spread": float(fitness.std())}
+            log.add(search.done, {**row, "seconds": time.monotonic() - began_iteration_s})
+            if search.done % plan.validate_every == 0:
+                validate()
+                validated = search.done
+    except KeyboardInterrupt:
+        interrupted = True
+    if validated < search.done:
+        validate()
+    draw_curves(out)
+    return TrainedPairs(search.done, shifts, teacher, best, time.monotonic() - began_s, interrupted)
+
+
+def validation(judges: Sequence[Ground], parameters: Array) -> float:
+    """Mean reward of the validation shifts over the value of their jobs."""
+    means: list[float] = []
+    for judge in judges:
+        seeds = judge.shifts
+        found = rewards(judge, np.tile(parameters, (len(seeds), 1)), seeds)
+        means.append(float(np.mean([reward / judge.value(seed) for reward, seed in zip(found, seeds, strict=True)])))
+    return float(np.mean(means))
+
+
+def _fitness(grounds: Sequence[Ground], search: Evolution, count: int) -> Array:
+    """Mean reward of every sample over the value of the jobs, on shifts that all samples share, [sample].
+
+    Large fleets are drawn less often, as their shifts take longer.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence([search.config.seed, 2, search.done]))
+    weights = np.array([1.0 / max(ground.arms, 4) for ground in grounds])
+    chosen = rng.choice(len(grounds), size=min(count, len(grounds)), replace=False, p=weights / weights.sum())
+    samples, total = search.ask(), np.zeros(search.config.samples)
+    for index in chosen.tolist():
+        seed = int(rng.integers(2**31))
+        total += rewards(grounds[index], samples, [seed] * len(samples)) / grounds[index].value(seed)
+    return total / len(chosen)
+
+
+def draw_curves(folder: Path) -> None:
+    """Plot validation, and the fitness of the samples, against the iteration."""
+    from matplotlib.figure import Figure  # without a display
+
+    judged = [row for row in read_log(folder) if "validation" in row]
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([row["iteration"] for row in judged], [row["validation"] for row in judged], "o-", ms=3, label="learned")
+    axes.axhline(judged[0]["teacher"], color="k", lw=1, ls="--", label="wsept")
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("reward / value of all jobs, validation")
+    axes.legend(frameon=False)
+    axes.grid(alpha=0.3)
+    with atomic_path(folder / CURVE) as draft:
+        figure.savefig(draft, dpi=120, format="png")
+
+
+def _check_folder(out: Path, card: dict[str, object], *, resume: bool) -> None:
+    path = out / "training.json"
+    if not resume:
+        if path.exists():
+            raise FleetError(f"'{out}' holds a training already. Continue it with --resume, or choose another --out.")
+        return
+    if not (out / STATE).is_file():
+        raise FleetError(f"'{out}' holds no training to resume.")
+    before = json.loads(path.read_text(encoding="utf-8"))
+    for name, value in json.loads(json.dumps(card)).items():
+        if before.get(name) != value:
+            raise FleetError(f"The training in '{out}' has {name} = {before.get(name)} (got {value}).")

@@ -1,0 +1,168 @@
+"""Learned scores of pairs of arm and job: they begin as `wsept`, and treat arms and jobs as sets."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agents.heat_rules import Wsept
+from agents.learned.evolution import Evolution, EvolutionConfig
+from agents.learned.pair_scores import (
+    PAIRS,
+    PARAMETERS,
+    PairPolicy,
+    ShiftLength,
+    first_parameters,
+    load_pairs,
+    save_pairs,
+    scores,
+)
+from fleet.errors import CheckpointError
+from fleet.observation import FIELDS, Layout, Observation
+from scenarios.policy_loader import policy_of, scope_of
+
+LAYOUT = Layout(5, 6, plans=2)
+
+
+def drawn(rng: np.random.Generator) -> Observation:
+    """What five arms might know: three free, one at work, one stopped; the jobs of all slots are offered."""
+    blank = LAYOUT.read(np.zeros((5, LAYOUT.size), np.float32), np.zeros((5, LAYOUT.actions), np.int8))
+    jobs = {
+        "offered": np.ones((5, 6)),
+        "value": np.tile(rng.uniform(0.5, 4.0, 6), (5, 1)),
+        "age_s": np.tile(rng.uniform(0.0, 900.0, 6), (5, 1)),
+        "payload_kg": np.tile(rng.uniform(0.0, 4.0, 6), (5, 1)),
+        "expires": np.tile(rng.integers(2, size=6), (5, 1)),
+    }
+    options = {
+        "duration_s": rng.uniform(60.0, 900.0, (5, 12)),
+        "slack_s": rng.uniform(-300.0, 900.0, (5, 12)),
+        "peak_c": rng.uniform(40.0, 80.0, (5, 12)) * (rng.random((5, 12)) < 0.8),
+        "difficulty": rng.uniform(0.0, 1.0, (5, 12)),
+        "feasible": np.ones((5, 12)),
+        "p_saturation": rng.random((5, 12)),
+    }
+    temp_c = rng.uniform(30.0, 50.0, (5, 7))
+    free, working = np.array([1, 1, 1, 0, 0]), np.array([0, 0, 0, 1, 0])
+    mask = (rng.random((5, LAYOUT.actions)) < 0.8) & (free[:, None] > 0)
+    mask[:, 0], mask[:, -1] = True, False
+    arms = {
+        "temp_c": temp_c,
+        "headroom_k": 60.0 - temp_c.max(axis=1),
+        "idle": free,
+        "working": working,
+        "busy_s": 60.0 * working,
+        "clock": np.full(5, 0.7),
+    }
+    return replace(blank, **jobs, **options, **arms, action_mask=mask.astype(np.int8))
+
+
+def of_arms(seen: Observation) -> dict[str, Observation]:
+    """The observation of each arm."""
+    names = [*(field.name for field in FIELDS), "action_mask"]
+    return {f"arm{a}": Observation(**{name: getattr(seen, name)[a] for name in names}) for a in range(5)}
+
+
+def batched(seen: Observation) -> Observation:
+    """With an axis of one env."""
+    return replace(seen, **{name: getattr(seen, name)[None] for name in vars(seen)})
+
+
+def trained(rng: np.random.Generator) -> np.ndarray:
+    return 0.3 * rng.standard_normal(PARAMETERS)
+
+
+def test_before_any_training_it_is_wsept() -> None:
+    rng = np.random.default_rng(0)
+    claims = 0
+    for _ in range(30):
+        observations = of_arms(drawn(rng))
+        actions = PairPolicy(first_parameters(rng)).act(observations)
+        assert actions == Wsept().act(observations)
+        claims += sum(action > 0 for action in actions.values())
+    assert claims > 30
+
+
+def test_scores_follow_arms_and_slots_in_any_order() -> None:
+    rng = np.random.default_rng(1)
+    seen, parameters, left_s = drawn(rng), trained(rng)[None], np.array([900.0])
+    expected = scores(batched(seen), left_s, parameters)[0]
+    assert np.isfinite(expected).sum() > 5
+    arms, slots = rng.permutation(5), rng.permutation(6)
+    options = (2 * slots[:, None] + np.arange(2)).ravel()
+    order: dict[tuple[str, ...], np.ndarray] = {("slot",): slots, ("option",): options}
+    moved = {
+        field.name: getattr(seen, field.name)[arms][:, order[field.axes]]
+        if field.axes in order
+        else getattr(seen, field.name)[arms]
+        for field in FIELDS
+        if "peer" not in field.axes
+    }
+    mask = seen.action_mask[arms][:, [0, *(1 + options), -1]]
+    found = scores(batched(replace(seen, **moved, action_mask=mask)), left_s, parameters)[0]
+    np.testing.assert_allclose(found, expected[arms][:, options], rtol=1e-9)
+
+
+def test_envs_of_a_batch_do_not_affect_each_other() -> None:
+    rng = np.random.default_rng(2)
+    several = [drawn(rng) for _ in range(3)]
+    parameters, left_s = np.stack([trained(rng) for _ in range(3)]), np.array([100.0, 1000.0, 5000.0])
+    names = vars(several[0])
+    together = Observation(**{name: np.stack([getattr(each, name) for each in several]) for name in names})
+    found = scores(together, left_s, parameters)
+    for e, seen in enumerate(several):
+        alone = scores(batched(seen), left_s[e : e + 1], parameters[e : e + 1])
+        np.testing.assert_allclose(found[e], alone[0], rtol=1e-9)
+
+
+def test_the_length_of_a_shift_follows_from_the_ages_of_jobs() -> None:
+    """Jobs age by 5 400 s while the clock goes from 0 to 1; now and then one is claimed and the others move up."""
+    rng = np.random.default_rng(3)
+    length, found_s, time_s = ShiftLength(), 0.0, 0.0
+    jobs = [(0.0, float(rng.integers(1, 4))) for _ in range(6)]
+    for _ in range(40):
+        time_s += float(rng.uniform(5.0, 60.0))
+        if rng.random() < 0.5:
+            jobs.pop(int(rng.integers(6)))
+            jobs.append((time_s, float(rng.integers(1, 4))))
+        blank = LAYOUT.read(np.zeros(LAYOUT.size, np.float32), np.zeros(LAYOUT.actions, np.int8))
+        ages, values = np.array([time_s - release_s for release_s, _ in jobs]), np.array([value for _, value in jobs])
+        seen = replace(blank, offered=np.ones(6), clock=np.float32(time_s / 5400.0), age_s=ages, value=values)
+        found_s = length.seen(seen)
+    assert found_s == pytest.approx(5400.0, rel=0.01)
+
+
+def test_a_folder_of_parameters_is_a_central_policy(tmp_path) -> None:
+    parameters = trained(np.random.default_rng(4))
+    save_pairs(parameters, tmp_path / "pairs", note="x")
+    assert scope_of(str(tmp_path / "pairs")) == "central"
+    observations = of_arms(drawn(np.random.default_rng(5)))
+    expected = PairPolicy(parameters.astype(np.float32)).act(observations)
+    assert policy_of(str(tmp_path / "pairs")).act(observations) == expected
+    np.save(tmp_path / "pairs" / PAIRS, parameters[:-1])
+    with pytest.raises(CheckpointError, match=f"must be {PARAMETERS} finite numbers"):
+        load_pairs(tmp_path / "pairs")
+
+
+def test_the_search_finds_a_known_optimum_and_goes_on_where_it_was(tmp_path) -> None:
+    target = np.linspace(-1.0, 1.0, 10)
+    search = Evolution(np.zeros(10), EvolutionConfig(samples=16, learning_rate=0.2, seed=7))
+
+    def step(search: Evolution) -> None:
+        samples = search.ask()
+        np.testing.assert_allclose(samples[:8] + samples[8:], np.tile(2.0 * search.mean, (8, 1)))
+        search.tell(-((samples - target) ** 2).sum(axis=1))
+
+    for _ in range(60):
+        step(search)
+    search.save(tmp_path / "state.npz", best=3.0)
+    again = Evolution(np.zeros(10), search.config)
+    assert again.load(tmp_path / "state.npz") == {"best": 3.0}
+    for each in (search, again):
+        for _ in range(60):
+            step(each)
+    np.testing.assert_allclose(search.average, target, atol=0.1)
+    np.testing.assert_array_equal(search.mean, again.mean)
+    (tmp_path / "state.npz").write_bytes(b"rubbish")
+    with pytest.raises(CheckpointError, match="cannot be resumed"):
+        again.load(tmp_path / "state.npz")

@@ -1,0 +1,116 @@
+"""Training over a split of the suite: rewards of batches, the folder that is left, going on, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agents.learned.evolution import EvolutionConfig
+from agents.learned.pair_scores import PARAMETERS, first_parameters
+from agents.learned.ppo import PpoConfig
+from fleet.errors import FleetError
+from scenarios.cli.main import main
+from scenarios.load import load, override
+from scenarios.policy_loader import scope_of
+from scenarios.prepare.fleet import prepare
+from scenarios.run.evaluate import outcomes
+from scenarios.run.suite_batches import ground_of, rewards
+from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs
+from scenarios.run.train_policy import TrainingPlan, train_on_split
+from scenarios.run.training_log import LOG
+from scenarios.studies.suite_scores import difference, row_of
+from scenarios.suite.splits import Instance
+
+
+@pytest.fixture(scope="module")
+def ground():
+    scenario = override(load("quickstart"), horizon_s=1200.0)
+    return ground_of(Instance("train/9999", scenario, 3), difficulty="oracle")
+
+
+def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
+    """In the same shift, decision by decision, with perfect messages; and other parameters give another reward."""
+    fleet = prepare(override(load("quickstart"), horizon_s=1200.0), difficulty="oracle")
+    expected = [outcome.reward for outcome in outcomes(fleet, "wsept", [3, 4])]
+    found = rewards(ground, np.zeros((2, PARAMETERS)), [3, 4])
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert row_of(ground, "wsept")["reward"] == pytest.approx(expected[0])
+    refuses_all = first_parameters(np.random.default_rng(0))
+    refuses_all[0] = 5.0  # an error limit 100 K lower
+    assert rewards(ground, refuses_all[None], [3])[0] < expected[0] - 1.0
+
+
+def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path, ground) -> None:
+    out, told = tmp_path / "pairs", list[str]()
+
+    def trained(iterations: int, *, resume: bool = False, samples: int = 4):
+        plan = PairPlan(minutes=5.0, iterations=iterations, validate_every=1)
+        config = EvolutionConfig(samples=samples)
+        card: dict[str, object] = {"suite": "train"}
+        return train_pairs([ground], [ground], config, out, plan, card=card, resume=resume, tell=told.append)
+
+    done = trained(2)
+    assert (done.iterations, done.shifts) == (2, 8)
+    rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
+    judged = [row["validation"] for row in rows if "validation" in row]
+    assert len(told) == len(judged) == 3
+    assert judged[0] == done.teacher
+    assert done.best == max(judged)
+    assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
+    assert scope_of(str(out)) == "central"
+    with pytest.raises(FleetError, match="holds a training already"):
+        trained(3)
+    again = trained(3, resume=True)
+    assert (again.iterations, again.teacher) == (3, done.teacher)
+    assert again.best >= done.best
+    with pytest.raises(FleetError, match="has config"):
+        trained(4, resume=True, samples=6)
+
+
+def test_a_split_is_trained_by_ppo_in_turns_of_its_cells(tmp_path, ground) -> None:
+    small = replace(ground, name="train/9998", seed=5)
+    config = PpoConfig(envs=2, steps=8, epochs=1)
+    plan = TrainingPlan(minutes=5.0, iterations=2, validate_every=2)
+    card: dict[str, object] = {"suite": "train"}
+    done = train_on_split([ground, small], [ground], config, tmp_path / "ppo", plan, card=card)
+    assert (done.iterations, done.env_steps) == (2, 32)
+    rows = [json.loads(line) for line in (tmp_path / "ppo" / LOG).read_text().splitlines()]
+    judged = {row["iteration"]: row["validation_reward"] for row in rows if "validation_reward" in row}
+    assert list(judged) == [0, 2]
+    assert done.best == max(judged.values())
+    assert 0.0 < max(judged.values()) < 1.0, "shares of the value of all jobs"
+
+
+def test_what_cannot_be_is_refused(capsys) -> None:
+    for words, reason in (
+        ([], "Give either a scenario or --suite SPLIT."),
+        (["quickstart", "--suite", "train"], "Give either a scenario or --suite SPLIT."),
+        (["--suite", "trian"], "No split 'trian'; did you mean 'train'?"),
+        (["quickstart", "--algo", "pairs"], "give --suite, not a scenario"),
+        (["quickstart", "--seeds", "2", "--out", "x"], "leave --out away"),
+        (["quickstart", "--lr", "0"], "--lr must be > 0 and at most 10 (got 0)."),
+        (["--suite", "train", "--minutes", "0"], "minutes must be > 0"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(["train", *words])
+        assert stop.value.code == 2
+        assert reason in " ".join(capsys.readouterr().err.split())
+
+
+def test_trainings_are_a_sample_of_their_own_in_a_difference() -> None:
+    """Three trainings that differ more from each other than from the baseline say less than 60 instances would."""
+    rng = np.random.default_rng(0)
+    rows = [
+        {"policy": policy, "instance": f"test/{i}", "offered": 10.0, "reward": 5.0 + gain + 0.1 * float(rng.random())}
+        for policy, gain in (("wsept", 0.0), ("a", 1.0), ("b", 2.0), ("c", 3.0))
+        for i in range(60)
+    ]
+    one, count = difference(rows, ["b"], "wsept")
+    assert count == 60
+    assert (round(one.mean, 1), one.high - one.low < 0.1) == (2.0, True)
+    three, _ = difference(rows, ["a", "b", "c"], "wsept")
+    assert round(three.mean, 1) == 2.0
+    assert three.low < 1.0 < 3.0 < three.high  # t of 2 degrees of freedom: 2 ± 4.3 · 1 / √3
+    share, _ = difference(rows, ["b"], "wsept", relative=True)
+    assert share.mean == pytest.approx(one.mean / 10.0)
