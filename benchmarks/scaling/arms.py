@@ -7,8 +7,8 @@ Each size is a process of its own with an empty cache of plans. Costs are CPU se
 the machine matters little; the load average is in the file. Arms observe their eight nearest peers, in 64 slots.
 
 - plans: planning every work for every arm that reaches it, from nothing.
-- conflicts: which plans of two arms exclude each other, from nothing. From 129 arms on these two are those of one of
-  several equal halls, multiplied; in the other costs the arms of all halls share one shift, all jobs and one matching.
+- conflicts: which plans of two arms exclude each other, from nothing. With more arms than
+  `--hall` these two are those of one of several equal halls, multiplied; in the other costs the arms of all halls share one shift, all jobs and one matching.
 - engine: a simulated shift of an hour, steps only. - matching: its decisions. - scores: the twins score two plans of
 each of the eight jobs that an arm gets in an hour; the four twins of quickstart stand for all.
 """
@@ -32,13 +32,11 @@ ONCE = ("plans", "conflicts")
 OUT = Path("docs/results/scaling/arms.jsonl")
 PICTURE = Path("docs/pictures/scaling_arms.png")
 HOURS, JOBS, PEERS = 1.0, 8, 8
-MOST_IN_HALL = 128
-"""A hall is at most 20 m wide; more arms are several halls."""
 SHIFTS = 3
 """Engine and matching: the median of these."""
 
 
-def measure(arms: int) -> dict[str, object]:
+def measure(arms: int, most_in_hall: int) -> dict[str, object]:
     """The costs of a hall of so many arms, CPU s in all, and the most memory, MB."""
     import numpy as np
     from ask import repeated
@@ -51,7 +49,7 @@ def measure(arms: int) -> dict[str, object]:
     from scenarios.prepare.fleet import prepare
     from scenarios.run.batch import Randomisation, library_of
 
-    halls = -(-arms // MOST_IN_HALL)
+    halls = -(-arms // most_in_hall)
     own_arms, costs = arms // halls, dict[str, float]()
     scenario = hall(own_arms, hours=HOURS, jobs=JOBS * own_arms * HOURS)
     randomise = Randomisation(arrivals=(halls, halls))
@@ -114,11 +112,15 @@ def machine() -> dict[str, object]:
     return {"cores": os.cpu_count(), "load_average": [round(load, 2) for load in os.getloadavg()]}
 
 
-def run(sizes: list[int], out: Path) -> None:
+def run(sizes: list[int], most_in_hall: int, out: Path) -> None:
     """Measure each size, and add a line for it to the file in place of an earlier one."""
     out.parent.mkdir(parents=True, exist_ok=True)
     for arms in sizes:
-        done = subprocess.run([sys.executable, __file__, "measure", "--arms", str(arms)], stdout=-1, check=True)
+        done = subprocess.run(
+            [sys.executable, __file__, "measure", "--arms", str(arms), "--hall", str(most_in_hall)],
+            stdout=-1,
+            check=True,
+        )
         rows = [json.loads(line) for line in out.read_text("utf-8").splitlines()] if out.exists() else []
         rows = [*(row for row in rows if row["arms"] != arms), json.loads(done.stdout) | machine()]
         lines = [json.dumps(row) for row in sorted(rows, key=lambda row: row["arms"])]
@@ -164,12 +166,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "measure", "plot"))
     parser.add_argument("--arms", type=int, nargs="+", default=[4, 16, 64, 256, 1000])
+    parser.add_argument("--hall", type=int, default=128, help="most arms in a hall, which is at most 20 m wide")
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     if arguments.what == "measure":
-        print(json.dumps(measure(arguments.arms[0])))
+        print(json.dumps(measure(arguments.arms[0], arguments.hall)))
     elif arguments.what == "run":
-        run(arguments.arms, arguments.out)
+        run(arguments.arms, arguments.hall, arguments.out)
     else:
         plot(arguments.out)
 
