@@ -3,8 +3,9 @@
 import dataclasses
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
+from inspect import Parameter, signature
 from itertools import combinations, pairwise
 from math import dist, isfinite
 from pathlib import Path
@@ -102,6 +103,31 @@ def override(scenario: Scenario, **changes: object) -> Scenario:
     except TypeError as error:
         raise ScenarioError(f"{where}: {error}.") from error
     return parse_scenario({**msgspec.to_builtins(scenario), **plain}, Path(where))
+
+
+def scenario_with(
+    scenario: str | Path | Scenario, overrides: Mapping[str, Any], function: Callable[..., object]
+) -> Scenario:
+    """The scenario with overrides, which may be values of any field.
+
+    Args:
+        function: Called with the overrides; its own options are named in errors, too.
+
+    Raises:
+        ScenarioError: an override is neither a field nor an option; names the nearest.
+    """
+    if not isinstance(scenario, str | Path | Scenario):
+        raise ScenarioError(f"scenario must be a library name, a .toml file or a Scenario (got {scenario!r}).")
+    chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
+    fields = [field.name for field in dataclasses.fields(Scenario)]
+    options = [name for name, p in signature(function).parameters.items() if p.kind is Parameter.KEYWORD_ONLY]
+    for name in overrides:
+        if name == "seed":
+            raise ScenarioError("make_env() takes no seed: give it to reset(seed=…).")
+        if name not in fields:
+            allowed = nearest(name, [*fields, *options])
+            raise ScenarioError(f"{chosen.name} with overrides: unknown key '{name}'{allowed}")
+    return override(chosen, **overrides) if overrides else chosen
 
 
 def _plain(value: object) -> object:

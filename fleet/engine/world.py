@@ -198,13 +198,14 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> 
     def row_of(forecast: Forecast | None) -> int:
         return -1 if forecast is None else forecasts.setdefault(id(forecast), (len(forecasts), forecast))[0]
 
-    offered: dict[int, list[ScoredPlans]] = {}  # by id: hashing a work takes longer than the rest
+    able, heavy = _arms_of_works(tuple(arms))
+    offered: dict[int, list[tuple[int, ScoredPlans]]] = {}  # by id: hashing a work takes longer than the rest
     for e, jobs in enumerate(shifts):
         for j, job in enumerate(jobs):
             if id(job.work) not in offered:
-                offered[id(job.work)] = [arm.offers(job.work) for arm in arms]
-            for a, offers in enumerate(offered[id(job.work)]):
-                too_heavy[e, a, j] = job.work in arms[a].too_heavy
+                offered[id(job.work)] = [(a, arms[a].offers(job.work)) for a in able.get(job.work, ())]
+            too_heavy[e, heavy.get(job.work, []), j] = True
+            for a, offers in offered[id(job.work)]:
                 for n, (offer, score) in enumerate(offers[job.repetitions][:most]):
                     if id(offer) not in rows:
                         rows[id(offer)] = len(plans)
@@ -217,6 +218,18 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> 
     stack = stack_forecasts([forecast for _, forecast in forecasts.values()]) if forecasts else None
     scores = {"difficulty": total, "p_saturation": p_saturation, "risk": risk, "peak": peak, "forecasts": stack}
     return tuple(plans), Offers(plan=plan, too_heavy=too_heavy, **scores)
+
+
+@lru_cache(maxsize=8)
+def _arms_of_works(arms: tuple[Arm, ...]) -> tuple[dict[Work, list[int]], dict[Work, list[int]]]:
+    """The arms that have plans for each work, and those for which its load is too heavy: few of a large cell."""
+    able: dict[Work, list[int]] = {}
+    heavy: dict[Work, list[int]] = {}
+    for a, arm in enumerate(arms):
+        for works, of in ((arm.plans, able), (arm.too_heavy, heavy)):
+            for work in works:
+                of.setdefault(work, []).append(a)
+    return able, heavy
 
 
 def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm], volume: Array) -> PlanTable:

@@ -28,10 +28,15 @@ Array = np.ndarray
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
+_written: dict[Path, int] = {}
+"""Bytes that this process wrote to a folder since it looked at its files; no folder that it never looked at."""
+
 PLANNER_VERSION = 3
 """Increment it whenever the plans of the same work change."""
 MAX_CACHE_BYTES = 2_000_000_000
-"""Of all files in a folder; after a new one the least recently used ones are removed."""
+"""Of all files in a folder; after new ones the least recently used ones are removed."""
+LOOK_EVERY = 0.01
+"""Share of these bytes that a process writes before it looks at all files again."""
 MAX_SAMPLES = 1_000_000
 """Of one phase in a file; a longer one is damage."""
 
@@ -150,7 +155,11 @@ def _write(path: Path, arrays: Mapping[str, Array]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as draft, draft.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
-    _remove_oldest(path.parent)
+    written = _written.get(path.parent, MAX_CACHE_BYTES) + path.stat().st_size
+    if written > LOOK_EVERY * MAX_CACHE_BYTES:
+        _remove_oldest(path.parent)
+        written = 0
+    _written[path.parent] = written
 
 
 def _remove_oldest(folder: Path) -> None:
@@ -160,7 +169,8 @@ def _remove_oldest(folder: Path) -> None:
         for entry in entries:
             with suppress(FileNotFoundError):
                 if entry.name.endswith(".npz"):
-                    files.append((entry.stat().st_mtime, entry.stat().st_size, entry.path))
+                    status = entry.stat()
+                    files.append((status.st_mtime, status.st_size, entry.path))
     total = sum(size for _, size, _ in files)
     for _, size, path in sorted(files)[:-1]:
         if total <= MAX_CACHE_BYTES:

@@ -41,7 +41,10 @@ def bounds_command(
             show_default=False,
         ),
     ] = None,
-    nodes: Annotated[int, options.number("Most nodes of the branch and bound of the upper bound.", 1, 10**6)] = 2000,
+    nodes: Annotated[
+        int,
+        options.number("Most nodes of the branch and bound of the upper bound; 0: the linear program alone.", 0, 10**6),
+    ] = 2000,
     jobs: Annotated[int, options.number("Number of processes.", 1, 1024)] = 1,
     difficulty: options.DifficultyOption = "oracle",
     out: Annotated[Path, typer.Option(help="File of the rows; finished ones are not computed again.")] = Path(

@@ -4,6 +4,7 @@ import re
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from functools import reduce
 from math import isfinite
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from fleet.files import cache_folder
 from fleet.seeding import child
 from scenarios.bounds.hindsight import SIDE_BY_SIDE, Budget, hindsight
 from scenarios.bounds.relaxation import Relaxation
-from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, without_scores
+from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, Simulated, without_scores
 from scenarios.bounds.upper import upper_bound
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
@@ -24,8 +25,8 @@ from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
-from scenarios.run.shift import scenario_hash
 from scenarios.schema import Scenario
+from scenarios.suite.splits import content_hash
 from scenarios.trials.fleets import Fleets, plan_content
 from scenarios.trials.plan import Case, Unit
 
@@ -42,7 +43,7 @@ class Reference:
     instance: str
     """As `heat_wave/100`, or the name of an instance of a split."""
     scenario_hash: str
-    """Of the scenario's content."""
+    """Of what is no default in the scenario: `scenarios.suite.splits.content_hash`."""
     seed: int
     difficulty: str
     """Source of the scores of the policies that the search starts from."""
@@ -112,8 +113,10 @@ def reference(
     entropy = np.random.SeedSequence(task.seed)
     episode, weights = ShiftFactory(fleet)(entropy), weights_of(fleet.scenario)
     world = episode.world
-    rules = ShiftSimulator(world, weights, len(STARTS), noise_key=episode.noise_key)
-    starts = rules.follow([policy_at(name, task.seed) for name in STARTS])
+    rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key)
+    # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
+    each = [rules.follow([policy_at(name, task.seed)]) for name in STARTS]
+    starts = reduce(Simulated.and_, each)
     best = int(starts.reward.argmax())
     rule, best_rule = STARTS[best], float(starts.reward[best])
     bare = without_scores(world)
@@ -130,7 +133,7 @@ def reference(
     ended_s, timed = time.process_time(), isfinite(budget.seconds)
     return Reference(
         instance=task.instance,
-        scenario_hash=scenario_hash(task.scenario),
+        scenario_hash=content_hash(task.scenario),
         seed=task.seed,
         difficulty=difficulty,
         random=float(random.mean()),
@@ -231,7 +234,7 @@ def _place(row: Row) -> list[object]:
 
 def key_of(task: Task, difficulty: str) -> str:
     """What a row of a file of references is found by."""
-    return _key(task.instance, scenario_hash(task.scenario), task.seed, difficulty)
+    return _key(task.instance, content_hash(task.scenario), task.seed, difficulty)
 
 
 def _key(instance: str, scenario: str, seed: int, difficulty: str) -> str:

@@ -17,6 +17,8 @@ ROUNDS = 3
 
 LEAST_GAIN = 1e-3
 """No more budgets are added once they lower the bound by less than this share."""
+MOST_COLUMNS = 12_000
+"""Programs with more columns, of some 40 arms, keep the bound with parts of jobs: whole ones take minutes."""
 GAP = 5e-4
 """The branch and bound ends once bound and solution differ by this share."""
 ROUNDING = 1e-6
@@ -39,12 +41,12 @@ def upper_bound(relaxation: Relaxation, *, heat: bool = True, nodes: int = 2000)
     """The upper bound of a relaxation: with whole jobs, and with the heat budgets that its solution in parts passes.
 
     Args:
-        nodes: Most nodes of the branch and bound; what it has proved by then counts.
+        nodes: Most nodes of the branch and bound; what it has proved by then counts. 0: the linear program alone.
     """
     rows, bounds = relaxation.rows
     linear, shares = _solve(relaxation, rows, bounds)
     value, count, budget = linear, 0, HeatBudget(relaxation)
-    for _ in range(ROUNDS if heat else 0):
+    for _ in range(ROUNDS if heat and nodes else 0):
         more, limits = budget.violated(shares)
         if not len(limits):
             break
@@ -55,7 +57,8 @@ def upper_bound(relaxation: Relaxation, *, heat: bool = True, nodes: int = 2000)
         gain, value = value - better, min(value, better)
         if gain < LEAST_GAIN * abs(value):
             break
-    value = min(value, _whole(relaxation, rows, bounds, nodes))
+    if nodes:
+        value = min(value, _whole(relaxation, rows, bounds, nodes))
     return UpperBound(value + relaxation.constant, linear + relaxation.constant, count)
 
 
@@ -75,7 +78,9 @@ def _solve(relaxation: Relaxation, rows: csr_array, bounds: Array) -> tuple[floa
 
 
 def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array, nodes: int) -> float:
-    """Bound with whole jobs; inf if branch and bound proved none."""
+    """Bound with whole jobs; inf if branch and bound proved none, or if the program is too large."""
+    if relaxation.columns > MOST_COLUMNS:
+        return np.inf
     whole = np.zeros(relaxation.columns)
     whole[relaxation.job_columns()] = 1
     result = milp(

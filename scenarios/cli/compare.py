@@ -1,5 +1,6 @@
 """`thermofleet compare` and `thermofleet ablate`."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +11,14 @@ from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.terminal import KEPT, out_console, print_json, progress_bar, say
 from scenarios.load import load
+from scenarios.result_folder import disk_errors
 from scenarios.schema_errors import choose
+
+PAGE = "index.html"
 
 
 def compare_command(
+    ctx: typer.Context,
     scenario: Annotated[
         list[str] | None,
         typer.Argument(
@@ -66,10 +71,18 @@ def compare_command(
     decision_limit: Annotated[
         float, options.number("Longest time for one decision of a policy, s. A slower policy fails.", 0.001, 86_400)
     ] = 60.0,
+    references: Annotated[
+        Path | None,
+        typer.Option(
+            help="Rows of `thermofleet bounds`, for normalised scores; the splits validation and test have their own.",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the results, one row per shift. The same command goes on after an interruption.",
+            help="Folder of the results, one row per shift, and of their page, index.html. The same command goes on "
+            "after an interruption.",
             show_default=False,
         ),
     ] = None,
@@ -80,6 +93,9 @@ def compare_command(
         str | None,
         typer.Option(help="Run on a Ray cluster: its address, `auto` for the one of this machine.", show_default=False),
     ] = None,
+    marl_eval: Annotated[
+        bool, typer.Option("--marl-eval", help="With --out: also write marl_eval.json, which marl-eval reads.")
+    ] = False,
     as_json: options.JsonOption = False,
     topology: options.TopologyOption = "complete",
     radius: options.RadiusOption = 0.5,
@@ -95,15 +111,23 @@ def compare_command(
     policy that fails is told with instance, seed and traceback; the others go on.
     """
     from scenarios.prepare.fleet import DifficultyName, RiskName
+    from scenarios.run.evaluate import FIGURES
+    from scenarios.statistics.marl_eval import to_marl_eval
     from scenarios.trials.cases import cases_of, suite_of
     from scenarios.trials.contest import run_study
-    from scenarios.trials.plan import Study
-    from scenarios.trials.summary import check_baseline, comparisons, competitors, result_page
+    from scenarios.trials.plan import Study, columns
+    from scenarios.trials.report.page import Judged, comparison_page
+    from scenarios.trials.scores import references_of
+    from scenarios.trials.summary import check_baseline, comparisons, competitors, result_page, scores_over_all
 
     if bool(scenario) == bool(suite):
         raise FleetError("Give either scenarios or --suite.")
     if jobs is not None and ray is not None:
         raise FleetError("Give either --jobs or --ray.")
+    if marl_eval and out is None:
+        raise FleetError("--marl-eval needs --out, the folder that it writes to.")
+    if references is not None and not references.is_file():
+        raise FleetError(f"There is no file of references '{references}'; make it with `thermofleet bounds`.")
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
     channels = [
         options.channel_of(
@@ -125,16 +149,28 @@ def compare_command(
     names = list(competitors(study).values())
     base = baseline or next((name for name in names if name.partition("@")[0] == "round_robin"), names[0])
     check_baseline(study, base)
+    known = references_of(cases, references)
     with progress_bar(kept="Finished shifts, plans and twins are" if out else KEPT) as progress:
         rows = run_study(study, out=out, workers=jobs or -1, ray=ray, progress=progress, tell=say)
-    results = comparisons(study, rows, base, suite)
+    results = comparisons(study, rows, base, suite, known)
+    if out:
+        values = scores_over_all(study, rows, known)
+        title = f"Comparison of {len(names)} policies on {suite or ', '.join(case.name for case in cases)}"
+        judged = Judged(
+            title=title, results=results, values=values, card=study.card(), command=options.command_line(ctx)
+        )
+        with disk_errors(out):
+            (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")
+            if marl_eval:
+                table = to_marl_eval(map(columns, rows), FIGURES)
+                (out / "marl_eval.json").write_text(json.dumps(table) + "\n", encoding="utf-8")
     if as_json:
         print_json(results[0] if len(results) == 1 else results)
         return
     for result in results:
         out_console.print(result_page(result))
     if out:
-        say(f"Written to {out}.")
+        say(f"Written to {out}; open {out / PAGE}.")
 
 
 def ablate_command(

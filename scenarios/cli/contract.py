@@ -10,7 +10,7 @@ import typer
 from fleet.errors import FleetError
 from scenarios.cli.terminal import out_console, say
 
-PAGES = ("bus.md", "cli.md", "env.md", "policies.md")
+PAGES = ("bounds.md", "bus.md", "cli.md", "env.md", "exchange.md", "leaderboard.md", "policies.md", "results.md")
 """Pages with generated tables."""
 
 
@@ -37,9 +37,17 @@ def documents(out: Path) -> dict[Path, str]:
     from fleet.bus.protocol.asyncapi import asyncapi
     from fleet.bus.protocol.schemas import schema_document
     from scenarios.doc_tables import fill_tables
-    from scenarios.policy_tables import policy_tables
+    from scenarios.leaderboard.board import benchmark_tables
+    from scenarios.studies.channel_table import channel_tables
+    from scenarios.studies.policy_tables import policy_tables
 
-    more = {"commands": _command_tables, **policy_tables(out.parent / "results" / "ladder")}
+    results = out.parent / "results"
+    more = {
+        "commands": _command_tables,
+        **policy_tables(results),
+        **channel_tables(results / "channels"),
+        **benchmark_tables(results),
+    }
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}
     for page in (out.parent / name for name in PAGES):
         if page.is_file():

@@ -53,6 +53,12 @@ COMMANDS = {
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
     "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of scores under one policy."),
     "bounds": LazyCommand(_POLICIES, "scenarios.bounds.command:bounds_command", "Bound the reward of shifts."),
+    "leaderboard": LazyCommand(
+        _POLICIES, "scenarios.leaderboard.command:leaderboard_command", "Print the leaderboard of a split."
+    ),
+    "submit-result": LazyCommand(
+        _POLICIES, "scenarios.leaderboard.command:submit_command", "Check a result and write the file to send."
+    ),
     "cooling": LazyCommand(
         _POLICIES, "heat.cooling:cooling_command", "Compare ways of cooling motor, joint and fleet."
     ),

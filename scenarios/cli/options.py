@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -45,6 +46,20 @@ def check_name(option: typer.CallbackParam, value: str) -> str:
         name = option.opts[0] if option.param_type_name == "option" else option.opts[0].upper()
         raise FleetError(f"{name} must have {NAME_RULE} (got '{printable(value)}').")
     return value
+
+
+def command_line(ctx: typer.Context) -> str:
+    """The command that is running with every value that is not its default, to be typed in a shell."""
+    words = ["thermofleet", *(ctx.info_name or "").split()]
+    for parameter in ctx.command.params:
+        value = ctx.params.get(parameter.name or "")
+        if parameter.param_type_name == "argument":
+            words += [str(each) for each in (value if isinstance(value, list | tuple) else [value]) if each is not None]
+        elif value is True:
+            words.append(parameter.opts[0])
+        elif value not in (None, False, parameter.default):
+            words += [parameter.opts[0], str(value)]
+    return shlex.join(words)
 
 
 ScenarioArg = Annotated[

@@ -1,10 +1,8 @@
 """From a scenario to a fleet of arms with plans and twins, and to the environment."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from dataclasses import fields as dataclass_fields
 from functools import cached_property
-from inspect import Parameter, signature
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,7 +16,7 @@ from fleet.difficulty import Blind
 from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.state import World
 from fleet.engine.world import Arm, build_world, warm_start
-from fleet.errors import FleetError, InfeasibleJob, ScenarioError, nearest
+from fleet.errors import FleetError, InfeasibleJob, ScenarioError
 from fleet.files import cache_folder
 from fleet.jit import cache_of_this_code
 from fleet.job import Job, Work
@@ -31,7 +29,7 @@ from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, all_works, rehearsal_works
-from scenarios.load import load, override
+from scenarios.load import scenario_with
 from scenarios.prepare.planned_arm import PlannedArm, air_offsets, plan_arms
 from scenarios.prepare.problems import problems_of
 from scenarios.prepare.randomisation import Randomisation, Variation
@@ -66,6 +64,8 @@ class Fleet:
     """What varies from shift to shift besides the jobs."""
     variants: tuple["Fleet", ...] = ()
     """The fleets of `randomise.variants`."""
+    planned: tuple[PlannedArm, ...] = ()
+    """What `prepare` planned, for another scenario of the same cell."""
 
     @property
     def all(self) -> tuple["Fleet", ...]:
@@ -86,12 +86,14 @@ def prepare(
     training: int = 0,
     cache: str | Path | None = None,
     progress: Progress = quiet,
+    like: Fleet | None = None,
 ) -> Fleet:
     """Plan every work for every arm, and give each arm its difficulty model; both are cached by content.
 
     Args:
         randomise: Beyond what a scenario draws for a shift: ambient temperature, arrivals, fleets.
         training: Which training of the twins, from 0.
+        like: Prepared from a scenario with the same arms, cell and works: its plans and space, too, are this fleet's.
 
     Raises:
         ScenarioError: no arm can do some work, arms at home are too close to each other, or a variant is no fleet of
@@ -100,23 +102,28 @@ def prepare(
     """
     if not isinstance(randomise, Randomisation | None):
         raise ScenarioError(f"randomise must be a scenarios.run.batch.Randomisation (got {randomise!r}).")
+    check_progress(progress)
     randomise = randomise or Randomisation()
     specs = randomise.scenarios_of(scenario)
     fleets: list[Fleet] = []
     for i, spec in enumerate(specs):
-
-        def share(stage: str, fraction: float, i: int = i) -> None:
-            progress(stage, fraction if len(specs) == 1 else (i + fraction) / len(specs))
-
+        share = progress if len(specs) == 1 else lambda stage, s, i=i: progress(stage, (i + s) / len(specs))
         every = range(len(spec.arms))
-        arms, refused = _arms(spec, every, difficulty, risk, cache, share, every_work=True, training=training)
-        fleets.append(_fleet(spec, arms, refused, _folder(cache)))
+        made = like and like.all[i]
+        arms, planned = _arms(
+            spec, every, difficulty, risk, cache, share, every_work=True, training=training, like=made
+        )
+        fleets.append(_fleet(spec, arms, planned, _folder(cache), made))
     return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))
 
 
-def _fleet(scenario: Scenario, arms: Sequence[Arm], refused: Sequence[InfeasibleJob], folder: Path) -> Fleet:
+def _fleet(
+    scenario: Scenario, arms: Sequence[Arm], planned: Sequence[PlannedArm], folder: Path, like: Fleet | None = None
+) -> Fleet:
     plans = [plan for arm in arms for variants in arm.plans.values() for plan in variants]
-    return Fleet(scenario, tuple(arms), tuple(refused), space_of(scenario, [arm.robot for arm in arms], plans, folder))
+    space = like.space if like else space_of(scenario, [arm.robot for arm in arms], plans, folder)
+    refused = [error for arm in planned for error in arm.infeasible]
+    return Fleet(scenario, tuple(arms), tuple(refused), space, planned=tuple(planned))
 
 
 def space_of(scenario: Scenario, robots: Sequence[Robot], plans: Sequence[Plan], folder: Path) -> SpaceTable:
@@ -152,8 +159,9 @@ def _arms(
     *,
     every_work: bool,
     training: int = 0,
-) -> tuple[list[Arm], list[InfeasibleJob]]:
-    """The arms at these places of the scenario, and the work that single arms cannot do.
+    like: Fleet | None = None,
+) -> tuple[list[Arm], Sequence[PlannedArm]]:
+    """The arms at these places of the scenario, with their difficulty models and as they were planned.
 
     Args:
         every_work: Raise if none of the arms can do some work.
@@ -165,10 +173,10 @@ def _arms(
     folder = _folder(cache)
     asked = all_works(scenario)
     works = rehearsal_works(scenario) if difficulty == "twin" else asked
-    planned = plan_arms(scenario, indices, works, folder, progress)
+    planned = like.planned if like else plan_arms(scenario, indices, works, folder, progress)
     if problems := problems_of(scenario, planned if every_work else (), folder):
         raise ScenarioError("\n".join(problems))
-    arms = [_blind_arm(arm, asked, folder) for arm in planned]
+    arms = list(like.arms) if like else [_blind_arm(arm, asked, folder) for arm in planned]
     if difficulty == "twin":
         from scenarios.prepare.calibrate_twins import calibrate_twins  # both need the extra `twin`
         from scenarios.prepare.train_twins import train_twins, training_seed
@@ -183,7 +191,7 @@ def _arms(
         ]
     elif difficulty == "oracle":
         arms = [_with_oracle(scenario, arm) for arm in arms]
-    return arms, [error for arm in planned for error in arm.infeasible]
+    return arms, planned
 
 
 def _blind_arm(planned: PlannedArm, works: Sequence[Work], folder: Path) -> Arm:
@@ -309,31 +317,6 @@ def open_exchange(
         return ZenohExchange(arms, fleet, endpoint, channel=channel)
     except ValueError as error:
         raise FleetError(str(error)) from error
-
-
-def scenario_with(
-    scenario: str | Path | Scenario, overrides: Mapping[str, Any], function: Callable[..., object]
-) -> Scenario:
-    """The scenario with overrides, which may be values of any field.
-
-    Args:
-        function: Called with the overrides; its own options are named in errors, too.
-
-    Raises:
-        ScenarioError: an override is neither a field nor an option; names the nearest.
-    """
-    if not isinstance(scenario, str | Path | Scenario):
-        raise ScenarioError(f"scenario must be a library name, a .toml file or a Scenario (got {scenario!r}).")
-    chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
-    fields = [field.name for field in dataclass_fields(Scenario)]
-    options = [name for name, p in signature(function).parameters.items() if p.kind is Parameter.KEYWORD_ONLY]
-    for name in overrides:
-        if name == "seed":
-            raise ScenarioError("make_env() takes no seed: give it to reset(seed=…).")
-        if name not in fields:
-            allowed = nearest(name, [*fields, *options])
-            raise ScenarioError(f"{chosen.name} with overrides: unknown key '{name}'{allowed}")
-    return override(chosen, **overrides) if overrides else chosen
 
 
 def make_env(

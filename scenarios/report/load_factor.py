@@ -17,8 +17,8 @@ does. In between the choice of arm decides.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.optimize import linprog
+from scipy.sparse import csr_array, vstack
 
 from fleet.engine.state import World
 from fleet.thermal import WINDING, drive_heat
@@ -78,21 +78,29 @@ def _heat_share(world: World, plan: Array) -> Array:
 
 
 def _least(load: Array, possible: Array, busy: Array | None = None, most: float = np.inf) -> float:
-    """Least largest load of an arm when every job is shared out, [arm, job], while no arm's `busy` passes `most`."""
-    arms, jobs = load.shape
-    whole = np.hstack([np.tile(np.eye(jobs), arms), np.zeros((jobs, 1))])
-    # Variables: the share of each job on each arm, arm by arm, and the largest load.
-    per_arm, bound = [np.hstack([np.asarray(block_diag(*load)), np.full((arms, 1), -1.0)])], [np.zeros(arms)]
-    if busy is not None:
-        per_arm.append(np.hstack([np.asarray(block_diag(*busy)), np.zeros((arms, 1))]))
-        bound.append(np.full(arms, most * (1.0 + 1e-9)))
+    """Least largest load of an arm when every job is shared out, [arm, job], while no arm's `busy` passes `most`.
+
+    Jobs that are alike for every arm are one, as often as there are such; only possible pairs are variables.
+    """
+    columns = np.stack([possible, load * possible, (load if busy is None else busy) * possible])
+    (alike, loads, busies), count = np.unique(columns, axis=2, return_counts=True)
+    arms, kinds = alike.shape
+    arm, kind = np.nonzero(alike)
+    pairs = np.arange(len(arm))
+    # Variables: how much of each kind goes to each arm that can do it, and the largest load.
+    shape = (arms, len(pairs) + 1)
+    own = csr_array((loads[arm, kind], (arm, pairs)), shape=shape) - csr_array(
+        (np.ones(arms), (np.arange(arms), np.full(arms, len(pairs)))), shape=shape
+    )
+    time = csr_array((busies[arm, kind], (arm, pairs)), shape=shape)
+    limited = busy is not None
     result = linprog(
-        np.append(np.zeros(arms * jobs), 1.0),
-        np.vstack(per_arm),
-        np.concatenate(bound),
-        whole,
-        np.ones(jobs),
-        bounds=[*((0.0, float(open_)) for open_ in possible.ravel()), (0.0, np.inf)],
+        np.append(np.zeros(len(pairs)), 1.0),
+        vstack([own, time]) if limited else own,
+        np.append(np.zeros(arms), np.full(arms, most * (1.0 + 1e-9)) if limited else []),
+        csr_array((np.ones(len(pairs)), (kind, pairs)), shape=(kinds, len(pairs) + 1)),
+        count,
+        method="highs",
     )
     if not result.success:
         raise ValueError(f"The load of the shift could not be computed: {result.message}")

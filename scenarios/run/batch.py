@@ -16,7 +16,8 @@ from fleet.seeding import key_of, shift_seeds
 from scenarios.cell_layout import near_of
 from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, works_of
-from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare, scenario_with, world_of
+from scenarios.load import scenario_with
+from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare, world_of
 from scenarios.prepare.randomisation import Randomisation as Randomisation
 from scenarios.progress import Progress, check_progress, quiet
 from scenarios.schema import Scenario

@@ -17,6 +17,7 @@ from scenarios.progress import Progress, quiet
 from scenarios.report.page import table
 from scenarios.run.evaluate import COUNTS, FIGURES, POSSIBLE, Outcome
 from scenarios.schema import Scenario
+from scenarios.statistics.scores import Scores
 from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
 
 Array = np.ndarray
@@ -73,6 +74,8 @@ class Comparison:
     """By policy: illegal actions in all its shifts."""
     failures: tuple[Failed, ...] = ()
     """Shifts in which a policy failed. A policy with one has no figures."""
+    scores: Scores | None = None
+    """Normalised scores; None without references of the shifts."""
 
     def _repr_html_(self) -> str:
         head = ("policy", *(HEADINGS[name] for name in FIGURES))

@@ -1,6 +1,9 @@
 """The tables of docs/exchange.md: figures of shifts on several channels, beside those on a perfect one."""
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,14 @@ COLUMNS = {
     "lost": ("rejected", 1),
 }
 """Heading and decimals of a figure."""
+
+
+def channel_tables(folder: Path) -> dict[str, Callable[[], str]]:
+    """Text of the table of every result in a folder, by `channels_SCENARIO`."""
+    return {
+        f"channels_{path.stem}": partial(channel_table, json.loads(path.read_text(encoding="utf-8")))
+        for path in folder.glob("*.json")
+    }
 
 
 def channel_table(measured: Mapping[str, Any]) -> str:

@@ -105,12 +105,17 @@ def drawn_rows(name: SplitName) -> Iterator[Row]:
         row = Row(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
         made = instance_of(row)
         jobs = jobs_content(made)
-        yield replace(row, scenario=_hash(scenario_content(made.scenario)), jobs=_hash(jobs), count=len(jobs))
+        yield replace(row, scenario=content_hash(made.scenario), jobs=_hash(jobs), count=len(jobs))
 
 
 def line_of(row: Row) -> str:
     """The line of a manifest file."""
     return json.dumps(asdict(row))
+
+
+def content_hash(scenario: Scenario) -> str:
+    """Hash of what is no default in a scenario, so that a new field with a default does not change it."""
+    return _hash(scenario_content(scenario))
 
 
 def scenario_content(value: Any) -> Any:

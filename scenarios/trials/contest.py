@@ -67,7 +67,7 @@ def run_study(
     """
     wanted = [key for unit in study.units(set()) for key in unit.keys]
     with _opened(study, out) as store:
-        units = list(study.units(set(store.rows)))
+        units = sorted(study.units(set(store.rows)), key=lambda unit: unit.cell)  # what shares plans follows
         folder = cache_dir or cache_folder()  # here: a worker may have started with another one
         warm(units, study, folder, here.fleets, progress)
         settings = Settings.of(study, cache_dir if ray else folder)

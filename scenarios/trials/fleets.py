@@ -2,42 +2,17 @@
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
-from scenarios.job_stream import all_works, works_of
-from scenarios.prepare.fleet import DifficultyName, Fleet, RiskName, prepare
+from scenarios.prepare.fleet import Fleet, RiskName, prepare
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
-from scenarios.schema import Scenario
+from scenarios.trials.cells import drawn, plan_content, prepared_content
 from scenarios.trials.plan import Study, Unit
 
 MOST_FLEETS = 4
 """Prepared fleets that a process keeps; one has some 10 MB per arm."""
-_UNREAD = ("name", "description", "jobs", "reward", "people", "slots", "decisions", "telemetry_interval_s", "bus")
-"""Fields of a scenario that `prepare` does not read, and its jobs."""
-_WEATHER = ("horizon_s", "decision_interval_s", "ambient", "start", "limits")
-"""Fields that plans and trained networks do not depend on; what does is quickly made."""
-
-
-def drawn(scenario: Scenario, fleet: int) -> Scenario:
-    """The scenario with the k-th draw of its arms."""
-    return replace(scenario, spread=replace(scenario.spread, seed=scenario.spread.seed + fleet))
-
-
-def prepared_content(scenario: Scenario, difficulty: DifficultyName) -> tuple[object, ...]:
-    """What `prepare` reads of a scenario: two with the same content have the same prepared fleet.
-
-    Past jobs of a twin are drawn from the scenario's streams, so these are kept whole.
-    """
-    jobs = scenario.jobs if difficulty == "twin" else tuple(works_of(scenario, stream) for stream in scenario.jobs)
-    return (jobs, *(getattr(scenario, field.name) for field in fields(scenario) if field.name not in _UNREAD))
-
-
-def plan_content(scenario: Scenario) -> tuple[object, ...]:
-    """What takes long to make of a scenario, plans and trained twins, depends on this."""
-    kept = (field.name for field in fields(scenario) if field.name not in (*_UNREAD, *_WEATHER))
-    return (frozenset(all_works(scenario)), *(getattr(scenario, name) for name in kept))
 
 
 class Fleets:
@@ -46,6 +21,8 @@ class Fleets:
     def __init__(self) -> None:
         self._cells: OrderedDict[object, Fleet] = OrderedDict()
         self._last: tuple[object, Fleet] | None = None
+        self._planned: tuple[object, Fleet] | None = None
+        """The fleet prepared last, and what its plans depend on."""
 
     def of(
         self,
@@ -66,6 +43,7 @@ class Fleets:
             return self._last[1]
         cell = (prepared_content(scenario, unit.difficulty), *asked[1:])
         if cell not in self._cells:
+            plans = (plan_content(scenario), unit.difficulty, risk, randomise, folder)
             self._cells[cell] = prepare(
                 scenario,
                 difficulty=unit.difficulty,
@@ -74,7 +52,9 @@ class Fleets:
                 training=unit.training,
                 cache=folder,
                 progress=progress,
+                like=self._planned[1] if self._planned and self._planned[0] == plans else None,
             )
+            self._planned = plans, self._cells[cell]
             while len(self._cells) > MOST_FLEETS:
                 self._cells.popitem(last=False)
         self._cells.move_to_end(cell)

@@ -17,8 +17,9 @@ from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.run.provenance import code_hash
-from scenarios.run.shift import scenario_hash
 from scenarios.schema import Scenario
+from scenarios.suite.splits import content_hash
+from scenarios.trials.cells import plan_content
 
 TOGETHER = 16
 """Shifts of a policy that are stepped side by side."""
@@ -79,6 +80,8 @@ class Unit:
     fleet: int
     training: int
     difficulty: DifficultyName
+    cell: int = field(default=-1, compare=False)
+    """Number of what its plans depend on, see `scenarios.trials.cells`; by default each instance is a cell."""
     deaths: int = field(default=0, compare=False)
     """How many processes died while they ran it."""
 
@@ -89,9 +92,9 @@ class Unit:
         return [Key(*of, seed) for seed in self.case.seeds]
 
     @property
-    def group(self) -> tuple[str, int, int, str]:
-        """Units of one group share a prepared fleet."""
-        return self.case.name, self.fleet, self.training, self.difficulty
+    def group(self) -> tuple[object, ...]:
+        """Units of one group share plans and twins."""
+        return self.case.name if self.cell < 0 else self.cell, self.fleet, self.training, self.difficulty
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,9 +126,11 @@ class Study:
             check_policy(policy)
 
     def units(self, done: set[Key]) -> Iterator[Unit]:
-        """What is left to run, in order: units of one group follow each other."""
+        """What is left to run, in the order of the instances."""
         together = TOGETHER if self.channel.perfect else 1
+        cells: dict[object, int] = {}
         for case in self.cases:
+            cell = cells.setdefault(plan_content(case.scenario), len(cells))
             for difficulty in self.difficulties:
                 for fleet in range(self.fleets):
                     for training in range(self.trainings_of(difficulty)):
@@ -134,7 +139,7 @@ class Study:
                             left = [seed for seed in case.seeds if Key(*of, seed) not in done]
                             for i in range(0, len(left), together):
                                 part = Case(name=case.name, scenario=case.scenario, seeds=tuple(left[i : i + together]))
-                                yield Unit(policy, part, fleet, training, difficulty)
+                                yield Unit(policy, part, fleet, training, difficulty, cell)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -155,7 +160,7 @@ class Study:
             "channel": self.channel.described(),
             "decision_limit_s": self.decision_limit_s,
             "figures": list(FIGURES),
-            "instances": {case.name: scenario_hash(case.scenario) for case in self.cases},
+            "instances": {case.name: content_hash(case.scenario) for case in self.cases},
             "policies": {policy: policy_hash(policy) for policy in self.policies},
         }
 

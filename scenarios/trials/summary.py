@@ -1,6 +1,7 @@
 """From rows to figures and differences, and what a table says of policies that failed."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -11,8 +12,18 @@ from scenarios.policy_loader import label, scope_of
 from scenarios.run.compare import Comparison, Failed, comparison_table, figures_of_shifts
 from scenarios.run.evaluate import Outcome
 from scenarios.statistics.means import unit
+from scenarios.statistics.scores import FEWEST, Normalised, score_tables, scores_of
+from scenarios.statistics.tables import LEGEND
 from scenarios.trials.plan import Case, Row, Study
+from scenarios.trials.scores import Shift, normalised
 
+if TYPE_CHECKING:  # slow to import
+    from scenarios.bounds.references import Reference
+
+NO_SCORES = (
+    f"No normalised scores: fewer than {FEWEST} of these shifts have references. Make them with thermofleet "
+    "bounds, then compare with --references FILE."
+)
 MOST_FAILURES = 8
 """Failed policies whose first failure a table tells."""
 
@@ -34,7 +45,13 @@ def check_baseline(study: Study, baseline: str) -> None:
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(names)}.")
 
 
-def comparison_of(study: Study, rows: Sequence[Row], baseline: str, name: str | None = None) -> Comparison:
+def comparison_of(
+    study: Study,
+    rows: Sequence[Row],
+    baseline: str,
+    name: str | None = None,
+    references: "Mapping[Shift, Reference] | None" = None,
+) -> Comparison:
     """The figures of each policy over the fleets, trainings and seeds of all instances of the rows, and its differences
     to the baseline.
 
@@ -42,11 +59,9 @@ def comparison_of(study: Study, rows: Sequence[Row], baseline: str, name: str | 
         rows: In the order of the study.
         baseline: One of `competitors`.
         name: Of the instances together; default: that of the only one.
+        references: Of the shifts, for normalised scores.
     """
-    names = competitors(study)
-    shifts: dict[str, list[Row]] = {each: [] for each in names.values()}
-    for row in rows:
-        shifts[names[row.key.policy, row.key.difficulty]].append(row)
+    names, shifts = competitors(study), rows_of_competitors(study, rows)
     failures = [
         Failed(each, k.instance, k.fleet, k.training, k.seed, row.error, row.trace or "")
         for each, of in shifts.items()
@@ -56,6 +71,7 @@ def comparison_of(study: Study, rows: Sequence[Row], baseline: str, name: str | 
     ]
     failed, count = {each.policy for each in failures}, len({row.key.instance for row in rows})
     whole = {each: repeated(study, of) for each, of in shifts.items() if each not in failed}
+    values = normalised({each: shifts[each] for each in whole}, references or {}) if baseline in whole else None
     return Comparison(
         scenario=name or rows[0].key.instance,
         seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
@@ -67,7 +83,23 @@ def comparison_of(study: Study, rows: Sequence[Row], baseline: str, name: str | 
         channel_text=study.channel.text,
         illegal={each: sum(row.illegal for row in of) for each, of in shifts.items()},
         failures=tuple(failures),
+        scores=scores_of(values, baseline) if values and len(values.instances) >= FEWEST else None,
     )
+
+
+def rows_of_competitors(study: Study, rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """The rows of each of `competitors`, in their order."""
+    names = competitors(study)
+    shifts: dict[str, list[Row]] = {each: [] for each in names.values()}
+    for row in rows:
+        shifts[names[row.key.policy, row.key.difficulty]].append(row)
+    return shifts
+
+
+def scores_over_all(study: Study, rows: Sequence[Row], references: "Mapping[Shift, Reference]") -> Normalised | None:
+    """Scores of the policies without a failure over all instances; None without references."""
+    shifts = rows_of_competitors(study, rows)
+    return normalised({each: of for each, of in shifts.items() if not any(row.error for row in of)}, references)
 
 
 def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:
@@ -83,13 +115,19 @@ def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:
     return found
 
 
-def comparisons(study: Study, rows: Sequence[Row], baseline: str, suite: str | None = None) -> list[Comparison]:
+def comparisons(
+    study: Study,
+    rows: Sequence[Row],
+    baseline: str,
+    suite: str | None = None,
+    references: "Mapping[Shift, Reference] | None" = None,
+) -> list[Comparison]:
     """One comparison of all instances of a suite, or one for each instance."""
     check_baseline(study, baseline)
     if suite:
-        return [comparison_of(study, rows, baseline, f"{suite}, {counted(study.cases)}")]
+        return [comparison_of(study, rows, baseline, f"{suite}, {counted(study.cases)}", references)]
     of = {case.name: [row for row in rows if row.key.instance == case.name] for case in study.cases}
-    return [comparison_of(study, own, baseline) for own in of.values()]
+    return [comparison_of(study, own, baseline, references=references) for own in of.values()]
 
 
 def counted(cases: Sequence[Case]) -> str:
@@ -100,6 +138,12 @@ def counted(cases: Sequence[Case]) -> str:
 def result_page(result: Comparison) -> Group:
     """The table of a comparison, then its illegal actions and failures."""
     parts: list[RenderableType] = [comparison_table(result)] if result.figures else []
+    if result.scores:
+        names = {policy: label(policy) for policy in result.scores.policies}
+        title = f"\nNormalised scores, paired difference to {label(result.baseline)}, {LEGEND}"
+        parts += [Text(title), *score_tables(result.scores, names), *map(Text, result.scores.remarks)]
+    elif result.figures:
+        parts.append(Text(NO_SCORES))
     if any(result.illegal.values()):
         told = ", ".join(f"{label(policy)} {count}" for policy, count in result.illegal.items() if count)
         parts.append(Text(f"Illegal actions, which count as waits: {told}."))

@@ -56,7 +56,7 @@ def check_plans(tables: Tables, actual: np.ndarray, world: World, expected: np.n
 
 def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None:
     logged, single = env_of(fleet, keep_events=True), env_of(fleet)
-    library = library_of([fleet])
+    library = library_of(fleet)
     batch = BatchEnv(library, 3, seed=[SEED - 1, SEED, SEED + 1], weights=weights_of(fleet.scenario))
     logged.reset(seed=SEED)
     single.reset(seed=SEED)

@@ -13,7 +13,6 @@ from fleet.engine.reward import RewardWeights
 from fleet.env.random_actions import random_legal
 from fleet.robot import ThermalLimits
 from scenarios.bounds import references as stored
-from scenarios.bounds.command import markdown
 from scenarios.bounds.exhaustive import optimum
 from scenarios.bounds.heat_budget import HeatBudget
 from scenarios.bounds.hindsight import Budget, hindsight
@@ -21,10 +20,13 @@ from scenarios.bounds.references import Task, load_references, reference, refere
 from scenarios.bounds.relaxation import Relaxation
 from scenarios.bounds.schedule import Replay, Schedules, ShiftSimulator, without_scores
 from scenarios.bounds.upper import upper_bound
+from scenarios.fault_price import weights_of
 from scenarios.load import parse_scenario
 from scenarios.policy_loader import policy_at
-from scenarios.prepare.fleet import Fleet, env_of, prepare
+from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare
 from scenarios.run.evaluate import outcomes
+from scenarios.suite.splits import instance, manifest
+from scenarios.trials.scores import split_file
 
 HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
 DEAR = RewardWeights(tardiness=-0.5, above_warning=-2.0, faults=-1.5, energy=-0.05)
@@ -212,9 +214,30 @@ def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):
     np.testing.assert_allclose(scored.reward, again.reward, rtol=1e-12)
 
 
-def test_the_page_has_the_table_of_the_stored_rows():
-    docs = Path(__file__).parents[2] / "docs"
-    rows = load_references(docs / "results" / "bounds_library.jsonl")
-    page = (docs / "bounds.md").read_text(encoding="utf-8")
-    assert page.split("<!-- bounds -->\n")[1].split("\n<!-- end -->")[0] == markdown(rows)
+def test_references_of_the_splits_are_of_their_instances():
+    for split in ("validation", "test"):
+        lines = {line.name: line for line in manifest(split)}
+        path = split_file(split)
+        rows = load_references(path) if path.is_file() else []
+        assert [each.instance for each in rows] == sorted({each.instance for each in rows})
+        for each in rows:
+            line = lines[each.instance]
+            assert (each.scenario_hash, each.seed, each.search_s) == (line.scenario, line.seed, None)
+            assert each.best_rule <= each.hindsight <= each.upper <= each.linear + 1e-3
+            assert each.random < each.hindsight
+
+
+@pytest.mark.slow
+def test_stored_schedules_still_have_their_rewards():
+    for each in load_references(split_file("test"))[:3]:
+        own = instance(each.instance)
+        fleet = prepare(own.scenario, difficulty="blind")
+        world = ShiftFactory(fleet)(np.random.SeedSequence(own.seed)).world
+        simulator = ShiftSimulator(without_scores(world), weights_of(fleet.scenario), 1)
+        assert simulator.follow([Replay(each.claims)]).reward[0] == pytest.approx(each.hindsight, abs=1e-9)
+
+
+def test_the_stored_rows_are_in_order_of_what_they_bound():
+    rows = load_references(Path(__file__).parents[2] / "docs" / "results" / "bounds_library.jsonl")
+    assert len(rows) == 20
     assert all(each.random <= each.best_rule <= each.hindsight <= each.upper for each in rows)

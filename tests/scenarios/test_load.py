@@ -312,7 +312,7 @@ def test_an_override_changes_that_field_and_no_other():
         ({"horizon_s": -1}, "heat with overrides: horizon_s must be > 0 and finite (got -1.0)."),
         ({"horizon_s": math.inf}, "heat with overrides: horizon_s: expected a finite number, got inf."),
         ({"slots": "a"}, "heat with overrides: slots: expected a whole number, got a text ('a')."),
-        ({"slots": object()}, "heat with overrides: Encoding objects of type object is unsupported."),
+        ({"slots": object()}, "heat with overrides: expected numbers, texts, lists and tables, got <object object"),
         ({"arms": []}, "heat with overrides: arms: there are no arms; give at least one [[arms]]."),
     ],
 )

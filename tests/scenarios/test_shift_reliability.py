@@ -21,7 +21,7 @@ class Plain:
 
 def test_p_and_peaks_come_true_in_the_shift(monkeypatch) -> None:
     monkeypatch.setattr(
-        train_twins, "train_twins", lambda scenario, planned, folder, progress: [Plain()] * len(planned)
+        train_twins, "train_twins", lambda scenario, planned, folder, progress, seed: [Plain()] * len(planned)
     )
     found = shift_reliability(load("heat_wave"), policies=("wspt",), seeds=(10_000, 10_001), fleets=1)
     said = verdict(found["wspt"])

@@ -166,7 +166,7 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     said = {
         "Raises": ("KeyError: 'nobody' (at 30 s of the shift)", 'return seen["nobody"]'),
         "Nonsense": ("ValueError: The action of 'left' must be one integer (got 'wait').", "validation.py"),
-        "Needs": ("must be a class that is created without arguments", "policy_loader.py"),
+        "Needs": ("must be a class or function that is called without arguments", "policy_loader.py"),
         "Stuck": ("TooSlow: a decision took longer than 0.2 s", "while True: pass"),
     }
     for name, (error, trace) in said.items():
@@ -286,13 +286,21 @@ def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet,
     assert "Raises: KeyError: 'nobody' (at 30 s of the shift)" in said.out
     assert "Illegal actions, which count as waits: Illegal 72." in said.out
     assert len(read_rows(out)) == 6
-    told = thermofleet("compare", "--suite", small_toml, "--policies", "wspt,random", *how, "--fleets", "2", "--json")
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert f"thermofleet compare {small_toml} --policies round_robin,{bad}:Raises" in page
+    assert "KeyError: &#x27;nobody&#x27; (at 30 s of the shift)" in page
+    told = thermofleet("compare", "--suite", small_toml, "--policies", "wspt,random", *how, "--fleets", "2", "--json",
+                       "--marl-eval")  # fmt: skip
     assert msgspec.json.decode(told.out)["scenario"] == f"{small_toml}, 1 instance"
     assert len(read_rows(out)) == 14
+    raw = msgspec.json.decode((out / "marl_eval.json").read_bytes())
+    assert len(raw["thermofleet"]["heat"]["wspt"]) == 4  # two fleets, two seeds
     for wrong, sentence in (
         ((), "Give either scenarios or --suite."),
         ((small_toml, "--suite", "test"), "Give either scenarios or --suite."),
         ((small_toml, "--jobs", "2", "--ray", "auto"), "Give either --jobs or --ray."),
+        ((small_toml, "--marl-eval"), "--marl-eval needs --out"),
+        ((small_toml, "--references", "none.jsonl"), "There is no file of references 'none.jsonl'"),
         ((small_toml, "--difficulty", "blind,oracel"), "No difficulty 'oracel'; did you mean 'oracle'?"),
     ):
         said = thermofleet("compare", *wrong)

@@ -136,14 +136,19 @@ def assemble(now_s: float, jobs: tuple[str, ...], conditions: AllConditions, sco
 
     row, contents = _distinct(scores)
     table = np.full((2, len(contents) + 1, len(jobs)), np.nan)
+    together: dict[int, list[int]] = {}  # contents of one broadcast share its jobs
     for index, content in enumerate(contents):
-        values = np.array((content.difficulty, content.p_saturation), dtype=float)  # None becomes NaN
-        if content.jobs == jobs:
-            table[:, index] = values
+        together.setdefault(id(content.jobs), []).append(index)
+    for indices in together.values():
+        known = contents[indices[0]].jobs
+        values = np.array([(contents[i].difficulty, contents[i].p_saturation) for i in indices], dtype=float)
+        values = values.swapaxes(0, 1)  # None became NaN
+        if known == jobs:
+            table[:, indices] = values
             continue
-        columns = {name: column for column, name in enumerate(content.jobs)}
+        columns = {name: column for column, name in enumerate(known)}
         slots = [slot for slot, name in enumerate(jobs) if name in columns]
-        table[:, index, slots] = values[:, [columns[jobs[slot]] for slot in slots]]
+        table[:, np.array(indices)[:, None], slots] = values[:, :, [columns[jobs[slot]] for slot in slots]]
     table[:, :, [slot for slot, name in enumerate(jobs) if not name]] = np.nan
     scores_s = np.array([*(content.time_s for content in contents), -math.inf])[row]
     difficulty, p_saturation = table[:, row]
@@ -212,15 +217,12 @@ def check_order(time_s: float, last_s: float) -> None:
 
 def _distinct(contents: Sequence[Sequence[Content | None]]) -> tuple[Array, list[Content]]:
     """[receiver, sender] index of each content in the list of distinct ones; -1 (its end) for None."""
-    index: dict[int, int] = {id(None): -1}
-    distinct: list[Content] = []
-    rows: dict[int, list[int]] = {}  # arms that share a client share one list
-    for row in contents:
-        if id(row) in rows:
-            continue
-        for content in row:
-            if content is not None and id(content) not in index:
-                index[id(content)] = len(distinct)
-                distinct.append(content)
-        rows[id(row)] = [index[id(content)] for content in row]
-    return np.array([rows[id(row)] for row in contents], dtype=int), distinct
+    rows = {id(row): row for row in contents}  # arms that share a client share one list
+    flat = [content for row in rows.values() for content in row]
+    ids = np.fromiter(map(id, flat), np.int64, len(flat))
+    _, first, which = np.unique(ids, return_index=True, return_inverse=True)
+    found = [flat[i] for i in first]
+    there = np.array([content is not None for content in found])
+    number = np.where(there, np.cumsum(there) - 1, -1)[which].reshape(len(rows), -1)
+    place = {key: i for i, key in enumerate(rows)}
+    return number[[place[id(row)] for row in contents]], [content for content in found if content is not None]

@@ -1,6 +1,7 @@
 """Tables of the studies: means over seeds with 95 % intervals."""
 
 from collections.abc import Callable, Sequence
+from math import isfinite
 
 import numpy as np
 
@@ -25,7 +26,8 @@ def transfer_tables(cells: Sequence[Cell]) -> tuple[Table, ...]:
             for row in cell.trained
             if (row.start, row.jobs) == (start, count)
         ]
-        return interval([getattr(row, name) for row in rows]).text(3)
+        known = [value for row in rows if isfinite(value := getattr(row, name))]  # AUROC needs hot and cool jobs
+        return interval(known).text(3) if known else "unknown"
 
     errors = tuple(
         (f"{target}, {start}", *(of(target, start, count, "error") for count in jobs))

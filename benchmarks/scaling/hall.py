@@ -1,0 +1,66 @@
+"""A hall of any number of arms: rows of up to 16 on the floor, with two stations between every two neighbours."""
+
+import json
+from dataclasses import asdict
+
+from scenarios.schema import ArrivalSpec, JobStream, Scenario, Spread, TwinSpec
+from scenarios.suite.layouts import layout_of
+
+SHOWN = ("name", "position_m", "tilt_deg", "home")
+
+
+def hall(
+    arms: int, *, hours: float = 1.0, jobs: float | None = None, slots: int = 64, cycles: tuple[int, int] = (5, 15)
+) -> Scenario:
+    """The scenario of a hall, in which neighbours sort parts between their stations.
+
+    Args:
+        jobs: Expected number; default: eight per arm and hour.
+        cycles: Fewest and most of a job, of 10 s or so each.
+    """
+    layout, horizon_s = layout_of("line", arms), 3600.0 * hours
+    every_s = horizon_s * len(layout.groups) / (8.0 * arms * hours if jobs is None else jobs)
+    streams = [
+        JobStream(
+            name=f"sort_{i:03d}",
+            kind="sort",
+            places=tuple(place.name for place in group),
+            arrivals=ArrivalSpec(kind="poisson", every_s=every_s),
+            payload_kg=(1.0, 2.0),
+            repetitions=cycles,
+            due_s=1800.0,
+        )
+        for i, group in enumerate(layout.groups)
+    ]
+    return Scenario(
+        name=f"hall_{arms}",
+        description=f"{arms} arms sort parts.",
+        horizon_s=horizon_s,
+        arms=layout.arms,
+        places=layout.places,
+        jobs=tuple(streams),
+        slots=slots,
+        spread=Spread(scale=0.5, seed=17),
+        twin=TwinSpec(size="quick", exploration=32),
+    )
+
+
+def toml_of(scenario: Scenario) -> str:
+    """The scenario file of a hall."""
+    lines = [
+        f'description = "{scenario.description}"',
+        f"horizon_s = {scenario.horizon_s}",
+        f"slots = {scenario.slots}",
+    ]
+    lines += ["[spread]", f"scale = {scenario.spread.scale}", f"seed = {scenario.spread.seed}"]
+    lines += ["[twin]", f'size = "{scenario.twin.size}"', f"exploration = {scenario.twin.exploration}"]
+    for arm in scenario.arms:
+        lines += ["[[arms]]", *(f"{name} = {json.dumps(getattr(arm, name))}" for name in SHOWN)]
+    for place in scenario.places:
+        lines += ["[[places]]", f'name = "{place.name}"', f"position_m = {list(place.position_m)}"]
+    for stream in scenario.jobs:
+        given = asdict(stream)
+        lines += ["[[jobs]]", *(f"{n} = {json.dumps(given[n])}" for n in ("name", "kind", "places", "payload_kg"))]
+        lines += [f"repetitions = {list(stream.repetitions)}", f"due_s = {stream.due_s}"]
+        lines += [f'arrivals = {{ kind = "poisson", every_s = {stream.arrivals.every_s} }}']
+    return "\n".join(lines) + "\n"

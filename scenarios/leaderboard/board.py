@@ -1,0 +1,124 @@
+"""The table of the leaderboard, from the files of results."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fleet.errors import FleetError
+from scenarios.bounds.command import markdown
+from scenarios.bounds.references import Reference, load_references
+from scenarios.doc_tables import table
+from scenarios.leaderboard.submission import Submission, check, read, split_references
+from scenarios.run.evaluate import FIGURES
+from scenarios.statistics.scores import FEWEST, Scores, ranked, score_cells, scores_of
+from scenarios.suite.splits import manifest
+from scenarios.trials.scores import Shift, normalised
+
+BASELINE = "wspt"
+"""Policy that differences refer to, by any source of scores; without it the last of the board."""
+HEADS = ("", "policy", "scores from", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound")
+MORE = ("faults", "failed", "by", "code")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """The results on one split, the best first."""
+
+    split: str
+    scores: Scores
+    """By name of the submission."""
+    entries: Mapping[str, Submission]
+    instances: int
+    """Of the split."""
+
+    @property
+    def order(self) -> list[str]:
+        """Names of the submissions, the best first."""
+        return ranked(self.scores)
+
+    def best(self, scope: str) -> Submission | None:
+        """The best of a scope."""
+        return next((self.entries[name] for name in self.order if self.entries[name].card.scope == scope), None)
+
+
+def read_all(folder: Path, split: str) -> list[Submission]:
+    """The checked results of a split in a folder, by the names of their files.
+
+    Raises:
+        FleetError: a file is no result, or one that is refused, or has the name of another.
+    """
+    references, found = split_references(split), list[Submission]()
+    for path in sorted(folder.glob(f"{split}-*.jsonl")):
+        submission = read(path)
+        if path.stem != submission.name:
+            raise FleetError(f"'{path}' must have the name of its policy and split, {submission.name}.jsonl.")
+        check(submission, references)
+        found.append(submission)
+    return found
+
+
+def board_of(
+    split: str, submissions: Sequence[Submission], references: Mapping[Shift, Reference] | None = None
+) -> Board | None:
+    """The board of a split; None without results or without references.
+
+    A failed shift counts as the mean of random.
+    """
+    entries = {each.name: each for each in submissions}
+    rows = {name: each.study_rows() for name, each in entries.items()}
+    values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
+    if values is None or len(values.instances) < FEWEST:
+        return None
+    base = min((name for name, each in entries.items() if each.card.policy == BASELINE), default=None)
+    last = min(entries, key=lambda name: values.score[name].mean())
+    return Board(split=split, scores=scores_of(values, base or last), entries=entries, instances=len(manifest(split)))
+
+
+def board_text(board: Board | None, split: str) -> str:
+    """The board as Markdown: what is best of each scope, the table, and what must be known."""
+    if board is None:
+        return f"No results with references on the split {split}."
+    scores = board.scores
+    best = [
+        f"{scope} `{each.card.policy}` ({scores.policies[each.name].mean.text()})"
+        for scope in ("central", "arm")
+        for each in [board.best(scope)]
+        if each
+    ]
+    parts = [f"Best policy of scope {', of scope '.join(best)}."]
+    rows = [(str(place), *_cells(scores, name, board.entries[name])) for place, name in enumerate(board.order, start=1)]
+    parts.append(table((*HEADS, *MORE), rows))
+    base = board.entries[scores.baseline].card
+    missing = board.instances - scores.instances - len(scores.flat)
+    told = f"{scores.instances} of {board.instances} instances; differences to `{base.policy}` ({base.difficulty})."
+    if missing:
+        told += f" {missing} have no reference yet and are not scored."
+    if scores.flat:
+        told += f" Not scored, as hindsight is no better than random there: {', '.join(scores.flat)}."
+    return "\n\n".join([*parts, told])
+
+
+def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
+    mean, difference, stars, *rest = score_cells(scores, name)
+    outcomes = [row.figures for row in entry.rows if row.figures is not None]
+    faults = sum(own[FIGURES.index("faults")] for own in outcomes) / max(1, len(outcomes))
+    card = entry.card
+    own = (f"`{card.policy}`", card.difficulty, card.scope, mean, f"{difference} {stars}".strip().replace("*", "\\*"))
+    return (*own, *rest, f"{faults:.2f}", str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
+
+
+def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
+    """Text of each table of docs/leaderboard.md and docs/bounds.md by the name in its mark.
+
+    Args:
+        results: docs/results.
+    """
+
+    def board(split: str) -> str:
+        return board_text(board_of(split, read_all(results / "leaderboard", split)), split)
+
+    return {
+        "bounds": lambda: markdown(load_references(results / "bounds_library.jsonl")),
+        "leaderboard_test": lambda: board("test"),
+        "leaderboard_validation": lambda: board("validation"),
+    }

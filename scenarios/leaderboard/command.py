@@ -1,0 +1,87 @@
+"""`thermofleet leaderboard` and `thermofleet submit-result`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleet.errors import FleetError
+from scenarios.cli import options
+from scenarios.cli.terminal import echo, print_json, progress_bar, say
+from scenarios.schema_errors import choose
+
+if TYPE_CHECKING:  # slow to import
+    from scenarios.leaderboard.submission import Submission
+
+FOLDER = Path("docs/results/leaderboard")
+"""Of the results in a checkout."""
+
+
+def leaderboard_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of results; it holds one file for each.")] = FOLDER,
+    split: Annotated[str, typer.Option(help="test or validation.")] = "test",
+    verify: Annotated[
+        int, options.number("Repeat so many shifts of each result whose policy comes with the code.", 0, 200)
+    ] = 0,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Print the table of the leaderboard: normalised scores of all results on a split.
+
+    Every file is checked as by `thermofleet submit-result`. A failed shift counts
+    as the mean of random. With --verify, figures must come out equal again.
+    """
+    from scenarios.leaderboard.board import board_of, board_text, read_all
+    from scenarios.suite.cells import SplitName
+
+    split = choose("split", split, SplitName)
+    if not folder.is_dir():
+        raise FleetError(f"There is no folder '{folder}'; give the folder of the results.")
+    found = read_all(folder, split)
+    if verify:
+        from scenarios.leaderboard.repeat import check_repeated
+
+        with progress_bar() as progress:
+            for each in found:
+                say(check_repeated(each, verify, progress))
+    board = board_of(split, found)
+    if as_json:
+        print_json(board.scores if board else None)
+    else:
+        echo(board_text(board, split))
+
+
+def submit_command(
+    results: Annotated[Path, typer.Argument(help="Folder of `thermofleet compare --suite test --out`.")],
+    author: Annotated[str, typer.Option(help="Who sends the result.")],
+    about: Annotated[str, typer.Option(help="What the policy is, and where it can be had; one sentence.")] = "",
+    policies: Annotated[
+        str | None, typer.Option(help="Policies of the folder, separated by commas; default: all.", show_default=False)
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path(),
+) -> None:
+    """Check results on a whole split, and write one file for each policy, to be sent.
+
+    Instances must have the hashes of the manifest, every shift must be there, and
+    versions must be stated. A failed shift counts as the mean of random.
+    """
+    from scenarios.extras import require_extra
+
+    require_extra("report")
+    from scenarios.leaderboard.submission import check, read_card, split_references, submissions_of, write
+    from scenarios.policy_loader import label
+    from scenarios.trials.store import read_rows
+
+    made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
+    if policies is not None:
+        wanted = [label(name.strip()) for name in policies.split(",")]
+        unknown = [name for name in wanted if name not in {each.card.policy for each in made}]
+        if unknown:
+            raise FleetError(f"'{results}' has no results of {', '.join(unknown)}.")
+        made = [each for each in made if each.card.policy in wanted]
+    known = {split: split_references(split) for split in {each.card.split for each in made}}
+    for each in made:
+        check(each, known[each.card.split])
+    for each in made:
+        path = write(each, out)
+        failed = f", {each.failures} failed shifts, which count as random" if each.failures else ""
+        say(f"Checked: {len(each.rows)} shifts of {each.card.policy}{failed}. Written to {path}.")

@@ -1,0 +1,148 @@
+"""Normalised scores of policies over instances: mean, difference to a baseline, and the figures of `suites`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.table import Table
+
+from scenarios.statistics.holm import holm
+from scenarios.statistics.means import LEVEL, Interval, interval, paired
+from scenarios.statistics.suites import aggregates, improvement
+
+Array = np.ndarray
+
+FEWEST = 2
+"""Instances that intervals over instances need."""
+
+
+@dataclass(frozen=True, eq=False)
+class Normalised:
+    """Scores of the same instances under several policies; 0 is the mean of random, 1 the hindsight."""
+
+    instances: tuple[str, ...]
+    """A scenario and a seed each."""
+    score: Mapping[str, Array]
+    """By policy, [instance]."""
+    to_bound: Mapping[str, Array]
+    """(upper bound − reward) / (upper bound − random), by policy, [instance]."""
+    missing: int = 0
+    """Shifts of each policy that have no reference."""
+    flat: tuple[str, ...] = ()
+    """Instances left out because their hindsight is not better than random."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """The normalised score of one policy; the unit of all intervals is the instance."""
+
+    mean: Interval
+    difference: Interval
+    """Of means, paired, to the baseline."""
+    p_holm: float
+    """Of no difference, adjusted for all policies."""
+    iqm: Interval
+    optimality_gap: Interval
+    """By how much scores are below 1 in the mean; those above count as 1."""
+    improvement: Interval
+    """Probability of a better score than the baseline's on an instance; an equal score counts one half."""
+    bound_gap: Interval
+    """Distance to the upper bound as a share of that from random to the bound, in the mean."""
+
+    @property
+    def stars(self) -> str:
+        """As `tables.LEGEND` says."""
+        return "*" * (self.difference.excludes_zero + (self.p_holm < 1 - LEVEL))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """Normalised scores of several policies."""
+
+    baseline: str
+    instances: int
+    missing: int
+    flat: tuple[str, ...]
+    policies: dict[str, Score]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a reader must know of the instances."""
+        told = [
+            f"Unit: {self.instances} instances. Score: 0 = mean of random, 1 = hindsight, the best schedule that a "
+            "clairvoyant search found."
+        ]
+        if self.missing:
+            told.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
+        if self.flat:
+            told.append(f"Not scored, as hindsight is no better than random there: {', '.join(self.flat)}.")
+        return told
+
+
+def scores_of(values: Normalised, baseline: str) -> Scores:
+    """The figures of every policy; baseline is one of them.
+
+    Raises:
+        ValueError: fewer than two instances.
+    """
+    if len(values.instances) < FEWEST:
+        raise ValueError(f"Scores need {FEWEST} instances or more (got {len(values.instances)}).")
+    base, names = values.score[baseline], list(values.score)
+    suite = aggregates({name: x[None] for name, x in values.score.items()})
+    differences = [Interval(0.0, 0.0, 0.0) if name == baseline else paired(values.score[name], base) for name in names]
+    adjusted = holm([each.p for each in differences]).tolist()
+    return Scores(
+        baseline=baseline,
+        instances=len(values.instances),
+        missing=values.missing,
+        flat=values.flat,
+        policies={
+            name: Score(
+                mean=interval(values.score[name]),
+                difference=difference,
+                p_holm=p_holm,
+                iqm=suite[name].iqm,
+                optimality_gap=suite[name].optimality_gap,
+                improvement=improvement(values.score[name][None], base[None]),
+                bound_gap=interval(values.to_bound[name]),
+            )
+            for name, difference, p_holm in zip(names, differences, adjusted, strict=True)
+        },
+    )
+
+
+def ranked(scores: Scores) -> list[str]:
+    """The policies, the best mean first."""
+    return sorted(scores.policies, key=lambda name: -scores.policies[name].mean.mean)
+
+
+HEADS = ("policy", "mean", "difference", "", "IQM", "short of 1", "better in", "to bound")
+
+
+def score_cells(scores: Scores, name: str, digits: int = 2) -> tuple[str, ...]:
+    """A row of `HEADS` but for the name."""
+    each, base = scores.policies[name], name == scores.baseline
+    return (
+        each.mean.text(digits),
+        "" if base else each.difference.text(digits),
+        "" if base else each.stars,
+        each.iqm.text(digits),
+        each.optimality_gap.text(digits),
+        "" if base else each.improvement.text(digits),
+        f"{each.bound_gap.mean:.{digits}f}",
+    )
+
+
+def score_tables(scores: Scores, labels: Mapping[str, str]) -> Sequence[Table]:
+    """Two tables of all policies, the best first, each narrow enough for 80 columns."""
+    parts: list[Table] = []
+    for columns in ((0, 1, 2, 6), (3, 4, 5)):
+        table = Table(box=None, pad_edge=False)
+        table.add_column("normalised score" if not columns[0] else "", overflow="fold")
+        for column in columns:
+            table.add_column(HEADS[1 + column], justify="right")
+        for name in ranked(scores):
+            cells = score_cells(scores, name)
+            table.add_row(labels[name], *(cells[column] for column in columns))
+        parts.append(table)
+    return parts

@@ -1,0 +1,241 @@
+"""The page of a comparison: one HTML file that opens offline, with verdict, intervals, charts and how to repeat."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any  # values of a card
+
+import numpy as np
+
+from scenarios.policy_loader import label
+from scenarios.report.page import escape, html_page, paragraph, table
+from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
+from scenarios.run.evaluate import FIGURES
+from scenarios.statistics.means import Interval, paired
+from scenarios.statistics.scores import FEWEST, HEADS, Normalised, ranked, score_cells, scores_of
+from scenarios.statistics.suites import profile
+from scenarios.statistics.tables import LEGEND
+from scenarios.suite.splits import manifest
+from scenarios.trials.report.charts import lines, points, spans
+
+Array = np.ndarray
+
+MOST_CURVES = 8
+"""Policies in the chart of profiles: the best ones, and the baseline."""
+MOST_FAILURES = 20
+"""Failed shifts with their traceback."""
+THRESHOLDS = np.linspace(-0.5, 1.1, 81)
+WORST = -1.5
+"""Scores below are cut in charts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """What a page is about."""
+
+    title: str
+    results: Sequence[Comparison]
+    """One for all instances, or one for each."""
+    values: Normalised | None
+    """Scores over all instances; None without references."""
+    card: Mapping[str, Any]
+    """Of the study: hashes, versions and settings."""
+    command: str
+    """That repeats it."""
+
+    @property
+    def baseline(self) -> str:
+        """That differences refer to."""
+        return self.results[0].baseline
+
+
+def comparison_page(judged: Judged) -> str:
+    """The page; the same input gives the same text."""
+    scored = judged.values is not None and len(judged.values.instances) >= FEWEST
+    body = [
+        *(paragraph(sentence, "verdict") for sentence in verdict(judged)),
+        *(_scores(judged, judged.values) if scored and judged.values else ()),
+        *_by_cell(judged),
+        *_heat(judged),
+        *(part for result in judged.results for part in _figures(result, alone=len(judged.results) == 1)),
+        *_failures(judged),
+        *_repeat(judged),
+    ]
+    return html_page(judged.title, body, narrow=True)
+
+
+def verdict(judged: Judged) -> list[str]:
+    """What came out, in sentences: the best policy against the baseline, and against the next one."""
+    values, base = judged.values, judged.baseline
+    failed = {each.policy for result in judged.results for each in result.failures}
+    last = [f"Failed: {', '.join(sorted(map(label, failed)))}; a policy with a failed shift has no figures."] * bool(
+        failed
+    )
+    if values is None or len(values.instances) < FEWEST:
+        return [*_reward_verdict(judged.results), *last]
+    scores = scores_of(values, base)
+    best, *rest = ranked(scores)
+    compared = [_against(best, base, scores.policies[best].difference, "the baseline ")] if best != base else []
+    others = [name for name in rest if name != base]
+    if others:
+        compared.append(
+            _against(best, others[0], paired(values.score[best], values.score[others[0]]), "the next one, ")
+        )
+    told = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
+    told.append(
+        f"Its mean score is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies, where 0 "
+        f"is random and 1 the best schedule known for each of {scores.instances} instances."
+    )
+    return [*told, *last]
+
+
+def _against(best: str, other: str, difference: Interval, role: str) -> str:
+    """`beats the baseline wspt by 0.12 [0.08, 0.16] of the way from random to the best known`."""
+    by = f"{difference.text()} of the way from random to the best known"
+    if difference.low > 0:
+        return f"beats {role}{label(other)} by {by}"
+    return f"is not shown to beat {role}{label(other)}: the difference is {by}"
+
+
+def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
+    """By reward, for instances without references."""
+    for result in results:
+        where = f"{result.scenario}, {result.unit}: "
+        if not result.figures:
+            yield f"{where}no differences, as the baseline {label(result.baseline)} failed."
+            continue
+        best = max(result.figures, key=lambda name: result.figures[name]["reward"].mean)
+        figure = result.figures[best]["reward"]
+        if best == result.baseline:
+            yield f"{where}no policy has more reward than the baseline {label(best)} ({figure.mean:.1f})."
+            continue
+        span = Interval(figure.difference, figure.difference_low, figure.difference_high).text(1)
+        more = "more reward than" if figure.excludes_zero else "more than, which is not significant,"
+        yield f"{where}{label(best)} has the most reward, {figure.mean:.1f}; {span} {more} {label(result.baseline)}."
+
+
+def _scores(judged: Judged, values: Normalised) -> Iterator[str]:
+    scores = scores_of(values, judged.baseline)
+    order = ranked(scores)
+    yield "<h2>Normalised score</h2>"
+    yield from (paragraph(sentence, "faint") for sentence in scores.remarks)
+    means = [(label(name), scores.policies[name].mean) for name in order]
+    rows = [(name, mean.mean, mean.low, mean.high) for name, mean in means]
+    yield spans(rows, "mean normalised score, 95 % interval", least=WORST, marked=label(judged.baseline))
+    cells = [(label(name), *score_cells(scores, name)) for name in order]
+    yield table(HEADS, cells, style="numbers scores")
+    yield paragraph(
+        f"difference: paired, to {label(judged.baseline)}; {LEGEND}. IQM: mean of the middle half. short of 1: mean "
+        "shortfall, where scores above 1 count as 1 (optimality gap). better in: share of instances with a better "
+        "score than the baseline. to bound: distance to the upper bound, of the way from random to it.",
+        "faint",
+    )
+    yield "<h2>Performance profiles</h2>"
+    about = f"bands: pointwise 95 % intervals of the best and of {label(judged.baseline)}"
+    yield paragraph(f"Share of instances with a score above each threshold; {about}.", "faint")
+    chosen = order[:MOST_CURVES]
+    if judged.baseline not in chosen:
+        chosen = [*chosen[:-1], judged.baseline]
+    curves = {name: profile(values.score[name][None], THRESHOLDS) for name in chosen}
+    bands = {label(name): (each.share, each.low, each.high) for name, each in curves.items()}
+    banded = {label(chosen[0]), label(judged.baseline)}
+    yield lines(THRESHOLDS, bands, banded, "normalised score", "share of instances above")
+
+
+def _by_cell(judged: Judged) -> Iterator[str]:
+    """Mean score of each policy in each cell of a split, or in each scenario."""
+    values = judged.values
+    if values is None:
+        return
+    cells = {name: _cell(name) for name in values.instances}
+    names = sorted(set(cells.values()))
+    if len(names) < 2 or len(names) == len(values.instances):
+        return
+    member = {name: np.array([cells[each] == name for each in values.instances]) for name in names}
+    order = sorted(values.score, key=lambda policy: -values.score[policy].mean())
+    means = {policy: [float(values.score[policy][member[name]].mean()) for name in names] for policy in order}
+    best = [max(column) for column in zip(*means.values(), strict=True)]
+    rows = [
+        (label(policy), *(f"{v:.2f}{' ●' if v == top else ''}" for v, top in zip(own, best, strict=True)))
+        for policy, own in means.items()
+    ]
+    head = ("policy", *(f"{name.replace('_', ' ')} ({int(member[name].sum())})" for name in names))
+    yield "<h2>By cell or scenario</h2>"
+    yield paragraph("Mean normalised score; ● best of the column; number of instances in brackets.", "faint")
+    yield table(head, rows, style="numbers scores")
+
+
+def _cell(instance: str) -> str:
+    """The cell of an instance of a split; else its scenario."""
+    split, _, number = instance.rpartition("/")
+    if split in ("train", "validation", "test"):
+        return next((row.cell for row in manifest(split) if row.name == instance), split)
+    return split or number
+
+
+def _heat(judged: Judged) -> Iterator[str]:
+    for result in judged.results:
+        rows = [(label(name), each["peak_c"].mean, each["value"].mean) for name, each in result.figures.items()]
+        if rows:
+            yield f"<h2>Value against heat{'' if len(judged.results) == 1 else f': {escape(result.scenario)}'}</h2>"
+            yield points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
+
+
+def _figures(result: Comparison, *, alone: bool) -> Iterator[str]:
+    """Every figure of every policy, with the difference to the baseline."""
+    yield f"<h2>All figures{'' if alone else f': {escape(result.scenario)}'}</h2>"
+    if not result.figures:
+        yield paragraph(f"None: the baseline {label(result.baseline)} failed.", "status bad")
+        return
+    about = f"{result.scenario}, {result.unit}. Mean [interval] and paired difference to "
+    yield paragraph(f"{about}{label(result.baseline)}; {LEGEND}. Channel: {result.channel_text}.", "faint")
+    order = sorted(result.figures, key=lambda name: -result.figures[name]["reward"].mean)
+    for name in FIGURES:
+        digits = LEAST_DIGITS.get(name, 1)
+        rows = []
+        for policy in order:
+            f = result.figures[policy][name]
+            own = Interval(f.mean, f.low, f.high).text(digits)
+            to_base = Interval(f.difference, f.difference_low, f.difference_high).text(digits)
+            rows.append((label(policy), own, "" if policy == result.baseline else f"{to_base} {f.stars}".rstrip()))
+        summary = f"{HEADINGS[name]}"
+        inner = table(("policy", "mean", "difference"), rows, style="numbers scores")
+        yield f"<details{' open' if name == 'reward' else ''}><summary>{escape(summary)}</summary>{inner}</details>"
+
+
+def _failures(judged: Judged) -> Iterator[str]:
+    yield "<h2>Failures and illegal actions</h2>"
+    failures = [each for result in judged.results for each in result.failures]
+    if not failures:
+        yield paragraph("No policy failed.")
+    for each in failures[:MOST_FAILURES]:
+        where = f"{label(each.policy)}, {each.instance}, fleet {each.fleet}, training {each.training}, seed {each.seed}"
+        yield paragraph(f"{where}: {each.error}", "bad")
+        if each.trace:
+            yield f"<details><summary>traceback</summary><pre>{escape(each.trace)}</pre></details>"
+    if len(failures) > MOST_FAILURES:
+        yield paragraph(f"{len(failures) - MOST_FAILURES} more are in results.parquet.", "faint")
+    illegal: dict[str, int] = {}
+    for result in judged.results:
+        for policy, count in result.illegal.items():
+            illegal[policy] = illegal.get(policy, 0) + count
+    some = ", ".join(f"{label(policy)} {count}" for policy, count in illegal.items() if count)
+    yield paragraph(f"Illegal actions, which count as waits: {some}." if some else "No illegal action.")
+
+
+def _repeat(judged: Judged) -> Iterator[str]:
+    yield "<h2>How to repeat</h2>"
+    yield f'<pre class="command"><code>{escape(judged.command)}</code></pre>'
+    card = judged.card
+    rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
+    rows += [(name, _plain(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
+    rows += [(f"policy {label(name)}", digest or "of the code") for name, digest in card["policies"].items()]
+    yield table((), rows)
+    hashes = [(name, digest) for name, digest in card["instances"].items()]
+    yield f"<details><summary>Hashes of {len(hashes)} scenarios</summary>{table((), hashes)}</details>"
+    yield paragraph("Every shift is a row of results.parquet beside this page; study.json has these hashes.", "faint")
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items())
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,112 @@
+"""The page of a comparison: its verdict against values by hand, nothing loaded or unescaped; the command repeats."""
+
+import re
+import shlex
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import typer
+
+from scenarios.cli import options
+from scenarios.load import load
+from scenarios.run.evaluate import FIGURES, Outcome
+from scenarios.trials.plan import Case, Key, Row, Study
+from scenarios.trials.report.charts import points, spans
+from scenarios.trials.report.page import Judged, comparison_page, verdict
+from scenarios.trials.scores import Shift
+from scenarios.trials.summary import comparisons, scores_over_all
+
+REWARD = {"wspt": 10.0, "wsept": 14.0, "fifo": 6.0}
+
+
+class Known:
+    """What scores read of a reference: random 0, hindsight 20, bound 40."""
+
+    random, hindsight, upper = 0.0, 20.0, 40.0
+
+    def __init__(self, instance: str) -> None:
+        self.instance = instance
+
+
+@pytest.fixture
+def study() -> Study:
+    scenario = load("quickstart")
+    case = Case(name=scenario.name, scenario=scenario, seeds=tuple(range(6)))
+    return Study(policies=[*REWARD, "random"], cases=[case], difficulties=["blind"])
+
+
+def rows_of(study: Study, error: str | None = None) -> list[Row]:
+    """Rewards around those of `REWARD`; random fails in its last shift if there is an error."""
+    blank, rng = Outcome(**dict.fromkeys(FIGURES, 0.0)), np.random.default_rng(0)
+    rows: list[Row] = []
+    for policy in study.policies:
+        for seed in study.cases[0].seeds:
+            key = Key(policy, study.cases[0].name, 0, 0, "blind", seed)
+            reward = REWARD.get(policy, 0.0) + 0.5 * rng.normal()
+            failed = error is not None and policy == "random" and seed == 5
+            rows.append(Row(key, None, 0, error, "line 3") if failed else Row(key, replace(blank, reward=reward), 2))
+    return rows
+
+
+def judged(study: Study, rows: list[Row], known: dict[Shift, Known]) -> Judged:
+    return Judged(
+        title="Comparison <here>",
+        results=comparisons(study, rows, "wspt", references=known),  # pyright: ignore[reportArgumentType]  # a stand-in
+        values=scores_over_all(study, rows, known),  # pyright: ignore[reportArgumentType]
+        card=study.card(),
+        command="thermofleet compare quickstart",
+    )
+
+
+def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
+    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
+    rows = rows_of(study, "Oops: <script>alert(1)</script>")
+    about = judged(study, rows, known)
+    first, second, failed = verdict(about)
+    mean = np.mean([row.outcome.reward for row in rows[6:12] if row.outcome]) / 20
+    better = mean - np.mean([row.outcome.reward for row in rows[:6] if row.outcome]) / 20
+    assert first.startswith(f"wsept beats the baseline wspt by {better:.2f} [")
+    assert "; it beats the next one, fifo by " in first
+    assert second.startswith(f"Its mean score is {mean:.2f} [")
+    assert failed.startswith("Failed: random;")
+    page = comparison_page(about)
+    assert page == comparison_page(about)
+    assert not re.search(r"<script|https?://|src=", page)
+    assert "Oops: &lt;script&gt;" in page
+    assert "Illegal actions, which count as waits: wspt 12" in page
+    for chart in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
+        ElementTree.fromstring(chart)
+    assert page.count("<svg") == 3
+
+
+def test_without_references_the_verdict_is_of_rewards(study: Study):
+    (only,) = verdict(judged(study, rows_of(study), {}))
+    assert re.fullmatch(
+        r"quickstart, 6 seeds, this fleet only: wsept has the most reward, 14\.\d; "
+        r"[34]\.\d \[[234]\.\d, [45]\.\d\] more reward than wspt\.",
+        only,
+    )
+
+
+def test_charts_place_points_by_value():
+    chart = spans([("a", 0.0, -0.5, 0.5), ("b", 1.0, 0.9, 1.1), ("c", -9.0, -9.9, 2.0)], "score", least=-1.0)
+    near, far = (float(x) for x in re.findall(r'circle cx="([\d.]+)"', chart))
+    assert near < far
+    assert "◂ -9.00" in chart
+    assert points([("a", 1.0, 2.0)], "x", "y").count("<circle") == 1
+
+
+def test_the_command_line_has_what_is_no_default():
+    told: list[str] = []
+    app = typer.Typer()
+
+    @app.command("compare")
+    def _(ctx: typer.Context, names: list[str], seeds: int = 3, out: str = "", fast: bool = False) -> None:
+        told.append(options.command_line(ctx))
+
+    typer.main.get_command(app).main(["a", "my b", "--seeds", "5", "--fast"], "compare", standalone_mode=False)
+    typer.main.get_command(app).main(["a", "--seeds", "3"], "compare", standalone_mode=False)
+    assert shlex.split(told[0]) == ["thermofleet", "compare", "a", "my b", "--seeds", "5", "--fast"]
+    assert told[1] == "thermofleet compare a"

@@ -1,0 +1,219 @@
+"""Results for the leaderboard: whole ones are taken, forged and incomplete ones refused, and the table is right."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fleet.errors import FleetError
+from scenarios.bounds.references import Reference
+from scenarios.cli.main import main
+from scenarios.leaderboard import board, submission
+from scenarios.leaderboard.board import board_of, board_text, read_all
+from scenarios.leaderboard.repeat import check_repeated
+from scenarios.leaderboard.submission import Card, Played, Submission, check, read, write
+from scenarios.policy_loader import policy_of, scope_of
+from scenarios.run.evaluate import FIGURES, Outcome
+from scenarios.suite.splits import manifest
+from scenarios.trials.cases import suite_of
+from scenarios.trials.plan import Row, Study
+from scenarios.trials.store import opened
+
+REWARD = FIGURES.index("reward")
+BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0))
+
+
+def reference(line) -> Reference:
+    """Random has 10, hindsight 30, the bound is 40."""
+    more = {"difficulty": "oracle", "random_se": 0.0, "rule": "wspt", "best_rule": 20.0, "linear": 40.0, "claims": ()}
+    times = {"evaluations": 1, "search_s": None, "upper_s": None, "seconds": None, "code": "", "seed": line.seed}
+    return Reference(
+        instance=line.name, scenario_hash=line.scenario, random=10.0, hindsight=30.0, upper=40.0, **more, **times
+    )  # pyright: ignore[reportArgumentType]  # of the dictionaries
+
+
+@pytest.fixture(autouse=True)
+def known(monkeypatch: pytest.MonkeyPatch):
+    """References of the test split."""
+    found = {(line.name, line.seed): reference(line) for line in manifest("test")}
+    for module in (submission, board):
+        monkeypatch.setattr(module, "split_references", lambda split: found if split == "test" else {})
+    return found
+
+
+@pytest.fixture(scope="module")
+def study() -> Study:
+    return Study(policies=["wspt", "wsept"], cases=suite_of("test", 1), difficulties=["oracle"])
+
+
+def finished(study: Study, out: Path, rewards: dict[str, float], failed: int = 0) -> Path:
+    """The folder of a study without running it; wsept fails in the first shifts."""
+    keys = [key for unit in study.units(set()) for key in unit.keys]
+    rows = [Row(key, replace(BLANK, reward=rewards[key.policy])) for key in keys]
+    with opened(out, study.card()) as store:
+        for n, row in enumerate(row for row in rows if row.key.policy == "wsept"):
+            if n < failed:
+                rows[rows.index(row)] = Row(row.key, None, 0, "Oops: x", "line 1")
+        store.add(rows)
+    return out
+
+
+def run(*words: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    return int(ended.value.code or 0)
+
+
+def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(study, tmp_path, capsys):
+    out = finished(study, tmp_path / "study", {"wspt": 15.0, "wsept": 30.0}, failed=50)
+    sent = tmp_path / "sent"
+    assert run("submit-result", out, "--author", "Ann", "--about", "rules", "--out", sent) == 0
+    assert sorted(path.name for path in sent.iterdir()) == ["test-wsept-oracle.jsonl", "test-wspt-oracle.jsonl"]
+    assert all(path.stat().st_size < 200_000 for path in sent.iterdir())
+    assert "50 failed shifts, which count as random" in capsys.readouterr().err
+    made = board_of("test", read_all(sent, "test"))
+    assert made is not None
+    assert made.order == ["test-wsept-oracle", "test-wspt-oracle"]
+    scores = made.scores.policies
+    assert scores["test-wspt-oracle"].mean.mean == pytest.approx(0.25)
+    assert scores["test-wsept-oracle"].mean.mean == pytest.approx(0.75)  # 150 of 200 shifts at 1, the others at 0
+    assert scores["test-wsept-oracle"].improvement.mean == 0.75
+    assert run("leaderboard", sent) == 0
+    text = capsys.readouterr().out
+    assert "Best policy of scope central `wsept` (0.75 [" in text or "of scope arm `wsept` (0.75 [" in text
+    (first,) = re.findall(r"\| 1 \|.*", text)
+    assert [cell.strip() for cell in first.split("|")][2:5] == ["`wsept`", "oracle", scope_of("wsept")]
+    assert "200 of 200 instances; differences to `wspt` (oracle)." in text
+    assert run("leaderboard", tmp_path / "absent") == 2
+
+
+def changed(index: int | None, **fields) -> Callable[[Submission], Submission]:
+    """A change of the card, or of one row; figures are given by name."""
+
+    def change(given: Submission) -> Submission:
+        if index is None:
+            return msgspec.structs.replace(given, card=msgspec.structs.replace(given.card, **fields))
+        rows, row = list(given.rows), given.rows[index]
+        own = dict(fields)
+        for name in [name for name in own if name in FIGURES]:
+            figures = list(own.get("figures", row.figures))
+            figures[FIGURES.index(name)] = own.pop(name)
+            own["figures"] = figures
+        rows[index] = msgspec.structs.replace(row, **own)
+        return msgspec.structs.replace(given, rows=tuple(rows))
+
+    return change
+
+
+def cut(first: int, last: int | None) -> Callable[[Submission], Submission]:
+    return lambda given: msgspec.structs.replace(given, rows=given.rows[first:last])
+
+
+FORGED = {
+    "all is well": (changed(None), None),
+    "a shift is missing": (cut(0, -1), "1 of 200 shifts are missing, the first test/0199, training 0"),
+    "a shift is given twice": (
+        lambda given: msgspec.structs.replace(given, rows=(*given.rows, given.rows[0])),
+        "1 shifts are given twice",
+    ),
+    "a training is missing": (changed(None, trainings=2), "200 of 400 shifts are missing"),
+    "a shift of another split": (changed(3, instance="train/0003"), "1 shifts are not of the split test"),
+    "another scenario": (changed(3, scenario="0" * 16), "test/0003 was another scenario"),
+    "another seed": (changed(3, seed=1), "test/0003 has seed"),
+    "another manifest": (changed(None, manifest="0" * 16), "manifest of the split test is another one"),
+    "no versions": (changed(None, versions={"python": "3.12"}), "versions of thermofleet, numpy, numba, scipy"),
+    "more than the bound": (changed(7, reward=40.1), r"test/0007 has a reward of 40\.1, above the upper bound 40"),
+    "more jobs than there are": (changed(7, finished=1e4), "test/0007 has 10000 finished jobs"),
+    "no number": (changed(7, value=float("nan")), "needs 11 finite figures"),
+    "below 0": (changed(7, faults=-1.0), "a figure below 0"),
+    "neither figures nor error": (changed(7, figures=None), "needs either figures or an error"),
+}
+
+
+@pytest.fixture(scope="module")
+def good(study: Study) -> Submission:
+    scenarios = study.card()["instances"]
+    assert isinstance(scenarios, dict)
+    versions: dict[str, str | None] = {name: "1" for name in submission.NEEDED}
+    card = Card(
+        format=1, policy="mine", difficulty="oracle", split="test", scope="arm", trainings=1, author="Ann", about="",
+        manifest=submission.manifest_hash("test"), code_hash="a" * 16, policy_hash="", risk="rc", versions=versions,
+    )  # fmt: skip
+    figures = [12.0, *[0.0] * (len(FIGURES) - 1)]
+    rows = [
+        Played(instance=case.name, scenario=scenarios[case.name], seed=case.seeds[0], training=0, figures=figures,
+               illegal=0)
+        for case in study.cases
+    ]  # fmt: skip
+    return Submission(card=card, rows=tuple(rows))
+
+
+@pytest.mark.parametrize(("change", "said"), FORGED.values(), ids=list(FORGED))
+def test_forged_and_incomplete_results_are_refused(good: Submission, known, change, said):
+    if said is None:
+        check(change(good), known)
+        return
+    with pytest.raises(FleetError, match=said):
+        check(change(good), known)
+
+
+def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, tmp_path: Path):
+    path = write(good, tmp_path)
+    assert read(path) == good
+    path.rename(tmp_path / "test-other-oracle.jsonl")
+    with pytest.raises(FleetError, match="must have the name of its policy and split, test-mine-oracle"):
+        read_all(tmp_path, "test")
+    lines = (tmp_path / "test-other-oracle.jsonl").read_text(encoding="utf-8").splitlines()
+    for bad in ("", "[1]", lines[1], json.dumps({**json.loads(lines[0]), "split": "own"})):
+        path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
+        with pytest.raises(FleetError, match="is no result of `thermofleet submit-result`"):
+            read(path)
+    path.write_text(lines[0] + "\n" + " " * 200_000, encoding="utf-8")
+    with pytest.raises(FleetError, match="at most 200000 bytes"):
+        read(path)
+
+
+def test_studies_of_other_settings_are_refused(study: Study, tmp_path: Path):
+    out = finished(study, tmp_path / "study", {"wspt": 15.0, "wsept": 30.0})
+    card = json.loads((out / "study.json").read_text(encoding="utf-8"))
+    for change, said in (
+        ({"status": "interrupted"}, "not finished"),
+        ({"randomise": {**card["randomise"], "ambient_k": [1, 2]}}, "no randomisation"),
+        ({"channel": {**card["channel"], "loss": 0.5}}, "bus of each instance"),
+        ({"instances": {"quickstart": "0" * 16}}, "no instance of the split"),
+    ):
+        with pytest.raises(FleetError, match=said):
+            submission.submissions_of(card | change, [], "Ann", "")
+
+
+def test_a_repetition_finds_other_figures(good: Submission, monkeypatch: pytest.MonkeyPatch):
+    truth = list(good.rows[0].figures or ())
+
+    def ran(study, **_):
+        outcome = Outcome(**dict(zip(FIGURES, truth, strict=True)))
+        return [Row(key, outcome) for unit in study.units(set()) for key in unit.keys]
+
+    monkeypatch.setattr("scenarios.leaderboard.repeat.run_study", ran)
+    of_code = changed(None, policy="wspt")(good)
+    assert check_repeated(of_code, 3) == "test-wspt-oracle: 3 shifts repeated, with equal figures."
+    truth[REWARD] += 0.01
+    with pytest.raises(FleetError, match="does not repeat"):
+        check_repeated(of_code, 3)
+    assert "not repeated" in check_repeated(changed(None, policy_hash="b" * 16)(good), 3)
+
+
+def test_without_results_the_table_says_so():
+    assert board_text(board_of("test", []), "test") == "No results with references on the split test."
+
+
+def test_the_policy_of_the_page_can_be_loaded(tmp_path: Path):
+    page = (Path(__file__).parents[2] / "docs" / "leaderboard.md").read_text(encoding="utf-8")
+    code = page.split("```python\n")[1].split("```")[0]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 10 + 1  # and the name of its file
+    (tmp_path / "mine.py").write_text(code, encoding="utf-8")
+    assert scope_of(f"{tmp_path / 'mine.py'}:FirstLegal") == "arm"
+    assert policy_of(f"{tmp_path / 'mine.py'}:FirstLegal")
