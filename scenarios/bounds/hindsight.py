@@ -47,7 +47,7 @@ class Budget:
     evaluations: int = 1_000_000
     """Simulated shifts."""
     nodes: int = 2000
-    """Most nodes of the branch and bound of the upper bound; what it has proved by then counts. 0: the linear program alone."""
+    """Most nodes of the branch and bound of the upper bound, which has proved something by then; 0: none."""
 
 
 def hindsight(
