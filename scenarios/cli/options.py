@@ -57,8 +57,9 @@ def command_line(ctx: typer.Context) -> str:
             words += [str(each) for each in (value if isinstance(value, list | tuple) else [value]) if each is not None]
         elif value is True:
             words.append(parameter.opts[0])
-        elif value not in (None, False, parameter.default):
-            words += [parameter.opts[0], str(value)]
+        elif value not in (None, False, (), [], parameter.default):
+            for each in value if isinstance(value, list | tuple) else [value]:
+                words += [parameter.opts[0], str(each)]
     return shlex.join(words)
 
 

@@ -103,10 +103,20 @@ def test_the_command_line_has_what_is_no_default():
     app = typer.Typer()
 
     @app.command("compare")
-    def _(ctx: typer.Context, names: list[str], seeds: int = 3, out: str = "", fast: bool = False) -> None:
+    def _(
+        ctx: typer.Context, names: list[str], seeds: int = 3, more: list[str] | None = None, fast: bool = False
+    ) -> None:
         told.append(options.command_line(ctx))
 
-    typer.main.get_command(app).main(["a", "my b", "--seeds", "5", "--fast"], "compare", standalone_mode=False)
+    typer.main.get_command(app).main(
+        ["a", "my b", "--seeds", "5", "--more", "1", "--more", "2", "--fast"], "compare", standalone_mode=False
+    )
     typer.main.get_command(app).main(["a", "--seeds", "3"], "compare", standalone_mode=False)
-    assert shlex.split(told[0]) == ["thermofleet", "compare", "a", "my b", "--seeds", "5", "--fast"]
+    assert shlex.split(told[0]) == [
+        "thermofleet",
+        "compare",
+        "a",
+        "my b",
+        *["--seeds", "5", "--more", "1", "--more", "2", "--fast"],
+    ]
     assert told[1] == "thermofleet compare a"

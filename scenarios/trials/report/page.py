@@ -81,9 +81,10 @@ def verdict(judged: Judged) -> list[str]:
             _against(best, others[0], paired(values.score[best], values.score[others[0]]), "the next one, ")
         )
     told = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
+    whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     told.append(
-        f"Its mean score is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies, where 0 "
-        f"is random and 1 the best schedule known for each of {scores.instances} instances."
+        f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies, where 0 is "
+        f"random and 1 the best schedule known for each of {scores.instances} instances."
     )
     return [*told, *last]
 
