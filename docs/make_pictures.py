@@ -12,6 +12,8 @@ from tempfile import TemporaryDirectory
 
 from playwright.sync_api import sync_playwright
 
+from scenarios.run.train_pairs import draw_curves
+
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "docs" / "pictures"
 FILM_RUN = ("quickstart", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "19")
@@ -60,6 +62,8 @@ def main() -> None:
         screenshot(Path(report) / "report.html", PICTURES / "report.png")
     for scenario in CELLS:
         thermofleet("layout", scenario, "--out", str(PICTURES / "library" / f"{scenario}.png"), "--overwrite")
+    trainings = sorted((ROOT / "docs" / "results" / "learned").glob("train-pairs-*"))
+    draw_curves(trainings, PICTURES / "learning_pairs.png")
     for picture in sorted(PICTURES.rglob("*.*")):
         print(f"{picture.relative_to(ROOT)}: {picture.stat().st_size / 1e6:.2f} MB")
 

@@ -123,7 +123,7 @@ def train_pairs(
         interrupted = True
     if validated < search.done:
         validate()
-    draw_curves(out)
+    draw_curves([out], out / CURVE)
     return TrainedPairs(search.done, shifts, teacher, best, time.monotonic() - began_s, interrupted)
 
 
@@ -152,20 +152,23 @@ def _fitness(grounds: Sequence[Ground], search: Evolution, count: int) -> Array:
     return total / len(chosen)
 
 
-def draw_curves(folder: Path) -> None:
-    """Plot validation, and the fitness of the samples, against the iteration."""
+def draw_curves(folders: Sequence[Path], picture: Path) -> None:
+    """Plot the validation of trainings against the iteration, with the line of their teacher."""
     from matplotlib.figure import Figure  # without a display
 
-    judged = [row for row in read_log(folder) if "validation" in row]
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    axes.plot([row["iteration"] for row in judged], [row["validation"] for row in judged], "o-", ms=3, label="learned")
-    axes.axhline(judged[0]["teacher"], color="k", lw=1, ls="--", label="wsept")
+    teacher = 0.0
+    for folder in folders:
+        judged = [row for row in read_log(folder) if "validation" in row]
+        teacher = judged[0]["teacher"]
+        axes.plot([r["iteration"] for r in judged], [r["validation"] for r in judged], "o-", ms=3, label=folder.name)
+    axes.axhline(teacher, color="k", lw=1, ls="--", label="wsept")
     axes.set_xlabel("iteration")
     axes.set_ylabel("reward / value of all jobs, validation")
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
-    with atomic_path(folder / CURVE) as draft:
+    with atomic_path(picture) as draft:
         figure.savefig(draft, dpi=120, format="png")
 
 

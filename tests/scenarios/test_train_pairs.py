@@ -35,7 +35,7 @@ def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
     expected = [outcome.reward for outcome in outcomes(fleet, "wsept", [3, 4])]
     found = rewards(ground, np.zeros((2, PARAMETERS)), [3, 4])
     np.testing.assert_allclose(found, expected, rtol=1e-9)
-    assert row_of(ground, "wsept")["reward"] == pytest.approx(expected[0])
+    assert row_of(ground, "wsept", 3)["reward"] == pytest.approx(expected[0])
     refuses_all = first_parameters(np.random.default_rng(0))
     refuses_all[0] = 5.0  # an error limit 100 K lower
     assert rewards(ground, refuses_all[None], [3])[0] < expected[0] - 1.0
@@ -102,15 +102,18 @@ def test_trainings_are_a_sample_of_their_own_in_a_difference() -> None:
     """Three trainings that differ more from each other than from the baseline say less than 60 instances would."""
     rng = np.random.default_rng(0)
     rows = [
-        {"policy": policy, "instance": f"test/{i}", "offered": 10.0, "reward": 5.0 + gain + 0.1 * float(rng.random())}
+        {"policy": policy, "instance": f"test/{i}", "seed": i, "reward": 5.0 + gain + 0.1 * float(rng.random())}
         for policy, gain in (("wsept", 0.0), ("a", 1.0), ("b", 2.0), ("c", 3.0))
         for i in range(60)
     ]
     one, count = difference(rows, ["b"], "wsept")
     assert count == 60
     assert (round(one.mean, 1), one.high - one.low < 0.1) == (2.0, True)
-    three, _ = difference(rows, ["a", "b", "c"], "wsept")
+    mean, _ = difference(rows, ["a", "b", "c"], "wsept")
+    assert (round(mean.mean, 1), mean.high - mean.low < 0.1) == (2.0, True)
+    three, _ = difference(rows, ["a", "b", "c"], "wsept", sample=True)
     assert round(three.mean, 1) == 2.0
     assert three.low < 1.0 < 3.0 < three.high  # t of 2 degrees of freedom: 2 ± 4.3 · 1 / √3
-    share, _ = difference(rows, ["b"], "wsept", relative=True)
-    assert share.mean == pytest.approx(one.mean / 10.0)
+    share, count = difference(rows, ["b"], "wsept", {("test/0", 0): 10.0, ("test/1", 1): 10.0})
+    first_two, _ = difference(rows[:2] + rows[120:122] + rows[60:62], ["b"], "wsept")
+    assert (share.mean, count) == (pytest.approx(first_two.mean / 10.0), 2)
