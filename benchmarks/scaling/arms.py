@@ -7,10 +7,14 @@ Each size is a process of its own with an empty cache of plans. Costs are CPU se
 the machine matters little; the load average is in the file. Arms observe their eight nearest peers, in 64 slots.
 
 - plans: planning every work for every arm that reaches it, from nothing.
-- conflicts: which plans of two arms exclude each other, from nothing. With more arms than
-  `--hall` these two are those of one of several equal halls, multiplied; in the other costs the arms of all halls share one shift, all jobs and one matching.
-- engine: a simulated shift of an hour, steps only. - matching: its decisions. - scores: the twins score two plans of
-each of the eight jobs that an arm gets in an hour; the four twins of quickstart stand for all.
+- conflicts: which plans of two arms exclude each other, from nothing.
+- engine: a simulated shift of an hour, steps only; no two arms share stations or space.
+- matching: its decisions.
+- scores: the twins score two plans of each of the eight jobs that an arm gets in an hour; the four twins of quickstart
+  stand for all.
+
+Arms beyond `--hall` are several equal halls. Their plans and conflicts are those of one, multiplied; in the other costs
+the arms of all halls share one shift, all jobs and one matching.
 """
 
 import argparse
@@ -156,7 +160,7 @@ def plot(out: Path) -> None:
     axes.set_xticks([row["arms"] for row in rows], [str(row["arms"]) for row in rows])
     axes.minorticks_off()
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     figure.savefig(PICTURE, dpi=130)
     print(table(rows))
 
