@@ -29,7 +29,7 @@ from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.shift import RunSpec, run
 from scenarios.schema import Scenario
-from scenarios.studies.channel_table import channel_table
+from scenarios.studies.page_tables.channels import channel_table
 
 FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "heard")
 

@@ -38,8 +38,8 @@ def documents(out: Path) -> dict[Path, str]:
     from fleet.bus.protocol.schemas import schema_document
     from scenarios.doc_tables import fill_tables
     from scenarios.leaderboard.board import benchmark_tables
-    from scenarios.studies.channel_table import channel_tables
-    from scenarios.studies.policy_tables import policy_tables
+    from scenarios.studies.page_tables.channels import channel_tables
+    from scenarios.studies.page_tables.policies import policy_tables
 
     results = out.parent / "results"
     more = {

@@ -1,0 +1,1 @@
+"""Tables of the pages, from files of results."""
