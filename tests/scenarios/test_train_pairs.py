@@ -12,6 +12,7 @@ from agents.learned.training_log import LOG
 from agents.pair_scores import PARAMETERS, first_parameters
 from fleet.errors import FleetError
 from scenarios.cli.main import main
+from scenarios.leaderboard.suite_scores import difference, row_of
 from scenarios.load import load, override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
@@ -20,7 +21,6 @@ from scenarios.run.suite_batches import ground_of, rewards
 from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs
 from scenarios.run.train_policy import TrainingPlan, train_on_split
 from scenarios.suite.splits import Instance
-from scenarios.trials.suite_scores import difference, row_of
 
 
 @pytest.fixture(scope="module")
