@@ -1,6 +1,5 @@
 """Sensor readings of the arms over time."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
@@ -34,8 +33,28 @@ class Telemetry:
     """Motor (winding) temperature with sensor noise, [sample, arm, joint]."""
 
 
-def join(parts: Sequence[Telemetry]) -> Telemetry:
-    """Readings joined in time."""
-    if not parts:
-        raise ValueError("Telemetry to join must have at least one part (got none).")
-    return Telemetry(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Telemetry)))
+class Readings:
+    """Telemetry that is added piece by piece, in the precision of recordings: float32, modes int8.
+
+    Args:
+        samples: Most samples of all pieces.
+    """
+
+    def __init__(self, samples: int) -> None:
+        self._most, self._count = samples, 0
+        self._all: dict[str, Array] = {}
+
+    def add(self, part: Telemetry) -> None:
+        """Append readings."""
+        rows = slice(self._count, self._count + len(part.time_s))
+        for f in fields(Telemetry):
+            values = getattr(part, f.name)
+            if f.name not in self._all:
+                kind = {"time_s": np.float64, "mode": np.int8}.get(f.name, np.float32)
+                self._all[f.name] = np.empty((self._most, *values.shape[1:]), kind)  # takes memory once written to
+            self._all[f.name][rows] = values
+        self._count = rows.stop
+
+    def telemetry(self) -> Telemetry | None:
+        """All readings so far; None without any."""
+        return Telemetry(**{name: values[: self._count] for name, values in self._all.items()}) if self._count else None

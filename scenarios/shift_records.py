@@ -28,7 +28,7 @@ class JobRecord:
     cycles: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Offer:
     """What one arm knew of a job at the moment it was awarded."""
 

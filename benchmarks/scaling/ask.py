@@ -86,9 +86,14 @@ def large_cell(arms: int, difficulty: DifficultyName, arrivals: float = 1.0) -> 
     """
     if arms % 4 or arms < 4:
         raise ValueError(f"The number of arms must be a multiple of four (got {arms}).")
-    times, rate = arms // 4, arms / 4 * arrivals
+    rate = arms / 4 * arrivals
     randomise = Randomisation(arrivals=(rate, rate))
-    one = library_of(prepare(load("quickstart"), difficulty=difficulty, randomise=randomise))
+    return repeated(library_of(prepare(load("quickstart"), difficulty=difficulty, randomise=randomise)), arms // 4)
+
+
+def repeated(one: Library, times: int, peers: int = 1) -> Library:
+    """Return a fleet several times, without stations or space that arms share; each observes its next few peers."""
+    arms = len(one.arms) * times
     tables = one.tables._replace(
         ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),
         feasible=np.tile(one.tables.feasible, (1, 1, times)),
@@ -97,7 +102,7 @@ def large_cell(arms: int, difficulty: DifficultyName, arrivals: float = 1.0) -> 
         excluded=np.zeros_like(one.tables.excluded),
         **{name: np.concatenate([getattr(one.tables, name)] * times, axis=1) for name in _PER_ARM},
     )
-    near = tuple(((a + 1) % arms,) for a in range(arms))  # peers are not read
+    near = tuple(tuple((a + n) % arms for n in range(1, peers + 1)) for a in range(arms))  # peers are not read
     return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, tables, one.draw, near)
 
 

@@ -39,20 +39,20 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
     ]
     problems += [f"{file}: {sentence}." for sentence in _outside_limits_at_home(scenario, arms, folder)]
     infeasible = [error for arm in arms for error in arm.infeasible]
+    possible = {work for arm in arms for work in arm.plans}
     for i, stream in enumerate(scenario.jobs if arms else ()):
+        loads = [f"{work.payload_kg:g}" for work in works_of(scenario, stream) if work not in possible]
+        if not loads:
+            continue
         here = [error for error in infeasible if error.place in stream.places]
         reasons = list(dict.fromkeys(f"{error.arm} at '{error.place}': {error.reason}" for error in here))
         if near and any(reason.endswith("at home") for reason in reasons):
             continue  # it may be possible once the homes are apart
-        loads = [
-            f"{work.payload_kg:g}" for work in works_of(scenario, stream) if not any(work in arm.plans for arm in arms)
-        ]
-        if loads:
-            more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
-            problems.append(
-                f"{file}: jobs[{i}].places: no arm can do '{stream.name}' with {' or '.join(loads)} kg "
-                f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
-            )
+        more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
+        problems.append(
+            f"{file}: jobs[{i}].places: no arm can do '{stream.name}' with {' or '.join(loads)} kg "
+            f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
+        )
     return problems
 
 

@@ -135,7 +135,7 @@ def lanes_of(telemetry: Telemetry, arms: int) -> list[int]:
     """Indices of the arms with a lane of temperatures: all of a small fleet, the hottest of a large one."""
     if arms <= MOST_LANES:
         return list(range(arms))
-    peak_c = np.nan_to_num(telemetry.temp_c, nan=-np.inf).max(axis=(0, 2), initial=-np.inf)
+    peak_c = np.fmax.reduce(telemetry.temp_c, axis=(0, 2), initial=-np.inf)
     return np.argsort(-peak_c, kind="stable")[:HOTTEST].tolist()
 
 
@@ -145,7 +145,7 @@ def heat_map(
     """The hottest motor of each arm over time, one row per arm; y axis `axis`, x axis 3."""
     samples = len(telemetry.time_s)
     edges = np.unique(np.linspace(0, samples, min(samples, HEAT_BINS) + 1).astype(int))[:-1]
-    hottest = np.nan_to_num(telemetry.temp_c, nan=-np.inf).max(axis=2)
+    hottest = np.fmax.reduce(telemetry.temp_c, axis=2, initial=-np.inf)
     peak_c = np.maximum.reduceat(hottest, edges, axis=0).T if samples else np.zeros((len(arms), 0))
     marks = heat_marks(warning_c, error_c)
     low, high = float(marks[0]), float(marks[-1])

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer
 
 FILES = ("run.json", "telemetry.parquet", "events.parquet", "jobs.parquet", "offers.parquet", "report.html")
+ROWS_AT_ONCE = 100_000
 RUN = ResultKind(name="run", card="run.json", files=FILES)
 
 
@@ -40,9 +41,8 @@ def write(result: RunResult, folder: Path) -> None:
         pq.write_table(record_table(Offer, result.offers), folder / "offers.parquet")
         if result.telemetry is None:
             return
-        arms, telemetry = [arm.name for arm in result.scenario.arms], _as_kept(result.telemetry)
-        pq.write_table(telemetry_table(telemetry, arms), folder / "telemetry.parquet")
-        html = run_html(run, result.scenario, telemetry, result.events, result.jobs, result.offers)
+        _write_telemetry(result.telemetry, [arm.name for arm in result.scenario.arms], folder / "telemetry.parquet")
+        html = run_html(run, result.scenario, result.telemetry, result.events, result.jobs, result.offers)
         (folder / "report.html").write_text(html, encoding="utf-8")
 
 
@@ -79,9 +79,18 @@ def run_html(
     )
 
 
-def _as_kept(telemetry: Telemetry) -> Telemetry:
-    """The readings in the precision of the file."""
-    return replace(telemetry, **{name: getattr(telemetry, name).astype(np.float32) for name in UNITS})
+def _write_telemetry(telemetry: Telemetry, arms: list[str], path: Path) -> None:
+    """Some rows at a time, as a table of all takes as much memory as the readings."""
+    samples = max(1, ROWS_AT_ONCE // len(arms))
+    first = telemetry_table(_part(telemetry, slice(0, samples)), arms)
+    with pq.ParquetWriter(path, first.schema) as writer:
+        writer.write_table(first)
+        for i in range(samples, len(telemetry.time_s), samples):
+            writer.write_table(telemetry_table(_part(telemetry, slice(i, i + samples)), arms))
+
+
+def _part(telemetry: Telemetry, rows: slice) -> Telemetry:
+    return Telemetry(**{name: values[rows] for name, values in vars(telemetry).items()})
 
 
 def check_format(run: Mapping[str, Any], folder: Path) -> None:

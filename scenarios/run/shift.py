@@ -16,7 +16,7 @@ from fleet.engine.shift import StepRecord, stack_records
 from fleet.env.allocation_v1 import VERSION, AllocationEnv
 from fleet.events import Event
 from fleet.observation import Observation
-from fleet.telemetry import Telemetry, join
+from fleet.telemetry import Readings, Telemetry
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
 from scenarios.progress import Progress, quiet
@@ -29,6 +29,8 @@ from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
 
 RUN_FORMAT = 6
 """Raised when run.json or the columns of the recordings change so that an earlier version cannot be read."""
+AT_ONCE = 50_000
+"""Readings of an arm that are computed at a time."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 
 
@@ -166,8 +168,9 @@ class _Recorder:
         every_s, dt_s = scenario.telemetry_interval_s, scenario.decision_interval_s
         self._dt_s, self._reads, self._burn_c = dt_s, reads, scenario.people.burn_c
         self._offsets_s = np.arange(1, int(np.floor(dt_s / every_s + 1e-9)) + 1) * every_s
+        self._most_steps = max(1, AT_ONCE // (len(scenario.arms) * len(self._offsets_s)))
         self._records: list[StepRecord] = []
-        self._parts: list[Telemetry] = []
+        self._kept = Readings(scenario.ticks * len(self._offsets_s))
 
     def __call__(self, record: StepRecord) -> None:
         self.heat = self.heat or HeatUse(record.start_c[0], self._burn_c)
@@ -175,21 +178,21 @@ class _Recorder:
         if not self._reads:
             return
         self._records.append(record)
-        if len(self._records) == self.env.episode.plant.most_steps:
+        if len(self._records) >= min(self._most_steps, self.env.episode.plant.most_steps):
             self._read()
 
     def telemetry(self) -> Telemetry | None:
         """All readings; None before the first step, or without reading."""
         if self._records:
             self._read()
-        return join(self._parts) if self._parts else None
+        return self._kept.telemetry()
 
     def _read(self) -> None:
         episode, record = self.env.episode, stack_records(self._records)
         world, offsets_s = episode.world, self._offsets_s
         motion = episode.plant.motion(world, record, offsets_s)
         noise = recorded_noise(episode.noise_key, record, offsets_s, world.dt_s, len(world.arms))
-        self._parts.append(telemetry_of(world, record, offsets_s, motion, noise))
+        self._kept.add(telemetry_of(world, record, offsets_s, motion, noise))
         self._records.clear()
 
 

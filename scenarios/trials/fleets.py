@@ -19,10 +19,9 @@ class Fleets:
     """Prepared fleets, the last few of them kept."""
 
     def __init__(self) -> None:
-        self._cells: OrderedDict[object, Fleet] = OrderedDict()
+        self._cells: OrderedDict[object, tuple[object, Fleet]] = OrderedDict()
+        """With what the plans of each depend on."""
         self._last: tuple[object, Fleet] | None = None
-        self._planned: tuple[object, Fleet] | None = None
-        """The fleet prepared last, and what its plans depend on."""
 
     def of(
         self,
@@ -44,7 +43,8 @@ class Fleets:
         cell = (prepared_content(scenario, unit.difficulty), *asked[1:])
         if cell not in self._cells:
             plans = (plan_content(scenario), unit.difficulty, risk, randomise, folder)
-            self._cells[cell] = prepare(
+            like = next((fleet for key, fleet in self._cells.values() if key == plans), None)
+            made = prepare(
                 scenario,
                 difficulty=unit.difficulty,
                 risk=risk,
@@ -52,13 +52,13 @@ class Fleets:
                 training=unit.training,
                 cache=folder,
                 progress=progress,
-                like=self._planned[1] if self._planned and self._planned[0] == plans else None,
+                like=like,
             )
-            self._planned = plans, self._cells[cell]
+            self._cells[cell] = plans, made
             while len(self._cells) > MOST_FLEETS:
                 self._cells.popitem(last=False)
         self._cells.move_to_end(cell)
-        found = replace(self._cells[cell], scenario=scenario)
+        found = replace(self._cells[cell][1], scenario=scenario)
         self._last = asked, found
         return found
 

@@ -12,6 +12,7 @@ from fleet.errors import FleetError
 from scenarios.load import load, override
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.fleet import prepare
+from scenarios.prepare.planned_arm import plan_arms
 from scenarios.run.evaluate import FIGURES, outcomes
 from scenarios.schema import Scenario
 from scenarios.trials import contest, fleets, run_unit
@@ -203,19 +204,25 @@ def test_shifts_of_a_process_that_dies_are_run_again(scenario, plans, bad, monke
 
 
 def test_instances_of_one_cell_share_a_prepared_fleet(scenario, plans, monkeypatch):
-    """And have the outcomes of fleets that are prepared for each."""
+    """And have the outcomes of fleets that are prepared for each; what is warmer alone shares the plans."""
     hold, sort = scenario.jobs
     scenarios = [
         scenario,
         replace(scenario, name="late", jobs=(replace(hold, due_s=30.0), replace(sort, value=3.0, repetitions=(2, 4)))),
         replace(scenario, name="paid", reward=replace(scenario.reward, tardiness=-0.1), slots=3),
+        replace(scenario, name="wide", clearance_m=0.03),
         replace(scenario, name="warm", ambient=replace(scenario.ambient, points=((0.0, 45.0),))),
     ]
     made: list[str] = []
+    planned: list[str] = []
 
     def counted(scenario, **more):
         made.append(scenario.name)
         return preparing.prepare(scenario, **more)
+
+    def plans_counted(scenario, *rest):
+        planned.append(scenario.name)
+        return plan_arms(scenario, *rest)
 
     monkeypatch.setattr(fleets, "prepare", counted)
     monkeypatch.setattr(run_unit, "fleets", fleets.Fleets())
@@ -223,9 +230,14 @@ def test_instances_of_one_cell_share_a_prepared_fleet(scenario, plans, monkeypat
     cases = [Case(name=each.name, scenario=each, seeds=(7,)) for each in scenarios]
     for difficulty in ("blind", "oracle"):
         made.clear()
+        planned.clear()
         study = Study(policies=["round_robin"], cases=cases, difficulties=[difficulty])
-        rows = contest.run_study(study, cache_dir=plans, workers=1)
-        assert made == ["heat", "warm"]
+        with monkeypatch.context() as patched:
+            patched.setattr(preparing, "plan_arms", plans_counted)
+            rows = contest.run_study(study, cache_dir=plans, workers=1)
+        assert made == ["heat", "wide", "warm"]
+        assert planned == ["heat", "wide"]
+        assert [row.key.instance for row in rows] == [case.name for case in cases]
         alone = [prepare(each, difficulty=difficulty, cache=plans) for each in scenarios]
         assert [row.outcome for row in rows] == [outcomes(fleet, "round_robin", [7])[0] for fleet in alone]
 
