@@ -8,7 +8,7 @@ from agents.consensus import Consensus
 from agents.dispatching import Atc, Edd, Fifo, LeastLoaded, Spt
 from agents.heat_guards import FuzzySpeed, Guard, Shutdown, TorqueLimiter
 from agents.heat_rules import Thermometer, Wsept, WseptAhead
-from agents.learned.pair_scores import WseptLearned
+from agents.pair_scores import WseptLearned
 from agents.policy import ArmPolicy, Policy, for_all_arms
 from agents.rolling_horizon import RollingHorizon
 from agents.rules import CoolestFirst, LeastDifficulty, RandomLegal, RoundRobin, Wspt, WsptCool

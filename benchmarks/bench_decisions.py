@@ -19,7 +19,7 @@ import numpy as np
 
 from agents.assignment import Ssi
 from agents.consensus import Consensus
-from agents.learned.pair_scores import PairPolicy
+from agents.pair_scores import PairPolicy
 from agents.registry import RULES
 from agents.rolling_horizon import RollingHorizon
 from fleet.observation import Layout, Observation

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 
 from agents.heat_guards import guarded
-from agents.learned.pair_scores import PAIRS, load_pairs
+from agents.pair_scores import PAIRS, load_pairs
 from agents.policy import SCOPES, ArmPolicy, Policy, for_all_arms
 from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
 from fleet.errors import FleetError, nearest

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.learned.pair_scores import claims, scores
+from agents.pair_scores import claims, scores
 from agents.policy import WAIT
 from fleet.engine.reward import RewardWeights
 from fleet.env.vector import BatchEnv, Library
@@ -89,7 +89,7 @@ def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
     Perfect and immediate messages; decisions are asked for by events, which changes no result of a central policy.
 
     Args:
-        parameters: [row, parameter] of `agents.learned.pair_scores`.
+        parameters: [row, parameter] of `agents.pair_scores`.
     """
     env = BatchEnv(ground.library, len(seeds), seed=list(seeds), weights=ground.weights, decisions="events")
     obs, _ = env.reset()

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from agents.learned.evolution import Evolution, EvolutionConfig
-from agents.learned.pair_scores import PARAMETERS, first_parameters, save_pairs
+from agents.learned.training_log import TrainingLog, read_log
+from agents.pair_scores import PARAMETERS, first_parameters, save_pairs
 from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.run.suite_batches import Ground, rewards
-from scenarios.run.training_log import TrainingLog, read_log
 
 Array = np.ndarray
 

@@ -13,6 +13,7 @@ import numpy as np
 from agents.learned.imitation import imitate
 from agents.learned.policy import CARD, save_policy
 from agents.learned.ppo import PpoConfig, Trainer
+from agents.learned.training_log import TrainingLog, read_log
 from agents.policy import WAIT, Policy, only_choices
 from fleet.engine.reward import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
@@ -27,7 +28,6 @@ from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.run.shift import scenario_hash
 from scenarios.run.suite_batches import Ground
-from scenarios.run.training_log import TrainingLog, read_log
 from scenarios.schema import Scenario
 
 Array = np.ndarray

@@ -7,7 +7,7 @@ import pytest
 
 from agents.heat_rules import Wsept
 from agents.learned.evolution import Evolution, EvolutionConfig
-from agents.learned.pair_scores import (
+from agents.pair_scores import (
     PAIRS,
     PARAMETERS,
     PairPolicy,

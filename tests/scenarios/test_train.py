@@ -6,12 +6,12 @@ import pytest
 
 from agents.learned.policy import load_policy
 from agents.learned.ppo import PpoConfig
+from agents.learned.training_log import LOG
 from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.load import load, override
 from scenarios.policy_loader import label, policy_of
 from scenarios.run.train_policy import CURVE, STATE, VALIDATION_SEED, TrainingPlan, train
-from scenarios.run.training_log import LOG
 
 SMALL = {"horizon_s": 300.0}
 

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from agents.learned.evolution import EvolutionConfig
-from agents.learned.pair_scores import PARAMETERS, first_parameters
 from agents.learned.ppo import PpoConfig
+from agents.learned.training_log import LOG
+from agents.pair_scores import PARAMETERS, first_parameters
 from fleet.errors import FleetError
 from scenarios.cli.main import main
+from scenarios.leaderboard.suite_scores import difference, row_of
 from scenarios.load import load, override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
@@ -18,8 +20,6 @@ from scenarios.run.evaluate import outcomes
 from scenarios.run.suite_batches import ground_of, rewards
 from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs
 from scenarios.run.train_policy import TrainingPlan, train_on_split
-from scenarios.run.training_log import LOG
-from scenarios.studies.suite_scores import difference, row_of
 from scenarios.suite.splits import Instance
 
 

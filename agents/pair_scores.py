@@ -1,7 +1,7 @@
 """A learned score of pairs of arm and option: `wsept` with a small network, matched as `wsept` matches.
 
 score = rate · exp(f) + g · mean rate, where `rate` is the expected worth per time with learned prices
-(`agents.learned.pairs.Worth`), and f and g are outputs of a network of the pair's numbers. All parameters are one
+(`agents.pairs.Worth`), and f and g are outputs of a network of the pair's numbers. All parameters are one
 vector; zeros of the prices and of the last layers give `wsept` exactly.
 """
 
@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from agents.assignment import matching
-from agents.learned.pairs import PAIR_FEATURES, Worth, pairs_of
+from agents.pairs import PAIR_FEATURES, Worth, pairs_of
 from agents.policy import WAIT, plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
@@ -182,7 +182,7 @@ def load_pairs(folder: Path) -> PairPolicy:
 @cache
 def shipped_parameters() -> Array:
     """The parameters that come with the project: the best on the validation split of several trainings."""
-    file = resources.files("agents").joinpath(f"learned/weights/{PAIRS}")
+    file = resources.files("agents").joinpath(f"weights/{PAIRS}")
     with file.open("rb") as opened:
         return np.load(opened, allow_pickle=False)
 

@@ -1,8 +1,9 @@
 """Central policies on a split of the suite: rows of results, and paired differences with trainings as a sample.
 
-`python -m scenarios.studies.suite_scores test --policies random,wsept,FOLDER --out FILE` appends a row for each policy
-and instance, and leaves out those that the file has. Steps end where an arm may claim a job, which changes no result of
-a central policy and takes a tenth of the time; `thermofleet compare --suite test` has all figures, and the bus.
+`python -m scenarios.leaderboard.suite_scores test --policies random,wsept,FOLDER --out FILE` appends a row for each
+policy and instance, and leaves out those that the file has. Steps end where an arm may claim a job, which changes no
+result of a central policy and takes a tenth of the time; `thermofleet compare --suite test` has all figures, and the
+bus.
 """
 
 import argparse
