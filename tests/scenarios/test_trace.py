@@ -1,7 +1,7 @@
 """The thread of an event: what it shows is what the files of the run and its twins hold."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -86,7 +86,7 @@ def test_every_event_of_a_run_leads_to_what_its_files_hold(folder: Path) -> None
             assert thread.award is not None
             assert thread.award.arm == event["arm"]
             own = [o for o in offers if (o["time_s"], o["job"]) == (thread.award.time_s, event["job"])]
-            assert [vars(offer) for offer in thread.offers] == own
+            assert [asdict(offer) for offer in thread.offers] == own
             (chosen,) = (offer for offer in thread.offers if offer.awarded)
             assert (chosen.arm, chosen.difficulty) == (event["arm"], pytest.approx(thread.award.value))
             assert chosen.plan in (0, 1)
