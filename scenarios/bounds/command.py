@@ -35,7 +35,7 @@ def bounds_command(
     evaluations: Annotated[
         int | None,
         options.number(
-            "End the search after so many simulated shifts instead: the file does not depend on the machine's load.",
+            "End the search after this number of simulated shifts; the file then does not depend on other load.",
             1,
             10**9,
             show_default=False,
@@ -43,7 +43,7 @@ def bounds_command(
     ] = None,
     nodes: Annotated[
         int,
-        options.number("Most nodes of the branch and bound of the upper bound; 0: the linear program alone.", 0, 10**6),
+        options.number("Maximum nodes of the upper bound's branch and bound; 0: only the linear program.", 0, 10**6),
     ] = 2000,
     jobs: Annotated[int, options.number("Number of processes.", 1, 1024)] = 1,
     difficulty: options.DifficultyOption = "oracle",
@@ -53,13 +53,13 @@ def bounds_command(
     show_only: Annotated[bool, typer.Option("--show", help="Compute nothing: print all rows of the file.")] = False,
     format_: Annotated[str, typer.Option("--format", help="table, markdown or json.")] = "table",
 ) -> None:
-    """Bound the reward of shifts from both sides.
+    """Bound the best possible reward of shifts from both sides.
 
     Below: the mean of the policy random, the best built-in policy, and the best
     schedule that a search finds with all jobs known (hindsight). Above: an upper
     bound that no policy can exceed. Every row is kept as soon as it is known; the
     same command continues after an interruption. A larger budget searches again.
-    A budget of --evaluations gives the same file whenever it is repeated.
+    With --evaluations in place of --budget, a repetition gives the same file.
     """
     choose("format", format_, Literal["table", "markdown", "json"])
     from scenarios.bounds.hindsight import Budget

@@ -74,14 +74,14 @@ def compare_command(
     references: Annotated[
         Path | None,
         typer.Option(
-            help="Rows of `thermofleet bounds`, for normalised scores; the splits validation and test have their own.",
+            help="Rows of `thermofleet bounds`, for normalised scores; splits use those of the package, if any.",
             show_default=False,
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the results, one row per shift, and of their page, index.html. The same command goes on "
+            help="Folder of the results, one row per shift, and of their page, index.html. The same command continues "
             "after an interruption.",
             show_default=False,
         ),
@@ -107,8 +107,9 @@ def compare_command(
 ) -> None:
     """Compare policies on the same seeds, with confidence intervals.
 
-    With several scenarios every one has a table, with --suite all have one. A
-    policy that fails is told with instance, seed and traceback; the others go on.
+    With several scenarios each has its own table; with --suite one table covers all.
+    The first failure of a policy is reported with instance, seed and traceback;
+    the other policies and shifts continue.
     """
     from scenarios.prepare.fleet import DifficultyName, RiskName
     from scenarios.run.evaluate import FIGURES

@@ -32,9 +32,10 @@ def suite_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the cells of the benchmark's suite, or the instances of one of its splits.
+    """List the cells of the benchmark suite, or the instances of one of its splits.
 
-    An instance is a scenario of its own with a seed: `thermofleet show test/0000` describes it.
+    A cell is a group of arms with stations and tasks. An instance is a scenario
+    in a cell with a seed: `thermofleet show test/0000` describes it.
     """
     from scenarios.suite.cells import CELLS
     from scenarios.suite.splits import manifest

@@ -21,7 +21,7 @@ def train_command(
     suite: Annotated[
         str | None,
         typer.Option(
-            help="Train over the instances of this split, and validate on the split validation.",
+            help="Train over the instances of this split of the suite, and validate on the split validation.",
             show_default=False,
         ),
     ] = None,
@@ -34,9 +34,7 @@ def train_command(
         ),
     ] = None,
     minutes: Annotated[float, number("Training time excluding the twins, min.", 0, 100_000, above=True)] = 30.0,
-    iterations: Annotated[
-        int | None, number("Stop earlier, after this many iterations in total.", 1, 1_000_000)
-    ] = None,
+    iterations: Annotated[int | None, number("Maximum number of iterations in total.", 1, 1_000_000)] = None,
     warm_start: Annotated[
         str, typer.Option(help="Rule that the network imitates first, for example wspt; default: none.")
     ] = "",
@@ -49,25 +47,32 @@ def train_command(
     ] = 2.0,
     lr: Annotated[
         float | None,
-        number("Learning rate; default: 0.0003, of pairs 0.04.", 0, 10, above=True, show_default=False),
+        number("Learning rate; default: 0.0003, with --algo pairs 0.04.", 0, 10, above=True, show_default=False),
     ] = None,
-    entropy: Annotated[float, number("Weight of the entropy bonus; not of pairs.", 0, 10)] = 0.002,
+    entropy: Annotated[float, number("Weight of the entropy bonus; not with --algo pairs.", 0, 10)] = 0.002,
     instances: Annotated[
         int | None,
-        number("Prepared training instances of --suite; default: 12, of pairs 48.", 1, 200, show_default=False),
+        number(
+            "With --suite: number of training instances; default: 12, with --algo pairs 48.", 1, 200, show_default=False
+        ),
     ] = None,
-    judges: Annotated[int, number("Validation instances of --suite, four shifts each.", 1, 200)] = 24,
+    judges: Annotated[int, number("With --suite: number of validation instances, four shifts each.", 1, 200)] = 24,
     seed: Annotated[int, number("Seed for shifts, initialisation and minibatches.", 0, MAX_SEED)] = 0,
-    seeds: Annotated[int, number("Number of trainings, from --seed on, one after another.", 1, 100)] = 1,
+    seeds: Annotated[int, number("Number of trainings, one after another, with seeds from --seed on.", 1, 100)] = 1,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED. Not with --seeds.")
+        Path | None,
+        typer.Option(
+            help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED or runs/SPLIT-ALGO-SEED. Not with --seeds."
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in --out.")] = False,
     threads: Annotated[int, number("Threads of the network's computations.", 1, 1024)] = 1,
     difficulty: DifficultyOption = "twin",
     risk: RiskOption = "rc",
 ) -> None:
-    """Train a policy by reinforcement learning, with checkpoints and learning curves; Ctrl-C keeps the result so far.
+    """Train a policy by reinforcement learning or evolution, with checkpoints and learning curves.
+
+    Ctrl-C ends the training and keeps the result so far.
 
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """

@@ -18,17 +18,17 @@ FOLDER = Path("docs/results/leaderboard")
 
 
 def leaderboard_command(
-    folder: Annotated[Path, typer.Argument(help="Folder of results; it holds one file for each.")] = FOLDER,
-    split: Annotated[str, typer.Option(help="test or validation.")] = "test",
+    folder: Annotated[Path, typer.Argument(help="Folder of results, one file for each policy.")] = FOLDER,
+    split: Annotated[str, typer.Option(help="Split of the suite: test or validation.")] = "test",
     verify: Annotated[
-        int, options.number("Repeat so many shifts of each result whose policy comes with the code.", 0, 200)
+        int, options.number("Number of shifts to repeat of each result of a built-in policy.", 0, 200)
     ] = 0,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Print the table of the leaderboard: normalised scores of all results on a split.
+    """Print the leaderboard: normalised scores of all results on a split.
 
     Every file is checked as by `thermofleet submit-result`. A failed shift counts
-    as the mean of random. With --verify, figures must come out equal again.
+    as the mean of random. With --verify, repeated shifts must give equal figures.
     """
     from scenarios.leaderboard.board import board_of, board_text, read_all
     from scenarios.suite.cells import SplitName
@@ -52,14 +52,14 @@ def leaderboard_command(
 
 def submit_command(
     results: Annotated[Path, typer.Argument(help="Folder of `thermofleet compare --suite test --out`.")],
-    author: Annotated[str, typer.Option(help="Who sends the result.")],
-    about: Annotated[str, typer.Option(help="What the policy is, and where it can be had; one sentence.")] = "",
+    author: Annotated[str, typer.Option(help="Name of the person who sends the result.")],
+    about: Annotated[str, typer.Option(help="What the policy is, and where to get it; one sentence.")] = "",
     policies: Annotated[
         str | None, typer.Option(help="Policies of the folder, separated by commas; default: all.", show_default=False)
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path(),
 ) -> None:
-    """Check results on a whole split, and write one file for each policy, to be sent.
+    """Check results on a whole split, and write one file per policy for the leaderboard.
 
     Instances must have the hashes of the manifest, every shift must be there, and
     versions must be stated. A failed shift counts as the mean of random.
