@@ -14,7 +14,7 @@ from scenarios.statistics.scores import FEWEST, Scores, ranked, score_cells, sco
 from scenarios.suite.splits import manifest
 from scenarios.trials.scores import Shift, normalised
 
-BASELINE = "wspt"
+BASELINE = "wsept"
 """Policy that differences refer to, by any source of scores; without it the last of the board."""
 HEADS = ("", "policy", "scores from", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound")
 MORE = ("faults", "failed", "by", "code")

@@ -81,13 +81,13 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     scores = made.scores.policies
     assert scores["test-wspt-oracle"].mean.mean == pytest.approx(0.25)
     assert scores["test-wsept-oracle"].mean.mean == pytest.approx(0.75)  # 150 of 200 shifts at 1, the others at 0
-    assert scores["test-wsept-oracle"].improvement.mean == 0.75
+    assert scores["test-wspt-oracle"].improvement.mean == 0.25
     assert run("leaderboard", sent) == 0
     text = capsys.readouterr().out
     assert "Best policy of scope central `wsept` (0.75 [" in text or "of scope arm `wsept` (0.75 [" in text
     (first,) = re.findall(r"\| 1 \|.*", text)
     assert [cell.strip() for cell in first.split("|")][2:5] == ["`wsept`", "oracle", scope_of("wsept")]
-    assert "200 of 200 instances; differences to `wspt` (oracle)." in text
+    assert "200 of 200 instances; differences to `wsept` (oracle)." in text
     assert run("leaderboard", tmp_path / "absent") == 2
 
 
