@@ -92,7 +92,7 @@ class StageClock:
 
 
 def check_progress(progress: object) -> None:
-    """Check that progress can be told.
+    """Check that `progress` can be called.
 
     Raises:
         ScenarioError: it is no function.

@@ -1,11 +1,31 @@
-"""The log of a training: JSON lines, and TensorBoard by TorchRL's logger where both are installed."""
+"""Length and log of a training: JSON lines, and TensorBoard by TorchRL's logger where both are installed."""
 
 import json
+from dataclasses import dataclass, fields
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-LOG, BOARD = "progress.jsonl", "tensorboard"
+from fleet.errors import FleetError
+
+LOG, CURVE, BOARD = "progress.jsonl", "curve.png", "tensorboard"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingLength:
+    """Length of a training; subclasses add counts, which must be positive."""
+
+    minutes: float = 30.0
+    iterations: int | None = None
+    """Most iterations, those before a resume included."""
+
+    def __post_init__(self) -> None:
+        if not self.minutes > 0:
+            raise FleetError(f"minutes must be > 0 (got {self.minutes}).")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and field.name != "minutes" and value < 1:
+                raise FleetError(f"{field.name} must be >= 1 (got {value}).")
 
 
 class TrainingLog:

@@ -41,7 +41,7 @@ SHIFTS = 3
 
 
 def measure(arms: int, most_in_hall: int) -> dict[str, object]:
-    """The costs of a hall of so many arms, CPU s in all, and the most memory, MB."""
+    """The costs of a hall of a number of arms, CPU s in all, and the most memory, MB."""
     import numpy as np
     from ask import repeated
     from hall import hall

@@ -80,6 +80,7 @@ def train_command(
         raise FleetError("Give either a scenario or --suite SPLIT.")
     if seeds > 1 and out is not None:
         raise FleetError("--seeds makes several trainings: they go to runs/, leave --out away.")
+    from agents.learned.training_log import CURVE
     from fleet.env.validation import Decisions
     from scenarios.prepare.fleet import DifficultyName, RiskName
 
@@ -141,11 +142,11 @@ def train_command(
             except ValueError as error:
                 raise FleetError(str(error)) from error
             with progress_bar() as progress:
-                told: Any = {"resume": resume, "progress": progress, "tell": say}
+                common: Any = {"resume": resume, "progress": progress, "tell": say}
                 if chosen is not None:
-                    done = train(chosen, config, where, length, **models, **told)
+                    done = train(chosen, config, where, length, **models, **common)
                 else:
-                    done = train_on_split(grounds, judging, config, where, length, card=card, **told)
+                    done = train_on_split(grounds, judging, config, where, length, card=card, **common)
         say(
             f"{'Interrupted after' if done.interrupted else 'Trained'} {done.iterations} iterations, {done.seconds:.0f}"
             f" s; best reward {done.best:.4g}: {'a shift' if chosen else 'of the value of all jobs'} in validation.",
@@ -158,4 +159,3 @@ def train_command(
 
 
 Algorithm = Literal["mappo", "ippo", "pairs"]
-CURVE = "curve.png"

@@ -90,12 +90,12 @@ def board_text(board: Board | None, split: str) -> str:
     parts.append(table((*HEADS, *MORE), rows))
     base = board.entries[scores.baseline].card
     missing = board.instances - scores.instances - len(scores.flat)
-    told = f"{scores.instances} of {board.instances} instances; differences to `{base.policy}` ({base.difficulty})."
+    remark = f"{scores.instances} of {board.instances} instances; differences to `{base.policy}` ({base.difficulty})."
     if missing:
-        told += f" {missing} have no reference yet and are not scored."
+        remark += f" {missing} have no reference yet and are not scored."
     if scores.flat:
-        told += f" Not scored, as hindsight is no better than random there: {', '.join(scores.flat)}."
-    return "\n\n".join([*parts, told])
+        remark += f" {scores.flat_remark}"
+    return "\n\n".join([*parts, remark])
 
 
 def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:

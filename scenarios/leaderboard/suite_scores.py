@@ -177,7 +177,7 @@ def main() -> None:
     parser.add_argument("--difficulty", default="oracle", help="twin, oracle or blind")
     parser.add_argument("--count", type=int, help="only the first instances, which are of all cells in turns")
     parser.add_argument("--seeds", type=int, default=1, help="shifts of every instance")
-    parser.add_argument("--least-arms", type=int, default=0, help="only instances of fleets of so many arms")
+    parser.add_argument("--least-arms", type=int, default=0, help="only instances with this many arms or more")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument(
         "--table", help="print differences to this policy instead; --policies are then trainings of one"

@@ -80,7 +80,7 @@ def _heat_share(world: World, plan: Array) -> Array:
 def _least(load: Array, possible: Array, busy: Array | None = None, most: float = np.inf) -> float:
     """Least largest load of an arm when every job is shared out, [arm, job], while no arm's `busy` passes `most`.
 
-    Jobs that are alike for every arm are one, as often as there are such; only possible pairs are variables.
+    Jobs that are equal for every arm are one job with a count; only possible pairs are variables.
     """
     columns = np.stack([possible, load * possible, (load if busy is None else busy) * possible])
     (alike, loads, busies), count = np.unique(columns, axis=2, return_counts=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.learned.evolution import Evolution, EvolutionConfig
-from agents.learned.training_log import TrainingLog, read_log
+from agents.learned.training_log import CURVE, TrainingLength, TrainingLog, read_log
 from agents.pair_scores import PARAMETERS, first_parameters, save_pairs
 from fleet.errors import FleetError
 from fleet.files import atomic_path
@@ -17,27 +17,16 @@ from scenarios.run.suite_batches import Ground, rewards
 
 Array = np.ndarray
 
-STATE, CURVE = "training.npz", "curve.png"
+STATE = "training.npz"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairPlan:
+class PairPlan(TrainingLength):
     """Length of a training, and its validation."""
 
-    minutes: float = 30.0
-    iterations: int | None = None
-    """Most iterations, those before a resume included."""
     instances: int = 10
     """Instances of an iteration, of different cells; all samples have the same shifts."""
     validate_every: int = 5
-
-    def __post_init__(self) -> None:
-        if not self.minutes > 0:
-            raise FleetError(f"minutes must be > 0 (got {self.minutes}).")
-        for name in ("iterations", "instances", "validate_every"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise FleetError(f"{name} must be >= 1 (got {value}).")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from agents.learned.imitation import imitate
 from agents.learned.policy import CARD, save_policy
 from agents.learned.ppo import PpoConfig, Trainer
-from agents.learned.training_log import TrainingLog, read_log
+from agents.learned.training_log import CURVE, TrainingLength, TrainingLog, read_log
 from agents.policy import WAIT, Policy, only_choices
 from fleet.engine.reward import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
@@ -34,27 +34,16 @@ Array = np.ndarray
 
 VALIDATION_SEED = 2_000_000
 """First validation seed; far from the seeds of comparisons."""
-STATE, CURVE = "training.pt", "curve.png"
+STATE = "training.pt"
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingPlan:
+class TrainingPlan(TrainingLength):
     """Length of a training, and its validation."""
 
-    minutes: float = 30.0
-    iterations: int | None = None
-    """Most iterations, those before a resume included."""
     validate_every: int = 20
     """Iterations from one validation to the next."""
     validation_envs: int = 32
-
-    def __post_init__(self) -> None:
-        if not self.minutes > 0:
-            raise FleetError(f"minutes must be > 0 (got {self.minutes}).")
-        for name in ("iterations", "validate_every", "validation_envs"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise FleetError(f"{name} must be >= 1 (got {value}).")
 
 
 @dataclass(frozen=True)

@@ -66,17 +66,23 @@ class Scores:
     policies: dict[str, Score]
 
     @property
+    def flat_remark(self) -> str:
+        """Which instances were left out; "" if none."""
+        names = ", ".join(self.flat)
+        return f"Not scored, as hindsight is no better than random there: {names}." if names else ""
+
+    @property
     def remarks(self) -> list[str]:
         """What a reader must know of the instances."""
-        told = [
+        remarks = [
             f"Unit: {self.instances} instances. Score: 0 = mean of random, 1 = hindsight, the best schedule that a "
             "clairvoyant search found."
         ]
         if self.missing:
-            told.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
+            remarks.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
         if self.flat:
-            told.append(f"Not scored, as hindsight is no better than random there: {', '.join(self.flat)}.")
-        return told
+            remarks.append(self.flat_remark)
+        return remarks
 
 
 def scores_of(values: Normalised, baseline: str) -> Scores:

@@ -239,7 +239,6 @@ def test_the_committed_documents_are_current():
         "exchange.md",
         "leaderboard.md",
         "policies.md",
-        "results.md",
     }
 
 
