@@ -19,13 +19,11 @@ from scenarios.trials import contest, fleets, run_unit
 from scenarios.trials.plan import Case, Key, Row, Study, Unit, seeds_of_instance
 from scenarios.trials.store import RESULTS, opened, read_rows
 from scenarios.trials.summary import comparison_of, comparisons, result_page
+from tests.own_policies import IDLE
 
-BAD = """
-import os, pathlib
-class Idle:
-    scope = "central"
-    def reset(self, rng): self.asked, self.drawn = 0, rng.random()
-    def act(self, seen): return {}
+BAD = (
+    IDLE
+    + """
 class Raises(Idle):
     def act(self, seen):
         self.asked += 1
@@ -42,18 +40,12 @@ class Stuck(Idle):
             except Exception: pass
 class Illegal(Idle):
     def act(self, seen): return dict.fromkeys(seen, 10**30)
-class DiesOnce(Idle):
-    def act(self, seen):
-        mark = pathlib.Path(__file__).with_name("died")
-        if not mark.exists():
-            mark.touch()
-            os._exit(3)
-        return {}
 class DiesInOne(Idle):
     def act(self, seen):
         if abs(self.drawn - DRAWN) < 1e-12: os._exit(3)
         return {}
 """
+)
 
 
 @pytest.fixture
