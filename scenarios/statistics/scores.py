@@ -8,7 +8,7 @@ from rich.table import Table
 
 from scenarios.statistics.holm import holm
 from scenarios.statistics.means import LEVEL, Interval, interval, paired
-from scenarios.statistics.suites import aggregates, improvement
+from scenarios.statistics.suites import Unit, aggregates, improvement
 
 Array = np.ndarray
 
@@ -23,18 +23,23 @@ class Normalised:
     instances: tuple[str, ...]
     """A scenario and a seed each."""
     score: Mapping[str, Array]
-    """By policy, [instance]."""
+    """By policy, [training of the policy, instance]; a single training counts as given, not as a sample."""
     to_bound: Mapping[str, Array]
-    """(upper bound − reward) / (upper bound − random), by policy, [instance]."""
+    """(upper bound − reward) / (upper bound − random), in the same shape."""
     missing: int = 0
     """Shifts of each policy that have no reference."""
     flat: tuple[str, ...] = ()
     """Instances left out because their hindsight is not better than random."""
 
+    def difference(self, policy: str, other: str) -> Interval:
+        """Of the mean scores of two policies, paired by instance, and by training if both have several."""
+        return paired(self.score[policy][:, None], self.score[other][:, None])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """The normalised score of one policy; the unit of all intervals is the instance."""
+    """The normalised score of one policy; the unit of all intervals is the instance, and the training if there are
+    several."""
 
     mean: Interval
     difference: Interval
@@ -94,8 +99,7 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
     if len(values.instances) < FEWEST:
         raise ValueError(f"Scores need {FEWEST} instances or more (got {len(values.instances)}).")
     base, names = values.score[baseline], list(values.score)
-    suite = aggregates({name: x[None] for name, x in values.score.items()})
-    differences = [Interval(0.0, 0.0, 0.0) if name == baseline else paired(values.score[name], base) for name in names]
+    differences = [Interval(0.0, 0.0, 0.0) if name == baseline else values.difference(name, baseline) for name in names]
     adjusted = holm([each.p for each in differences]).tolist()
     return Scores(
         baseline=baseline,
@@ -104,17 +108,23 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
         flat=values.flat,
         policies={
             name: Score(
-                mean=interval(values.score[name]),
+                mean=interval(values.score[name][:, None]),
                 difference=difference,
                 p_holm=p_holm,
-                iqm=suite[name].iqm,
-                optimality_gap=suite[name].optimality_gap,
-                improvement=improvement(values.score[name][None], base[None]),
-                bound_gap=interval(values.to_bound[name]),
+                iqm=suite.iqm,
+                optimality_gap=suite.optimality_gap,
+                improvement=improvement(values.score[name], base, sample_of(values.score[name])),
+                bound_gap=interval(values.to_bound[name][:, None]),
             )
             for name, difference, p_holm in zip(names, differences, adjusted, strict=True)
+            for suite in [aggregates({name: values.score[name]}, sample_of(values.score[name]))[name]]
         },
     )
+
+
+def sample_of(scores: Array) -> Unit:
+    """What is a sample in scores [training, instance]."""
+    return "both" if len(scores) > 1 else "instances"
 
 
 def ranked(scores: Scores) -> list[str]:
