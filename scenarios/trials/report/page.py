@@ -77,9 +77,7 @@ def verdict(judged: Judged) -> list[str]:
     compared = [_against(best, base, scores.policies[best].difference, "the baseline ")] if best != base else []
     others = [name for name in rest if name != base]
     if others:
-        compared.append(
-            _against(best, others[0], values.difference(best, others[0]), "the next one, ")
-        )
+        compared.append(_against(best, others[0], values.difference(best, others[0]), "the next one, "))
     told = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     told.append(
