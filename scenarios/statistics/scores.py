@@ -68,6 +68,8 @@ class Scores:
     instances: int
     missing: int
     flat: tuple[str, ...]
+    trainings: int = 1
+    """Most trainings of a policy."""
     policies: dict[str, Score]
 
     @property
@@ -80,8 +82,8 @@ class Scores:
     def remarks(self) -> list[str]:
         """What a reader must know of the instances."""
         remarks = [
-            f"Unit: {self.instances} instances. Score: 0 = mean of random, 1 = hindsight, the best schedule that a "
-            "clairvoyant search found."
+            f"Unit: {self.instances} instances{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = "
+            "hindsight, the best schedule that a clairvoyant search found."
         ]
         if self.missing:
             remarks.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
@@ -106,6 +108,7 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
         instances=len(values.instances),
         missing=values.missing,
         flat=values.flat,
+        trainings=max(map(len, values.score.values())),
         policies={
             name: Score(
                 mean=interval(values.score[name][:, None]),
@@ -120,6 +123,11 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
             for suite in [aggregates({name: values.score[name]}, sample_of(values.score[name]))[name]]
         },
     )
+
+
+def and_trainings(count: int) -> str:
+    """What a unit says of the trainings of policies."""
+    return f" × {count} trainings of a policy" if count > 1 else ""
 
 
 def sample_of(scores: Array) -> Unit:

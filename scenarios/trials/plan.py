@@ -165,6 +165,11 @@ class Study:
         trainings = max(self.trainings_of(policy, each) for policy in self.policies for each in self.difficulties)
         return self.fleets, trainings, len(self.cases[0].seeds)
 
+    @property
+    def most_trainings(self) -> int:
+        """Of those policies that have trainings of their own."""
+        return max(len(trainings_of(policy)) for policy in self.policies)
+
     def trainings_of(self, policy: str, difficulty: DifficultyName) -> int:
         """How many trainings a policy has with a source of scores: of its own, or else of the twins."""
         own = len(trainings_of(policy))
