@@ -28,7 +28,8 @@ def compare_command(
     policies: Annotated[
         str,
         typer.Option(
-            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train`; "
+            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train` "
+            "('FOLDER-*': one policy with several trainings); "
             f"{WRAPPERS_HELP}. Default: {', '.join(RULES)}.",
             show_default=False,
         ),

@@ -1,7 +1,7 @@
 """Normalised scores of policies over instances: mean, difference to a baseline, and the figures of `suites`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.table import Table
@@ -30,6 +30,12 @@ class Normalised:
     """Shifts of each policy that have no reference."""
     flat: tuple[str, ...] = ()
     """Instances left out because their hindsight is not better than random."""
+
+    def only(self, chosen: Array) -> "Normalised":
+        """Some of the instances, bool [instance]."""
+        names = tuple(name for name, own in zip(self.instances, chosen.tolist(), strict=True) if own)
+        score, to_bound = ({name: x[:, chosen] for name, x in each.items()} for each in (self.score, self.to_bound))
+        return replace(self, instances=names, score=score, to_bound=to_bound)
 
     def difference(self, policy: str, other: str) -> Interval:
         """Of the mean scores of two policies, paired by instance, and by training if both have several."""
