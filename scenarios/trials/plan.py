@@ -103,6 +103,11 @@ class Unit:
         return self.training if len(trainings_of(self.policy)) == 1 else 0
 
     @property
+    def size(self) -> int:
+        """Arms times decision intervals, which the time of a run follows."""
+        return len(self.case.seeds) * len(self.case.scenario.arms) * self.case.scenario.ticks
+
+    @property
     def group(self) -> tuple[object, ...]:
         """Units of one group share plans and twins."""
         return self.case.name if self.cell < 0 else self.cell, self.fleet, self.twins, self.difficulty
