@@ -26,7 +26,7 @@ from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
-from scenarios.run.shift import scenario_hash
+from scenarios.run.provenance import scenario_hash
 from scenarios.run.suite_batches import Ground
 from scenarios.schema import Scenario
 

@@ -16,9 +16,8 @@ from scenarios.policy_loader import Unusable, policy_of, source_of, trainings_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.evaluate import FIGURES, Outcome
-from scenarios.run.provenance import code_hash
+from scenarios.run.provenance import code_hash, scenario_hash
 from scenarios.schema import Scenario
-from scenarios.suite.splits import content_hash
 from scenarios.trials.cells import plan_content
 
 TOGETHER = 16
@@ -190,7 +189,7 @@ class Study:
             "channel": self.channel.described(),
             "decision_limit_s": self.decision_limit_s,
             "figures": list(FIGURES),
-            "instances": {case.name: content_hash(case.scenario) for case in self.cases},
+            "instances": {case.name: scenario_hash(case.scenario) for case in self.cases},
             "policies": {policy: policy_hash(policy) for policy in self.policies},
         }
 

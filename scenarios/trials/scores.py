@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenarios.policy_loader import has_trainings
+from scenarios.run.provenance import scenario_hash
 from scenarios.statistics.scores import Normalised
-from scenarios.suite.splits import content_hash
 from scenarios.trials.plan import Case, Row
 
 if TYPE_CHECKING:  # slow to import
@@ -42,7 +42,7 @@ def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shif
     rows = {(each.instance, each.seed): each for path in files for each in load_references(path)}
     found: dict[Shift, Reference] = {}
     for case in cases:
-        content = content_hash(case.scenario)
+        content = scenario_hash(case.scenario)
         for seed in case.seeds:
             own = rows.get((case.name if "/" in case.name else f"{case.name}/{seed}", seed))
             if own and own.scenario_hash == content:

@@ -173,7 +173,7 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
         with pytest.raises(FleetError, match="is no result of `thermofleet submit-result`"):
             read(path)
     path.write_text(lines[0] + "\n" + " " * MOST_BYTES, encoding="utf-8")
-    with pytest.raises(FleetError, match="at most 200000 bytes"):
+    with pytest.raises(FleetError, match=f"at most {MOST_BYTES} bytes"):
         read(path)
 
 
