@@ -24,7 +24,8 @@ from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
 from scenarios.progress import Count, Progress, quiet
-from scenarios.run.provenance import code_hash, scenario_hash
+from scenarios.run.provenance import code_hash
+from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 from scenarios.trials.fleets import Fleets, plan_content
 from scenarios.trials.plan import Case, Unit
@@ -42,7 +43,7 @@ class Reference:
     instance: str
     """As `heat_wave/100`, or the name of an instance of a split."""
     scenario_hash: str
-    """Of what is no default in the scenario: `scenarios.run.provenance.scenario_hash`."""
+    """Of what is no default in the scenario: `scenarios.scenario_hash`."""
     seed: int
     difficulty: str
     """Source of the scores of the policies that the search starts from."""

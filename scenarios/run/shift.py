@@ -21,7 +21,8 @@ from scenarios.progress import Progress, quiet
 from scenarios.run.heat_use import HeatUse
 from scenarios.run.metrics import Metrics
 from scenarios.run.outcome import metrics_of
-from scenarios.run.provenance import code_hash, provenance, scenario_hash
+from scenarios.run.provenance import code_hash, provenance
+from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
 

@@ -12,7 +12,7 @@ import numpy as np
 from fleet.errors import ScenarioError
 from fleet.seeding import shift_seeds
 from scenarios.job_stream import draw_jobs
-from scenarios.run.provenance import hash_of, scenario_hash
+from scenarios.scenario_hash import hash_of, scenario_hash
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
 from scenarios.suite.axes import Axes, draw_axes, scenario_of
@@ -44,7 +44,7 @@ class Row:
     axes: Axes
     seed: int
     scenario: str
-    """Hash of the scenario, see `scenarios.run.provenance`."""
+    """Hash of the scenario, see `scenarios.scenario_hash`."""
     jobs: str
     """Hash of the drawn jobs, see `jobs_content`."""
     count: int

@@ -16,7 +16,8 @@ from scenarios.policy_loader import Unusable, policy_of, source_of, trainings_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.evaluate import FIGURES, Outcome
-from scenarios.run.provenance import code_hash, scenario_hash
+from scenarios.run.provenance import code_hash
+from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 from scenarios.trials.cells import plan_content
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenarios.policy_loader import has_trainings
-from scenarios.run.provenance import scenario_hash
+from scenarios.scenario_hash import scenario_hash
 from scenarios.statistics.scores import Normalised
 from scenarios.trials.plan import Case, Row
 

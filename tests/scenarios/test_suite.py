@@ -10,7 +10,7 @@ from scenarios.job_stream import all_works
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.report.load_factor import load_factor
-from scenarios.run.provenance import scenario_content
+from scenarios.scenario_hash import scenario_content
 from scenarios.schema import BusSpec, Scenario
 from scenarios.suite.axes import BUSES, DUE, Axes, scenario_of
 from scenarios.suite.cells import CELLS, SPLITS, layout
