@@ -51,7 +51,7 @@ class Observation:
     """
 
     clock: Annotated[Array, Field((), "1", 0, 1, "share of the episode that has passed")]
-    left_s: Annotated[Array, Field((), "s", 0, LONG_S, "time until the end of the episode; 100000 live, if it has none")]
+    left_s: Annotated[Array, Field((), "s", 0, LONG_S, "time until the end of the episode; 100000 live without end")]
     idle: Annotated[Array, Field((), "1", 0, 1, "1 when this arm is free")]
     working: Annotated[Array, Field((), "1", 0, 1, "1 when it works or goes home")]
     faulted: Annotated[Array, Field((), "1", 0, 1, "1 from a fault until it recovers")]
