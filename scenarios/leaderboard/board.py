@@ -78,15 +78,26 @@ def board_text(board: Board | None, split: str) -> str:
     if board is None:
         return f"No results with references on the split {split}."
     scores = board.scores
+    parts = [best_text(board)]
+    rows = [(str(place), *_cells(scores, name, board.entries[name])) for place, name in enumerate(board.order, start=1)]
+    parts.append(table((*HEADS, *MORE), rows))
+    return "\n\n".join([*parts, remark_text(board)])
+
+
+def best_text(board: Board) -> str:
+    """The best policy of each scope, in a sentence."""
     best = [
-        f"{scope} `{each.card.policy}` ({scores.policies[each.name].mean.text()})"
+        f"{scope} `{each.card.policy}` ({board.scores.policies[each.name].mean.text()})"
         for scope in ("central", "arm")
         for each in [board.best(scope)]
         if each
     ]
-    parts = [f"Best policy of scope {', of scope '.join(best)}."]
-    rows = [(str(place), *_cells(scores, name, board.entries[name])) for place, name in enumerate(board.order, start=1)]
-    parts.append(table((*HEADS, *MORE), rows))
+    return f"Best policy of scope {', of scope '.join(best)}."
+
+
+def remark_text(board: Board) -> str:
+    """What a reader must know of the results."""
+    scores = board.scores
     base = board.entries[scores.baseline].card
     missing = board.instances - scores.instances - len(scores.flat)
     remark = f"{scores.instances} of {board.instances} instances; differences to `{base.policy}` ({base.difficulty})."
@@ -94,7 +105,9 @@ def board_text(board: Board | None, split: str) -> str:
         remark += f" {missing} have no reference yet and are not scored."
     if scores.flat:
         remark += f" {scores.flat_remark}"
-    return "\n\n".join([*parts, remark])
+    if len({each.card.code_hash for each in board.entries.values()}) > 1:
+        remark += " Results are of several versions of the code; `--verify` repeats some shifts of each with this one."
+    return remark
 
 
 def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:

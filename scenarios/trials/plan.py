@@ -171,6 +171,12 @@ class Study:
         return self.fleets, trainings, len(self.cases[0].seeds)
 
     @property
+    def channel_text(self) -> str:
+        """The channel of all instances in words."""
+        texts = {case.scenario.channel(self.channel).text for case in self.cases}
+        return texts.pop() if len(texts) == 1 else "that of each instance"
+
+    @property
     def most_trainings(self) -> int:
         """Of those policies that have trainings of their own."""
         return max(len(trainings_of(policy)) for policy in self.policies)

@@ -133,12 +133,13 @@ def _joined(out: Path, card: Mapping[str, Any]) -> dict[str, Any]:
     return joined
 
 
-def read_rows(out: Path) -> list[Row]:
+def read_rows(out: str | Path) -> list[Row]:
     """The rows of a study's folder, finished or interrupted, sorted by key.
 
     Raises:
         FleetError: it is no such folder, or damaged.
     """
+    out = Path(out)
     if not (out / CARD).is_file():
         raise FleetError(f"'{out}' holds no study of `thermofleet compare --out`.")
     with disk_errors(out):
