@@ -31,6 +31,10 @@ class Ground:
     """Of the instance itself."""
     library: Library
     weights: RewardWeights
+    random: float = 0.0
+    """Mean reward of the policy `random` in the shift of its own seed."""
+    span: float | None = None
+    """Reward of the hindsight of that shift less `random`; None if unknown."""
 
     @property
     def shifts(self) -> list[int]:
@@ -46,6 +50,11 @@ class Ground:
         """Value of all jobs that arrive in the shift of a seed: the unit of a fitness, so that instances are alike."""
         shift = self.library.draw(np.random.SeedSequence(seed))
         return max(float(self.library.tables.value[shift.fleet, shift.kind].sum()), 1.0)
+
+    @property
+    def unit(self) -> float:
+        """What rewards of its shifts are divided by: the span, or the value of all jobs if that is unknown."""
+        return self.value(self.seed) if self.span is None else self.span
 
 
 def ground_of(

@@ -18,6 +18,8 @@ from scenarios.run.suite_batches import Ground, rewards
 Array = np.ndarray
 
 STATE = "training.npz"
+MOST_LOSS = 1.0
+"""A sample loses at most this much to the best one in a shift, so that one shift does not decide an iteration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +69,7 @@ def train_pairs(
     """
     card = {**card, "config": asdict(config), "instances": plan.instances}
     _check_folder(out, card, resume=resume)
-    rng = np.random.default_rng(np.random.SeedSequence([config.seed, 0]))
-    search = Evolution(first_parameters(rng), config)
+    search = Evolution(first_parameters(), config)
     wsept = np.zeros(PARAMETERS)
     began_s, interrupted, shifts = time.monotonic(), False, 0
     out.mkdir(parents=True, exist_ok=True)
@@ -117,13 +118,9 @@ def train_pairs(
 
 
 def validation(judges: Sequence[Ground], parameters: Array) -> float:
-    """Mean reward of the validation shifts over the value of their jobs."""
-    means: list[float] = []
-    for judge in judges:
-        seeds = judge.shifts
-        found = rewards(judge, np.tile(parameters, (len(seeds), 1)), seeds)
-        means.append(float(np.mean([reward / judge.value(seed) for reward, seed in zip(found, seeds, strict=True)])))
-    return float(np.mean(means))
+    """Mean score of the shifts of the judges' own seeds, see `Ground`."""
+    scores = [(rewards(judge, parameters[None], [judge.seed])[0] - judge.random) / judge.unit for judge in judges]
+    return float(np.mean(scores))
 
 
 def _fitness(grounds: Sequence[Ground], search: Evolution, count: int) -> Array:
@@ -137,7 +134,8 @@ def _fitness(grounds: Sequence[Ground], search: Evolution, count: int) -> Array:
     samples, total = search.ask(), np.zeros(search.config.samples)
     for index in chosen.tolist():
         seed = int(rng.integers(2**31))
-        total += rewards(grounds[index], samples, [seed] * len(samples)) / grounds[index].value(seed)
+        scores = rewards(grounds[index], samples, [seed] * len(samples)) / grounds[index].unit
+        total += np.maximum(scores, scores.max() - MOST_LOSS)
     return total / len(chosen)
 
 
