@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 
 from agents.assignment import matching
-from agents.pairs import PAIR_FEATURES, Worth, pairs_of
+from agents.pairs import FILLS, PAIR_FEATURES, Worth, pairs_of
 from agents.policy import WAIT, plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
@@ -31,9 +31,14 @@ PARAMETERS = len(Worth._fields) + PAIR_FEATURES * OUTPUTS
 
 
 def first_parameters() -> Array:
-    """Parameters of `wsept`, but a job that cannot end before the shift does has no value, float [PARAMETERS]."""
+    """Parameters from which a training begins, float [PARAMETERS]: `wsept`, except for the end of the shift and faults.
+
+    A job that cannot end before the shift does has no value, and one that just can has twice the score. A predicted
+    peak may be 4 K above the error limit.
+    """
     parameters = np.zeros(PARAMETERS)
-    parameters[Worth._fields.index("end")] = 1.0
+    parameters[Worth._fields.index("end")], parameters[Worth._fields.index("margin")] = 1.0, 0.4
+    parameters[len(Worth._fields) + FILLS * OUTPUTS] = 0.7
     return parameters
 
 
@@ -89,7 +94,7 @@ class PairPolicy:
         return dict(zip(observations, claims(score, plans_of(seen[0])).tolist(), strict=True))
 
 
-PAIRS_FORMAT = 2
+PAIRS_FORMAT = 3
 """Increase it when the numbers of a pair or the network change."""
 
 

@@ -15,8 +15,8 @@ from fleet.observation import Observation
 
 Array = np.ndarray
 
-PAIR_FEATURES = 28
-"""Numbers of a pair."""
+PAIR_FEATURES, FILLS = 28, 26
+"""Numbers of a pair; the one of them that is 1 for a job that ends just before the shift does."""
 SOON_S = 180.0
 """Time until home of arms whose claim a job might wait for."""
 MOST = 4.0
@@ -26,6 +26,8 @@ MOST = 4.0
 class Worth(NamedTuple):
     """What a learned worth per time has beyond `wsept`, [env] each; zeros give `wsept`."""
 
+    margin: Array
+    """Predicted peaks may be this much higher, in units of 10 K."""
     spread: Array
     """Logarithm of the factor on the deviation of true peaks."""
     fault: Array
@@ -78,7 +80,7 @@ def worth_per_second(seen: Observation, at: Places, learned: Worth) -> Array:
         # As `Wsept.predicted_peak_c` of one arm.
         margin_k = Wsept.peak_sd_k * logit(np.clip(seen.p_saturation[at], LEAST_P, 1.0 - LEAST_P))
         peak_c = np.where(peak_c > 0, peak_c, warning_c + margin_k)
-    error_c = seen.error_headroom_k[env, arm] + hottest_c
+    error_c = seen.error_headroom_k[env, arm] + hottest_c + 10.0 * learned.margin[env]
     p_fault = ndtr((peak_c - error_c) / (Wsept.peak_sd_k * np.exp(learned.spread[env])))
     above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
     minute_price = Wsept.minute_price * np.exp(learned.minute[env])

@@ -1,7 +1,7 @@
 """Shifts of a split of the suite as batches, for a learner of scores of pairs: one batched environment per instance."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,8 @@ from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.suite.splits import Instance, split
+from scenarios.trials.plan import Case
+from scenarios.trials.scores import references_of
 
 Array = np.ndarray
 
@@ -32,9 +34,9 @@ class Ground:
     library: Library
     weights: RewardWeights
     random: float = 0.0
-    """Mean reward of the policy `random` in the shift of its own seed."""
+    """Mean reward of the policy `random` in the shift of its own seed; 0 without a reference."""
     span: float | None = None
-    """Reward of the hindsight of that shift less `random`; None if unknown."""
+    """Reward of the hindsight of that shift less `random`; None without a reference."""
 
     @property
     def shifts(self) -> list[int]:
@@ -53,7 +55,7 @@ class Ground:
 
     @property
     def unit(self) -> float:
-        """What rewards of its shifts are divided by: the span, or the value of all jobs if that is unknown."""
+        """What rewards of its shifts are divided by: the span, or the value of all jobs without a reference."""
         return self.value(self.seed) if self.span is None else self.span
 
 
@@ -64,10 +66,13 @@ def ground_of(
     risk: RiskName = RISK,
     cache: Path | None = None,
 ) -> Ground:
-    """Prepare an instance; its cell is prepared once."""
+    """Prepare an instance; its cell is planned once."""
     fleet = prepare(instance.scenario, difficulty=difficulty, risk=risk, cache=cache)
-    weights = weights_of(instance.scenario)
-    return Ground(instance.name, instance.seed, library_of(fleet), weights)
+    ground = Ground(instance.name, instance.seed, library_of(fleet), weights_of(instance.scenario))
+    case = Case(name=instance.name, scenario=instance.scenario, seeds=(instance.seed,))
+    for known in references_of([case]).values():
+        ground = replace(ground, random=known.random, span=known.hindsight - known.random)
+    return ground
 
 
 def grounds_of(
@@ -107,8 +112,9 @@ def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
         asked = np.flatnonzero(~over & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
         if len(asked):
             seen = env.layout.read(obs["observation"][asked], obs["action_mask"][asked])
-            for row, score in zip(asked.tolist(), scores(seen, parameters[asked]), strict=True):
-                actions[row] = claims(score, env.layout.plans)
+            score = scores(seen, parameters[asked])
+            for k in np.flatnonzero(np.isfinite(score).any(axis=(1, 2))).tolist():
+                actions[asked[k]] = claims(score[k], env.layout.plans)
         obs, reward, terminated, truncated, _ = env.step(actions)
         total += np.where(over, 0.0, reward)
         over |= terminated | truncated
