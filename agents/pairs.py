@@ -95,7 +95,8 @@ def worth_per_second(seen: Observation, at: Places, learned: Worth) -> Array:
 def pairs_of(seen: Observation, learned: Worth) -> Pairs:
     """The legal pairs of arms and options; arguments as of `worth_per_second`."""
     legal = seen.action_mask[..., 1:-1] > 0
-    at = env, _, _ = np.nonzero(legal)
+    env, arm, option = np.nonzero(legal)
+    at = env, arm, option
     rate = worth_per_second(seen, at, learned)
     count = np.maximum(np.bincount(env, minlength=len(legal)), 1)
     scale = np.maximum(np.bincount(env, np.abs(rate), len(legal)) / count, 1e-6)
@@ -162,7 +163,8 @@ def _features(seen: Observation, at: Places, learned: Worth, rate: Array, scale:
 def _best_soon(seen: Observation, learned: Worth, scale: Array) -> Array:
     """Largest worth per second of arms that are home soon, relative to a scale [env], for each job, [env, slot]."""
     soon = (seen.working > 0) & (seen.busy_s <= SOON_S)
-    at = env, arm, option = np.nonzero(soon[..., None] & (seen.feasible > 0))
+    env, arm, option = np.nonzero(soon[..., None] & (seen.feasible > 0))
+    at = env, arm, option
     best = np.zeros((len(scale), seen.offered.shape[-1]))
     if len(env):
         duration_s, busy_s = np.maximum(seen.duration_s[at], 1.0), seen.busy_s[env, arm]

@@ -119,11 +119,17 @@ def train_command(
         length = PairPlan(**length)
     if suite is not None:
         from scenarios.run.suite_batches import grounds_of
+        from scenarios.suite.splits import split
+        from scenarios.trials.plan import Case
+        from scenarios.trials.scores import references_of
 
         usual = (36, 60) if algorithm == "pairs" else (12, 24)
+        train, validation = split(suite)[: instances or usual[0]], split("validation")[: judges or usual[1]]
+        cases = [Case(name=each.name, scenario=each.scenario, seeds=(each.seed,)) for each in (*train, *validation)]
+        known = {shift: (each.random, each.hindsight) for shift, each in references_of(cases).items()}
         with progress_bar() as progress:
-            grounds = grounds_of(suite, instances or usual[0], **models, progress=progress)
-            judging = grounds_of("validation", judges or usual[1], **models, progress=progress)
+            grounds = grounds_of(train, **models, known=known, progress=progress)
+            judging = grounds_of(validation, **models, known=known, progress=progress)
         card |= {"prepared": len(grounds), "judges": len(judging)}
     for k, where in enumerate(places):
         if algorithm == "pairs":

@@ -1,7 +1,7 @@
 """Shifts of a split of the suite as batches, for a learner of scores of pairs: one batched environment per instance."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +14,16 @@ from scenarios.fault_price import weights_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
-from scenarios.suite.splits import Instance, split
-from scenarios.trials.plan import Case
-from scenarios.trials.scores import references_of
+from scenarios.suite.splits import Instance
 
 Array = np.ndarray
 
 SHIFTS = 4
 """Shifts of a validation instance: that of its own seed, and others."""
+
+
+Known = Mapping[tuple[str, int], tuple[float, float]]
+"""Rewards of random and of the hindsight in the shift of an instance and its seed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,34 +67,33 @@ def ground_of(
     difficulty: DifficultyName = "oracle",
     risk: RiskName = RISK,
     cache: Path | None = None,
+    known: Known | None = None,
 ) -> Ground:
     """Prepare an instance; its cell is planned once."""
     fleet = prepare(instance.scenario, difficulty=difficulty, risk=risk, cache=cache)
-    ground = Ground(instance.name, instance.seed, library_of(fleet), weights_of(instance.scenario))
-    case = Case(name=instance.name, scenario=instance.scenario, seeds=(instance.seed,))
-    for known in references_of([case]).values():
-        ground = replace(ground, random=known.random, span=known.hindsight - known.random)
-    return ground
+    random, hindsight = (known or {}).get((instance.name, instance.seed), (0.0, None))
+    span = None if hindsight is None else hindsight - random
+    return Ground(instance.name, instance.seed, library_of(fleet), weights_of(instance.scenario), random, span)
 
 
 def grounds_of(
-    name: str,
-    count: int,
+    instances: Sequence[Instance],
     *,
     difficulty: DifficultyName = "oracle",
     risk: RiskName = RISK,
     cache: Path | None = None,
+    known: Known | None = None,
     progress: Progress = quiet,
 ) -> list[Ground]:
-    """The first instances of a split, in turns of its cells.
+    """Prepare instances.
 
-    Raises:
-        ScenarioError: there is no such split.
+    Args:
+        known: References of those instances that have one.
     """
     grounds: list[Ground] = []
-    for instance in split(name)[:count]:
-        progress(f"preparing {instance.name}", Count(len(grounds), count))
-        grounds.append(ground_of(instance, difficulty=difficulty, risk=risk, cache=cache))
+    for instance in instances:
+        progress(f"preparing {instance.name}", Count(len(grounds), len(instances)))
+        grounds.append(ground_of(instance, difficulty=difficulty, risk=risk, cache=cache, known=known))
     return grounds
 
 
