@@ -132,6 +132,18 @@ def test_a_learned_price_of_the_end_counts_for_jobs_that_end_after_the_shift() -
         np.testing.assert_allclose(share(left_s), expected, atol=1e-6)
 
 
+def test_with_a_margin_hotter_peaks_are_worth_the_same() -> None:
+    """Where the time above the warning limit costs nothing, only the distance of the peak to the error limit counts."""
+    seen = drawn(np.random.default_rng(4))
+    seen = replace(seen, peak_c=np.maximum(seen.peak_c, 50.0))
+    parameters = np.zeros((1, PARAMETERS))
+    parameters[0, Worth._fields.index("minute")] = -40.0
+    expected = scores(batched(seen), parameters)
+    parameters[0, Worth._fields.index("margin")] = 0.4
+    np.testing.assert_allclose(scores(batched(replace(seen, peak_c=seen.peak_c + 4.0)), parameters), expected)
+    assert (scores(batched(seen), parameters) != expected).any()
+
+
 def test_a_folder_of_parameters_is_a_central_policy(tmp_path) -> None:
     parameters = trained(np.random.default_rng(4))
     save_pairs(parameters, tmp_path / "pairs", note="x")
