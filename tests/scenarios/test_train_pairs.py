@@ -10,6 +10,7 @@ from agents.learned.evolution import EvolutionConfig
 from agents.learned.ppo import PpoConfig
 from agents.learned.training_log import LOG
 from agents.pair_scores import PARAMETERS, first_parameters
+from agents.pairs import Worth
 from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.leaderboard.suite_scores import difference, row_of
@@ -18,9 +19,9 @@ from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
 from scenarios.run.evaluate import outcomes
 from scenarios.run.suite_batches import ground_of, rewards
-from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs
+from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs, validation
 from scenarios.run.train_policy import TrainingPlan, train_on_split
-from scenarios.suite.splits import Instance
+from scenarios.suite.splits import Instance, instance
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +37,22 @@ def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
     found = rewards(ground, np.zeros((2, PARAMETERS)), [3, 4])
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     assert row_of(ground, "wsept", 3)["reward"] == pytest.approx(expected[0])
-    refuses_all = first_parameters(np.random.default_rng(0))
-    refuses_all[0] = 5.0  # true peaks that deviate by 740 K: each claim is as likely to fault as not
+    refuses_all = first_parameters()
+    refuses_all[Worth._fields.index("spread")] = (
+        5.0  # true peaks that deviate by 740 K: each claim is as likely to fault as not
+    )
     assert rewards(ground, refuses_all[None], [3])[0] < expected[0] - 1.0
+
+
+def test_validation_is_the_normalised_score_of_the_shift_of_the_benchmark(ground) -> None:
+    (reward,) = rewards(ground, np.zeros((1, PARAMETERS)), [ground.seed])
+    half = replace(ground, random=reward - 5.0, span=10.0)
+    none = replace(ground, random=reward, span=20.0)
+    assert validation([half, none], np.zeros(PARAMETERS)) == pytest.approx(0.25)
+    assert validation([ground], np.zeros(PARAMETERS)) == pytest.approx(reward / ground.value(ground.seed))
+    own = replace(instance("train/0005"), name="x", seed=3)
+    made = ground_of(own, known={("x", 3): (40.0, 60.0), ("x", 4): (0.0, 1.0)})
+    assert (made.random, made.unit) == (40.0, 20.0)
 
 
 def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path, ground) -> None:
@@ -55,7 +69,7 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
     rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
     judged = [row["validation"] for row in rows if "validation" in row]
     assert len(told) == len(judged) == 3
-    assert judged[0] == done.teacher
+    assert rows[0]["teacher"] == done.teacher
     assert done.best == max(judged)
     assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
     assert scope_of(str(out)) == "central"
