@@ -10,7 +10,7 @@ import typer
 from fleet.errors import FleetError
 from scenarios.cli.terminal import out_console, say
 
-PAGES = ("bounds.md", "bus.md", "cli.md", "env.md", "exchange.md", "leaderboard.md", "policies.md")
+PAGES = ("bounds.md", "bus.md", "cli.md", "env.md", "exchange.md", "leaderboard.md", "learning.md", "policies.md")
 """Pages with generated tables."""
 
 
@@ -40,6 +40,7 @@ def documents(out: Path) -> dict[Path, str]:
     from scenarios.leaderboard.board import benchmark_tables
     from scenarios.studies.page_tables.channels import channel_tables
     from scenarios.studies.page_tables.policies import policy_tables
+    from scenarios.studies.page_tables.sample_efficiency import efficiency_tables
 
     results = out.parent / "results"
     more = {
@@ -47,6 +48,7 @@ def documents(out: Path) -> dict[Path, str]:
         **policy_tables(results),
         **channel_tables(results / "channels"),
         **benchmark_tables(results),
+        **efficiency_tables(results),
     }
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}
     for page in (out.parent / name for name in PAGES):
