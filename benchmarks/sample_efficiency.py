@@ -22,7 +22,8 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import cache, partial
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -32,11 +33,12 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import numpy as np
 import torch
 
-from fleet.env.vector import BatchEnv, Obs, random_legal
+from fleet.engine.reward import RewardWeights
+from fleet.env.vector import BatchEnv, Library, Obs, random_legal
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Rows
 from scenarios.load import load
-from scenarios.prepare.fleet import env_of, prepare
+from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.batch import library_of
 from scenarios.run.provenance import code_hash
 from scenarios.run.train_policy import returns, rule_actions
@@ -44,6 +46,8 @@ from scenarios.studies.page_tables.sample_efficiency import course, trainings
 
 Array = np.ndarray
 Act = Callable[[Obs], Array]
+Training = tuple[list[dict[str, float]], dict[str, Any]]
+"""Its points and its configuration."""
 
 SCENARIO, RULE = "heat_wave", "wsept"
 BUDGET, EVERY = 24_000, 6_000
@@ -59,15 +63,15 @@ PICTURE = Path("docs/pictures/sample_efficiency.png")
 
 
 @cache
-def fleet() -> Any:
-    """The prepared fleet, with its library and reward weights."""
-    made = prepare(load(SCENARIO), difficulty="oracle")
-    return made, library_of(made), weights_of(made.scenario)
+def cell() -> tuple[Fleet, Library, RewardWeights]:
+    """What all methods train on."""
+    fleet = prepare(load(SCENARIO), difficulty="oracle")
+    return fleet, library_of(fleet), weights_of(fleet.scenario)
 
 
 def batch(count: int) -> BatchEnv:
     """Shifts side by side, from event to event."""
-    _, library, weights = fleet()
+    _, library, weights = cell()
     return BatchEnv(library, count, weights=weights, decisions="events")
 
 
@@ -89,21 +93,21 @@ class Curve:
         self._since_s = process_time()
 
 
-def run_rule(rule: str, seed: int) -> tuple[list[dict[str, float]], dict[str, Any]]:
+def run_rule(rule: str, seed: int) -> Training:
     """A rule without training."""
     curve = Curve()
     curve.add(0, 0.0, rule_actions(rule, curve.env, [1000 * seed + n for n in range(len(SHIFTS))]))
     return curve.points, {"rule": rule}
 
 
-def train_here(algorithm: Any, seed: int, warm_start: str = "") -> tuple[list[dict[str, float]], dict[str, Any]]:
+def train_here(algorithm: Any, seed: int, warm_start: str = "") -> Training:
     """PPO of `agents.learned`; 30 envs and 20 steps instead of 32 and 16, so that `EVERY` is a whole number of
     iterations."""
     from agents.learned.ppo import PpoConfig
     from scenarios.run.train_policy import DEMONSTRATIONS, STEPS, TEACHERS, imitate_rule, trainer_of
 
     config = PpoConfig(algorithm=algorithm, envs=30, steps=20, warm_start=warm_start, seed=seed)
-    cells, curve, hours = [fleet()[1:]], Curve(), 0.0
+    cells, curve, hours = [cell()[1:]], Curve(), 0.0
     trainer = trainer_of(cells, config)
     if warm_start:
         imitate_rule(trainer, cells)
@@ -143,7 +147,7 @@ def standardise(vectors: Array) -> Array:
     return np.clip((vectors - mean) / spread, -LARGEST, LARGEST).astype(np.float32)
 
 
-def train_benchmarl(algorithm: str, seed: int) -> tuple[list[dict[str, float]], dict[str, Any]]:
+def train_benchmarl(algorithm: str, seed: int) -> Training:
     """BenchMARL's PPO with its default MLP and hyperparameters."""
     import benchmarl.algorithms
     from benchmarl.experiment import Callback, Experiment, ExperimentConfig
@@ -197,7 +201,7 @@ def train_benchmarl(algorithm: str, seed: int) -> tuple[list[dict[str, float]], 
             return dict, ()
 
     with tempfile.TemporaryDirectory() as config.save_folder:
-        task = Standardised(SCENARIO, lambda: env_of(fleet()[0], decisions="events"), max_steps=10_000)
+        task = Standardised(SCENARIO, lambda: env_of(cell()[0], decisions="events"), max_steps=10_000)
         experiment = Experiment(task, *parts, seed=seed, config=config, callbacks=[Evaluation()])
         with torch.random.fork_rng():
             curve.add(0, 0.0, act)
@@ -207,7 +211,7 @@ def train_benchmarl(algorithm: str, seed: int) -> tuple[list[dict[str, float]], 
     return curve.points, chosen | {key: str(value) for part in parts for key, value in vars(part).items()}
 
 
-METHODS: dict[str, Callable[[int], tuple[list[dict[str, float]], dict[str, Any]]]] = {
+METHODS: dict[str, Callable[[int], Training]] = {
     "random": partial(run_rule, "random"),
     "rule": partial(run_rule, RULE),
     "mappo": partial(train_here, "mappo"),
@@ -232,12 +236,8 @@ def train(methods: list[str], seeds: int, out: Path) -> None:
 
 def made_with() -> dict[str, Any]:
     """Scenario, evaluation, versions and code of a row."""
-    versions = dict[str, str]()
-    for package in ("torch", "torchrl", "tensordict", "benchmarl", "numpy"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
+    packages = ("torch", "torchrl", "tensordict", "benchmarl", "numpy")
+    versions = {package: version(package) for package in packages if find_spec(package)}
     shifts = {"first_seed": SHIFTS[0], "count": len(SHIFTS)}
     return {"scenario": SCENARIO, "difficulty": "oracle", "shifts": shifts, "versions": versions, "code": code_hash()}
 

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from scenarios.doc_tables import table
 from scenarios.json_rows import Row, Rows
@@ -20,6 +21,8 @@ LABELS = {
 """Methods in the order of the table; the values in braces are those of the configuration."""
 SHARES = (0.25, 0.5, 1.0)
 """Parts of the budget in the table."""
+COSTS = {"hours": "simulated hours", "cpu_s": "CPU s"}
+"""What a training used from its first to its last evaluation, and the heading."""
 
 
 def efficiency_tables(results: Path) -> dict[str, Callable[[], str]]:
@@ -61,13 +64,6 @@ def efficiency_table(found: dict[str, list[Row]]) -> str:
         if list(rewards) == [0]:
             rows.append((label, *(rewards[0].text(1) for _ in at), "", ""))
             continue
-        ends = [row["points"][-1] for row in own]
-        cost = [f"{_mean(end[name] for end in ends):,.0f}" for name in ("hours", "cpu_s")]
+        cost = [f"{np.mean([row['points'][-1][k] - row['points'][0][k] for row in own]):,.0f}" for k in COSTS]
         rows.append((label, *(rewards[steps].text(1) for steps in at), *cost))
-    heads = (*(f"{steps:,} env steps" for steps in at), "simulated hours", "CPU s")
-    return table(("", *heads), rows)
-
-
-def _mean(values: Iterable[Any]) -> float:
-    numbers = list(values)
-    return sum(numbers) / len(numbers)
+    return table(("", *(f"{steps:,} env steps" for steps in at), *COSTS.values()), rows)
