@@ -13,11 +13,15 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
+.PHONY: demo leaderboard test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
 	fuzz docs pictures clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
+
+# How well policies do on the test split of the suite, from the stored results.
+leaderboard: $(STAMP)
+	@$(BIN)/thermofleet leaderboard
 
 test: $(STAMP)
 	@$(BIN)/python -m pytest -n 2 --dist loadfile

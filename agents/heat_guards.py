@@ -14,11 +14,9 @@ import numpy as np
 
 from agents.policy import WAIT, ArmPolicy, Policy, per_option, plans_of
 from fleet.observation import Observation
-from fleet.robot import RATING, ThermalLimits
+from fleet.robot import RATING
 
 Array = np.ndarray
-
-ERROR_ABOVE_WARNING_K = ThermalLimits.error_c - ThermalLimits.warning_c
 
 
 class Guard(Protocol):
@@ -46,9 +44,10 @@ class TorqueLimiter:
     arm_kg: ClassVar = 2.65
     """Payload whose torque at joint 2 of the stretched Gen3 equals that of the arm itself: 23.5 N·m of 8.85 N·m/kg."""
 
-    def limit(self, headroom_k: float) -> float:
-        """Torque limit as a share of the rated torque, for a headroom to the warning limit in K."""
-        return float(np.clip((headroom_k + ERROR_ABOVE_WARNING_K) / (self.full_k + ERROR_ABOVE_WARNING_K), 0.0, 1.0))
+    def limit(self, seen: Observation) -> float:
+        """Torque limit as a share of the rated torque."""
+        error_k, apart_k = float(seen.error_headroom_k), float(seen.error_headroom_k - seen.headroom_k)
+        return float(np.clip(error_k / (self.full_k + apart_k), 0.0, 1.0))
 
     def torque(self, payload_kg: Array | float) -> Array:
         """Torque with a payload, as a share of the rated torque."""
@@ -57,11 +56,11 @@ class TorqueLimiter:
 
     def claims(self, seen: Observation) -> Array:
         """Claims of jobs whose torque is below the limit, bool [option]."""
-        return per_option(seen, self.torque(seen.payload_kg)) <= self.limit(float(seen.headroom_k))
+        return per_option(seen, self.torque(seen.payload_kg)) <= self.limit(seen)
 
     def gives_back(self, seen: Observation, payload_kg: float) -> bool:
         """Whether the torque of the job is above the limit."""
-        return bool(self.torque(payload_kg) > self.limit(float(seen.headroom_k)))
+        return bool(self.torque(payload_kg) > self.limit(seen))
 
 
 class FuzzySpeed:

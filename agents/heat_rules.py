@@ -1,7 +1,6 @@
 """Central rules that consider heat and value: one by measured temperatures, one by predicted peak temperatures.
 
-Both match arms and jobs by value per time. The warning limit follows from the observed headroom. The error limit is
-assumed to be as far above it as in the default `fleet.robot.ThermalLimits`.
+Both match arms and jobs by value per time. Warning and error limit follow from the observed headrooms.
 """
 
 from collections.abc import Sequence
@@ -12,11 +11,8 @@ import numpy as np
 from agents.assignment import Ahead, Matching
 from agents.policy import per_option
 from fleet.observation import Observation
-from fleet.robot import ThermalLimits
 
 Array = np.ndarray
-
-ERROR_ABOVE_WARNING_K = ThermalLimits.error_c - ThermalLimits.warning_c
 
 
 class Thermometer(Matching):
@@ -70,7 +66,8 @@ class Wsept(Thermometer):
     def _rate(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
         value, hottest_c = per_option(seen, seen.value), float(seen.temp_c.max())
-        worth = self.worth_of(value, seen.duration_s, self.predicted_peak_c(seen), hottest_c, warning_of(seen))
+        peak_c, limits_c = self.predicted_peak_c(seen), (warning_of(seen), error_of(seen))
+        worth = self.worth_of(value, seen.duration_s, peak_c, hottest_c, *limits_c)
         return _per_second(seen, worth, worth > 0)
 
     def predicted_peak_c(self, seen: Observation) -> Array:
@@ -82,18 +79,18 @@ class Wsept(Thermometer):
         return np.where(seen.peak_c > 0, seen.peak_c, warning_of(seen) + margin_k)
 
     def worth_of(
-        self, value: Array, duration_s: Array, peak_c: Array, hottest_c: Array | float, warning_c: float
+        self, value: Array, duration_s: Array, peak_c: Array, hottest_c: Array | float, warning_c: float, error_c: float
     ) -> Array:
         """Expected value of jobs less the expected cost of heat, [n].
 
         Args:
             value, duration_s, peak_c: Of each job, [n], with the predicted peak.
             hottest_c: Hottest motor at the beginning, [n] or one for all.
-            warning_c: The warning limit.
+            warning_c, error_c: The limits.
         """
         from scipy.special import ndtr  # slow import that few processes need
 
-        p_fault = ndtr((peak_c - warning_c - ERROR_ABOVE_WARNING_K) / self.peak_sd_k)
+        p_fault = ndtr((peak_c - error_c) / self.peak_sd_k)
         # Approximation: the temperature rises linearly to its peak.
         above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
         heat = p_fault * self.fault_price + self.minute_price * above_share * duration_s / 60.0
@@ -115,6 +112,11 @@ LEAST_P = 1e-3
 def warning_of(seen: Observation) -> float:
     """The warning limit, °C."""
     return float(seen.headroom_k) + float(seen.temp_c.max())
+
+
+def error_of(seen: Observation) -> float:
+    """The error limit, °C."""
+    return float(seen.error_headroom_k) + float(seen.temp_c.max())
 
 
 def _per_second(seen: Observation, worth: Array, allowed: Array) -> Array:

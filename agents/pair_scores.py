@@ -6,7 +6,6 @@ vector; zeros of the prices and of the last layers give `wsept` exactly.
 """
 
 import json
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -37,8 +36,6 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 _ENDS = np.cumsum([int(np.prod(shape)) for shape in _SHAPES.values()])
 PARAMETERS = int(_ENDS[-1])
 """Length of the vector of parameters."""
-USUAL_S = 7200.0
-"""Length of a shift until two observations have shown it; before that, its end is far in any case."""
 
 
 def first_parameters(rng: np.random.Generator) -> Array:
@@ -49,12 +46,11 @@ def first_parameters(rng: np.random.Generator) -> Array:
     return parameters
 
 
-def scores(seen: Observation, left_s: Array, parameters: Array) -> Array:
+def scores(seen: Observation, parameters: Array) -> Array:
     """Scores of all options, [env, arm, option]; −inf where a claim is not legal or not wanted.
 
     Args:
         seen: Observations [env, arm].
-        left_s: Time until the end of the shift, [env].
         parameters: [env, PARAMETERS].
     """
     parts = np.split(parameters, _ENDS[:-1], axis=-1)
@@ -62,7 +58,7 @@ def scores(seen: Observation, left_s: Array, parameters: Array) -> Array:
         part.reshape(-1, *shape) for part, shape in zip(parts, _SHAPES.values(), strict=True)
     )
     every = seen.duration_s.shape[-1]
-    pairs = pairs_of(_without_empty(seen), left_s, Worth(*worth.T))
+    pairs = pairs_of(_without_empty(seen), Worth(*worth.T))
     envs, arms, options = pairs.legal.shape
     inputs = pairs.features.reshape(envs, arms * options, PAIR_FEATURES)
     found = inputs @ direct + np.tanh(inputs @ hidden + bias[:, None]) @ output
@@ -83,37 +79,6 @@ def claims(score: Array, plans: int) -> Array:
     return actions
 
 
-class ShiftLength:
-    """Length of a shift, from how the clock moves between two observations while jobs age.
-
-    The clock is a share of the shift and the age of a job is a time, so each job that still waits gives a quotient.
-    Jobs that moved to another slot give wrong ones, which scatter: the most frequent quotient counts.
-    """
-
-    def __init__(self) -> None:
-        self._before: tuple[float, Array, Array] | None = None
-        self._counts: dict[int, int] = defaultdict(int)
-        self._sums: dict[int, float] = defaultdict(float)
-
-    def seen(self, seen: Observation) -> float:
-        """The length, s, after one more observation of any arm."""
-        clock, ages, kinds = float(seen.clock), np.array(seen.age_s), np.stack([seen.value, seen.payload_kg])
-        if self._before is not None and clock > self._before[0]:
-            then, ages_then, kinds_then = self._before
-            n = min(len(ages), len(ages_then))  # a live queue has as many slots as jobs
-            same = (kinds[:, :n] == kinds_then[:, :n]).all(axis=0) & (ages_then[:n] > 0) & (seen.offered[:n] > 0)
-            aged_s = (ages[:n] - ages_then[:n])[same]
-            for length in (aged_s[aged_s > 0] / (clock - then)).tolist():
-                place = round(50.0 * np.log(length))
-                self._counts[place] += 1
-                self._sums[place] += length
-        self._before = clock, ages, kinds
-        if not self._counts:
-            return USUAL_S
-        place = max(self._counts, key=self._counts.__getitem__)
-        return self._sums[place] / self._counts[place]
-
-
 class PairPolicy:
     """Matching by learned scores of arms and jobs. Scope central: it compares all pairs.
 
@@ -126,24 +91,20 @@ class PairPolicy:
 
     def __init__(self, parameters: Array) -> None:
         self._parameters = np.asarray(parameters, dtype=float)[None]
-        self._length = ShiftLength()
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Begin a shift."""
-        self._length = ShiftLength()
+        """Begin a shift: nothing to do."""
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The claims of the matched pairs."""
         seen = list(observations.values())
         if not any(each.action_mask[1:-1].any() for each in seen):
             return dict.fromkeys(observations, WAIT)
-        length_s = self._length.seen(seen[0])
-        left_s = np.array([(1.0 - float(seen[0].clock)) * length_s])
-        score = scores(_stacked(seen), left_s, self._parameters)[0]
+        score = scores(_stacked(seen), self._parameters)[0]
         return dict(zip(observations, claims(score, plans_of(seen[0])).tolist(), strict=True))
 
 
-PAIRS_FORMAT = 1
+PAIRS_FORMAT = 2
 """Increase it when the numbers of a pair or the network change."""
 
 

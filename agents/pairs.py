@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.heat_rules import ERROR_ABOVE_WARNING_K, LEAST_P, Wsept
+from agents.heat_rules import LEAST_P, Wsept
 from agents.policy import per_option, plans_of
 from fleet.observation import Observation
 
@@ -26,8 +26,6 @@ MOST = 4.0
 class Worth(NamedTuple):
     """What a learned worth per time has beyond `wsept`, [env] each; zeros give `wsept`."""
 
-    error_limit: Array
-    """The error limit is this much lower, in units of 20 K."""
     spread: Array
     """Logarithm of the factor on the deviation of true peaks."""
     fault: Array
@@ -59,13 +57,8 @@ TARDINESS_PRICE = 0.01
 """Per unit of value and minute, as in the default reward."""
 
 
-def worth_per_second(seen: Observation, left_s: Array, learned: Worth) -> Array:
-    """Expected worth per second of all options, [env, arm, option].
-
-    Args:
-        seen: Observations [env, arm].
-        left_s: Time until the end of the shift, [env].
-    """
+def worth_per_second(seen: Observation, learned: Worth) -> Array:
+    """Expected worth per second of all options, [env, arm, option], of observations [env, arm]."""
     from scipy.special import logit, ndtr  # slow import that few processes need
 
     def each(values: Array) -> Array:
@@ -79,31 +72,31 @@ def worth_per_second(seen: Observation, left_s: Array, learned: Worth) -> Array:
         # As `Wsept.predicted_peak_c` of one arm.
         margin_k = Wsept.peak_sd_k * logit(np.clip(seen.p_saturation, LEAST_P, 1.0 - LEAST_P))
         peak_c = np.where(peak_c > 0, peak_c, warning_c + margin_k)
-    limit_c = warning_c + ERROR_ABOVE_WARNING_K - 20.0 * each(learned.error_limit)
-    p_fault = ndtr((peak_c - limit_c) / (Wsept.peak_sd_k * np.exp(each(learned.spread))))
+    error_c = seen.error_headroom_k[..., None] + hottest_c
+    p_fault = ndtr((peak_c - error_c) / (Wsept.peak_sd_k * np.exp(each(learned.spread))))
     above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
     minute_price = Wsept.minute_price * np.exp(each(learned.minute))
     heat = p_fault * Wsept.fault_price * np.exp(each(learned.fault)) + minute_price * above_share * duration_s / 60.0
-    ends = 1.0 / (1.0 + np.exp(np.clip((duration_s - each(left_s)) / 20.0, -30.0, 30.0)))
+    ends = 1.0 / (1.0 + np.exp(np.clip((duration_s - seen.left_s[..., None]) / 20.0, -30.0, 30.0)))
     value_left = value * (1.0 - np.clip(each(learned.end), 0.0, 1.0) * (1.0 - ends))
     late = TARDINESS_PRICE * value * np.maximum(-seen.slack_s, 0.0) / 60.0
     worth = (1.0 - p_fault) * value_left - heat - each(learned.tardiness) * late
     return worth / np.maximum(duration_s + 120.0 * np.maximum(each(learned.overhead), -0.2), 1.0)
 
 
-def pairs_of(seen: Observation, left_s: Array, learned: Worth) -> Pairs:
+def pairs_of(seen: Observation, learned: Worth) -> Pairs:
     """All pairs of arms and options; arguments as of `worth_per_second`."""
     legal = seen.action_mask[..., 1:-1] > 0
-    rate = worth_per_second(seen, left_s, learned)
+    rate = worth_per_second(seen, learned)
     count = np.maximum(legal.sum(axis=(1, 2), keepdims=True), 1)
     scale = np.maximum(np.abs(np.where(legal, rate, 0.0)).sum(axis=(1, 2), keepdims=True) / count, 1e-6)
-    return Pairs(legal, rate, scale, _features(seen, left_s, legal, rate, scale))
+    return Pairs(legal, rate, scale, _features(seen, legal, rate, scale))
 
 
-def _features(seen: Observation, left_s: Array, legal: Array, rate: Array, scale: Array) -> Array:
+def _features(seen: Observation, legal: Array, rate: Array, scale: Array) -> Array:
     plans = plans_of(seen)
     envs, arms, options = legal.shape
-    duration_s, left = np.maximum(seen.duration_s, 1.0), left_s[:, None, None]
+    duration_s, left = np.maximum(seen.duration_s, 1.0), seen.left_s[..., None]
     value = per_option(seen, seen.value)
     hottest_c = seen.temp_c.max(axis=-1)[..., None]
     warning_c = seen.headroom_k[..., None] + hottest_c

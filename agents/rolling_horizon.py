@@ -27,7 +27,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from agents.heat_rules import Wsept, warning_of
+from agents.heat_rules import Wsept, error_of, warning_of
 from agents.policy import WAIT, per_option, plans_of
 from agents.rules import claims_of
 from fleet.observation import Observation
@@ -164,7 +164,7 @@ class RollingHorizon(Wsept):
         due_s = seen.slack_s.astype(float)[options] + d
         warmer_k = np.maximum(start_c - hottest_c, 0.0)
         later_c = np.maximum(peak_c[options] + warmer_k * np.exp(-d / self.tau_s), start_c)
-        worth = self.worth_of(value, d, later_c, start_c, warning_of(seen))
+        worth = self.worth_of(value, d, later_c, start_c, warning_of(seen), error_of(seen))
         late_s = np.maximum(self.horizon_s + d - due_s, 0.0) - np.maximum(begin_s + d - due_s, 0.0)
         late = self.tardiness_share * self.tardiness_price * value * late_s / 60.0
         earned = worth * np.exp(-(begin_s + d) / self.discount_s) + late

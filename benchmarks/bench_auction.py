@@ -155,7 +155,7 @@ def ours(endpoint: str, folder: Path, options: argparse.Namespace) -> tuple[list
     timing = Timing(lease_s=120.0, max_jobs=options.jobs)
     # Enough jobs to keep the number of offers constant until the last batch.
     work = words(options.arms * options.batches + options.jobs)
-    allocate = CentralAllocation(policy_at(options.policy, 0), LiveFleet(arms=(), warning_c=60.0))
+    allocate = CentralAllocation(policy_at(options.policy, 0), LiveFleet(arms=()))
     with BusClient(endpoint, FLEET) as link, Journal[AuctionRecord](folder / "bench.journal", AuctionRecord) as book:
         node = AuctionNode(link, "auctioneer", book, allocate=allocate, speed=1.0, timing=timing)
         deadline_s = time.monotonic() + PATIENCE_S

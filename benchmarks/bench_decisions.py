@@ -58,7 +58,8 @@ def draw(rng: np.random.Generator, arms: int, jobs: int) -> dict[str, Observatio
         temp_c = WARNING_C - headroom_k[arm] - np.append(0.0, rng.uniform(0, 10, 6))
         known = {
             "idle": float(free[arm]), "working": float(not free[arm]), "busy_s": busy_s[arm], "temp_c": temp_c,
-            "housing_c": temp_c - 3.0, "ambient_c": 25.0, "headroom_k": headroom_k[arm], "offered": np.ones(jobs),
+            "housing_c": temp_c - 3.0, "ambient_c": 25.0, "headroom_k": headroom_k[arm],
+            "error_headroom_k": headroom_k[arm] + 15.0, "left_s": 3600.0, "offered": np.ones(jobs),
             "station_free": station, "feasible": feasible, "space_free": space, "known": feasible,
             "difficulty": difficulty[arm], "peak_c": rng.uniform(35, 75, options),
             "p_saturation": rng.uniform(0, 0.8, options), "duration_s": duration_s,

@@ -51,6 +51,7 @@ class Observation:
     """
 
     clock: Annotated[Array, Field((), "1", 0, 1, "share of the episode that has passed")]
+    left_s: Annotated[Array, Field((), "s", 0, LONG_S, "time until the end of the episode; 100000 live without end")]
     idle: Annotated[Array, Field((), "1", 0, 1, "1 when this arm is free")]
     working: Annotated[Array, Field((), "1", 0, 1, "1 when it works or goes home")]
     faulted: Annotated[Array, Field((), "1", 0, 1, "1 from a fault until it recovers")]
@@ -60,6 +61,7 @@ class Observation:
     housing_c: Annotated[Array, Field(_JOINT, "°C", -60, 200, "own estimate of the housing temperatures")]
     ambient_c: Annotated[Array, Field((), "°C", -60, 200, "ambient temperature at this arm")]
     headroom_k: Annotated[Array, Field((), "K", -150, 150, "warning limit minus hottest motor")]
+    error_headroom_k: Annotated[Array, Field((), "K", -150, 150, "error limit minus hottest motor")]
     job_value: Annotated[Array, Field((), "1", 0, 1e6, "value of the current job, 0 without one")]
     job_cycles: Annotated[Array, Field((), "1", 0, 1e5, "unfinished cycles of the current job")]
     job_peak_c: Annotated[Array, Field((), "°C", -60, 300, "predicted peak in the rest of that job, 0 if unknown")]

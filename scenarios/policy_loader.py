@@ -61,6 +61,8 @@ def scope_of(name: str) -> str:
     """
     if wrapped := _wrapped(name):
         return scope_of(wrapped[1])
+    if has_trainings(name):
+        return scope_of(trainings_of(name)[0])
     if _is_folder(name):
         return "central" if _has_pairs(name) else "arm"
     return _made_by(name)[1]
@@ -94,11 +96,33 @@ def source_of(name: str) -> Path | None:
     return Path(file) if file else None
 
 
+def trainings_of(name: str) -> tuple[str, ...]:
+    """The policies that a name with * stands for: trainings of one recipe, in folders; of another name itself.
+
+    Raises:
+        FleetError: no folder has such a name.
+    """
+    if wrapped := _wrapped(name):
+        return tuple(f"{name.partition(':')[0]}:{each}" for each in trainings_of(wrapped[1]))
+    if not has_trainings(name):
+        return (name,)
+    path = Path(name)
+    found = [str(each) for each in path.parent.glob(path.name) if each.is_dir()]
+    if not found:
+        raise FleetError(f"There is no folder '{name}': it must match the folders of `thermofleet train --seeds K`.")
+    return tuple(sorted(found, key=lambda each: (len(each), each)))  # 2 before 10
+
+
+def has_trainings(name: str) -> bool:
+    """Whether a name stands for several trainings."""
+    return "*" in name
+
+
 def label(name: str) -> str:
     """What a table calls a policy: the rule, the class, or the last folder, after its wrapper."""
     if wrapped := _wrapped(name):
         return f"{name.partition(':')[0]}:{label(wrapped[1])}"
-    if _is_folder(name):
+    if _is_folder(name) or has_trainings(name):
         return Path(os.path.abspath(name)).name
     return name.rpartition(":")[2]
 

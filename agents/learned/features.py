@@ -7,7 +7,7 @@ from torch import Tensor
 
 from fleet.observation import Layout
 
-OWN, OPTION, PEER, PAIR = 26, 15, 6, 4
+OWN, OPTION, PEER, PAIR = 28, 15, 6, 4
 """Number of features of the arm itself, of an option, of a peer, and of a peer's score of an option."""
 
 
@@ -30,12 +30,14 @@ def sets_of(layout: Layout, vectors: Tensor) -> Sets:
     o: Any = layout.read(as_array, as_array[..., :0])  # an Observation of tensors
     own = [
         o.clock,
+        _minutes(o.left_s),
         o.idle,
         o.working,
         o.faulted,
         _minutes(o.busy_s),
         o.last_award,
         o.headroom_k / 20.0,
+        o.error_headroom_k / 20.0,
         o.job_value / 4.0,
         torch.log1p(o.job_cycles),
         _degrees(o.job_peak_c),

@@ -18,7 +18,7 @@ from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Layout, Observation
 
-FORMAT = 4
+FORMAT = 5
 """Increase it when the network or its inputs change."""
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
@@ -92,7 +92,7 @@ def load_policy(folder: Path) -> LearnedPolicy:
         card = json.loads((folder / CARD).read_text(encoding="utf-8"))
         if card["format"] != FORMAT:
             raise CheckpointError(
-                f"{folder / CARD}: format {card['format']} is not {FORMAT}, and those below 4 are of allocation_v0. "
+                f"{folder / CARD}: format {card['format']} is not {FORMAT}: its network takes other observations. "
                 "Train the policy again."
             )
         size = NetworkSize(**card["size"])

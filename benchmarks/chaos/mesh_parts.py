@@ -59,7 +59,7 @@ def auction(endpoint: str, journals: Path, arms: int, speed: float, stop: Stop) 
         BusClient(endpoint, FLEET, stopped=stop.is_set) as link,
         Journal[AuctionRecord](journals / "auctioneer.journal", AuctionRecord) as book,
     ):
-        known = LiveFleet(arms=names_of(arms), warning_c=load(SCENARIO).limits.warning_c)
+        known = LiveFleet(arms=names_of(arms), limits=load(SCENARIO).limits)
         allocate = CentralAllocation(policy_at("quickest_matching", 0), known)
         timing = Timing(max_jobs=16, window_s=2.0, ack_s=2.0)
         node = AuctionNode(link, "auctioneer", book, allocate=allocate, speed=speed, timing=timing)

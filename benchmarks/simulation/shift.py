@@ -24,6 +24,7 @@ from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.round import Assignment, Timing
 from fleet.live.consensus.participant import Membership
 from fleet.live.space import ANYWHERE, Excludes
+from fleet.robot import ThermalLimits
 
 SPEEDS = (1.0, 10.0, 60.0, 120.0, 120.0, 240.0)
 """Fleet seconds per real second."""
@@ -111,7 +112,7 @@ class Shift:
         timing = Timing(lease_s=rng.choice([3.0, 6.0]), max_jobs=8)
         membership: Membership | None = None
         if self.alone:
-            live = LiveFleet(arms=self.arms, warning_c=80.0)
+            live = LiveFleet(arms=self.arms, limits=ThermalLimits(warning_c=80.0, error_c=95.0))
             membership = Membership(fleet=live, choose=first_legal, slots=4, excludes=self.excludes, timing=timing)
         world.bus = Bus(world)
         rate_hz, capacity = rng.choice([0.5, 1.0]), rng.choice([1, 1, 2])

@@ -46,12 +46,13 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     peers = nonnegative((size - at.peer_heard) // (6 + 3 * slots))
     low_c, high_c, low_k, high_k = low[at.temp_c], high[at.temp_c], low[at.headroom_k], high[at.headroom_k]
     most_kg, most_value, most_returns = high[at.payload_kg], high[at.value], high[at.returns]
-    true_c, measured_c, headroom_k = np.empty(LANES), np.empty((arms, LANES)), np.empty(arms, np.float32)
+    true_c, measured_c, hottest_c = np.empty(LANES), np.empty((arms, LANES)), np.empty(arms)
+    headroom_k = np.empty(arms, np.float32)
     left, slack_s, slot_kind = np.empty(slots), np.empty(slots), np.empty(slots, np.int64)
     fast_volume, fast_can = np.empty(slots, np.int64), np.empty(slots, np.bool_)
     known, shared = np.zeros((arms, slots), np.float32), np.zeros((arms, slots), np.float32)
     first_block, block, curve = t.forecast_first, t.forecast_block, t.forecast_curve
-    warning_c, forecasts = t.warning_c, len(curve) > 0
+    warning_c, error_c, forecasts = t.warning_c, t.error_c, len(curve) > 0
     known_c, values_c, left_s = np.zeros(KNOWN), np.empty(LANES), np.zeros(arms)
     housing_c, ambient, offsets_k = s.housing_c, t.ambient_c, d.ambient_offset_k
     too_heavy, expires = t.too_heavy, d.expires
@@ -67,6 +68,7 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
         fleet, now_s, key = nonnegative(fleets[e]), ticks[e] * t.dt_s, keys[e]
         count = np.uint64(nonnegative(ticks[e]) * arms * JOINTS)
         frame[at.clock] = now_s / (t.ticks * t.dt_s)
+        frame[at.left_s] = min((t.ticks - ticks[e]) * t.dt_s, LONG_S)
         filled = 0
         while filled < slots and slot_job[e, filled] >= 0:
             j = nonnegative(slot_job[e, filled])
@@ -91,7 +93,8 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                 true_c[k] = temp_c[e, a, k] + noise_k[fleet, a, k] * random_normal(key, count + np.uint64(k + 1))
                 measured_c[a, k] = true_c[k]
             count += np.uint64(JOINTS)
-            headroom_k[a] = min(max(t.warning_c - hottest(true_c), low_k), high_k)
+            hottest_c[a] = hottest(true_c)
+            headroom_k[a] = min(max(warning_c - hottest_c[a], low_k), high_k)
             left_s[a] = 0.0
             if modes[e, a] == WORKING:
                 plan = nonnegative(plans[e, a])
@@ -124,6 +127,7 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                 known_c[k], known_c[JOINTS + k] = measured_c[a, k], housing_c[e, a, k]
             known_c[2 * JOINTS] = air_c
             out[e, a, at.headroom_k], out[e, a, at.ambient_c] = headroom_k[a], min(max(air_c, low_c), high_c)
+            out[e, a, at.error_headroom_k] = min(max(error_c - hottest_c[a], low_k), high_k)
             if mode == WORKING and pending[e, a]:
                 j = nonnegative(jobs[e, a])
                 kind, plan = nonnegative(kinds[e, j]), nonnegative(plans[e, a])

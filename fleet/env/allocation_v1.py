@@ -24,7 +24,7 @@ from fleet.engine.shift import ShiftRunner, Watch
 from fleet.engine.state import State, World
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import Cell
-from fleet.env.spaces import arm_spaces
+from fleet.env.spaces import arm_spaces, spaces_like
 from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, decisions_of, seed_of
 from fleet.events import Event
 from fleet.observation import Layout, Observation
@@ -104,7 +104,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.agents: list[str] = []
         self._exchange = exchange or MemoryExchange(world.arms)
         self.layout = Layout(len(world.arms), world.slots, near, world.plans_per_job)
-        per_arm = [arm_spaces(self.layout) for _ in world.arms]
+        first = arm_spaces(self.layout)
+        per_arm = [spaces_like(first) for _ in world.arms]
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
             arm: own["observation"] if mask_in == "info" else own
             for arm, (own, _) in zip(world.arms, per_arm, strict=True)

@@ -1,5 +1,7 @@
 """Spaces of one arm, for the single environment and the batch."""
 
+from copy import copy
+
 import numpy as np
 from gymnasium import spaces
 
@@ -16,3 +18,9 @@ def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:
         }
     )
     return observation, spaces.Discrete(layout.actions)
+
+
+def spaces_like(first: tuple[spaces.Dict, spaces.Discrete]) -> tuple[spaces.Dict, spaces.Discrete]:
+    """Spaces with a random generator of their own that share the bounds of others, which are large with many arms."""
+    observation, action = first
+    return spaces.Dict({name: copy(space) for name, space in observation.items()}), copy(action)

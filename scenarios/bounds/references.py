@@ -25,8 +25,8 @@ from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
+from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
-from scenarios.suite.splits import content_hash
 from scenarios.trials.fleets import Fleets, plan_content
 from scenarios.trials.plan import Case, Unit
 
@@ -43,7 +43,7 @@ class Reference:
     instance: str
     """As `heat_wave/100`, or the name of an instance of a split."""
     scenario_hash: str
-    """Of what is no default in the scenario: `scenarios.suite.splits.content_hash`."""
+    """Of what is no default in the scenario: `scenarios.scenario_hash`."""
     seed: int
     difficulty: str
     """Source of the scores of the policies that the search starts from."""
@@ -133,7 +133,7 @@ def reference(
     ended_s, timed = time.process_time(), isfinite(budget.seconds)
     return Reference(
         instance=task.instance,
-        scenario_hash=content_hash(task.scenario),
+        scenario_hash=scenario_hash(task.scenario),
         seed=task.seed,
         difficulty=difficulty,
         random=float(random.mean()),
@@ -234,7 +234,7 @@ def _place(row: Row) -> list[object]:
 
 def key_of(task: Task, difficulty: str) -> str:
     """What a row of a file of references is found by."""
-    return _key(task.instance, content_hash(task.scenario), task.seed, difficulty)
+    return _key(task.instance, scenario_hash(task.scenario), task.seed, difficulty)
 
 
 def _key(instance: str, scenario: str, seed: int, difficulty: str) -> str:

@@ -28,7 +28,8 @@ def compare_command(
     policies: Annotated[
         str,
         typer.Option(
-            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train`; "
+            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train` "
+            "('FOLDER-*': one policy with several trainings); "
             f"{WRAPPERS_HELP}. Default: {', '.join(RULES)}.",
             show_default=False,
         ),
@@ -151,7 +152,7 @@ def compare_command(
     base = baseline or next((name for name in names if name.partition("@")[0] == "round_robin"), names[0])
     check_baseline(study, base)
     known = references_of(cases, references)
-    with progress_bar(kept="Finished shifts, plans and twins are" if out else KEPT) as progress:
+    with progress_bar(kept="Finished shifts are" if out else KEPT, file=out) as progress:
         rows = run_study(study, out=out, workers=jobs or -1, ray=ray, progress=progress, tell=say)
     results = comparisons(study, rows, base, suite, known)
     if out:
@@ -219,7 +220,7 @@ def ablate_command(
     given = {} if scores is None else {"scores": tuple(name.strip() for name in scores.split(","))}
     plan = AblationPlan(policy=policy, fleets=fleets, trainings=trainings, seeds=seeds, first_seed=first_seed, **given)
     folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy).replace(':', '-')}")
-    with progress_bar(kept="Finished shifts, plans and twins are") as progress:
+    with progress_bar(kept="Finished shifts are", file=folder) as progress:
         result = ablate(chosen, plan, folder, progress=progress)
     if as_json:
         print_json(result)

@@ -39,6 +39,7 @@ def documents(out: Path) -> dict[Path, str]:
     from scenarios.doc_tables import fill_tables
     from scenarios.leaderboard.board import benchmark_tables
     from scenarios.studies.page_tables.channels import channel_tables
+    from scenarios.studies.page_tables.learned import learned_tables
     from scenarios.studies.page_tables.policies import policy_tables
     from scenarios.studies.page_tables.sample_efficiency import efficiency_tables
 
@@ -49,6 +50,7 @@ def documents(out: Path) -> dict[Path, str]:
         **channel_tables(results / "channels"),
         **benchmark_tables(results),
         **efficiency_tables(results),
+        **learned_tables(results),
     }
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}
     for page in (out.parent / name for name in PAGES):

@@ -67,7 +67,7 @@ def progress_bar(
 
     Args:
         kept: What an interruption leaves in the cache, as the beginning of a sentence; empty for nothing.
-        file: A file that has it, in place of the cache.
+        file: File or folder that has it, in place of the cache.
 
     Raises:
         Interrupted: Ctrl-C.

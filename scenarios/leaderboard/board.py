@@ -9,7 +9,6 @@ from scenarios.bounds.command import markdown
 from scenarios.bounds.references import Reference, load_references
 from scenarios.doc_tables import table
 from scenarios.leaderboard.submission import Submission, check, read, split_references
-from scenarios.run.evaluate import FIGURES
 from scenarios.statistics.scores import FEWEST, Scores, ranked, score_cells, scores_of
 from scenarios.suite.splits import manifest
 from scenarios.trials.scores import Shift, normalised
@@ -100,11 +99,16 @@ def board_text(board: Board | None, split: str) -> str:
 
 def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
     mean, difference, stars, *rest = score_cells(scores, name)
-    outcomes = [row.figures for row in entry.rows if row.figures is not None]
-    faults = sum(own[FIGURES.index("faults")] for own in outcomes) / max(1, len(outcomes))
     card = entry.card
     own = (f"`{card.policy}`", card.difficulty, card.scope, mean, f"{difference} {stars}".strip().replace("*", "\\*"))
-    return (*own, *rest, f"{faults:.2f}", str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
+    return (
+        *own,
+        *rest,
+        f"{entry.mean('faults'):.2f}",
+        str(entry.failures or ""),
+        card.author,
+        f"`{card.code_hash[:8]}`",
+    )
 
 
 def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:

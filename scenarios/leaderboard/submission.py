@@ -29,7 +29,7 @@ from scenarios.trials.scores import Shift, references_of
 FORMAT = 1
 DIGITS = 10
 """Significant digits of figures in a file."""
-MOST_BYTES = 200_000
+MOST_BYTES = 1_000_000
 MOST_TRAININGS = 20
 SLACK = 1e-6
 """By which a reward may exceed an upper bound, as a share, for rounding."""
@@ -50,7 +50,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     split: SplitName
     scope: Literal["arm", "central"]
     trainings: Annotated[int, msgspec.Meta(ge=1, le=MOST_TRAININGS)]
-    """Trainings of the twins; each has a row for every instance."""
+    """Trainings of the policy, or else of the twins; each has a row for every instance."""
     author: Text
     about: Text
     """What the policy is, and where it can be had."""
@@ -93,6 +93,11 @@ class Submission(msgspec.Struct, frozen=True, kw_only=True):
     def failures(self) -> int:
         """Shifts in which the policy failed."""
         return sum(row.figures is None for row in self.rows)
+
+    def mean(self, figure: str) -> float:
+        """Mean of a figure over the shifts that did not fail."""
+        place = FIGURES.index(figure)
+        return sum(row.figures[place] for row in self.rows if row.figures) / max(1, len(self.rows) - self.failures)
 
     def study_rows(self) -> list[Row]:
         """As a study has them."""

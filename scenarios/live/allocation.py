@@ -28,20 +28,25 @@ class CentralAllocation:
         return awarded
 
 
-def live_fleet(scenario: Scenario) -> LiveFleet:
-    """Parameters of a scenario that live policies see."""
+def live_fleet(scenario: Scenario, *, ends: bool = True) -> LiveFleet:
+    """Parameters of a scenario that live policies see.
+
+    Args:
+        ends: Whether the shift ends at the scenario's horizon; a fleet without the scenario's jobs has no end.
+    """
     return LiveFleet(
         arms=tuple(arm.name for arm in scenario.arms),
-        warning_c=scenario.limits.warning_c,
-        horizon_s=scenario.horizon_s,
+        limits=scenario.limits,
+        horizon_s=scenario.horizon_s if ends else float("inf"),
     )
 
 
-def central_allocation(policy: str, scenario: Scenario, seed: int) -> Allocate:
+def central_allocation(policy: str, scenario: Scenario, seed: int, *, ends: bool = True) -> Allocate:
     """Allocation rule of the auctioneer of a scenario.
 
     Args:
         policy: As `scenarios.policy_loader` takes it.
+        ends: As of `live_fleet`.
 
     Raises:
         FleetError: no such policy, or one of scope `arm`, which takes no auctioneer.
@@ -51,4 +56,4 @@ def central_allocation(policy: str, scenario: Scenario, seed: int) -> Allocate:
             f"Policy '{policy}' of scope arm runs without an auctioneer. "
             f"Start each arm with: thermofleet arm SCENARIO NAME --policy {policy}"
         )
-    return CentralAllocation(policy_at(policy, seed), live_fleet(scenario))
+    return CentralAllocation(policy_at(policy, seed), live_fleet(scenario, ends=ends))

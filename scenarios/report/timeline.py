@@ -260,8 +260,8 @@ def _legend_height(bars: Sequence[Trace]) -> float:
 
 
 def _temperature_range(temp_c: Array, warning_c: float, error_c: float) -> list[float]:
-    finite = temp_c[np.isfinite(temp_c)]
-    low, high = float(finite.min(initial=warning_c - 20.0)), float(finite.max(initial=error_c))
+    low = float(np.fmin.reduce(temp_c, axis=None, initial=warning_c - 20.0))  # NaN is ignored, and nothing copied
+    high = float(np.fmax.reduce(temp_c, axis=None, initial=error_c))
     room = 0.06 * (high - low)
     return [low - room, high + room]
 

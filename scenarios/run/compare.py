@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.text import Text
 
 from fleet.bus.exchange.channel import PERFECT, Channel
-from scenarios.policy_loader import label
+from scenarios.policy_loader import has_trainings, label
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
@@ -141,14 +141,18 @@ def figures_of_shifts(
     Args:
         by_policy: On the same seeds, in the same order.
         baseline: The one that differences refer to.
-        shape: Instances, fleets, trainings and seeds. Of several instances each counts once, by its mean.
+        shape: Instances, fleets, trainings and seeds. Of several instances each counts once, by its mean; trainings of
+            a policy, which do all instances, are a sample, too.
     """
 
-    def values_of(rows: Sequence[Outcome], name: str) -> Array:
+    def values_of(policy: str, rows: Sequence[Outcome], name: str) -> Array:
         values = np.array([getattr(row, name) for row in rows], dtype=float).reshape(shape)
-        return values[0] if shape[0] == 1 else values.mean(axis=(1, 2, 3))
+        if shape[0] == 1:
+            return values[0]
+        by_training = values.mean(axis=(1, 3)).T[:, None]  # [training, 1, instance]
+        return by_training if has_trainings(policy) else by_training.mean(axis=0, keepdims=True)
 
-    values = {policy: {name: values_of(rows, name) for name in FIGURES} for policy, rows in by_policy.items()}
+    values = {policy: {name: values_of(policy, rows, name) for name in FIGURES} for policy, rows in by_policy.items()}
     return figures_of(values, baseline, counts=COUNTS, possible=POSSIBLE)
 
 

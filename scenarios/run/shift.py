@@ -1,13 +1,11 @@
 """One shift from beginning to end, recorded."""
 
-import hashlib
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT, Channel
@@ -24,6 +22,7 @@ from scenarios.run.heat_use import HeatUse
 from scenarios.run.metrics import Metrics
 from scenarios.run.outcome import metrics_of
 from scenarios.run.provenance import code_hash, provenance
+from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
 
@@ -194,11 +193,6 @@ class _Recorder:
         noise = recorded_noise(episode.noise_key, record, offsets_s, world.dt_s, len(world.arms))
         self._kept.add(telemetry_of(world, record, offsets_s, motion, noise))
         self._records.clear()
-
-
-def scenario_hash(scenario: Scenario) -> str:
-    """Hash of a scenario's content, values left to their default included."""
-    return hashlib.sha256(msgspec.json.encode(asdict(scenario))).hexdigest()[:16]
 
 
 def summary(result: RunResult) -> dict[str, Any]:

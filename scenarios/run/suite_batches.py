@@ -29,7 +29,6 @@ class Ground:
     name: str
     seed: int
     """Of the instance itself."""
-    horizon_s: float
     library: Library
     weights: RewardWeights
 
@@ -59,7 +58,7 @@ def ground_of(
     """Prepare an instance; its cell is prepared once."""
     fleet = prepare(instance.scenario, difficulty=difficulty, risk=risk, cache=cache)
     weights = weights_of(instance.scenario)
-    return Ground(instance.name, instance.seed, instance.scenario.horizon_s, library_of(fleet), weights)
+    return Ground(instance.name, instance.seed, library_of(fleet), weights)
 
 
 def grounds_of(
@@ -99,8 +98,7 @@ def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
         asked = np.flatnonzero(~over & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
         if len(asked):
             seen = env.layout.read(obs["observation"][asked], obs["action_mask"][asked])
-            left_s = (1.0 - seen.clock[:, 0].astype(float)) * ground.horizon_s
-            for row, score in zip(asked.tolist(), scores(seen, left_s, parameters[asked]), strict=True):
+            for row, score in zip(asked.tolist(), scores(seen, parameters[asked]), strict=True):
                 actions[row] = claims(score, env.layout.plans)
         obs, reward, terminated, truncated, _ = env.step(actions)
         total += np.where(over, 0.0, reward)

@@ -26,8 +26,8 @@ from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
-from scenarios.run.shift import scenario_hash
 from scenarios.run.suite_batches import Ground
+from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 
 Array = np.ndarray

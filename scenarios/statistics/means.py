@@ -100,11 +100,14 @@ def interval(values: ArrayLike, *, least: float = -np.inf, most: float = np.inf,
 def paired(values: ArrayLike, base: ArrayLike, *, level: float = LEVEL) -> Interval:
     """The interval of the mean difference of values to those of a baseline on the same fleets, trainings and seeds.
 
+    Of [fleet, training, seed], one of the two may have a single fleet that stands for all.
+
     Raises:
         ValueError: as `interval`, or different shapes.
     """
     x, y = np.asarray(values, dtype=float), np.asarray(base, dtype=float)
-    if x.shape != y.shape:
+    single = x.ndim == y.ndim == 3 and 1 in (len(x), len(y))
+    if x.shape[single:] != y.shape[single:]:
         raise ValueError(f"Paired values need equal shapes (got {x.shape}, {y.shape}).")
     return interval(x - y, level=level)
 

@@ -1,14 +1,14 @@
 """Normalised scores of policies over instances: mean, difference to a baseline, and the figures of `suites`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.table import Table
 
 from scenarios.statistics.holm import holm
 from scenarios.statistics.means import LEVEL, Interval, interval, paired
-from scenarios.statistics.suites import aggregates, improvement
+from scenarios.statistics.suites import Unit, aggregates, improvement
 
 Array = np.ndarray
 
@@ -23,18 +23,29 @@ class Normalised:
     instances: tuple[str, ...]
     """A scenario and a seed each."""
     score: Mapping[str, Array]
-    """By policy, [instance]."""
+    """By policy, [training of the policy, instance]; a single training counts as given, not as a sample."""
     to_bound: Mapping[str, Array]
-    """(upper bound − reward) / (upper bound − random), by policy, [instance]."""
+    """(upper bound − reward) / (upper bound − random), in the same shape."""
     missing: int = 0
     """Shifts of each policy that have no reference."""
     flat: tuple[str, ...] = ()
     """Instances left out because their hindsight is not better than random."""
 
+    def only(self, chosen: Array) -> "Normalised":
+        """Some of the instances, bool [instance]."""
+        names = tuple(name for name, own in zip(self.instances, chosen.tolist(), strict=True) if own)
+        score, to_bound = ({name: x[:, chosen] for name, x in each.items()} for each in (self.score, self.to_bound))
+        return replace(self, instances=names, score=score, to_bound=to_bound)
+
+    def difference(self, policy: str, other: str) -> Interval:
+        """Of the mean scores of two policies, paired by instance, and by training if both have several."""
+        return paired(self.score[policy][:, None], self.score[other][:, None])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """The normalised score of one policy; the unit of all intervals is the instance."""
+    """The normalised score of one policy; the unit of all intervals is the instance, and the training if there are
+    several."""
 
     mean: Interval
     difference: Interval
@@ -63,6 +74,8 @@ class Scores:
     instances: int
     missing: int
     flat: tuple[str, ...]
+    trainings: int = 1
+    """Most trainings of a policy."""
     policies: dict[str, Score]
 
     @property
@@ -75,8 +88,8 @@ class Scores:
     def remarks(self) -> list[str]:
         """What a reader must know of the instances."""
         remarks = [
-            f"Unit: {self.instances} instances. Score: 0 = mean of random, 1 = hindsight, the best schedule that a "
-            "clairvoyant search found."
+            f"Unit: {self.instances} instances{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = "
+            "hindsight, the best schedule that a clairvoyant search found."
         ]
         if self.missing:
             remarks.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
@@ -94,27 +107,38 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
     if len(values.instances) < FEWEST:
         raise ValueError(f"Scores need {FEWEST} instances or more (got {len(values.instances)}).")
     base, names = values.score[baseline], list(values.score)
-    suite = aggregates({name: x[None] for name, x in values.score.items()})
-    differences = [Interval(0.0, 0.0, 0.0) if name == baseline else paired(values.score[name], base) for name in names]
+    differences = [Interval(0.0, 0.0, 0.0) if name == baseline else values.difference(name, baseline) for name in names]
     adjusted = holm([each.p for each in differences]).tolist()
     return Scores(
         baseline=baseline,
         instances=len(values.instances),
         missing=values.missing,
         flat=values.flat,
+        trainings=max(map(len, values.score.values())),
         policies={
             name: Score(
-                mean=interval(values.score[name]),
+                mean=interval(values.score[name][:, None]),
                 difference=difference,
                 p_holm=p_holm,
-                iqm=suite[name].iqm,
-                optimality_gap=suite[name].optimality_gap,
-                improvement=improvement(values.score[name][None], base[None]),
-                bound_gap=interval(values.to_bound[name]),
+                iqm=suite.iqm,
+                optimality_gap=suite.optimality_gap,
+                improvement=improvement(values.score[name], base, sample_of(values.score[name])),
+                bound_gap=interval(values.to_bound[name][:, None]),
             )
             for name, difference, p_holm in zip(names, differences, adjusted, strict=True)
+            for suite in [aggregates({name: values.score[name]}, sample_of(values.score[name]))[name]]
         },
     )
+
+
+def and_trainings(count: int) -> str:
+    """What a unit says of the trainings of policies."""
+    return f" × {count} trainings of a policy" if count > 1 else ""
+
+
+def sample_of(scores: Array) -> Unit:
+    """What is a sample in scores [training, instance]."""
+    return "both" if len(scores) > 1 else "instances"
 
 
 def ranked(scores: Scores) -> list[str]:

@@ -141,7 +141,7 @@ def _weights(shape: tuple[int, ...], unit: Unit) -> Array:
 def _run_weights(shape: tuple[int, ...], unit: Unit, stream: int) -> Array:
     """Of runs, [draw, run, instance or 1]."""
     runs, instances = shape
-    if unit == "instances":
+    if unit == "instances" or (unit == "both" and runs == 1):  # a single run is given
         return np.ones((DRAWS, runs, 1))
     if runs < 2:
         raise ValueError(f"The unit '{unit}' needs two runs or more of each instance (got one).")

@@ -22,7 +22,7 @@ from scenarios.policy_loader import label, policy_of
 from scenarios.progress import COUNTED, Count, Progress, quiet
 from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import COUNTS, POSSIBLE, outcomes
-from scenarios.run.shift import scenario_hash
+from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 from scenarios.statistics.means import unit
 from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks

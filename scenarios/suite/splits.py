@@ -1,9 +1,8 @@
 """The frozen splits: instances with a manifest of hashes, which `scenarios.suite.freeze` writes."""
 
-import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib import resources
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from fleet.errors import ScenarioError
 from fleet.seeding import shift_seeds
 from scenarios.job_stream import draw_jobs
+from scenarios.scenario_hash import hash_of, scenario_hash
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
 from scenarios.suite.axes import Axes, draw_axes, scenario_of
@@ -44,7 +44,7 @@ class Row:
     axes: Axes
     seed: int
     scenario: str
-    """Hash of the scenario, see `scenario_content`."""
+    """Hash of the scenario, see `scenarios.scenario_hash`."""
     jobs: str
     """Hash of the drawn jobs, see `jobs_content`."""
     count: int
@@ -105,32 +105,12 @@ def drawn_rows(name: SplitName) -> Iterator[Row]:
         row = Row(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
         made = instance_of(row)
         jobs = jobs_content(made)
-        yield replace(row, scenario=content_hash(made.scenario), jobs=_hash(jobs), count=len(jobs))
+        yield replace(row, scenario=scenario_hash(made.scenario), jobs=hash_of(jobs), count=len(jobs))
 
 
 def line_of(row: Row) -> str:
     """The line of a manifest file."""
     return json.dumps(asdict(row))
-
-
-def content_hash(scenario: Scenario) -> str:
-    """Hash of what is no default in a scenario, so that a new field with a default does not change it."""
-    return _hash(scenario_content(scenario))
-
-
-def scenario_content(value: Any) -> Any:
-    """What is no default in a dataclass, at every depth (hence Any): a new field with a default changes no hash."""
-    if isinstance(value, tuple):
-        return [scenario_content(item) for item in value]
-    if not is_dataclass(value):
-        return value
-    content: dict[str, Any] = {}
-    for field in fields(value):
-        given = getattr(value, field.name)
-        default = field.default_factory() if field.default_factory is not MISSING else field.default
-        if given != default:
-            content[field.name] = scenario_content(given)
-    return content
 
 
 def jobs_content(made: Instance) -> list[Any]:
@@ -141,10 +121,6 @@ def jobs_content(made: Instance) -> list[Any]:
          round(job.due_s, DIGITS), job.value, job.after, job.expires]
         for job in jobs
     ]  # fmt: skip
-
-
-def _hash(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def instance_of(row: Row) -> Instance:

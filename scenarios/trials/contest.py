@@ -18,7 +18,7 @@ from scenarios.trials.run_unit import Settings, run_unit
 from scenarios.trials.workers import LocalWorker, Queue, Worker, run_units
 
 HERE_S = 5.0
-"""About the time that a worker process takes to start; until then this process does the work."""
+"""About the time that a worker process takes to start; this process does work that takes no longer."""
 
 
 class Rows(Protocol):
@@ -67,7 +67,8 @@ def run_study(
     """
     wanted = [key for unit in study.units(set()) for key in unit.keys]
     with _opened(study, out) as store:
-        units = sorted(study.units(set(store.rows)), key=lambda unit: unit.cell)  # what shares plans follows
+        # The largest first, so that processes end together; what shares plans follows.
+        units = sorted(study.units(set(store.rows)), key=lambda unit: (-unit.size, unit.cell))
         folder = cache_dir or cache_folder()  # here: a worker may have started with another one
         warm(units, study, folder, here.fleets, progress)
         settings = Settings.of(study, cache_dir if ray else folder)
@@ -92,9 +93,13 @@ def _run(
     units: list[Unit], settings: Settings, workers: int, ray: str | None, tell: Callable[[str], None]
 ) -> Iterator[list[Row]]:
     """The rows of each unit."""
-    began_s, todo = time.monotonic(), list(units)
-    while todo and not ray and (workers == 1 or time.monotonic() - began_s < HERE_S):
-        yield run_unit(todo.pop(0), settings)
+    began_s, todo, left_s = time.monotonic(), list(units), 0.0
+    whole = left = sum(unit.size for unit in units)
+    while todo and not ray and (workers == 1 or left_s < HERE_S):
+        unit = todo.pop(0)
+        yield run_unit(unit, settings)
+        left -= unit.size
+        left_s = (time.monotonic() - began_s) * left / (whole - left)
     if todo:
         yield from run_units(Queue(todo), _workers(workers, ray, settings, len(todo)), tell)
 

@@ -37,7 +37,7 @@ class Fleets:
             FleetError: it cannot be prepared.
         """
         scenario = drawn(unit.case.scenario, unit.fleet)
-        asked = (scenario, unit.training, unit.difficulty, risk, randomise, folder)
+        asked = (scenario, unit.twins, unit.difficulty, risk, randomise, folder)
         if self._last and self._last[0] == asked:
             return self._last[1]
         cell = (prepared_content(scenario, unit.difficulty), *asked[1:])
@@ -49,7 +49,7 @@ class Fleets:
                 difficulty=unit.difficulty,
                 risk=risk,
                 randomise=randomise,
-                training=unit.training,
+                training=unit.twins,
                 cache=folder,
                 progress=progress,
                 like=like,
@@ -68,7 +68,7 @@ def warm(units: Sequence[Unit], study: Study, folder: Path, fleets: Fleets, prog
     seen: set[object] = set()
     for unit in units:
         content = plan_content(drawn(unit.case.scenario, unit.fleet))
-        cell = (content, unit.training, unit.difficulty)
+        cell = (content, unit.twins, unit.difficulty)
         if cell not in seen:
             seen.add(cell)
             fleets.of(unit, study.risk, folder, progress, study.randomise)

@@ -12,13 +12,13 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from fleet.seeding import child
-from scenarios.policy_loader import Unusable, policy_of, source_of
+from scenarios.policy_loader import Unusable, policy_of, source_of, trainings_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.run.provenance import code_hash
+from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
-from scenarios.suite.splits import content_hash
 from scenarios.trials.cells import plan_content
 
 TOGETHER = 16
@@ -50,7 +50,7 @@ class Key(NamedTuple):
     fleet: int
     """Draw of the arms: `spread.seed` of the scenario plus this."""
     training: int
-    """Training of the twins, from 0."""
+    """Training of the policy if it has several, else of the twins; from 0."""
     difficulty: str
     seed: int
 
@@ -92,9 +92,25 @@ class Unit:
         return [Key(*of, seed) for seed in self.case.seeds]
 
     @property
+    def played(self) -> str:
+        """The policy itself, or the one of its trainings."""
+        own = trainings_of(self.policy)
+        return own[self.training if len(own) > 1 else 0]
+
+    @property
+    def twins(self) -> int:
+        """Training of the twins."""
+        return self.training if len(trainings_of(self.policy)) == 1 else 0
+
+    @property
+    def size(self) -> int:
+        """Arms times decision intervals, which the time of a run follows."""
+        return len(self.case.seeds) * len(self.case.scenario.arms) * self.case.scenario.ticks
+
+    @property
     def group(self) -> tuple[object, ...]:
         """Units of one group share plans and twins."""
-        return self.case.name if self.cell < 0 else self.cell, self.fleet, self.training, self.difficulty
+        return self.case.name if self.cell < 0 else self.cell, self.fleet, self.twins, self.difficulty
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +139,11 @@ class Study:
                 if name in given[:i]:
                     raise FleetError(f"The {what} '{name}' is given twice; names must be unique.")
         for policy in self.policies:
-            check_policy(policy)
+            own = trainings_of(policy)
+            for each in own:
+                check_policy(each)
+            if len(own) > 1 and self.trainings > 1:
+                raise FleetError(f"'{policy}' has {len(own)} trainings of its own: then --trainings must be 1.")
 
     def units(self, done: set[Key]) -> Iterator[Unit]:
         """What is left to run, in the order of the instances."""
@@ -133,8 +153,11 @@ class Study:
             cell = cells.setdefault(plan_content(case.scenario), len(cells))
             for difficulty in self.difficulties:
                 for fleet in range(self.fleets):
-                    for training in range(self.trainings_of(difficulty)):
+                    most = max(self.trainings_of(policy, difficulty) for policy in self.policies)
+                    for training in range(most):
                         for policy in self.policies:
+                            if training >= self.trainings_of(policy, difficulty):
+                                continue
                             of = (policy, case.name, fleet, training, difficulty)
                             left = [seed for seed in case.seeds if Key(*of, seed) not in done]
                             for i in range(0, len(left), together):
@@ -144,11 +167,18 @@ class Study:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Fleets, trainings and seeds of an instance: the order of a policy's rows."""
-        return self.fleets, max(map(self.trainings_of, self.difficulties)), len(self.cases[0].seeds)
+        trainings = max(self.trainings_of(policy, each) for policy in self.policies for each in self.difficulties)
+        return self.fleets, trainings, len(self.cases[0].seeds)
 
-    def trainings_of(self, difficulty: DifficultyName) -> int:
-        """How many trainings a source of scores has."""
-        return self.trainings if difficulty == "twin" else 1
+    @property
+    def most_trainings(self) -> int:
+        """Of those policies that have trainings of their own."""
+        return max(len(trainings_of(policy)) for policy in self.policies)
+
+    def trainings_of(self, policy: str, difficulty: DifficultyName) -> int:
+        """How many trainings a policy has with a source of scores: of its own, or else of the twins."""
+        own = len(trainings_of(policy))
+        return self.trainings if own == 1 and difficulty == "twin" else own
 
     def card(self) -> dict[str, object]:
         """What makes two results comparable: hashes of code, scenarios and policies, versions, settings."""
@@ -160,7 +190,7 @@ class Study:
             "channel": self.channel.described(),
             "decision_limit_s": self.decision_limit_s,
             "figures": list(FIGURES),
-            "instances": {case.name: content_hash(case.scenario) for case in self.cases},
+            "instances": {case.name: scenario_hash(case.scenario) for case in self.cases},
             "policies": {policy: policy_hash(policy) for policy in self.policies},
         }
 
@@ -190,14 +220,16 @@ def check_policy(name: str) -> None:
 
 
 def policy_hash(name: str) -> str:
-    """Hash of the files of a policy; "" of a rule, which belongs to the code."""
-    source = source_of(name)
-    if source is None:
+    """Hash of the files of a policy with all its trainings; "" of a rule, which belongs to the code."""
+    sources = [source for each in trainings_of(name) if (source := source_of(each)) is not None]
+    if not sources:
         return ""
     digest = hashlib.sha256()
-    files = sorted(path for path in source.rglob("*") if path.is_file()) if source.is_dir() else [source]
-    for path in files:
-        digest.update(f"{path.relative_to(source) if source.is_dir() else path.name}\n".encode() + path.read_bytes())
+    for source in sources:
+        folder = source if source.is_dir() else source.parent
+        files = sorted(path for path in source.rglob("*") if path.is_file()) if source.is_dir() else [source]
+        for path in files:
+            digest.update(f"{path.relative_to(folder)}\n".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 

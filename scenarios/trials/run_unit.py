@@ -59,7 +59,7 @@ def run_unit(unit: Unit, settings: Settings) -> list[Row]:
     _check(unit.policy, settings)
     fleet = fleets.of(unit, settings.risk, settings.folder or cache_folder(), randomise=settings.randomise)
     with _one_thread():  # so that sums have one order
-        played = play(fleet, unit.policy, unit.case.seeds, settings.channel, settings.decision_limit_s)
+        played = play(fleet, unit.played, unit.case.seeds, settings.channel, settings.decision_limit_s)
     return [row_of(unit, i, each) for i, each in enumerate(played)]
 
 

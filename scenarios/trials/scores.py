@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scenarios.policy_loader import has_trainings
+from scenarios.scenario_hash import scenario_hash
 from scenarios.statistics.scores import Normalised
-from scenarios.suite.splits import content_hash
 from scenarios.trials.plan import Case, Row
 
 if TYPE_CHECKING:  # slow to import
@@ -41,7 +42,7 @@ def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shif
     rows = {(each.instance, each.seed): each for path in files for each in load_references(path)}
     found: dict[Shift, Reference] = {}
     for case in cases:
-        content = content_hash(case.scenario)
+        content = scenario_hash(case.scenario)
         for seed in case.seeds:
             own = rows.get((case.name if "/" in case.name else f"{case.name}/{seed}", seed))
             if own and own.scenario_hash == content:
@@ -54,7 +55,8 @@ def normalised(
 ) -> Normalised | None:
     """The scores of policies on the shifts that have a reference; None if there are none.
 
-    An instance is a scenario and a seed, with the mean reward over the trainings. References are of the first fleet.
+    An instance is a scenario and a seed, with the mean reward over trainings of its twins; trainings of a policy, which
+    do all instances, are kept apart. References are of the first fleet.
 
     Args:
         by_policy: Rows of each policy, of the same shifts.
@@ -72,14 +74,14 @@ def normalised(
     )
     score, to_bound = dict[str, np.ndarray](), dict[str, np.ndarray]()
     for policy, rows in by_policy.items():
-        rewards: dict[Shift, list[float]] = {}
+        rewards: dict[int, dict[Shift, list[float]]] = {}
         for row in rows:
             shift = row.key.instance, row.key.seed
             if row.key.fleet == 0 and shift in references:
                 assert row.outcome is not None or failed_as_random
-                reward = row.outcome.reward if row.outcome else references[shift].random
-                rewards.setdefault(shift, []).append(reward)
-        reward = np.array([np.mean(rewards[shift]) for shift in spread])
+                own = rewards.setdefault(row.key.training if has_trainings(policy) else 0, {})
+                own.setdefault(shift, []).append(row.outcome.reward if row.outcome else references[shift].random)
+        reward = np.array([[np.mean(own[shift]) for shift in spread] for own in rewards.values()])
         score[policy] = (reward - random) / (best - random)
         to_bound[policy] = (upper - reward) / (upper - random)
     return Normalised(

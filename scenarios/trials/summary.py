@@ -12,7 +12,7 @@ from scenarios.policy_loader import label, scope_of
 from scenarios.run.compare import Comparison, Failed, comparison_table, figures_of_shifts
 from scenarios.run.evaluate import Outcome
 from scenarios.statistics.means import unit
-from scenarios.statistics.scores import FEWEST, Normalised, score_tables, scores_of
+from scenarios.statistics.scores import FEWEST, Normalised, and_trainings, score_tables, scores_of
 from scenarios.statistics.tables import LEGEND
 from scenarios.trials.plan import Case, Row, Study
 from scenarios.trials.scores import Shift, normalised
@@ -75,7 +75,7 @@ def comparison_of(
     return Comparison(
         scenario=name or rows[0].key.instance,
         seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
-        unit=unit(study.shape) if count == 1 else f"{count} instances",
+        unit=unit(study.shape) if count == 1 else f"{count} instances{and_trainings(study.most_trainings)}",
         baseline=baseline,
         figures=figures_of_shifts(whole, baseline, (count, *study.shape)) if baseline in whole else {},
         scopes={names[p, d]: scope_of(p) if names[p, d] in whole else "failed" for p, d in names},

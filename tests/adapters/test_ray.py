@@ -13,6 +13,7 @@ from fleet.files import user_cache_folder
 from scenarios.load import load
 from scenarios.trials.contest import run_study
 from scenarios.trials.plan import Case, Row, Study
+from tests.own_policies import IDLE
 from tests.waiting import wait_until
 
 pytestmark = [
@@ -23,32 +24,21 @@ pytestmark = [
 
 COMPILED = user_cache_folder()
 """Before the tests get a home of their own: the nodes need not compile the engine again."""
-OWN = """
-import os, pathlib, time
-class Idle:
-    scope = "central"
-    def reset(self, rng): pass
-    def act(self, seen): return {}
-class DiesOnce(Idle):
-    def act(self, seen):
-        mark = pathlib.Path(__file__).with_name("died")
-        if not mark.exists():
-            mark.touch()
-            os._exit(3)
-        return {}
+OWN = f"""{IDLE}
 class Where(Idle):
     def act(self, seen):
         import ray
         node = ray.get_runtime_context().get_node_id()
-        pathlib.Path(__file__).with_name(f"ran_{node}").touch()
-        return {}
+        pathlib.Path(__file__).with_name(f"ran_{{node}}").touch()
+        return {{}}
 class Waits(Idle):
     def act(self, seen):
         here = pathlib.Path(__file__).parent
         (here / "waits").touch()
-        while not (here / "go").exists():
-            time.sleep(0.05)
-        return {}
+        for _ in range(1200):
+            if (here / "go").exists(): break
+            threading.Event().wait(0.05)
+        return {{}}
 """
 
 

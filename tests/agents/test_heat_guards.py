@@ -20,7 +20,9 @@ from scenarios.policy_loader import arm_policy_of, label, policy_of, scope_of
 WARNING_C = 60.0
 
 
-def seen(temp_c: float, payload_kg=(0.5, 3.5), *, excess_k: float = 0.0, idle: bool = True) -> Observation:
+def seen(
+    temp_c: float, payload_kg=(0.5, 3.5), *, excess_k: float = 0.0, idle: bool = True, error_c: float = 75.0
+) -> Observation:
     """What an arm knows with two plans for each job; at work it may only give its job back."""
     slots = len(payload_kg)
     layout = Layout(1, slots, plans=2)
@@ -33,6 +35,7 @@ def seen(temp_c: float, payload_kg=(0.5, 3.5), *, excess_k: float = 0.0, idle: b
         temp_c=np.full(7, temp_c),
         housing_c=np.full(7, temp_c - excess_k),
         headroom_k=np.array(WARNING_C - temp_c),
+        error_headroom_k=np.array(error_c - temp_c),
         payload_kg=np.array(payload_kg),
         value=np.ones(slots),
         duration_s=np.tile([100.0, 150.0], slots),
@@ -47,9 +50,13 @@ def test_the_limiter_knows_the_weight_of_the_arm() -> None:
     assert float(TorqueLimiter().torque(RATING.mid_range_kg)) == 1.0
 
 
-@pytest.mark.parametrize(("temp_c", "limit"), [(20.0, 1.0), (50.0, 1.0), (60.0, 0.6), (75.0, 0.0), (90.0, 0.0)])
-def test_the_torque_limit_falls_linearly_from_below_the_warning_to_the_error_limit(temp_c, limit) -> None:
-    assert TorqueLimiter().limit(WARNING_C - temp_c) == pytest.approx(limit)
+@pytest.mark.parametrize(
+    ("error_c", "temp_c", "limit"),
+    [(75.0, t, x) for t, x in ((20.0, 1.0), (50.0, 1.0), (60.0, 0.6), (75.0, 0.0), (90.0, 0.0))]
+    + [(67.0, t, x) for t, x in ((50.0, 1.0), (58.5, 0.5), (67.0, 0.0))],
+)
+def test_the_torque_limit_falls_linearly_from_below_the_warning_to_the_error_limit(error_c, temp_c, limit) -> None:
+    assert TorqueLimiter().limit(seen(temp_c, error_c=error_c)) == pytest.approx(limit)
 
 
 def test_a_warm_arm_claims_light_jobs_only_and_puts_a_heavy_one_down() -> None:

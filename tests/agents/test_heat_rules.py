@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from agents.heat_rules import Wsept
+from agents.pairs import Worth, worth_per_second
 from agents.policy import WAIT
 from agents.registry import make_policy
 from fleet.observation import Layout, Observation
@@ -13,7 +14,7 @@ from fleet.observation import Layout, Observation
 SLOW, FAST = 1200.0, 800.0
 
 
-def seen(value: list[float], peak_c: list[float], *, temp_c: float = 40.0, legal=None, **fields) -> Observation:
+def seen(value: list[float], peak_c: list[float], *, temp_c=40.0, error_c=75.0, legal=None, **fields) -> Observation:
     """What a free arm knows that has a fast and a slow plan for each slot; peaks by option."""
     slots = len(value)
     layout = Layout(1, slots, plans=2)
@@ -24,6 +25,7 @@ def seen(value: list[float], peak_c: list[float], *, temp_c: float = 40.0, legal
         "peak_c": np.array(peak_c),
         "temp_c": np.full(7, temp_c),
         "headroom_k": np.array(60.0 - temp_c),
+        "error_headroom_k": np.array(error_c - temp_c),
         "duration_s": np.tile([FAST, SLOW], slots),
         "p_saturation": np.full(2 * slots, 0.5),
         "offered": np.ones(slots),
@@ -56,6 +58,18 @@ def test_a_claim_of_positive_worth_is_made_and_its_worth_is_the_expectation() ->
     assert rates[0] == pytest.approx((1.0 - heat) / FAST, rel=1e-4)
     assert action("wsept", seen([heat * 1.01], [peak_c, 95.0])) == 1
     assert action("wsept", seen([heat * 0.9], [peak_c, 95.0])) == WAIT
+
+
+@pytest.mark.parametrize(("error_c", "p_fault", "claims"), [(67.0, 0.5792597, False), (75.0, 0.0807567, True)])
+def test_the_probability_of_a_fault_is_that_of_a_peak_above_the_error_limit(error_c, p_fault, claims) -> None:
+    """Φ(1/5) and Φ(−7/5): a peak predicted as 68 °C, 1 K above or 7 K below the limit, with a deviation of 5 K."""
+    observation = seen([40.0], [68.0, 95.0], error_c=error_c)
+    worth = 40.0 - p_fault * (40.0 + Wsept.fault_price) - 0.05 * (8.0 / 28.0) * FAST / 60.0
+    assert -Wsept().cost([observation])[0, 0] == pytest.approx(worth / FAST, rel=1e-5)
+    batch = replace(observation, **{name: np.asarray(each)[None, None] for name, each in vars(observation).items()})
+    untrained = Worth(*np.zeros((len(Worth._fields), 1)))
+    assert worth_per_second(batch, untrained)[0, 0, 0] == pytest.approx(worth / FAST, rel=1e-5)
+    assert (action("wsept", seen([4.0], [68.0, 95.0], error_c=error_c)) == 1) == claims
 
 
 def test_without_scores_heat_is_ignored() -> None:

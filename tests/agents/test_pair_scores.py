@@ -11,14 +11,14 @@ from agents.pair_scores import (
     PAIRS,
     PARAMETERS,
     PairPolicy,
-    ShiftLength,
     first_parameters,
     load_pairs,
     save_pairs,
     scores,
 )
+from agents.pairs import Worth
 from fleet.errors import CheckpointError
-from fleet.observation import FIELDS, Layout, Observation
+from fleet.observation import FIELDS, LONG_S, Layout, Observation
 from scenarios.policy_loader import policy_of, scope_of
 
 LAYOUT = Layout(5, 6, plans=2)
@@ -49,10 +49,12 @@ def drawn(rng: np.random.Generator) -> Observation:
     arms = {
         "temp_c": temp_c,
         "headroom_k": 60.0 - temp_c.max(axis=1),
+        "error_headroom_k": 67.0 - temp_c.max(axis=1),
         "idle": free,
         "working": working,
         "busy_s": 60.0 * working,
         "clock": np.full(5, 0.7),
+        "left_s": np.full(5, rng.uniform(100.0, 5000.0)),
     }
     return replace(blank, **jobs, **options, **arms, action_mask=mask.astype(np.int8))
 
@@ -85,8 +87,8 @@ def test_before_any_training_it_is_wsept() -> None:
 
 def test_scores_follow_arms_and_slots_in_any_order() -> None:
     rng = np.random.default_rng(1)
-    seen, parameters, left_s = drawn(rng), trained(rng)[None], np.array([900.0])
-    expected = scores(batched(seen), left_s, parameters)[0]
+    seen, parameters = drawn(rng), trained(rng)[None]
+    expected = scores(batched(seen), parameters)[0]
     assert np.isfinite(expected).sum() > 5
     arms, slots = rng.permutation(5), rng.permutation(6)
     options = (2 * slots[:, None] + np.arange(2)).ravel()
@@ -99,37 +101,36 @@ def test_scores_follow_arms_and_slots_in_any_order() -> None:
         if "peer" not in field.axes
     }
     mask = seen.action_mask[arms][:, [0, *(1 + options), -1]]
-    found = scores(batched(replace(seen, **moved, action_mask=mask)), left_s, parameters)[0]
+    found = scores(batched(replace(seen, **moved, action_mask=mask)), parameters)[0]
     np.testing.assert_allclose(found, expected[arms][:, options], rtol=1e-9)
 
 
 def test_envs_of_a_batch_do_not_affect_each_other() -> None:
     rng = np.random.default_rng(2)
     several = [drawn(rng) for _ in range(3)]
-    parameters, left_s = np.stack([trained(rng) for _ in range(3)]), np.array([100.0, 1000.0, 5000.0])
+    parameters = np.stack([trained(rng) for _ in range(3)])
     names = vars(several[0])
     together = Observation(**{name: np.stack([getattr(each, name) for each in several]) for name in names})
-    found = scores(together, left_s, parameters)
+    found = scores(together, parameters)
     for e, seen in enumerate(several):
-        alone = scores(batched(seen), left_s[e : e + 1], parameters[e : e + 1])
+        alone = scores(batched(seen), parameters[e : e + 1])
         np.testing.assert_allclose(found[e], alone[0], rtol=1e-9)
 
 
-def test_the_length_of_a_shift_follows_from_the_ages_of_jobs() -> None:
-    """Jobs age by 5 400 s while the clock goes from 0 to 1; now and then one is claimed and the others move up."""
-    rng = np.random.default_rng(3)
-    length, found_s, time_s = ShiftLength(), 0.0, 0.0
-    jobs = [(0.0, float(rng.integers(1, 4))) for _ in range(6)]
-    for _ in range(40):
-        time_s += float(rng.uniform(5.0, 60.0))
-        if rng.random() < 0.5:
-            jobs.pop(int(rng.integers(6)))
-            jobs.append((time_s, float(rng.integers(1, 4))))
-        blank = LAYOUT.read(np.zeros(LAYOUT.size, np.float32), np.zeros(LAYOUT.actions, np.int8))
-        ages, values = np.array([time_s - release_s for release_s, _ in jobs]), np.array([value for _, value in jobs])
-        seen = replace(blank, offered=np.ones(6), clock=np.float32(time_s / 5400.0), age_s=ages, value=values)
-        found_s = length.seen(seen)
-    assert found_s == pytest.approx(5400.0, rel=0.01)
+def test_a_learned_price_of_the_end_counts_for_jobs_that_end_after_the_shift() -> None:
+    """With full price, half of the value of a job that ends just with the shift, and nothing of a later one."""
+    seen = drawn(np.random.default_rng(3))
+    seen = replace(seen, duration_s=np.full((5, 12), 300.0), peak_c=np.full((5, 12), 20.0))
+    free, parameters = np.zeros((1, PARAMETERS)), np.zeros((1, PARAMETERS))
+    parameters[0, Worth._fields.index("end")] = 1.0
+
+    def share(left_s: float) -> np.ndarray:
+        moment = batched(replace(seen, left_s=np.full(5, left_s)))
+        worth, worth_free = (np.maximum(scores(moment, each), 0.0) for each in (parameters, free))
+        return worth[worth_free > 0] / worth_free[worth_free > 0]
+
+    for left_s, expected in ((LONG_S, 1.0), (300.0, 0.5), (0.0, 0.0)):
+        np.testing.assert_allclose(share(left_s), expected, atol=1e-6)
 
 
 def test_a_folder_of_parameters_is_a_central_policy(tmp_path) -> None:

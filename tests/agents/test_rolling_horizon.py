@@ -48,6 +48,7 @@ def seen(
         "temp_c": np.full(7, temp_c),
         "ambient_c": np.array(25.0),
         "headroom_k": np.array(WARNING_C - temp_c),
+        "error_headroom_k": np.array(75.0 - temp_c),
     }
     return replace(blank, **{**known, **fields})
 

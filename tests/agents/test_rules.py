@@ -54,6 +54,7 @@ def fleet(
             known=known[me].astype(float),
             difficulty=values[me],
             headroom_k=np.float32(0.0 if headroom_k is None else headroom_k[me]),
+            error_headroom_k=np.float32(15.0),
             peer_heard=np.ones(arms - 1),
             peer_working=1.0 - idle[peers],
             peer_known=known[peers].astype(float),

@@ -120,9 +120,11 @@ def reference(world: World, state: State, slots: list[int], key: int) -> dict[st
         known_c = np.concatenate([measured_c[a], state.housing_c[0, a], ambient_c[a : a + 1]])
         busy_s = times_s[away[a]] @ [1, todo, 1] - state.progress_s[0, a] if mode == WORKING else 0.0
         mine = {
-            "clock": now_s / world.horizon_s, "idle": mode == IDLE, "working": mode == WORKING,
-            "faulted": mode == FAULTED, "last_award": state.last_award[0, a], "temp_c": measured_c[a],
+            "clock": now_s / world.horizon_s, "left_s": world.horizon_s - now_s,
+            "idle": mode == IDLE, "working": mode == WORKING, "faulted": mode == FAULTED,
+            "last_award": state.last_award[0, a], "temp_c": measured_c[a],
             "busy_s": busy_s, "headroom_k": world.limits.warning_c - measured_c[a].max(),
+            "error_headroom_k": world.limits.error_c - measured_c[a].max(),
             "housing_c": state.housing_c[0, a], "ambient_c": ambient_c[a],
             "job_value": 0.0, "job_cycles": 0.0, "job_peak_c": 0.0, "job_p": 0.0, "give_back": 0.0,
         }  # fmt: skip

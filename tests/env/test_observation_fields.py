@@ -16,9 +16,11 @@ from fleet.engine.shift import Episode
 from fleet.engine.state import State, World, initial
 from fleet.engine.tables import tables_of
 from fleet.env.allocation_v1 import parallel_env
+from fleet.env.vector import BatchEnv
 from fleet.motion import Plan
 from fleet.motor import gen3_motors
 from fleet.observation import LONG_S, Layout, Observation
+from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 NO_NOISE = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
@@ -178,6 +180,36 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0, 0])
     assert np.isnan(message.difficulty[:, 1:]).all()
     assert np.isnan(message.p_saturation[:, 1:]).all()
+
+
+def test_headrooms_are_to_both_limits_and_time_is_left_until_the_horizon(small) -> None:
+    content = small.work()
+    arms = [small.arm(i, [content], motors=NO_NOISE) for i in range(2)]
+    near = ThermalLimits(warning_c=60.0, error_c=67.0)
+    world, _ = small.shop([[small.job("a")]], arms=arms, ticks=50, limits=near)
+    state = initial(world)
+    state.temp_c[0, :, :7] = np.arange(14.0).reshape(2, 7) + 55.0  # hottest 61 and 68 °C
+    state.tick[:] = 12
+    observed = observe(world, state)
+    assert observed.headroom_k[0].tolist() == [-1.0, -8.0]
+    assert observed.error_headroom_k[0].tolist() == [6.0, -1.0]
+    assert observed.left_s[0].tolist() == [380.0, 380.0]  # of 50 · 10 s
+    late, _ = small.shop([[small.job("a")]], arms=arms, ticks=20_000, limits=near)
+    assert observe(late, initial(late)).left_s[0].tolist() == [LONG_S, LONG_S]
+
+
+def test_in_a_batch_the_time_left_falls_by_that_of_each_step(small) -> None:
+    batch = BatchEnv(small.Shifts(ticks=60).library(), 3, seed=1, autoreset=False, decisions="events")
+    obs, _ = batch.reset()
+    spent_s, over = np.zeros(3), np.zeros(3, bool)
+    while not over.any():
+        seen = batch.layout.read(obs["observation"], obs["action_mask"])
+        np.testing.assert_array_equal(seen.left_s, np.tile(600.0 - spent_s[:, None], batch.layout.arms))
+        np.testing.assert_allclose(seen.error_headroom_k - seen.headroom_k, 75.0 - 60.0, rtol=1e-6)
+        obs, _, terminated, truncated, info = batch.step(obs["action_mask"][..., 1:-1].argmax(axis=-1) + 1)
+        spent_s += info["elapsed_s"]
+        over = terminated | truncated
+    assert len(set(spent_s.tolist())) > 1, "rows at different times"
 
 
 class SecondJointDecides:

@@ -29,7 +29,7 @@ def start(kind: str, name: str, journal) -> None:
         case _:
             arm = Arm()
             arm.executor.arm = name
-            fleet = LiveFleet(arms=("arm_1", "arm_2"), warning_c=60.0)
+            fleet = LiveFleet(arms=("arm_1", "arm_2"))
             ConsensusNode(arm, Membership(fleet=fleet, choose=lambda *_: {}), journal, boot=1)
 
 

@@ -288,7 +288,7 @@ def test_a_live_policy_observes_what_it_observes_in_simulation(small, error_c, c
     env = parallel_env(episode)
     env.reset(seed=0)
     policy = Comparing(env)
-    live = LiveFleet(arms=NAMES, warning_c=limits.warning_c, horizon_s=env.world.horizon_s)
+    live = LiveFleet(arms=NAMES, limits=limits, horizon_s=env.world.horizon_s)
     shift = LiveShift(env, arms, jobs, (all_plans, space(all_plans)[1]), CentralAllocation(policy, live), live)
     by_arms = 0
     while env.agents:

@@ -18,6 +18,7 @@ from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Assignment, Bidding, Choice, offers_of, resolve_claims
 from fleet.observation import FIELDS, LONG_S, Observation
 from fleet.offered_plans import PLANS
+from fleet.robot import ThermalLimits
 from scenarios.live.allocation import CentralAllocation
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central"]
@@ -119,7 +120,7 @@ def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, na
         open_slots = [slot for slot in range(len(seen["arm_0"].offered)) if seen["arm_0"].offered[slot]]
         if any(o.action_mask[1:-1].any() for o in seen.values()):
             time_s = float(env.truth.tick[0] * env.world.dt_s)
-            fleet = LiveFleet(arms=tuple(seen), warning_c=env.world.limits.warning_c, horizon_s=env.world.horizon_s)
+            fleet = LiveFleet(arms=tuple(seen), limits=env.world.limits, horizon_s=env.world.horizon_s)
             live_seen = observe(quoted(seen, time_s), fleet)
             for arm, o in seen.items():
                 # A quote does not contain busy stations, and no job is given back.
@@ -161,7 +162,8 @@ def test_quotes_become_observations() -> None:
         "three": State("three", 0, 98.0, "working", (40.0,) * 7, 20.0, **begun),
     }
     bidding = Bidding("r", 100.0, jobs, quotes, full, states, {"a": (2, 90.0)})
-    seen = observe(bidding, LiveFleet(arms=("two", "one", "four"), warning_c=60.0, horizon_s=400.0), last={"one": -1})
+    fleet = LiveFleet(arms=("two", "one", "four"), limits=ThermalLimits(error_c=67.0), horizon_s=400.0)
+    seen = observe(bidding, fleet, last={"one": -1})
     assert list(seen) == ["two", "one", "four", "three"]
     one, two, three, four = (seen[name] for name in ("one", "two", "three", "four"))
     assert [o.action_mask.tolist() for o in (one, two, three, four)] == [  # wait; a; b; give back
@@ -171,6 +173,12 @@ def test_quotes_become_observations() -> None:
         [1, 0, 0, 0, 0, 0],
     ]
     assert (one.clock, one.busy_s, one.last_award, two.last_award) == (0.25, 0.0, -1.0, 0.0)
+    assert [(o.left_s, o.headroom_k, o.error_headroom_k) for o in (one, two)] == [
+        (300.0, 20.0, 27.0),
+        (300.0, 5.0, 12.0),
+    ]
+    endless, over = (observe(bidding, LiveFleet(arms=("one",), horizon_s=end_s)) for end_s in (np.inf, 50.0))
+    assert (endless["one"].left_s, over["one"].left_s, endless["one"].error_headroom_k) == (LONG_S, 0.0, 35.0)
     assert [float(o.idle) for o in (one, two, three, four)] == [1, 1, 0, 0]
     assert [float(o.working) for o in (one, two, three, four)] == [0, 0, 1, 0]
     assert one.known.tolist() == [1, 1, 0, 0]
@@ -219,7 +227,7 @@ def test_every_central_policy_awards_jobs_with_a_bid_once(name, seed) -> None:
         for arm in ("a", "b", "c")[: rng.integers(1, 4)]
     }
     bidding = Bidding("r", 0.0, jobs, quotes)
-    awarded = CentralAllocation(fresh(name), LiveFleet(arms=("a", "b", "c"), warning_c=60.0))(bidding)
+    awarded = CentralAllocation(fresh(name), LiveFleet(arms=("a", "b", "c")))(bidding)
     assert all(bidding.offer(arm, job, plan) for job, (arm, plan) in awarded.items())
     assert len({arm for arm, _ in awarded.values()}) == len(awarded)
     taken = [job.places[0] for job in jobs if job.name in awarded]
@@ -230,7 +238,7 @@ def test_every_central_policy_awards_jobs_with_a_bid_once(name, seed) -> None:
 
 @pytest.mark.parametrize("name", CENTRAL)
 def test_every_central_policy_completes_the_jobs_of_an_auctioneer(live, name) -> None:
-    rule = CentralAllocation(fresh(name), LiveFleet(arms=("arm_0", "arm_1", "arm_2"), warning_c=60.0))
+    rule = CentralAllocation(fresh(name), LiveFleet(arms=("arm_0", "arm_1", "arm_2")))
     fleet = live.Fleet([live.Arm(f"arm_{i}") for i in range(3)], allocate=rule)
     fleet.submit(*(JobSpec(name=f"j{i}", kind="hold", places=("xyz"[i % 3],), repetitions=2) for i in range(7)))
     for _ in range(40):
@@ -299,7 +307,7 @@ def test_an_illegal_action_is_logged_and_waits(caplog) -> None:
     bidding = Bidding(
         "r", 0.0, (JobSpec("j", "hold", ("x",)),), {"a": quote("a", Estimate("j", (PlanQuote(), PlanQuote(1))))}
     )
-    seen = observe(bidding, LiveFleet(arms=("a",), warning_c=60.0))
+    seen = observe(bidding, LiveFleet(arms=("a",)))
     claims = [claimed_jobs(bidding, seen, {"a": action}) for action in (0, 1, 2, 3, -1)]
     assert claims == [{}, {"a": Choice("j")}, {"a": Choice("j", 1)}, {}, {}]
     assert caplog.text.count("The policy chose the illegal action") == 2

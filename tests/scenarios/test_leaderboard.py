@@ -15,7 +15,7 @@ from scenarios.cli.main import main
 from scenarios.leaderboard import board, submission
 from scenarios.leaderboard.board import board_of, board_text, read_all
 from scenarios.leaderboard.repeat import check_repeated
-from scenarios.leaderboard.submission import Card, Played, Submission, check, read, write
+from scenarios.leaderboard.submission import MOST_BYTES, Card, Played, Submission, check, read, write
 from scenarios.policy_loader import policy_of, scope_of
 from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.suite.splits import manifest
@@ -172,8 +172,8 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
         path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
         with pytest.raises(FleetError, match="is no result of `thermofleet submit-result`"):
             read(path)
-    path.write_text(lines[0] + "\n" + " " * 200_000, encoding="utf-8")
-    with pytest.raises(FleetError, match="at most 200000 bytes"):
+    path.write_text(lines[0] + "\n" + " " * MOST_BYTES, encoding="utf-8")
+    with pytest.raises(FleetError, match=f"at most {MOST_BYTES} bytes"):
         read(path)
 
 

@@ -11,7 +11,8 @@ import pytest
 from agents.registry import RULES
 from scenarios.load import load
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.shift import RunResult, RunSpec, run, scenario_hash, summary
+from scenarios.run.shift import RunResult, RunSpec, run, summary
+from scenarios.scenario_hash import scenario_hash
 
 TICKS = 18
 

@@ -3,10 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from scenarios.load import load
 from scenarios.run.evaluate import FIGURES, Outcome
+from scenarios.statistics.means import interval
 from scenarios.statistics.scores import scores_of
 from scenarios.trials.plan import Case, Key, Row
 from scenarios.trials.scores import normalised, references_of
@@ -48,9 +50,9 @@ def test_scores_are_shares_of_the_way_from_random_to_hindsight():
     assert values is not None
     assert values.instances == ("test/0000", "test/0001")
     assert values.flat == ("test/0002",)
-    assert values.score["a"].tolist() == [0.5, 1.0]
-    assert values.score["b"].tolist() == pytest.approx([-0.2, 0.5])  # means of trainings: 8 and 25
-    assert values.to_bound["a"].tolist() == [0.75, 0.0]
+    assert values.score["a"].tolist() == [[0.5, 1.0]]
+    assert values.score["b"].tolist() == [pytest.approx([-0.2, 0.5])]  # means of trainings of twins: 8 and 25
+    assert values.to_bound["a"].tolist() == [[0.75, 0.0]]
     scores = scores_of(values, "b")
     assert scores.policies["a"].mean.mean == 0.75
     assert scores.policies["a"].difference.mean == pytest.approx(0.6)
@@ -59,12 +61,28 @@ def test_scores_are_shares_of_the_way_from_random_to_hindsight():
     assert scores.policies["b"].bound_gap.mean == pytest.approx((22 / 20 + 0.5) / 2)
 
 
+def test_trainings_of_a_policy_are_a_sample_and_those_of_twins_are_not():
+    rewards = {0: 15.0, 1: 40.0, 2: 5.0}
+    by_policy = {"pairs-*": rows_of("pairs-*", rewards, 3), "a": rows_of("a", {0: 12.0, 1: 30.0, 2: 5.0})}
+    values = scored(by_policy, REFERENCES)
+    assert values is not None
+    each = np.array([[0.5, 0.8], [0.6, 0.82], [0.7, 0.84]])  # instances in columns
+    assert values.score["pairs-*"].tolist() == [pytest.approx(row.tolist()) for row in each]
+    learned = scores_of(values, "a").policies["pairs-*"]
+    assert learned.mean == interval(values.score["pairs-*"][:, None])
+    assert learned.mean.mean == pytest.approx(each.mean())
+    # Two instances: with trainings as a sample the interval is wider than that of the means over trainings.
+    given = interval(each.mean(axis=0))
+    assert learned.mean.high - learned.mean.low > given.high - given.low
+    assert scores_of(values, "a").remarks[0].startswith("Unit: 2 instances × 3 trainings of a policy.")
+
+
 def test_shifts_without_a_reference_are_counted_and_failures_can_count_as_random():
     rows = rows_of("a", {0: None, 1: 50.0, 2: 0.0})
     known = {shift: REFERENCES[shift] for shift in SHIFTS[:2]}
     values = scored({"a": rows}, known, failed_as_random=True)
     assert values is not None
-    assert (values.missing, values.score["a"].tolist()) == (1, [0.0, 1.0])
+    assert (values.missing, values.score["a"].tolist()) == (1, [[0.0, 1.0]])
     assert scored({"a": rows}, {}) is None
     with pytest.raises(ValueError, match="2 instances"):
         scores_of(replace(values, instances=("x",)), "a")

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from agents.pair_scores import PARAMETERS, save_pairs
 from fleet.errors import FleetError
 from scenarios.load import load, override
 from scenarios.prepare import fleet as preparing
@@ -16,16 +17,14 @@ from scenarios.prepare.planned_arm import plan_arms
 from scenarios.run.evaluate import FIGURES, outcomes
 from scenarios.schema import Scenario
 from scenarios.trials import contest, fleets, run_unit
-from scenarios.trials.plan import Case, Key, Row, Study, Unit, seeds_of_instance
+from scenarios.trials.plan import Case, Key, Row, Study, Unit, policy_hash, seeds_of_instance
 from scenarios.trials.store import RESULTS, opened, read_rows
 from scenarios.trials.summary import comparison_of, comparisons, result_page
+from tests.own_policies import IDLE
 
-BAD = """
-import os, pathlib
-class Idle:
-    scope = "central"
-    def reset(self, rng): self.asked, self.drawn = 0, rng.random()
-    def act(self, seen): return {}
+BAD = (
+    IDLE
+    + """
 class Raises(Idle):
     def act(self, seen):
         self.asked += 1
@@ -42,18 +41,12 @@ class Stuck(Idle):
             except Exception: pass
 class Illegal(Idle):
     def act(self, seen): return dict.fromkeys(seen, 10**30)
-class DiesOnce(Idle):
-    def act(self, seen):
-        mark = pathlib.Path(__file__).with_name("died")
-        if not mark.exists():
-            mark.touch()
-            os._exit(3)
-        return {}
 class DiesInOne(Idle):
     def act(self, seen):
         if abs(self.drawn - DRAWN) < 1e-12: os._exit(3)
         return {}
 """
+)
 
 
 @pytest.fixture
@@ -257,6 +250,25 @@ def test_several_instances_are_told_apart_or_together(scenario, plans):
         assert together.figures[name]["peak_c"].mean == pytest.approx(np.mean(means))
     with pytest.raises(FleetError, match="'random' is not among the policies compared: random@blind, "):
         comparisons(study, rows, "random")
+
+
+def test_folders_of_trainings_are_one_policy(scenario, plans, tmp_path):
+    for k in (0, 1, 10):
+        save_pairs(np.full(PARAMETERS, 0.3 * k), tmp_path / f"pairs-{k}")
+    every = str(tmp_path / "pairs-*")
+    rows = contest.run_study(study_of(scenario, "wsept", every), cache_dir=plans, workers=1)
+    assert [(row.key.policy, row.key.training) for row in rows[::3]] == [("wsept", 0), *((every, k) for k in range(3))]
+    apart = study_of(scenario, *(str(tmp_path / f"pairs-{k}") for k in (0, 1, 10)))
+    alone = contest.run_study(apart, cache_dir=plans, workers=1)
+    assert [row.outcome for row in rows[3:]] == [row.outcome for row in alone]
+    assert rows[3].outcome != rows[6].outcome
+    assert len({policy_hash(each) for each in (every, *apart.policies)}) == 4
+    for given, said in (
+        ({"trainings": 2, "difficulties": ["twin"]}, "has 3 trainings of its own: then --trainings must be 1"),
+        ({"policies": [str(tmp_path / "none-*")]}, "There is no folder"),
+    ):
+        with pytest.raises(FleetError, match=said):
+            study_of(scenario, **({"policies": ["wsept", every]} | given))
 
 
 def test_seeds_of_instances_are_their_own():

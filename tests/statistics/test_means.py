@@ -97,6 +97,13 @@ def test_no_variation_is_not_certainty() -> None:
     assert interval([0.0, 0.0, 0.0, 3.0], least=0.0).low == 0.0
 
 
+def test_what_has_a_single_fleet_stands_for_all_in_a_difference() -> None:
+    rng = np.random.default_rng(0)
+    several, single = rng.normal(1.0, 1.0, (3, 1, 20)), rng.normal(size=(1, 1, 20))
+    assert paired(several, single) == paired(several, np.tile(single, (3, 1, 1)))
+    assert paired(several, single).mean == -paired(single, several).mean
+
+
 def test_groups_are_the_sample_if_there_are_several() -> None:
     values = [("a", 1.0), ("a", 3.0), ("b", 5.0), ("c", 5.0), ("c", 6.0)]
     assert mean_by_group(values) == interval([2.0, 5.0, 5.5])

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from fleet.bus.protocol.messages import State
 from fleet.live.auction.round import Bidding, Choice
 from fleet.observation import LONG_S, Layout, Observation, all_peers
 from fleet.offered_plans import PLANS
-from fleet.robot import JOINTS
+from fleet.robot import JOINTS, ThermalLimits
 
 _LOG = logging.getLogger(__name__)
 
@@ -26,8 +26,8 @@ class LiveFleet:
 
     arms: tuple[str, ...]
     """In the fleet's order; other arms that quote come after them, by name."""
-    warning_c: float
-    """Motor temperature of zero headroom."""
+    limits: ThermalLimits = field(default_factory=ThermalLimits)
+    """Motor temperatures of zero headroom (`warning_c`) and of a fault (`error_c`)."""
     horizon_s: float = np.inf
     """Length of the shift; inf if it has no end."""
 
@@ -49,7 +49,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     Args:
         last: Outcome of the last claim of each arm: 1 won, -1 lost.
     """
-    by_arm = {**bidding.full, **bidding.quotes}
+    by_arm, limits = {**bidding.full, **bidding.quotes}, fleet.limits
     arms, time_s = fleet.order(by_arm), bidding.time_s
     layout, peers = Layout(len(arms), len(bidding.jobs), plans=PLANS), all_peers(len(arms))
     quotes, states = [by_arm.get(arm) for arm in arms], [bidding.states.get(arm) for arm in arms]
@@ -98,9 +98,10 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     due_s = per_job([LONG_S + time_s if job.due_s is None else job.due_s for job in bidding.jobs])
     busy_s = stated(lambda state: state.busy_s)
     ambient_c = np.array([each.ambient_c if each else None for each in states], float)  # None becomes NaN
-    temp_c = _per_joint(states, "temp_c", np.repeat(fleet.warning_c - headroom_k[:, None], JOINTS, axis=1))
+    temp_c = _per_joint(states, "temp_c", np.repeat(limits.warning_c - headroom_k[:, None], JOINTS, axis=1))
     fields = Observation(
         clock=np.full(len(arms), time_s / fleet.horizon_s),
+        left_s=np.full(len(arms), fleet.horizon_s - time_s),
         idle=room,
         working=working,
         faulted=modes == "faulted",
@@ -110,6 +111,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         housing_c=_per_joint(states, "housing_c", temp_c),
         ambient_c=np.where(np.isnan(ambient_c), temp_c.min(axis=1), ambient_c),
         headroom_k=headroom_k,
+        error_headroom_k=headroom_k + limits.error_c - limits.warning_c,
         job_value=stated(lambda state: state.job_value),
         job_cycles=stated(lambda state: state.job_cycles_left),
         job_peak_c=stated(lambda state: state.job_peak_c),

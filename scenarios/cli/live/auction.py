@@ -64,7 +64,7 @@ def auction_command(
 ) -> None:
     """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
     chosen = load(scenario)
-    allocate = central_allocation(policy, chosen, seed)
+    allocate = central_allocation(policy, chosen, seed, ends=jobs == "scenario")
     own = own_jobs(chosen, seed) if jobs == "scenario" else []
     fleet, folder = folder_of(journal, fleet, chosen)
     refuse_other_way(folder, (arm.name for arm in chosen.arms), alone=False)

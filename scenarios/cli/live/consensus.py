@@ -40,13 +40,14 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
     chosen = arm_policy_of(policy)
     chosen.reset(np.random.default_rng(np.random.SeedSequence([seed, 1, place])))
     stream = jobs == "scenario"
+    fleet = live_fleet(scenario, ends=stream)
     return Membership(
-        fleet=live_fleet(scenario),
+        fleet=fleet,
         choose=chosen.choose,
         slots=scenario.slots,
         places=frozenset(place.name for place in scenario.places),
         stream=tuple(own_jobs(scenario, seed)) if stream else (),
-        horizon_s=scenario.horizon_s if stream else float("inf"),
+        horizon_s=fleet.horizon_s,
         excludes=cell_space(scenario),
         cell=cell_message(scenario, name),
     )

@@ -10,8 +10,8 @@ from scenarios.policy_loader import label
 from scenarios.report.page import escape, html_page, paragraph, table
 from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
 from scenarios.run.evaluate import FIGURES
-from scenarios.statistics.means import Interval, paired
-from scenarios.statistics.scores import FEWEST, HEADS, Normalised, ranked, score_cells, scores_of
+from scenarios.statistics.means import Interval
+from scenarios.statistics.scores import FEWEST, HEADS, Normalised, ranked, sample_of, score_cells, scores_of
 from scenarios.statistics.suites import profile
 from scenarios.statistics.tables import LEGEND
 from scenarios.suite.splits import manifest
@@ -77,9 +77,7 @@ def verdict(judged: Judged) -> list[str]:
     compared = [_against(best, base, scores.policies[best].difference, "the baseline ")] if best != base else []
     others = [name for name in rest if name != base]
     if others:
-        compared.append(
-            _against(best, others[0], paired(values.score[best], values.score[others[0]]), "the next one, ")
-        )
+        compared.append(_against(best, others[0], values.difference(best, others[0]), "the next one, "))
     told = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     told.append(
@@ -136,7 +134,7 @@ def _scores(judged: Judged, values: Normalised) -> Iterator[str]:
     chosen = order[:MOST_CURVES]
     if judged.baseline not in chosen:
         chosen = [*chosen[:-1], judged.baseline]
-    curves = {name: profile(values.score[name][None], THRESHOLDS) for name in chosen}
+    curves = {name: profile(values.score[name], THRESHOLDS, sample_of(values.score[name])) for name in chosen}
     bands = {label(name): (each.share, each.low, each.high) for name, each in curves.items()}
     banded = {label(chosen[0]), label(judged.baseline)}
     yield lines(THRESHOLDS, bands, banded, "normalised score", "share of instances above")
@@ -153,7 +151,7 @@ def _by_cell(judged: Judged) -> Iterator[str]:
         return
     member = {name: np.array([cells[each] == name for each in values.instances]) for name in names}
     order = sorted(values.score, key=lambda policy: -values.score[policy].mean())
-    means = {policy: [float(values.score[policy][member[name]].mean()) for name in names] for policy in order}
+    means = {policy: [float(values.score[policy][:, member[name]].mean()) for name in names] for policy in order}
     best = [max(column) for column in zip(*means.values(), strict=True)]
     rows = [
         (label(policy), *(f"{v:.2f}{' ●' if v == top else ''}" for v, top in zip(own, best, strict=True)))

@@ -77,7 +77,7 @@ class Arm:
             self,
             granter,
             Membership(
-                fleet=LiveFleet(arms=self.fleet.names, warning_c=60.0),
+                fleet=LiveFleet(arms=self.fleet.names),
                 choose=self.fleet.policy().choose,
                 timing=TIMING,
                 excludes=self.fleet.excludes,

@@ -38,7 +38,7 @@ from scenarios.cli.live.consensus import refuse_auctioneer
 PATIENCE_S = 20.0
 SPEED = 120.0
 ROSTER = ("arm_0", "arm_1", "arm_2")
-FLEET = LiveFleet(arms=ROSTER, warning_c=60.0)
+FLEET = LiveFleet(arms=ROSTER)
 TIMING = Timing(lease_s=1.0, margin_s=0.1, window_s=0.3, pause_s=(0.1, 0.4))
 PLACES = {name: Place(name=name, position_m=(0.5, 0.0, 0.2)) for name in ("bench", "rack", "shelf")}
 

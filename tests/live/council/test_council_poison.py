@@ -78,7 +78,7 @@ def node(tmp_path_factory):
     with ExitStack() as stack:
         path = tmp_path_factory.mktemp("poison") / "grants"
         journal = stack.enter_context(Journal(path, GrantRecord, sync=lambda file: None))
-        membership = Membership(fleet=LiveFleet(arms=ROSTER, warning_c=60.0), choose=Consensus().choose)
+        membership = Membership(fleet=LiveFleet(arms=ROSTER), choose=Consensus().choose)
         node = ConsensusNode(Arm(), membership, journal, boot=1)
         node._take_epoch("e")
         node._set_time(1.0, time.monotonic())

@@ -1,0 +1,51 @@
+"""Table of docs/learning.md: learned policies on fleets of sizes that they were trained on, and on larger ones."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from scenarios.doc_tables import table
+from scenarios.leaderboard.board import BASELINE, read_all
+from scenarios.leaderboard.submission import split_references
+from scenarios.policy_loader import has_trainings
+from scenarios.statistics.scores import ranked, scores_of
+from scenarios.suite.splits import instance
+from scenarios.trials.scores import normalised
+
+TRAINED_ARMS = 16
+"""Most arms of the fleets of the training split."""
+SOURCE = "oracle"
+
+
+def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
+    """Text of the table by the name in its mark.
+
+    Args:
+        results: docs/results, with the files of the leaderboard.
+    """
+    return {"learned_test": lambda: _by_size(results / "leaderboard")}
+
+
+def _by_size(folder: Path) -> str:
+    """Differences of normalised scores to the best rule, on all instances and by the number of arms."""
+    found = {each.card.policy: each for each in read_all(folder, "test") if each.card.difficulty == SOURCE}
+    values = normalised(
+        {name: each.study_rows() for name, each in found.items()}, split_references("test"), failed_as_random=True
+    )
+    assert values is not None
+    large = np.array([len(instance(name).scenario.arms) > TRAINED_ARMS for name in values.instances])
+    groups = {"all instances": large | True, f"up to {TRAINED_ARMS} arms": ~large, "more arms": large}
+    parts = {
+        f"{name} ({int(chosen.sum())})": scores_of(values.only(chosen), BASELINE) for name, chosen in groups.items()
+    }
+    rows: list[tuple[str, ...]] = []
+    for name in ranked(next(iter(parts.values()))):
+        trainings = len(values.score[name])
+        cells = [f"`{name}`" + (f", {trainings} trainings" if has_trainings(name) else "")]
+        for scores in parts.values():
+            own = scores.policies[name]
+            text = own.difference.text()
+            cells.append("" if name == BASELINE else f"**{text}**" if own.difference.excludes_zero else text)
+        rows.append((*cells, f"{found[name].mean('faults'):.2f}"))
+    return table(("policy", *parts, "faults"), rows)
