@@ -19,7 +19,7 @@ LABELS = {
     "benchmarl_ippo": "BenchMARL, IPPO",
 }
 """Methods in the order of the table; the values in braces are those of the configuration."""
-SHARES = (0.25, 0.5, 1.0)
+SHARES = (0.0, 0.25, 0.5, 1.0)
 """Parts of the budget in the table."""
 COSTS = {"hours": "simulated hours", "cpu_s": "CPU s"}
 """What a training used from its first to its last evaluation, and the heading."""
@@ -61,9 +61,7 @@ def efficiency_table(found: dict[str, list[Row]]) -> str:
     rows: list[tuple[str, ...]] = []
     for label, own in found.items():
         rewards = course(own)
-        if list(rewards) == [0]:
-            rows.append((label, *(rewards[0].text(1) for _ in at), "", ""))
-            continue
         cost = [f"{np.mean([row['points'][-1][k] - row['points'][0][k] for row in own]):,.0f}" for k in COSTS]
-        rows.append((label, *(rewards[steps].text(1) for steps in at), *cost))
-    return table(("", *(f"{steps:,} env steps" for steps in at), *COSTS.values()), rows)
+        cells = (rewards[steps].text(1) if steps in rewards else "" for steps in at)
+        rows.append((label, str(len(own)), *cells, *cost))
+    return table(("", "seeds", *(f"{steps:,} env steps" for steps in at), *COSTS.values()), rows)
