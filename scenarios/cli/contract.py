@@ -51,6 +51,7 @@ def documents(out: Path) -> dict[Path, str]:
     from scenarios.studies.page_tables.channels import channel_tables
     from scenarios.studies.page_tables.learned import learned_tables
     from scenarios.studies.page_tables.policies import policy_tables
+    from scenarios.studies.page_tables.sample_efficiency import efficiency_tables
 
     results = out.parent / "results"
     more = {
@@ -58,6 +59,7 @@ def documents(out: Path) -> dict[Path, str]:
         **policy_tables(results),
         **channel_tables(results / "channels"),
         **benchmark_tables(results),
+        **efficiency_tables(results),
         **learned_tables(results),
     }
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}

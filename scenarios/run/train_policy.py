@@ -158,25 +158,14 @@ def _train(
     progress: Progress,
     tell: Callable[[str], None],
 ) -> Trained:
-    options: Any = {"autoreset": False, "decisions": config.decisions, "stagger": True}  # two kinds of values
-
-    def factory(library: Library, weights: RewardWeights) -> Callable[[int, int], TorchRLEnv]:
-        return lambda envs, seed: TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=weights, **options))
-
-    layouts = [BatchEnv(library, 1).layout for library, _ in cells]
-    trainer = Trainer([(factory(*cell), layout) for cell, layout in zip(cells, layouts, strict=True)], config)
+    trainer = trainer_of(cells, config)
     best = -np.inf
     if resume:
         best = trainer.load(out / STATE)["best"]
         if plan.iterations is not None and trainer.done >= plan.iterations:
             raise FleetError(f"The training in '{out}' has {trainer.done} iterations: --iterations must be more.")
     elif config.warm_start:
-        rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
-        for (library, weights), layout in zip(cells, layouts, strict=True):
-            seed = int(rng.integers(2**31))
-            teacher = BatchEnv(library, 16, seed=seed, weights=weights, stagger=True, decisions="events")
-            batches = max(1, DEMONSTRATIONS // len(cells))
-            imitate(trainer.actor, layout, _demonstrations(teacher, config.warm_start, batches, progress), rng)
+        imitate_rule(trainer, cells, progress)
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     log, began_s, interrupted = TrainingLog(out), time.monotonic(), False
@@ -202,7 +191,7 @@ def _train(
     try:
         if not resume:
             if rule := config.warm_start:
-                found = [judge.reward(_rule_actions(rule, judge.env, judge.seeds)) for judge in judges]
+                found = [judge.reward(rule_actions(rule, judge.env, judge.seeds)) for judge in judges]
                 log.add(0, {"teacher": float(np.mean(found))})
                 tell(f"Teacher {rule}: {np.mean(found):.4g} per shift on the validation seeds.")
             validate(0, 0)
@@ -226,10 +215,30 @@ def _train(
     return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
 
 
+def trainer_of(cells: Sequence[tuple[Library, RewardWeights]], config: PpoConfig) -> Trainer:
+    """A trainer on the batched environments of some cells, with envs spread over the hours of a shift."""
+    options: Any = {"autoreset": False, "decisions": config.decisions, "stagger": True}  # two kinds of values
+
+    def factory(library: Library, weights: RewardWeights) -> Callable[[int, int], TorchRLEnv]:
+        return lambda envs, seed: TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=weights, **options))
+
+    return Trainer([(factory(*cell), BatchEnv(cell[0], 1).layout) for cell in cells], config)
+
+
 DEMONSTRATIONS = 60
 """Batches of a rule's decisions for a warm start, of all cells together."""
-STEPS = 16
-"""Steps of every env in a batch."""
+STEPS, TEACHERS = 16, 16
+"""Steps of every env in a batch, and its envs."""
+
+
+def imitate_rule(trainer: Trainer, cells: Sequence[tuple[Library, RewardWeights]], progress: Progress = quiet) -> None:
+    """Warm start: let the actor imitate the rule of the configuration."""
+    rule, rng = trainer.config.warm_start, np.random.default_rng(np.random.SeedSequence([trainer.config.seed, 4]))
+    for library, weights in cells:
+        seed = int(rng.integers(2**31))
+        teacher = BatchEnv(library, TEACHERS, seed=seed, weights=weights, stagger=True, decisions="events")
+        batches = max(1, DEMONSTRATIONS // len(cells))
+        imitate(trainer.actor, teacher.layout, _demonstrations(teacher, rule, batches, progress), rng)
 
 
 def _demonstrations(env: BatchEnv, rule: str, count: int, progress: Progress) -> Iterator[tuple[Array, Array, Array]]:
@@ -256,7 +265,7 @@ def _actions_of(policy: Policy, env: BatchEnv, obs: Obs, e: int) -> list[int]:
     return [actions[arm] for arm in env.agents]
 
 
-def _rule_actions(rule: str, env: BatchEnv, seeds: Sequence[int]) -> Callable[[Obs], Array]:
+def rule_actions(rule: str, env: BatchEnv, seeds: Sequence[int]) -> Callable[[Obs], Array]:
     """Actions of a rule, one instance for each env, [env, arm]."""
     policies = [policy_at(rule, seed) for seed in seeds]
     when_asked = only_choices(policies[0])

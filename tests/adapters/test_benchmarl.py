@@ -113,6 +113,19 @@ def test_a_rollout_is_the_episode_of_the_environment(small_workshop, by_hand, en
     env.close()
 
 
+def test_the_environments_of_a_training_draw_shifts_of_their_own(small_workshop) -> None:
+    from fleet.env.adapters.benchmarl import AllocationTask
+
+    def offers(env) -> np.ndarray:
+        return np.stack([env.reset()["state"].numpy() for _ in range(3)])
+
+    task = AllocationTask("small", small_workshop(), max_steps=400)
+    make, again = (task.get_env_fun(2, False, 5, "cpu") for _ in range(2))
+    first, second = offers(make()), offers(make())
+    assert (first != second).any(axis=1).all()
+    np.testing.assert_array_equal(offers(again()), first)
+
+
 class Renamed(BaseParallelWrapper):
     """The same with arms that are called otherwise."""
 

@@ -11,6 +11,8 @@ Traps:
 - The task is pickled with the experiment, so the factory must pickle (a `functools.partial` does, a lambda does not).
 - TorchRL puts each agent whose name does not end in a number into a group of its own, and BenchMARL trains each group
   alone: an arm named "wall" would share no MAPPO policy. The adapter puts all arms into one group, "arm".
+- BenchMARL makes all environments of a training with one seed, so all would simulate the same shifts. The adapter seeds
+  each environment of a process with a child of it.
 - `max_steps` limits evaluation only; the environment sets an episode's length.
 """
 
@@ -18,6 +20,7 @@ Traps:
 
 from collections.abc import Callable
 
+import numpy as np
 from benchmarl.environments.pettingzoo.common import PettingZooClass
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
@@ -43,15 +46,17 @@ class AllocationTask(PettingZooClass):
     def get_env_fun(
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: str
     ) -> Callable[[], EnvBase]:
-        """Factory of one environment; BenchMARL runs as many of them as it needs."""
+        """Factory of one environment; BenchMARL runs as many of them as it needs. Each draws shifts of its own."""
+        seeds = np.random.SeedSequence(seed)
 
         def make() -> EnvBase:
             env = self.factory()
+            own = int(seeds.spawn(1)[0].generate_state(1)[0])
             return PettingZooWrapper(
                 env,
                 return_state=True,
                 categorical_actions=True,
-                seed=seed,
+                seed=own,
                 device=device,
                 group_map={GROUP: list(env.possible_agents)},
             )
