@@ -89,7 +89,7 @@ def bounds_command(
         for name in policies:
             scope_of(name)
         chosen: Any = {"difficulty": source, "jobs": jobs, "policies": policies}
-        with progress_bar(kept="Finished rows and plans are") as progress:
+        with progress_bar(kept="Finished rows are", file=out) as progress:
             found = references(tasks, out, limit, **chosen, progress=progress)
     if format_ == "json":
         print_json([asdict(each) | {"gap": each.gap, "rule_score": each.normalised(each.best_rule)} for each in found])
@@ -116,6 +116,9 @@ def tasks_of(names: str, seeds: int, first_seed: int) -> "list[Task]":
             tasks.append(Task(case.name, case.scenario, case.seeds[0]))
         else:
             tasks += [Task(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
+    for i, task in enumerate(tasks):
+        if task.instance in {other.instance for other in tasks[:i]}:
+            raise FleetError(f"The instance '{task.instance}' is given twice.")
     return tasks
 
 

@@ -130,6 +130,7 @@ def compare_command(
         raise FleetError("--marl-eval needs --out, the folder that it writes to.")
     if references is not None and not references.is_file():
         raise FleetError(f"There is no file of references '{references}'; make it with `thermofleet bounds`.")
+    out = out and out.resolve()  # a policy may change the folder of the process
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
     channels = [
         options.channel_of(
@@ -157,7 +158,7 @@ def compare_command(
     results = comparisons(study, rows, base, suite, known)
     values = scores_over_all(study, rows, known)
     title = f"Comparison of {len(names)} policies on {suite_label(suite or ','.join(case.name for case in cases))}"
-    judged = Judged(title=title, results=results, values=values, card=study.card(), command=options.command_line(ctx))
+    judged = Judged(title=title, results=results, values=values, card=study.card, command=options.command_line(ctx))
     if out:
         with disk_errors(out):
             (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")

@@ -14,7 +14,8 @@ from scenarios.suite.splits import manifest
 from scenarios.trials.scores import Shift, normalised
 
 BASELINE = "wsept"
-"""Policy that differences refer to, by any source of scores; without it the last of the board."""
+"""Policy that differences refer to, with the scores of `SOURCE`; without it the last of the board."""
+SOURCE = "oracle"
 HEADS = ("", "policy", "scores from", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound")
 MORE = ("faults", "failed", "by", "code")
 
@@ -68,9 +69,14 @@ def board_of(
     values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
     if values is None or len(values.instances) < FEWEST:
         return None
-    base = min((name for name, each in entries.items() if each.card.policy == BASELINE), default=None)
+    base = next((name for name, each in entries.items() if _is_baseline(each)), None)
     last = min(entries, key=lambda name: values.score[name].mean())
     return Board(split=split, scores=scores_of(values, base or last), entries=entries, instances=len(manifest(split)))
+
+
+def _is_baseline(each: Submission) -> bool:
+    card = each.card
+    return (card.policy, card.difficulty, card.policy_hash) == (BASELINE, SOURCE, "")
 
 
 def board_text(board: Board | None, split: str) -> str:
@@ -113,7 +119,14 @@ def remark_text(board: Board) -> str:
 def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
     mean, difference, stars, *rest = score_cells(scores, name)
     card = entry.card
-    own = (f"`{card.policy}`", card.difficulty, card.scope, mean, f"{difference} {stars}".strip().replace("*", "\\*"))
+    trainings = f", {card.trainings} trainings" if card.trainings > 1 else ""
+    own = (
+        f"`{card.policy}`{trainings}",
+        card.difficulty,
+        card.scope,
+        mean,
+        f"{difference} {stars}".strip().replace("*", "\\*"),
+    )
     return (
         *own,
         *rest,

@@ -78,7 +78,10 @@ def submit_command(
     from scenarios.policy_loader import label
     from scenarios.trials.store import read_rows
 
-    made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
+    try:
+        made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FleetError(f"'{results}' is damaged: study.json lacks {error}. Run the comparison again.") from error
     if policies is not None:
         wanted = [label(name.strip()) for name in policies.split(",")]
         unknown = [name for name in wanted if name not in {each.card.policy for each in made}]

@@ -112,7 +112,10 @@ def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:
     found: list[Outcome] = []
     for instance, fleet in dict.fromkeys((instance, fleet) for instance, fleet, _ in of):
         for training in range(study.shape[1]):
-            found += of.get((instance, fleet, training), of[instance, fleet, 0])
+            own = of.get((instance, fleet, training))
+            if own is None and (instance, fleet, 1) in of:
+                raise FleetError(f"A training of the rows is missing: {training} of instance {instance}.")
+            found += own or of[instance, fleet, 0]
     return found
 
 

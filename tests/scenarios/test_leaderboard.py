@@ -54,7 +54,7 @@ def finished(study: Study, out: Path, rewards: dict[str, float], failed: int = 0
     """The folder of a study without running it; wsept fails in the first shifts."""
     keys = [key for unit in study.units(set()) for key in unit.keys]
     rows = [Row(key, replace(BLANK, reward=rewards[key.policy])) for key in keys]
-    with opened(out, study.card()) as store:
+    with opened(out, study.card) as store:
         for n, row in enumerate(row for row in rows if row.key.policy == "wsept"):
             if n < failed:
                 rows[rows.index(row)] = Row(row.key, None, 0, "Oops: x", "line 1")
@@ -136,7 +136,7 @@ FORGED = {
 
 @pytest.fixture(scope="module")
 def good(study: Study) -> Submission:
-    scenarios = study.card()["instances"]
+    scenarios = study.card["instances"]
     assert isinstance(scenarios, dict)
     versions: dict[str, str | None] = {name: "1" for name in submission.NEEDED}
     card = Card(

@@ -144,7 +144,7 @@ def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
     bad.write_text(bad.read_text() + "\n", encoding="utf-8")
     with pytest.raises(FleetError, match=f"in which policy '{own}' was another one"):
         contest.run_study(study, out=out, cache_dir=plans, workers=1)
-    with opened(tmp_path / "busy", study.card()), pytest.raises(FleetError, match="Another process writes to"):
+    with opened(tmp_path / "busy", study.card), pytest.raises(FleetError, match="Another process writes to"):
         contest.run_study(study, out=tmp_path / "busy", cache_dir=plans, workers=1)
     with pytest.raises(FleetError, match="holds other files"):
         contest.run_study(study, out=tmp_path, cache_dir=plans, workers=1)
