@@ -68,7 +68,8 @@ def test_the_probability_of_a_fault_is_that_of_a_peak_above_the_error_limit(erro
     assert -Wsept().cost([observation])[0, 0] == pytest.approx(worth / FAST, rel=1e-5)
     batch = replace(observation, **{name: np.asarray(each)[None, None] for name, each in vars(observation).items()})
     untrained = Worth(*np.zeros((len(Worth._fields), 1)))
-    assert worth_per_second(batch, untrained)[0, 0, 0] == pytest.approx(worth / FAST, rel=1e-5)
+    first = (np.array([0]), np.array([0]), np.array([0]))
+    assert worth_per_second(batch, first, untrained) == pytest.approx(worth / FAST, rel=1e-5)
     assert (action("wsept", seen([4.0], [68.0, 95.0], error_c=error_c)) == 1) == claims
 
 
