@@ -150,7 +150,7 @@ def problems(submission: Submission, references: Mapping[Shift, Reference]) -> I
     card, rows = submission.card, submission.rows
     lines = {line.name: line for line in manifest(card.split)}
     if is_built_in(card.policy) == bool(card.policy_hash):
-        yield f"its policy '{card.policy}' must be a built-in one without a hash, or another one with a hash of its files"
+        yield f"its policy '{card.policy}' must be built-in and have no hash, or have another name and one"
     if card.manifest != manifest_hash(card.split):
         yield f"its manifest of the split {card.split} is another one (hash {card.manifest})"
     missing = [name for name in NEEDED if not card.versions.get(name)]

@@ -173,6 +173,11 @@ class Study:
         """The trainings of each policy, as they were when the study began; itself if it has none."""
         return {policy: trainings_of(policy) for policy in self.policies}
 
+    @cached_property
+    def policy_hashes(self) -> dict[str, str]:
+        """Of each policy, as its files were when the study began."""
+        return {policy: policy_hash(policy) for policy in self.policies}
+
     @property
     def channel_text(self) -> str:
         """The channel of all instances in words."""
@@ -201,7 +206,7 @@ class Study:
             "decision_limit_s": self.decision_limit_s,
             "figures": list(FIGURES),
             "instances": {case.name: scenario_hash(case.scenario) for case in self.cases},
-            "policies": {policy: policy_hash(policy) for policy in self.policies},
+            "policies": self.policy_hashes,
         }
 
 

@@ -43,8 +43,9 @@ class Settings:
     @classmethod
     def of(cls, study: Study, folder: Path | None) -> "Settings":
         """The settings of a study that this process starts."""
-        hashes = {policy: policy_hash(policy) for policy in study.policies}
-        return cls(study.risk, study.randomise, study.channel, study.decision_limit_s, folder, code_hash(), hashes)
+        return cls(
+            study.risk, study.randomise, study.channel, study.decision_limit_s, folder, code_hash(), study.policy_hashes
+        )
 
 
 fleets = Fleets()

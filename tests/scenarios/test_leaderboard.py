@@ -83,6 +83,10 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     assert scores["test-wsept-oracle"].mean.mean == pytest.approx(0.75)  # 150 of 200 shifts at 1, the others at 0
     assert scores["test-wspt-oracle"].improvement.mean == 0.25
     assert run("leaderboard", sent) == 0
+    assert "of 200 instances; differences to `wsept` (oracle)." in capsys.readouterr().out
+    assert run("submit-result", out, "--author", "Bob", "--out", sent) == 2
+    assert "has a result of Ann" in capsys.readouterr().err
+    assert run("leaderboard", sent, "--markdown") == 0
     text = capsys.readouterr().out
     assert "Best policy of scope central `wsept` (0.75 [" in text or "of scope arm `wsept` (0.75 [" in text
     (first,) = re.findall(r"\| 1 \|.*", text)
@@ -128,7 +132,9 @@ FORGED = {
     "no versions": (changed(None, versions={"python": "3.12"}), "versions of thermofleet, numpy, numba, scipy"),
     "more than the bound": (changed(7, reward=40.1), r"test/0007 has a reward of 40\.1, above the upper bound 40"),
     "more jobs than there are": (changed(7, finished=1e4), "test/0007 has 10000 finished jobs"),
-    "no number": (changed(7, value=float("nan")), "needs 11 finite figures"),
+    "the name of a rule": (changed(None, policy="wsept"), "must be built-in and have no hash"),
+    "code of its author": (changed(None, policy="this:x", policy_hash=""), "must be built-in and have no hash"),
+    "no number": (changed(7, value=float("nan")), "needs 11 figures of at most 1e\\+09"),
     "below 0": (changed(7, faults=-1.0), "a figure below 0"),
     "neither figures nor error": (changed(7, figures=None), "needs either figures or an error"),
 }
@@ -141,7 +147,8 @@ def good(study: Study) -> Submission:
     versions: dict[str, str | None] = {name: "1" for name in submission.NEEDED}
     card = Card(
         format=1, policy="mine", difficulty="oracle", split="test", scope="arm", trainings=1, author="Ann", about="",
-        manifest=submission.manifest_hash("test"), code_hash="a" * 16, policy_hash="", risk="rc", versions=versions,
+        manifest=submission.manifest_hash("test"), code_hash="a" * 16, policy_hash="c" * 16, risk="rc",
+        versions=versions,
     )  # fmt: skip
     figures = [12.0, *[0.0] * (len(FIGURES) - 1)]
     rows = [
@@ -198,7 +205,7 @@ def test_a_repetition_finds_other_figures(good: Submission, monkeypatch: pytest.
         return [Row(key, outcome) for unit in study.units(set()) for key in unit.keys]
 
     monkeypatch.setattr("scenarios.leaderboard.repeat.run_study", ran)
-    of_code = changed(None, policy="wspt")(good)
+    of_code = changed(None, policy="wspt", policy_hash="")(good)
     assert check_repeated(of_code, 3) == "test-wspt-oracle: 3 shifts repeated, with equal figures."
     truth[REWARD] += 0.01
     with pytest.raises(FleetError, match="does not repeat"):
