@@ -34,10 +34,11 @@ def first_parameters() -> Array:
     """Parameters from which a training begins, float [PARAMETERS]: `wsept`, except for the end of the shift and faults.
 
     A job that cannot end before the shift does has no value, and one that just can has twice the score. A predicted
-    peak may be 4 K above the error limit.
+    peak may be 4 K above the error limit, and deviates twice as much.
     """
     parameters = np.zeros(PARAMETERS)
-    parameters[Worth._fields.index("end")], parameters[Worth._fields.index("margin")] = 1.0, 0.4
+    first = Worth(0.4, np.log(2.0), 0.0, 0.0, 0.0, end=1.0, overhead=0.0)  # pyright: ignore[reportArgumentType]
+    parameters[: len(first)] = first
     parameters[len(Worth._fields) + FILLS * OUTPUTS] = 0.7
     return parameters
 
@@ -94,7 +95,7 @@ class PairPolicy:
         return dict(zip(observations, claims(score, plans_of(seen[0])).tolist(), strict=True))
 
 
-PAIRS_FORMAT = 3
+PAIRS_FORMAT = 4
 """Increase it when the numbers of a pair or the network change."""
 
 
