@@ -56,7 +56,7 @@ def train_command(
             "With --suite: number of training instances; default: 12, with --algo pairs 36.", 1, 200, show_default=False
         ),
     ] = None,
-    judges: Annotated[
+    validation_instances: Annotated[
         int | None,
         number(
             "With --suite: number of validation instances; default: 24, four shifts each, with --algo pairs 60, the "
@@ -81,7 +81,9 @@ def train_command(
 ) -> None:
     """Train a policy by reinforcement learning or evolution, with checkpoints and learning curves.
 
-    Ctrl-C ends the training and keeps the result so far.
+    The time of a training begins after the preparation of its instances, which takes
+    some minutes the first time; the last iteration may exceed it. Ctrl-C ends the
+    training and keeps the result so far.
 
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """
@@ -124,7 +126,8 @@ def train_command(
         from scenarios.trials.scores import references_of
 
         usual = (36, 60) if algorithm == "pairs" else (12, 24)
-        train, validation = split(suite)[: instances or usual[0]], split("validation")[: judges or usual[1]]
+        train = split(suite)[: instances or usual[0]]
+        validation = split("validation")[: validation_instances or usual[1]]
         cases = [Case(name=each.name, scenario=each.scenario, seeds=(each.seed,)) for each in (*train, *validation)]
         known = {shift: (each.random, each.hindsight) for shift, each in references_of(cases).items()}
         with progress_bar() as progress:
@@ -168,8 +171,9 @@ def train_command(
             f" s; best {'score' if algorithm == 'pairs' else 'reward'} in validation {done.best:.4g}{unit}.",
             out_console,
         )
-        target = scenario if suite is None else "--suite validation"
-        say(f"Curves: {where / CURVE}. Try it: thermofleet compare {target} --policies random,{where}", out_console)
+        target = scenario if suite is None else "--suite test"  # the split validation chose the best of the training
+        how = f"{target} --difficulty {difficulty} --policies random,{where}"
+        say(f"Curves: {where / CURVE}. Try it: thermofleet compare {how}", out_console)
         if done.interrupted:
             return
 
