@@ -79,6 +79,12 @@ def policy_at(name: str, seed: int) -> Policy:
     return policy
 
 
+def is_built_in(name: str) -> bool:
+    """Whether a name is that of a rule, perhaps in wrappers; no code is loaded for it."""
+    wrapper, colon, policy = name.partition(":")
+    return is_built_in(policy) if colon and wrapper in WRAPPERS else name in RULES
+
+
 def source_of(name: str) -> Path | None:
     """The file or folder of a policy of one's own; None for a rule.
 

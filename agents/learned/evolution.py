@@ -22,9 +22,9 @@ class EvolutionConfig:
 
     samples: int = 32
     """Samples of an iteration, even: half of them mirror the others."""
-    deviation: float = 0.1
+    deviation: float = 0.2
     """Standard deviation of every parameter in a sample."""
-    learning_rate: float = 0.04
+    learning_rate: float = 0.08
     decay: int = 60
     """Iterations after which the learning rate is halved, then a third, and so on."""
     averaged: int = 8

@@ -101,6 +101,7 @@ def reference(
     difficulty: str = "oracle",
     bound: bool = True,
     known: Sequence[Claim] = (),
+    policies: Sequence[str] = STARTS,
 ) -> Reference:
     """The reference of one instance of a prepared fleet.
 
@@ -108,6 +109,7 @@ def reference(
         difficulty: With which the fleet was prepared.
         bound: Compute the upper bound; else it is infinite.
         known: A schedule of an earlier search, which this one also starts from.
+        policies: Those that the search starts from.
     """
     began_s = time.process_time()
     entropy = np.random.SeedSequence(task.seed)
@@ -115,10 +117,10 @@ def reference(
     world = episode.world
     rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key)
     # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
-    each = [rules.follow([policy_at(name, task.seed)]) for name in STARTS]
+    each = [rules.follow([policy_at(name, task.seed)]) for name in policies]
     starts = reduce(Simulated.and_, each)
     best = int(starts.reward.argmax())
-    rule, best_rule = STARTS[best], float(starts.reward[best])
+    rule, best_rule = policies[best], float(starts.reward[best])
     bare = without_scores(world)
     if known:
         starts = starts.and_(ShiftSimulator(bare, weights, 1).follow([Replay(known)]))
@@ -160,6 +162,7 @@ def references(
     difficulty: DifficultyName = "oracle",
     cache: Path | None = None,
     jobs: int = 1,
+    policies: Sequence[str] = STARTS,
     progress: Progress = quiet,
 ) -> list[Reference]:
     """The references of instances, kept in a file of JSON lines; those in it are not computed again.
@@ -170,6 +173,7 @@ def references(
 
     Args:
         jobs: Processes.
+        policies: Those that the searches start from.
 
     Raises:
         ScenarioError: the weights of the reward allow no bound.
@@ -185,7 +189,8 @@ def references(
         for task in first.values():
             _fleet_of(task, difficulty, folder, progress)  # so that no two processes plan the same motions
     work = (
-        delayed(_bounded)(task, budget, difficulty, rows.by_key.get(key_of(task, difficulty)), folder) for task in order
+        delayed(_bounded)(task, budget, difficulty, rows.by_key.get(key_of(task, difficulty)), folder, policies)
+        for task in order
     )
     done = len(tasks) - len(left)
     progress("bounding", Count(done, max(1, len(tasks))))
@@ -208,12 +213,14 @@ def _fleet_of(task: Task, difficulty: DifficultyName, folder: Path, progress: Pr
     return _fleets.of(Unit("", case, 0, 0, difficulty), RISK, folder, progress)
 
 
-def _bounded(task: Task, budget: Budget, difficulty: DifficultyName, known: Row | None, folder: Path) -> Reference:
+def _bounded(
+    task: Task, budget: Budget, difficulty: DifficultyName, known: Row | None, folder: Path, policies: Sequence[str]
+) -> Reference:
     """The reference of a task, in whichever process this is."""
     fleet = _fleet_of(task, difficulty, folder)
     try:
         claims = load_reference(known).claims if known else ()
-        return reference(fleet, task, budget, difficulty=difficulty, known=claims)
+        return reference(fleet, task, budget, difficulty=difficulty, known=claims, policies=policies)
     except ValueError as error:
         raise ScenarioError(f"{task.instance}: {error}") from error
 

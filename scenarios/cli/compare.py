@@ -37,8 +37,8 @@ def compare_command(
     suite: Annotated[
         str | None,
         typer.Option(
-            help="Instances that are judged together: train, validation or test, or library names and .toml files, "
-            "separated by commas.",
+            help="Instances that are judged together: train, validation or test; or instances of a split (test/0017), "
+            "library names and .toml files, separated by commas.",
             show_default=False,
         ),
     ] = None,
@@ -115,10 +115,10 @@ def compare_command(
     from scenarios.prepare.fleet import DifficultyName, RiskName
     from scenarios.run.evaluate import FIGURES
     from scenarios.statistics.marl_eval import to_marl_eval
-    from scenarios.trials.cases import cases_of, suite_of
+    from scenarios.trials.cases import cases_of, suite_label, suite_of
     from scenarios.trials.contest import run_study
     from scenarios.trials.plan import Study, columns
-    from scenarios.trials.report.page import Judged, comparison_page
+    from scenarios.trials.report.page import Judged, comparison_page, verdict
     from scenarios.trials.scores import references_of
     from scenarios.trials.summary import check_baseline, comparisons, competitors, result_page, scores_over_all
 
@@ -130,6 +130,7 @@ def compare_command(
         raise FleetError("--marl-eval needs --out, the folder that it writes to.")
     if references is not None and not references.is_file():
         raise FleetError(f"There is no file of references '{references}'; make it with `thermofleet bounds`.")
+    out = out and out.resolve()  # a policy may change the folder of the process
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
     channels = [
         options.channel_of(
@@ -155,12 +156,10 @@ def compare_command(
     with progress_bar(kept="Finished shifts are" if out else KEPT, file=out) as progress:
         rows = run_study(study, out=out, workers=jobs or -1, ray=ray, progress=progress, tell=say)
     results = comparisons(study, rows, base, suite, known)
+    values = scores_over_all(study, rows, known)
+    title = f"Comparison of {len(names)} policies on {suite_label(suite or ','.join(case.name for case in cases))}"
+    judged = Judged(title=title, results=results, values=values, card=study.card, command=options.command_line(ctx))
     if out:
-        values = scores_over_all(study, rows, known)
-        title = f"Comparison of {len(names)} policies on {suite or ', '.join(case.name for case in cases)}"
-        judged = Judged(
-            title=title, results=results, values=values, card=study.card(), command=options.command_line(ctx)
-        )
         with disk_errors(out):
             (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")
             if marl_eval:
@@ -171,6 +170,7 @@ def compare_command(
         return
     for result in results:
         out_console.print(result_page(result))
+    out_console.print("", *verdict(judged), sep="\n")
     if out:
         say(f"Written to {out}; open {out / PAGE}.")
 

@@ -10,7 +10,17 @@ import typer
 from fleet.errors import FleetError
 from scenarios.cli.terminal import out_console, say
 
-PAGES = ("bounds.md", "bus.md", "cli.md", "env.md", "exchange.md", "leaderboard.md", "learning.md", "policies.md")
+PAGES = (
+    "bounds.md",
+    "bus.md",
+    "cli.md",
+    "env.md",
+    "exchange.md",
+    "leaderboard.md",
+    "learning.md",
+    "policies.md",
+    "results.md",
+)
 """Pages with generated tables."""
 
 

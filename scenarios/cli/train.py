@@ -47,16 +47,25 @@ def train_command(
     ] = 2.0,
     lr: Annotated[
         float | None,
-        number("Learning rate; default: 0.0003, with --algo pairs 0.04.", 0, 10, above=True, show_default=False),
+        number("Learning rate; default: 0.0003, with --algo pairs 0.08.", 0, 10, above=True, show_default=False),
     ] = None,
     entropy: Annotated[float, number("Weight of the entropy bonus; not with --algo pairs.", 0, 10)] = 0.002,
     instances: Annotated[
         int | None,
         number(
-            "With --suite: number of training instances; default: 12, with --algo pairs 48.", 1, 200, show_default=False
+            "With --suite: number of training instances; default: 12, with --algo pairs 36.", 1, 200, show_default=False
         ),
     ] = None,
-    judges: Annotated[int, number("With --suite: number of validation instances, four shifts each.", 1, 200)] = 24,
+    validation_instances: Annotated[
+        int | None,
+        number(
+            "With --suite: number of validation instances; default: 24, four shifts each, with --algo pairs 60, the "
+            "shift of the benchmark each.",
+            1,
+            200,
+            show_default=False,
+        ),
+    ] = None,
     seed: Annotated[int, number("Seed for shifts, initialisation and minibatches.", 0, MAX_SEED)] = 0,
     seeds: Annotated[int, number("Number of trainings, one after another, with seeds from --seed on.", 1, 100)] = 1,
     out: Annotated[
@@ -72,7 +81,9 @@ def train_command(
 ) -> None:
     """Train a policy by reinforcement learning or evolution, with checkpoints and learning curves.
 
-    Ctrl-C ends the training and keeps the result so far.
+    The time of a training begins after the preparation of its instances, which takes
+    some minutes the first time; the last iteration may exceed it. Ctrl-C ends the
+    training and keeps the result so far.
 
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """
@@ -110,18 +121,25 @@ def train_command(
         length = PairPlan(**length)
     if suite is not None:
         from scenarios.run.suite_batches import grounds_of
+        from scenarios.suite.splits import split
+        from scenarios.trials.plan import Case
+        from scenarios.trials.scores import references_of
 
-        count = instances or (48 if algorithm == "pairs" else 12)
+        usual = (36, 60) if algorithm == "pairs" else (12, 24)
+        train = split(suite)[: instances or usual[0]]
+        validation = split("validation")[: validation_instances or usual[1]]
+        cases = [Case(name=each.name, scenario=each.scenario, seeds=(each.seed,)) for each in (*train, *validation)]
+        known = {shift: (each.random, each.hindsight) for shift, each in references_of(cases).items()}
         with progress_bar() as progress:
-            grounds = grounds_of(suite, count, **models, progress=progress)
-            judging = grounds_of("validation", judges, **models, progress=progress)
+            grounds = grounds_of(train, **models, known=known, progress=progress)
+            judging = grounds_of(validation, **models, known=known, progress=progress)
         card |= {"prepared": len(grounds), "judges": len(judging)}
     for k, where in enumerate(places):
         if algorithm == "pairs":
             from agents.learned.evolution import EvolutionConfig
             from scenarios.run.train_pairs import train_pairs
 
-            search = EvolutionConfig(seed=seed + k, learning_rate=0.04 if lr is None else lr)
+            search = EvolutionConfig(seed=seed + k, learning_rate=0.08 if lr is None else lr)
             done = train_pairs(grounds, judging, search, where, length, card=card, resume=resume, tell=say)
         else:
             from agents.learned.ppo import PpoConfig, use_threads
@@ -147,13 +165,15 @@ def train_command(
                     done = train(chosen, config, where, length, **models, **common)
                 else:
                     done = train_on_split(grounds, judging, config, where, length, card=card, **common)
+        unit = "" if algorithm == "pairs" else " a shift" if chosen else " of the value of all jobs"
         say(
             f"{'Interrupted after' if done.interrupted else 'Trained'} {done.iterations} iterations, {done.seconds:.0f}"
-            f" s; best reward {done.best:.4g}: {'a shift' if chosen else 'of the value of all jobs'} in validation.",
+            f" s; best {'score' if algorithm == 'pairs' else 'reward'} in validation {done.best:.4g}{unit}.",
             out_console,
         )
-        target = scenario if suite is None else "--suite validation"
-        say(f"Curves: {where / CURVE}. Try it: thermofleet compare {target} --policies random,{where}", out_console)
+        target = scenario if suite is None else "--suite test"  # the split validation chose the best of the training
+        how = f"{target} --difficulty {difficulty} --policies random,{where}"
+        say(f"Curves: {where / CURVE}. Try it: thermofleet compare {how}", out_console)
         if done.interrupted:
             return
 

@@ -14,7 +14,8 @@ from scenarios.suite.splits import manifest
 from scenarios.trials.scores import Shift, normalised
 
 BASELINE = "wsept"
-"""Policy that differences refer to, by any source of scores; without it the last of the board."""
+"""Policy that differences refer to, with the scores of `SOURCE`; without it the last of the board."""
+SOURCE = "oracle"
 HEADS = ("", "policy", "scores from", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound")
 MORE = ("faults", "failed", "by", "code")
 
@@ -68,9 +69,14 @@ def board_of(
     values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
     if values is None or len(values.instances) < FEWEST:
         return None
-    base = min((name for name, each in entries.items() if each.card.policy == BASELINE), default=None)
+    base = next((name for name, each in entries.items() if _is_baseline(each)), None)
     last = min(entries, key=lambda name: values.score[name].mean())
     return Board(split=split, scores=scores_of(values, base or last), entries=entries, instances=len(manifest(split)))
+
+
+def _is_baseline(each: Submission) -> bool:
+    card = each.card
+    return (card.policy, card.difficulty, card.policy_hash) == (BASELINE, SOURCE, "")
 
 
 def board_text(board: Board | None, split: str) -> str:
@@ -78,15 +84,26 @@ def board_text(board: Board | None, split: str) -> str:
     if board is None:
         return f"No results with references on the split {split}."
     scores = board.scores
+    parts = [best_text(board)]
+    rows = [(str(place), *_cells(scores, name, board.entries[name])) for place, name in enumerate(board.order, start=1)]
+    parts.append(table((*HEADS, *MORE), rows))
+    return "\n\n".join([*parts, remark_text(board)])
+
+
+def best_text(board: Board) -> str:
+    """The best policy of each scope, in a sentence."""
     best = [
-        f"{scope} `{each.card.policy}` ({scores.policies[each.name].mean.text()})"
+        f"{scope} `{each.card.policy}` ({board.scores.policies[each.name].mean.text()})"
         for scope in ("central", "arm")
         for each in [board.best(scope)]
         if each
     ]
-    parts = [f"Best policy of scope {', of scope '.join(best)}."]
-    rows = [(str(place), *_cells(scores, name, board.entries[name])) for place, name in enumerate(board.order, start=1)]
-    parts.append(table((*HEADS, *MORE), rows))
+    return f"Best policy of scope {', of scope '.join(best)}."
+
+
+def remark_text(board: Board) -> str:
+    """What a reader must know of the results."""
+    scores = board.scores
     base = board.entries[scores.baseline].card
     missing = board.instances - scores.instances - len(scores.flat)
     remark = f"{scores.instances} of {board.instances} instances; differences to `{base.policy}` ({base.difficulty})."
@@ -94,13 +111,22 @@ def board_text(board: Board | None, split: str) -> str:
         remark += f" {missing} have no reference yet and are not scored."
     if scores.flat:
         remark += f" {scores.flat_remark}"
-    return "\n\n".join([*parts, remark])
+    if len({each.card.code_hash for each in board.entries.values()}) > 1:
+        remark += " Results are of several versions of the code; `--verify` repeats some shifts of each with this one."
+    return remark
 
 
 def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
     mean, difference, stars, *rest = score_cells(scores, name)
     card = entry.card
-    own = (f"`{card.policy}`", card.difficulty, card.scope, mean, f"{difference} {stars}".strip().replace("*", "\\*"))
+    trainings = f", {card.trainings} trainings" if card.trainings > 1 else ""
+    own = (
+        f"`{card.policy}`{trainings}",
+        card.difficulty,
+        card.scope,
+        mean,
+        f"{difference} {stars}".strip().replace("*", "\\*"),
+    )
     return (
         *own,
         *rest,

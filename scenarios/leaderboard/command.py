@@ -7,7 +7,7 @@ import typer
 
 from fleet.errors import FleetError
 from scenarios.cli import options
-from scenarios.cli.terminal import echo, print_json, progress_bar, say
+from scenarios.cli.terminal import echo, out_console, print_json, progress_bar, say
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
@@ -23,6 +23,9 @@ def leaderboard_command(
     verify: Annotated[
         int, options.number("Number of shifts to repeat of each result of a built-in policy.", 0, 200)
     ] = 0,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Print the table as docs/leaderboard.md has it.")
+    ] = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Print the leaderboard: normalised scores of all results on a split.
@@ -30,7 +33,8 @@ def leaderboard_command(
     Every file is checked as by `thermofleet submit-result`. A failed shift counts
     as the mean of random. With --verify, repeated shifts must give equal figures.
     """
-    from scenarios.leaderboard.board import board_of, board_text, read_all
+    from scenarios.leaderboard.board import best_text, board_of, board_text, read_all, remark_text
+    from scenarios.statistics.scores import score_tables
     from scenarios.suite.cells import SplitName
 
     split = choose("split", split, SplitName)
@@ -46,8 +50,11 @@ def leaderboard_command(
     board = board_of(split, found)
     if as_json:
         print_json(board.scores if board else None)
-    else:
+    elif board is None or markdown:
         echo(board_text(board, split))
+    else:
+        labels = {name: f"{each.card.policy}@{each.card.difficulty}" for name, each in board.entries.items()}
+        out_console.print(best_text(board), *score_tables(board.scores, labels), remark_text(board), sep="\n")
 
 
 def submit_command(
@@ -71,7 +78,10 @@ def submit_command(
     from scenarios.policy_loader import label
     from scenarios.trials.store import read_rows
 
-    made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
+    try:
+        made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FleetError(f"'{results}' is damaged: study.json lacks {error}. Run the comparison again.") from error
     if policies is not None:
         wanted = [label(name.strip()) for name in policies.split(",")]
         unknown = [name for name in wanted if name not in {each.card.policy for each in made}]

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -15,7 +14,7 @@ from fleet.bus.exchange.channel import PERFECT
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
 from scenarios.bounds.references import Reference
-from scenarios.policy_loader import label, scope_of
+from scenarios.policy_loader import is_built_in, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import FIGURES, Outcome
@@ -23,7 +22,7 @@ from scenarios.suite.cells import SplitName
 from scenarios.suite.splits import Row as Line
 from scenarios.suite.splits import line_of, manifest
 from scenarios.trials.cases import suite_of
-from scenarios.trials.plan import Key, Row
+from scenarios.trials.plan import DECISION_LIMIT_S, Key, Row
 from scenarios.trials.scores import Shift, references_of
 
 FORMAT = 1
@@ -35,9 +34,12 @@ SLACK = 1e-6
 """By which a reward may exceed an upper bound, as a share, for rounding."""
 NEEDED = ("python", "thermofleet", "numpy", "numba", "scipy")
 """Versions that a result must state."""
+MOST_FIGURE = 1e9
 SHOWN = 3
 """Problems that an error names."""
 Text = Annotated[str, msgspec.Meta(max_length=200)]
+Name = Annotated[str, msgspec.Meta(max_length=200, pattern=r"^[^\x00-\x1f\x7f-\x9f|<>\u2028\u2029\ud800-\udfff]*$")]
+"""Text of a table: no control characters, and no | < >."""
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
 
 
@@ -51,8 +53,8 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     scope: Literal["arm", "central"]
     trainings: Annotated[int, msgspec.Meta(ge=1, le=MOST_TRAININGS)]
     """Trainings of the policy, or else of the twins; each has a row for every instance."""
-    author: Text
-    about: Text
+    author: Name
+    about: Name
     """What the policy is, and where it can be had."""
     manifest: Hash
     """Of the split."""
@@ -147,6 +149,8 @@ def problems(submission: Submission, references: Mapping[Shift, Reference]) -> I
     """
     card, rows = submission.card, submission.rows
     lines = {line.name: line for line in manifest(card.split)}
+    if is_built_in(card.policy) == bool(card.policy_hash):
+        yield f"its policy '{card.policy}' must be built-in and have no hash, or have another name and one"
     if card.manifest != manifest_hash(card.split):
         yield f"its manifest of the split {card.split} is another one (hash {card.manifest})"
     missing = [name for name in NEEDED if not card.versions.get(name)]
@@ -176,8 +180,8 @@ def _of_shift(row: Played, line: Line, references: Mapping[Shift, Reference]) ->
         yield "needs either figures or an error"
     if row.figures is None:
         return
-    if len(row.figures) != len(FIGURES) or not all(map(math.isfinite, row.figures)):
-        yield f"needs {len(FIGURES)} finite figures"
+    if len(row.figures) != len(FIGURES) or not all(abs(value) <= MOST_FIGURE for value in row.figures):
+        yield f"needs {len(FIGURES)} figures of at most {MOST_FIGURE:g}"
         return
     own = dict(zip(FIGURES, row.figures, strict=True))
     if not 0 <= own["on_time"] <= own["finished"] <= line.count:
@@ -205,13 +209,15 @@ def write(submission: Submission, folder: Path) -> Path:
     """Write the file of a result, and return its path.
 
     Raises:
-        FleetError: it is too large, or cannot be written.
+        FleetError: it is too large, cannot be written, or would replace the result of another author.
     """
     lines = [msgspec.json.encode(each).decode() for each in (submission.card, *submission.rows)]
     content = "\n".join(lines) + "\n"
     if len(content.encode()) > MOST_BYTES:
         raise FleetError(f"The file of '{submission.name}' would be larger than {MOST_BYTES} bytes: fewer trainings.")
     path = folder / f"{submission.name}.jsonl"
+    if path.exists() and (other := read(path).card.author) != submission.card.author:
+        raise FleetError(f"'{path}' has a result of {other}; give another --out, or your policy another name.")
     with disk_errors(path):
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as draft:
@@ -228,7 +234,7 @@ def read(path: Path) -> Submission:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise FleetError(f"'{path}': a result has at most {MOST_BYTES} bytes.")
-        first, *rest = path.read_text(encoding="utf-8").splitlines()
+        first, *rest = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
         card = msgspec.json.decode(first, type=Card)
         rows = tuple(msgspec.json.decode(line, type=Played) for line in rest)
     except OSError as error:
@@ -254,6 +260,8 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
     usual = json.loads(json.dumps({"channel": PERFECT.described(), "randomise": asdict(Randomisation())}))
     if any(card[name] != value for name, value in usual.items()):
         raise FleetError("Results of the leaderboard have no randomisation, and the bus of each instance.")
+    if card["decision_limit_s"] is None or card["decision_limit_s"] > DECISION_LIMIT_S:
+        raise FleetError(f"Results of the leaderboard have a decision limit of at most {DECISION_LIMIT_S:g} s.")
     splits = sorted({name.partition("/")[0] for name in card["instances"] if "/" in name} & {"validation", "test"})
     if not splits:
         raise FleetError("The study has no instance of the split validation or test; compare with --suite test.")

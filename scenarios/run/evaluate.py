@@ -17,7 +17,7 @@ from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet
 from scenarios.run.batch import library_of
-from scenarios.run.decision_limit import DecisionLimit, TooSlow
+from scenarios.run.decision_limit import DecisionLimit
 from scenarios.run.heat_use import HeatUse
 from scenarios.run.outcome import common_figures
 
@@ -45,8 +45,6 @@ class Outcome:
     hot_surface_min: float
 
 
-FAULTS = (Exception, SystemExit, TooSlow)
-"""What a policy may raise without ending the shifts of others."""
 FIGURES = tuple(field.name for field in fields(Outcome))
 """Names of the compared figures."""
 COUNTS = ("finished", "on_time", "faults")
@@ -123,7 +121,9 @@ def play(
         try:
             with limit.decision():
                 yield
-        except FAULTS as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # whatever the policy raises
             results[e], running[e] = Played(None, 0, error, time_s), False
 
     with limit.watching():

@@ -1,6 +1,6 @@
 """Shifts of a split of the suite as batches, for a learner of scores of pairs: one batched environment per instance."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,12 +14,16 @@ from scenarios.fault_price import weights_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
-from scenarios.suite.splits import Instance, split
+from scenarios.suite.splits import Instance
 
 Array = np.ndarray
 
 SHIFTS = 4
 """Shifts of a validation instance: that of its own seed, and others."""
+
+
+Known = Mapping[tuple[str, int], tuple[float, float]]
+"""Rewards of random and of the hindsight in the shift of an instance and its seed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +35,10 @@ class Ground:
     """Of the instance itself."""
     library: Library
     weights: RewardWeights
+    random: float = 0.0
+    """Mean reward of the policy `random` in the shift of its own seed; 0 without a reference."""
+    span: float | None = None
+    """Reward of the hindsight of that shift less `random`; None without a reference."""
 
     @property
     def shifts(self) -> list[int]:
@@ -47,6 +55,11 @@ class Ground:
         shift = self.library.draw(np.random.SeedSequence(seed))
         return max(float(self.library.tables.value[shift.fleet, shift.kind].sum()), 1.0)
 
+    @property
+    def unit(self) -> float:
+        """What rewards of its shifts are divided by: the span, or the value of all jobs without a reference."""
+        return self.value(self.seed) if self.span is None else self.span
+
 
 def ground_of(
     instance: Instance,
@@ -54,31 +67,33 @@ def ground_of(
     difficulty: DifficultyName = "oracle",
     risk: RiskName = RISK,
     cache: Path | None = None,
+    known: Known | None = None,
 ) -> Ground:
-    """Prepare an instance; its cell is prepared once."""
+    """Prepare an instance; its cell is planned once."""
     fleet = prepare(instance.scenario, difficulty=difficulty, risk=risk, cache=cache)
-    weights = weights_of(instance.scenario)
-    return Ground(instance.name, instance.seed, library_of(fleet), weights)
+    random, hindsight = (known or {}).get((instance.name, instance.seed), (0.0, None))
+    span = None if hindsight is None else hindsight - random
+    return Ground(instance.name, instance.seed, library_of(fleet), weights_of(instance.scenario), random, span)
 
 
 def grounds_of(
-    name: str,
-    count: int,
+    instances: Sequence[Instance],
     *,
     difficulty: DifficultyName = "oracle",
     risk: RiskName = RISK,
     cache: Path | None = None,
+    known: Known | None = None,
     progress: Progress = quiet,
 ) -> list[Ground]:
-    """The first instances of a split, in turns of its cells.
+    """Prepare instances.
 
-    Raises:
-        ScenarioError: there is no such split.
+    Args:
+        known: References of those instances that have one.
     """
     grounds: list[Ground] = []
-    for instance in split(name)[:count]:
-        progress(f"preparing {instance.name}", Count(len(grounds), count))
-        grounds.append(ground_of(instance, difficulty=difficulty, risk=risk, cache=cache))
+    for instance in instances:
+        progress(f"preparing {instance.name}", Count(len(grounds), len(instances)))
+        grounds.append(ground_of(instance, difficulty=difficulty, risk=risk, cache=cache, known=known))
     return grounds
 
 
@@ -98,8 +113,9 @@ def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
         asked = np.flatnonzero(~over & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
         if len(asked):
             seen = env.layout.read(obs["observation"][asked], obs["action_mask"][asked])
-            for row, score in zip(asked.tolist(), scores(seen, parameters[asked]), strict=True):
-                actions[row] = claims(score, env.layout.plans)
+            score = scores(seen, parameters[asked])
+            for k in np.flatnonzero(np.isfinite(score).any(axis=(1, 2))).tolist():
+                actions[asked[k]] = claims(score[k], env.layout.plans)
         obs, reward, terminated, truncated, _ = env.step(actions)
         total += np.where(over, 0.0, reward)
         over |= terminated | truncated

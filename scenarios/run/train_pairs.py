@@ -18,25 +18,29 @@ from scenarios.run.suite_batches import Ground, rewards
 Array = np.ndarray
 
 STATE = "training.npz"
+LEAST_SPAN = 0.04
+"""Shortest span of an instance in training, as a share of the value of its jobs."""
+MOST_LOSS = 1.0
+"""A sample loses at most this much to the best one in a shift, so that one shift does not decide an iteration."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairPlan(TrainingLength):
     """Length of a training, and its validation."""
 
-    instances: int = 10
+    instances: int = 12
     """Instances of an iteration, of different cells; all samples have the same shifts."""
-    validate_every: int = 5
+    validate_every: int = 8
 
 
 @dataclass(frozen=True)
 class TrainedPairs:
-    """Result of a training; rewards are shares of the value of all jobs."""
+    """Result of a training, in normalised scores."""
 
     iterations: int
     shifts: int
     teacher: float
-    """Of `wsept` on the validation shifts."""
+    """Of `wsept` in validation."""
     best: float
     """Of the kept parameters."""
     seconds: float
@@ -56,7 +60,8 @@ def train_pairs(
 ) -> TrainedPairs:
     """Write into a folder the parameters with the best validation as a policy, the last state, and the curves.
 
-    Iteration 0 is `wsept`. Ctrl-C ends the training early and keeps its result.
+    Iteration 0 is `agents.pair_scores.first_parameters`, the teacher is `wsept`. Ctrl-C ends the training early and
+    keeps its result.
 
     Args:
         grounds, judges: Instances of training and of validation.
@@ -67,9 +72,7 @@ def train_pairs(
     """
     card = {**card, "config": asdict(config), "instances": plan.instances}
     _check_folder(out, card, resume=resume)
-    rng = np.random.default_rng(np.random.SeedSequence([config.seed, 0]))
-    search = Evolution(first_parameters(rng), config)
-    wsept = np.zeros(PARAMETERS)
+    search = Evolution(first_parameters(), config)
     began_s, interrupted, shifts = time.monotonic(), False, 0
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
@@ -78,10 +81,10 @@ def train_pairs(
         numbers = search.load(out / STATE)
         teacher, best = numbers["teacher"], numbers["best"]
     else:
-        teacher = best = validation(judges, wsept)
+        teacher, best = (validation(judges, each) for each in (np.zeros(PARAMETERS), search.average))
         save_pairs(search.average, out, **card, iterations=0, validation=best, teacher=teacher)
         log.add(0, {"iteration": 0, "validation": best, "teacher": teacher})
-        tell(f"Iteration 0: wsept has {teacher:.4f} of the value on the validation shifts.")
+        tell(f"Iteration 0: {best:.4f} on the validation shifts, wsept {teacher:.4f}.")
 
     def validate() -> None:
         nonlocal best
@@ -117,27 +120,25 @@ def train_pairs(
 
 
 def validation(judges: Sequence[Ground], parameters: Array) -> float:
-    """Mean reward of the validation shifts over the value of their jobs."""
-    means: list[float] = []
-    for judge in judges:
-        seeds = judge.shifts
-        found = rewards(judge, np.tile(parameters, (len(seeds), 1)), seeds)
-        means.append(float(np.mean([reward / judge.value(seed) for reward, seed in zip(found, seeds, strict=True)])))
-    return float(np.mean(means))
+    """Mean normalised score of the shifts of the judges' own seeds."""
+    scores = [(rewards(judge, parameters[None], [judge.seed])[0] - judge.random) / judge.unit for judge in judges]
+    return float(np.mean(scores))
 
 
 def _fitness(grounds: Sequence[Ground], search: Evolution, count: int) -> Array:
-    """Mean reward of every sample over the value of the jobs, on shifts that all samples share, [sample].
+    """Mean reward of every sample over the span of the instance, on shifts that all samples share, [sample].
 
     Large fleets are drawn less often, as their shifts take longer.
     """
     rng = np.random.default_rng(np.random.SeedSequence([search.config.seed, 2, search.done]))
-    weights = np.array([1.0 / max(ground.arms, 4) for ground in grounds])
+    weights = np.array([max(ground.arms, 4.0) ** -2 for ground in grounds])
     chosen = rng.choice(len(grounds), size=min(count, len(grounds)), replace=False, p=weights / weights.sum())
     samples, total = search.ask(), np.zeros(search.config.samples)
     for index in chosen.tolist():
-        seed = int(rng.integers(2**31))
-        total += rewards(grounds[index], samples, [seed] * len(samples)) / grounds[index].value(seed)
+        ground, seed = grounds[index], int(rng.integers(2**31))
+        unit = max(ground.unit, LEAST_SPAN * ground.value(ground.seed))
+        scores = rewards(ground, samples, [seed] * len(samples)) / unit
+        total += np.maximum(scores, scores.max() - MOST_LOSS)
     return total / len(chosen)
 
 
@@ -154,7 +155,7 @@ def draw_curves(folders: Sequence[Path], picture: Path) -> None:
         axes.plot([r["iteration"] for r in judged], [r["validation"] for r in judged], "o-", ms=3, label=folder.name)
     axes.axhline(teacher, color="k", lw=1, ls="--", label="wsept")
     axes.set_xlabel("iteration")
-    axes.set_ylabel("reward / value of all jobs, validation")
+    axes.set_ylabel("normalised score, validation")
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
     with atomic_path(picture) as draft:

@@ -2,10 +2,14 @@
 
 from collections.abc import Sequence
 
-from scenarios.load import INSTANCE, load
+from fleet.errors import FleetError, nearest
+from scenarios.load import INSTANCE, library, load
 from scenarios.suite.cells import SPLITS
 from scenarios.suite.splits import Instance, instance, split
 from scenarios.trials.plan import Case, seeds_of_instance
+
+MOST_NAMES = 3
+"""Instances of a suite that a title names each."""
 
 
 def cases_of(names: Sequence[str], seeds: int, first_seed: int = 0) -> list[Case]:
@@ -34,8 +38,21 @@ def suite_of(name: str, seeds: int, first_seed: int = 0) -> list[Case]:
     """The instances of a split, each with its own seed and others drawn from it; or names separated by commas.
 
     Raises:
-        FleetError: there is no such split or scenario.
+        FleetError: there is no such split, instance or scenario.
     """
-    if name not in SPLITS:
-        return cases_of([each.strip() for each in name.split(",")], seeds, first_seed)
-    return [_case(each, seeds) for each in split(name)]
+    if name in SPLITS:
+        return [_case(each, seeds) for each in split(name)]
+    names = [each.strip() for each in name.split(",")]
+    for each in names:
+        if not (INSTANCE.fullmatch(each) or each in library() or each.endswith(".toml")):
+            near = nearest(each, [*SPLITS, *library()])
+            raise FleetError(
+                f"No instances '{each}'{near} An instance of a split is named as test/0017; a split stands alone."
+            )
+    return cases_of(names, seeds, first_seed)
+
+
+def suite_label(name: str) -> str:
+    """What a table calls a suite: its name, or the first and the last of many instances."""
+    names = [each.strip() for each in name.split(",")]
+    return ", ".join(names) if len(names) <= MOST_NAMES else f"{names[0]} to {names[-1]}"

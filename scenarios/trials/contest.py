@@ -86,7 +86,7 @@ def _opened(study: Study, out: Path | None) -> AbstractContextManager[Rows]:
     require_extra("report")
     from scenarios.trials.store import opened
 
-    return opened(out, study.card())
+    return opened(out, study.card)
 
 
 def _run(

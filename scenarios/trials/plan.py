@@ -4,6 +4,7 @@ import hashlib
 import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from fleet.seeding import child
-from scenarios.policy_loader import Unusable, policy_of, source_of, trainings_of
+from scenarios.policy_loader import Unusable, label, policy_of, source_of, trainings_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.evaluate import FIGURES, Outcome
@@ -80,6 +81,10 @@ class Unit:
     fleet: int
     training: int
     difficulty: DifficultyName
+    played: str = ""
+    """The policy itself, or the one of its trainings."""
+    twins: int = 0
+    """Training of the twins."""
     cell: int = field(default=-1, compare=False)
     """Number of what its plans depend on, see `scenarios.trials.cells`; by default each instance is a cell."""
     deaths: int = field(default=0, compare=False)
@@ -90,17 +95,6 @@ class Unit:
         """The rows it gives."""
         of = (self.policy, self.case.name, self.fleet, self.training, self.difficulty)
         return [Key(*of, seed) for seed in self.case.seeds]
-
-    @property
-    def played(self) -> str:
-        """The policy itself, or the one of its trainings."""
-        own = trainings_of(self.policy)
-        return own[self.training if len(own) > 1 else 0]
-
-    @property
-    def twins(self) -> int:
-        """Training of the twins."""
-        return self.training if len(trainings_of(self.policy)) == 1 else 0
 
     @property
     def size(self) -> int:
@@ -138,12 +132,14 @@ class Study:
             for i, name in enumerate(given):
                 if name in given[:i]:
                     raise FleetError(f"The {what} '{name}' is given twice; names must be unique.")
-        for policy in self.policies:
-            own = trainings_of(policy)
+        labels: dict[str, str] = {}
+        for policy, own in self.own_trainings.items():
             for each in own:
                 check_policy(each)
             if len(own) > 1 and self.trainings > 1:
                 raise FleetError(f"'{policy}' has {len(own)} trainings of its own: then --trainings must be 1.")
+            if (other := labels.setdefault(label(policy), policy)) != policy:
+                raise FleetError(f"'{other}' and '{policy}' are both called {label(policy)} in results: rename one.")
 
     def units(self, done: set[Key]) -> Iterator[Unit]:
         """What is left to run, in the order of the instances."""
@@ -162,7 +158,9 @@ class Study:
                             left = [seed for seed in case.seeds if Key(*of, seed) not in done]
                             for i in range(0, len(left), together):
                                 part = Case(name=case.name, scenario=case.scenario, seeds=tuple(left[i : i + together]))
-                                yield Unit(policy, part, fleet, training, difficulty, cell)
+                                own = self.own_trainings[policy]
+                                member, twins = (training, 0) if len(own) > 1 else (0, training)
+                                yield Unit(policy, part, fleet, training, difficulty, own[member], twins, cell)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -170,16 +168,33 @@ class Study:
         trainings = max(self.trainings_of(policy, each) for policy in self.policies for each in self.difficulties)
         return self.fleets, trainings, len(self.cases[0].seeds)
 
+    @cached_property
+    def own_trainings(self) -> dict[str, tuple[str, ...]]:
+        """The trainings of each policy, as they were when the study began; itself if it has none."""
+        return {policy: trainings_of(policy) for policy in self.policies}
+
+    @cached_property
+    def policy_hashes(self) -> dict[str, str]:
+        """Of each policy, as its files were when the study began."""
+        return {policy: policy_hash(policy) for policy in self.policies}
+
+    @property
+    def channel_text(self) -> str:
+        """The channel of all instances in words."""
+        texts = {case.scenario.channel(self.channel).text for case in self.cases}
+        return texts.pop() if len(texts) == 1 else "that of each instance"
+
     @property
     def most_trainings(self) -> int:
         """Of those policies that have trainings of their own."""
-        return max(len(trainings_of(policy)) for policy in self.policies)
+        return max(map(len, self.own_trainings.values()))
 
     def trainings_of(self, policy: str, difficulty: DifficultyName) -> int:
         """How many trainings a policy has with a source of scores: of its own, or else of the twins."""
-        own = len(trainings_of(policy))
+        own = len(self.own_trainings[policy])
         return self.trainings if own == 1 and difficulty == "twin" else own
 
+    @cached_property
     def card(self) -> dict[str, object]:
         """What makes two results comparable: hashes of code, scenarios and policies, versions, settings."""
         return {
@@ -191,7 +206,7 @@ class Study:
             "decision_limit_s": self.decision_limit_s,
             "figures": list(FIGURES),
             "instances": {case.name: scenario_hash(case.scenario) for case in self.cases},
-            "policies": {policy: policy_hash(policy) for policy in self.policies},
+            "policies": self.policy_hashes,
         }
 
 

@@ -3,7 +3,8 @@
 import os
 import socket
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from traceback import format_tb
@@ -42,12 +43,12 @@ class Settings:
     @classmethod
     def of(cls, study: Study, folder: Path | None) -> "Settings":
         """The settings of a study that this process starts."""
-        hashes = {policy: policy_hash(policy) for policy in study.policies}
-        return cls(study.risk, study.randomise, study.channel, study.decision_limit_s, folder, code_hash(), hashes)
+        return cls(
+            study.risk, study.randomise, study.channel, study.decision_limit_s, folder, code_hash(), study.policy_hashes
+        )
 
 
 fleets = Fleets()
-_checked: set[tuple[str, str, str]] = set()
 
 
 def run_unit(unit: Unit, settings: Settings) -> list[Row]:
@@ -58,8 +59,9 @@ def run_unit(unit: Unit, settings: Settings) -> list[Row]:
     """
     _check(unit.policy, settings)
     fleet = fleets.of(unit, settings.risk, settings.folder or cache_folder(), randomise=settings.randomise)
-    with _one_thread():  # so that sums have one order
+    with _one_thread(), _contained():  # one thread, so that sums have one order
         played = play(fleet, unit.played, unit.case.seeds, settings.channel, settings.decision_limit_s)
+    _check(unit.policy, settings)  # its files may have been changed meanwhile
     return [row_of(unit, i, each) for i, each in enumerate(played)]
 
 
@@ -70,7 +72,7 @@ def row_of(unit: Unit, index: int, played: Played) -> Row:
         figures = {name: float(value) for name, value in asdict(played.outcome).items()}  # as a file gives them
         return Row(key, Outcome(**figures), played.illegal)
     assert played.error is not None
-    error = f"{type(played.error).__name__}: {played.error}"[:MOST_TEXT]
+    error = f"{type(played.error).__name__}: {_text(played.error)}"[:MOST_TEXT]
     frames = [text for text in format_tb(played.error.__traceback__) if f'"{evaluate.__file__}"' not in text]
     trace = "".join(frames[-MOST_TRACE:])
     return Row(key, None, 0, f"{error} (at {played.time_s:g} s of the shift)", trace[-MOST_TEXT:])
@@ -83,9 +85,6 @@ def died(unit: Unit) -> list[Row]:
 
 
 def _check(policy: str, settings: Settings) -> None:
-    expected = policy, settings.policies[policy], settings.code_hash
-    if expected in _checked:
-        return
     here = f"process {os.getpid()} on {socket.gethostname()}"
     if code_hash() != settings.code_hash:
         raise FleetError(
@@ -97,8 +96,32 @@ def _check(policy: str, settings: Settings) -> None:
     except OSError as error:
         raise FleetError(f"The {here} cannot read the policy '{policy}': {error.strerror}.") from error
     if found != settings.policies[policy]:
-        raise FleetError(f"The {here} has other files of the policy '{policy}': copy the same to every machine.")
-    _checked.add(expected)
+        raise FleetError(
+            f"The {here} has other files of the policy '{policy}' than this command began with: copy the same to every "
+            "machine, and change none while it runs."
+        )
+
+
+def _text(error: BaseException) -> str:
+    """What an error of a policy says, whatever it is made of."""
+    try:
+        return str(error).encode("utf-8", "backslashreplace").decode()
+    except Exception as failed:  # whatever its own code raises
+        return f"(its text raises {type(failed).__name__})"
+
+
+@contextmanager
+def _contained() -> Iterator[None]:
+    """Keep what a policy prints off standard output, and undo what it does to the process; end a fork of it."""
+    process, folder, streams = os.getpid(), Path.cwd(), (sys.stdout, sys.stderr)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        if os.getpid() != process:
+            os._exit(0)
+        sys.stdout, sys.stderr = streams
+        os.chdir(folder)
 
 
 def _one_thread() -> AbstractContextManager[None]:

@@ -79,7 +79,7 @@ def normalised(
             shift = row.key.instance, row.key.seed
             if row.key.fleet == 0 and shift in references:
                 assert row.outcome is not None or failed_as_random
-                own = rewards.setdefault(row.key.training if has_trainings(policy) else 0, {})
+                own = rewards.setdefault(row.key.training if has_trainings(row.key.policy) else 0, {})
                 own.setdefault(shift, []).append(row.outcome.reward if row.outcome else references[shift].random)
         reward = np.array([[np.mean(own[shift]) for shift in spread] for own in rewards.values()])
         score[policy] = (reward - random) / (best - random)

@@ -92,6 +92,8 @@ def opened(out: Path, card: Mapping[str, object]) -> Iterator[Store]:
             whole = _joined(out, json.loads(json.dumps(card)))  # as a file gives it
             rows = _read(out) if (out / CARD).exists() else {}
             (out / PARTS).mkdir(exist_ok=True)
+            for draft in (out / PARTS).glob(".*"):  # of a process that was killed
+                draft.unlink()
             write_card(out, {**whole, "status": "interrupted"})
         store = Store(out, whole, rows)
         yield store
@@ -108,7 +110,7 @@ def write_card(out: Path, card: Mapping[str, object]) -> None:
 
 def _joined(out: Path, card: Mapping[str, Any]) -> dict[str, Any]:
     """The card, with the instances and policies that the folder has already."""
-    if not any(out.iterdir()):
+    if not any(path.name != PARTS and not path.name.startswith(".") for path in out.iterdir()):
         return dict(card)
     try:
         known = json.loads((out / CARD).read_text(encoding="utf-8"))
@@ -133,12 +135,13 @@ def _joined(out: Path, card: Mapping[str, Any]) -> dict[str, Any]:
     return joined
 
 
-def read_rows(out: Path) -> list[Row]:
+def read_rows(out: str | Path) -> list[Row]:
     """The rows of a study's folder, finished or interrupted, sorted by key.
 
     Raises:
         FleetError: it is no such folder, or damaged.
     """
+    out = Path(out)
     if not (out / CARD).is_file():
         raise FleetError(f"'{out}' holds no study of `thermofleet compare --out`.")
     with disk_errors(out):

@@ -14,7 +14,8 @@ from scenarios.run.evaluate import Outcome
 from scenarios.statistics.means import unit
 from scenarios.statistics.scores import FEWEST, Normalised, and_trainings, score_tables, scores_of
 from scenarios.statistics.tables import LEGEND
-from scenarios.trials.plan import Case, Row, Study
+from scenarios.trials.cases import suite_label
+from scenarios.trials.plan import Row, Study
 from scenarios.trials.scores import Shift, normalised
 
 if TYPE_CHECKING:  # slow to import
@@ -80,7 +81,7 @@ def comparison_of(
         figures=figures_of_shifts(whole, baseline, (count, *study.shape)) if baseline in whole else {},
         scopes={names[p, d]: scope_of(p) if names[p, d] in whole else "failed" for p, d in names},
         channel=study.channel.described(),
-        channel_text=study.channel.text,
+        channel_text=study.channel_text,
         illegal={each: sum(row.illegal for row in of) for each, of in shifts.items()},
         failures=tuple(failures),
         scores=scores_of(values, baseline) if values and len(values.instances) >= FEWEST else None,
@@ -111,7 +112,10 @@ def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:
     found: list[Outcome] = []
     for instance, fleet in dict.fromkeys((instance, fleet) for instance, fleet, _ in of):
         for training in range(study.shape[1]):
-            found += of.get((instance, fleet, training), of[instance, fleet, 0])
+            own = of.get((instance, fleet, training))
+            if own is None and (instance, fleet, 1) in of:
+                raise FleetError(f"A training of the rows is missing: {training} of instance {instance}.")
+            found += own or of[instance, fleet, 0]
     return found
 
 
@@ -125,14 +129,9 @@ def comparisons(
     """One comparison of all instances of a suite, or one for each instance."""
     check_baseline(study, baseline)
     if suite:
-        return [comparison_of(study, rows, baseline, f"{suite}, {counted(study.cases)}", references)]
+        return [comparison_of(study, rows, baseline, suite_label(suite), references)]
     of = {case.name: [row for row in rows if row.key.instance == case.name] for case in study.cases}
     return [comparison_of(study, own, baseline, references=references) for own in of.values()]
-
-
-def counted(cases: Sequence[Case]) -> str:
-    """How many instances there are."""
-    return f"{len(cases)} instance{'s' if len(cases) > 1 else ''}"
 
 
 def result_page(result: Comparison) -> Group:

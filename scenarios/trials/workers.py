@@ -18,6 +18,10 @@ MOST_DEATHS = 3
 """So many processes may die of a unit; then its shifts have failed."""
 
 
+IDLE_S = 120.0
+"""A process without work ends after this time, also that of a command that was killed."""
+
+
 class Worker(Protocol):
     """One process that runs a unit at a time."""
 
@@ -46,7 +50,7 @@ class LocalWorker:
         self._pool = self._new()
 
     def _new(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, context=get_context("loky"), env={"OMP_NUM_THREADS": "1"})
+        return ProcessPoolExecutor(1, context=get_context("loky"), env={"OMP_NUM_THREADS": "1"}, timeout=IDLE_S)
 
     def submit(self, unit: Unit) -> "Future[list[Row]]":
         """Begin a unit."""

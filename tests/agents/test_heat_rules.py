@@ -50,25 +50,26 @@ def test_of_two_plans_the_cool_one_is_taken_only_where_the_fast_one_would_fault(
 
 
 def test_a_claim_of_positive_worth_is_made_and_its_worth_is_the_expectation() -> None:
-    """A peak two deviations below the error limit faults with 2.3 %; the time above 60 °C is (65 − 60) / (65 − 40)."""
+    """A peak two deviations below the error limit faults with 2.3 %; the time above 60 °C is (70 − 60) / (70 − 40)."""
     peak_c = 75.0 - 2.0 * Wsept.peak_sd_k
-    assert peak_c == 65.0
-    heat = 0.0227501 * (1.0 + Wsept.fault_price) + 0.05 * (5.0 / 25.0) * FAST / 60.0
+    assert peak_c == 70.0
+    heat = 0.0227501 * (1.0 + Wsept.fault_price) + 0.05 * (10.0 / 30.0) * FAST / 60.0
     rates = -Wsept().cost([seen([1.0], [peak_c, 95.0])])[0]
     assert rates[0] == pytest.approx((1.0 - heat) / FAST, rel=1e-4)
     assert action("wsept", seen([heat * 1.01], [peak_c, 95.0])) == 1
     assert action("wsept", seen([heat * 0.9], [peak_c, 95.0])) == WAIT
 
 
-@pytest.mark.parametrize(("error_c", "p_fault", "claims"), [(67.0, 0.5792597, False), (75.0, 0.0807567, True)])
+@pytest.mark.parametrize(("error_c", "p_fault", "claims"), [(67.0, 0.6554217, False), (75.0, 0.0025551, True)])
 def test_the_probability_of_a_fault_is_that_of_a_peak_above_the_error_limit(error_c, p_fault, claims) -> None:
-    """Φ(1/5) and Φ(−7/5): a peak predicted as 68 °C, 1 K above or 7 K below the limit, with a deviation of 5 K."""
+    """Φ(0.4) and Φ(−2.8): a peak predicted as 68 °C, 1 K above or 7 K below the limit, with a deviation of 2.5 K."""
     observation = seen([40.0], [68.0, 95.0], error_c=error_c)
     worth = 40.0 - p_fault * (40.0 + Wsept.fault_price) - 0.05 * (8.0 / 28.0) * FAST / 60.0
     assert -Wsept().cost([observation])[0, 0] == pytest.approx(worth / FAST, rel=1e-5)
     batch = replace(observation, **{name: np.asarray(each)[None, None] for name, each in vars(observation).items()})
     untrained = Worth(*np.zeros((len(Worth._fields), 1)))
-    assert worth_per_second(batch, untrained)[0, 0, 0] == pytest.approx(worth / FAST, rel=1e-5)
+    first = (np.array([0]), np.array([0]), np.array([0]))
+    assert worth_per_second(batch, first, untrained) == pytest.approx(worth / FAST, rel=1e-5)
     assert (action("wsept", seen([4.0], [68.0, 95.0], error_c=error_c)) == 1) == claims
 
 

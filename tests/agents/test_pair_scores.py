@@ -11,7 +11,6 @@ from agents.pair_scores import (
     PAIRS,
     PARAMETERS,
     PairPolicy,
-    first_parameters,
     load_pairs,
     save_pairs,
     scores,
@@ -71,7 +70,7 @@ def batched(seen: Observation) -> Observation:
 
 
 def trained(rng: np.random.Generator) -> np.ndarray:
-    return 0.3 * rng.standard_normal(PARAMETERS)
+    return 0.1 * rng.standard_normal(PARAMETERS)
 
 
 def test_before_any_training_it_is_wsept() -> None:
@@ -79,14 +78,14 @@ def test_before_any_training_it_is_wsept() -> None:
     claims = 0
     for _ in range(30):
         observations = of_arms(drawn(rng))
-        actions = PairPolicy(first_parameters(rng)).act(observations)
+        actions = PairPolicy(np.zeros(PARAMETERS)).act(observations)
         assert actions == Wsept().act(observations)
         claims += sum(action > 0 for action in actions.values())
     assert claims > 30
 
 
 def test_scores_follow_arms_and_slots_in_any_order() -> None:
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(6)
     seen, parameters = drawn(rng), trained(rng)[None]
     expected = scores(batched(seen), parameters)[0]
     assert np.isfinite(expected).sum() > 5
@@ -131,6 +130,18 @@ def test_a_learned_price_of_the_end_counts_for_jobs_that_end_after_the_shift() -
 
     for left_s, expected in ((LONG_S, 1.0), (300.0, 0.5), (0.0, 0.0)):
         np.testing.assert_allclose(share(left_s), expected, atol=1e-6)
+
+
+def test_with_a_margin_hotter_peaks_are_worth_the_same() -> None:
+    """Where the time above the warning limit costs nothing, only the distance of the peak to the error limit counts."""
+    seen = drawn(np.random.default_rng(4))
+    seen = replace(seen, peak_c=np.maximum(seen.peak_c, 50.0))
+    parameters = np.zeros((1, PARAMETERS))
+    parameters[0, Worth._fields.index("minute")] = -40.0
+    expected = scores(batched(seen), parameters)
+    parameters[0, Worth._fields.index("margin")] = 0.4
+    np.testing.assert_allclose(scores(batched(replace(seen, peak_c=seen.peak_c + 4.0)), parameters), expected)
+    assert (scores(batched(seen), parameters) != expected).any()
 
 
 def test_a_folder_of_parameters_is_a_central_policy(tmp_path) -> None:

@@ -171,6 +171,9 @@ def test_a_search_starts_from_a_known_schedule(fleet: Fleet):
     again = reference(fleet, task, Budget(evaluations=1), difficulty="blind", bound=False, known=found.claims)
     assert again.hindsight >= found.hindsight - 1e-9 > found.best_rule
     assert (again.rule, again.best_rule) == (found.rule, found.best_rule)
+    alone = reference(fleet, task, Budget(evaluations=1), difficulty="blind", bound=False, policies=("fifo",))
+    assert alone.rule == "fifo"
+    assert alone.best_rule < found.best_rule
 
 
 def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
@@ -215,7 +218,7 @@ def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):
 
 
 def test_references_of_the_splits_are_of_their_instances():
-    for split in ("validation", "test"):
+    for split in ("train", "validation", "test"):
         lines = {line.name: line for line in manifest(split)}
         path = split_file(split)
         rows = load_references(path) if path.is_file() else []

@@ -55,7 +55,7 @@ def judged(study: Study, rows: list[Row], known: dict[Shift, Known]) -> Judged:
         title="Comparison <here>",
         results=comparisons(study, rows, "wspt", references=known),  # pyright: ignore[reportArgumentType]  # a stand-in
         values=scores_over_all(study, rows, known),  # pyright: ignore[reportArgumentType]
-        card=study.card(),
+        card=study.card,
         command="thermofleet compare quickstart",
     )
 

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import msgspec
@@ -20,6 +20,7 @@ from scenarios.policy_loader import policy_of, scope_of
 from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.suite.splits import manifest
 from scenarios.trials.cases import suite_of
+from scenarios.trials.contest import run_study
 from scenarios.trials.plan import Row, Study
 from scenarios.trials.store import opened
 
@@ -54,7 +55,7 @@ def finished(study: Study, out: Path, rewards: dict[str, float], failed: int = 0
     """The folder of a study without running it; wsept fails in the first shifts."""
     keys = [key for unit in study.units(set()) for key in unit.keys]
     rows = [Row(key, replace(BLANK, reward=rewards[key.policy])) for key in keys]
-    with opened(out, study.card()) as store:
+    with opened(out, study.card) as store:
         for n, row in enumerate(row for row in rows if row.key.policy == "wsept"):
             if n < failed:
                 rows[rows.index(row)] = Row(row.key, None, 0, "Oops: x", "line 1")
@@ -83,12 +84,19 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     assert scores["test-wsept-oracle"].mean.mean == pytest.approx(0.75)  # 150 of 200 shifts at 1, the others at 0
     assert scores["test-wspt-oracle"].improvement.mean == 0.25
     assert run("leaderboard", sent) == 0
+    assert "of 200 instances; differences to `wsept` (oracle)." in capsys.readouterr().out
+    assert run("submit-result", out, "--author", "Bob", "--out", sent) == 2
+    assert "has a result of Ann" in capsys.readouterr().err
+    assert run("leaderboard", sent, "--markdown") == 0
     text = capsys.readouterr().out
     assert "Best policy of scope central `wsept` (0.75 [" in text or "of scope arm `wsept` (0.75 [" in text
     (first,) = re.findall(r"\| 1 \|.*", text)
     assert [cell.strip() for cell in first.split("|")][2:5] == ["`wsept`", "oracle", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text
     assert run("leaderboard", tmp_path / "absent") == 2
+
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results" / "leaderboard"
 
 
 def changed(index: int | None, **fields) -> Callable[[Submission], Submission]:
@@ -128,7 +136,9 @@ FORGED = {
     "no versions": (changed(None, versions={"python": "3.12"}), "versions of thermofleet, numpy, numba, scipy"),
     "more than the bound": (changed(7, reward=40.1), r"test/0007 has a reward of 40\.1, above the upper bound 40"),
     "more jobs than there are": (changed(7, finished=1e4), "test/0007 has 10000 finished jobs"),
-    "no number": (changed(7, value=float("nan")), "needs 11 finite figures"),
+    "the name of a rule": (changed(None, policy="wsept"), "must be built-in and have no hash"),
+    "code of its author": (changed(None, policy="this:x", policy_hash=""), "must be built-in and have no hash"),
+    "no number": (changed(7, value=float("nan")), "needs 11 figures of at most 1e\\+09"),
     "below 0": (changed(7, faults=-1.0), "a figure below 0"),
     "neither figures nor error": (changed(7, figures=None), "needs either figures or an error"),
 }
@@ -136,12 +146,13 @@ FORGED = {
 
 @pytest.fixture(scope="module")
 def good(study: Study) -> Submission:
-    scenarios = study.card()["instances"]
+    scenarios = study.card["instances"]
     assert isinstance(scenarios, dict)
     versions: dict[str, str | None] = {name: "1" for name in submission.NEEDED}
     card = Card(
         format=1, policy="mine", difficulty="oracle", split="test", scope="arm", trainings=1, author="Ann", about="",
-        manifest=submission.manifest_hash("test"), code_hash="a" * 16, policy_hash="", risk="rc", versions=versions,
+        manifest=submission.manifest_hash("test"), code_hash="a" * 16, policy_hash="c" * 16, risk="rc",
+        versions=versions,
     )  # fmt: skip
     figures = [12.0, *[0.0] * (len(FIGURES) - 1)]
     rows = [
@@ -198,12 +209,24 @@ def test_a_repetition_finds_other_figures(good: Submission, monkeypatch: pytest.
         return [Row(key, outcome) for unit in study.units(set()) for key in unit.keys]
 
     monkeypatch.setattr("scenarios.leaderboard.repeat.run_study", ran)
-    of_code = changed(None, policy="wspt")(good)
+    of_code = changed(None, policy="wspt", policy_hash="")(good)
     assert check_repeated(of_code, 3) == "test-wspt-oracle: 3 shifts repeated, with equal figures."
     truth[REWARD] += 0.01
     with pytest.raises(FleetError, match="does not repeat"):
         check_repeated(of_code, 3)
     assert "not repeated" in check_repeated(changed(None, policy_hash="b" * 16)(good), 3)
+
+
+def test_stored_results_of_built_in_policies_repeat():
+    """One shift of each, with the present code: a change of a policy needs new results."""
+    found = [each for each in read_all(RESULTS, "test") if not each.card.policy_hash]
+    for difficulty in {each.card.difficulty for each in found}:
+        stored = {each.card.policy: each for each in found if each.card.difficulty == difficulty}
+        study = Study(policies=list(stored), cases=suite_of("test/0000", 1), difficulties=[difficulty])
+        for row in run_study(study, workers=1):
+            (before,) = [own.figures for own in stored[row.key.policy].rows if own.instance == "test/0000"]
+            assert row.outcome is not None
+            assert list(asdict(row.outcome).values()) == pytest.approx(before, rel=1e-6, abs=1e-6), row.key
 
 
 def test_without_results_the_table_says_so():

@@ -10,17 +10,17 @@ from agents.learned.evolution import EvolutionConfig
 from agents.learned.ppo import PpoConfig
 from agents.learned.training_log import LOG
 from agents.pair_scores import PARAMETERS, first_parameters
+from agents.pairs import Worth
 from fleet.errors import FleetError
 from scenarios.cli.main import main
-from scenarios.leaderboard.suite_scores import difference, row_of
 from scenarios.load import load, override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
 from scenarios.run.evaluate import outcomes
 from scenarios.run.suite_batches import ground_of, rewards
-from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs
+from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs, validation
 from scenarios.run.train_policy import TrainingPlan, train_on_split
-from scenarios.suite.splits import Instance
+from scenarios.suite.splits import Instance, instance
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +35,22 @@ def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
     expected = [outcome.reward for outcome in outcomes(fleet, "wsept", [3, 4])]
     found = rewards(ground, np.zeros((2, PARAMETERS)), [3, 4])
     np.testing.assert_allclose(found, expected, rtol=1e-9)
-    assert row_of(ground, "wsept", 3)["reward"] == pytest.approx(expected[0])
-    refuses_all = first_parameters(np.random.default_rng(0))
-    refuses_all[0] = 5.0  # true peaks that deviate by 740 K: each claim is as likely to fault as not
+    refuses_all = first_parameters()
+    refuses_all[Worth._fields.index("spread")] = (
+        5.0  # true peaks that deviate by 740 K: each claim is as likely to fault as not
+    )
     assert rewards(ground, refuses_all[None], [3])[0] < expected[0] - 1.0
+
+
+def test_validation_is_the_normalised_score_of_the_shift_of_the_benchmark(ground) -> None:
+    (reward,) = rewards(ground, np.zeros((1, PARAMETERS)), [ground.seed])
+    half = replace(ground, random=reward - 5.0, span=10.0)
+    none = replace(ground, random=reward, span=20.0)
+    assert validation([half, none], np.zeros(PARAMETERS)) == pytest.approx(0.25)
+    assert validation([ground], np.zeros(PARAMETERS)) == pytest.approx(reward / ground.value(ground.seed))
+    own = replace(instance("train/0005"), name="x", seed=3)
+    made = ground_of(own, known={("x", 3): (40.0, 60.0), ("x", 4): (0.0, 1.0)})
+    assert (made.random, made.unit) == (40.0, 20.0)
 
 
 def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path, ground) -> None:
@@ -55,7 +67,7 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
     rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
     judged = [row["validation"] for row in rows if "validation" in row]
     assert len(told) == len(judged) == 3
-    assert judged[0] == done.teacher
+    assert rows[0]["teacher"] == done.teacher
     assert done.best == max(judged)
     assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
     assert scope_of(str(out)) == "central"
@@ -96,24 +108,3 @@ def test_what_cannot_be_is_refused(capsys) -> None:
             main(["train", *words])
         assert stop.value.code == 2
         assert reason in " ".join(capsys.readouterr().err.split())
-
-
-def test_trainings_are_a_sample_of_their_own_in_a_difference() -> None:
-    """Three trainings that differ more from each other than from the baseline say less than 60 instances would."""
-    rng = np.random.default_rng(0)
-    rows = [
-        {"policy": policy, "instance": f"test/{i}", "seed": i, "reward": 5.0 + gain + 0.1 * float(rng.random())}
-        for policy, gain in (("wsept", 0.0), ("a", 1.0), ("b", 2.0), ("c", 3.0))
-        for i in range(60)
-    ]
-    one, count = difference(rows, ["b"], "wsept")
-    assert count == 60
-    assert (round(one.mean, 1), one.high - one.low < 0.1) == (2.0, True)
-    mean, _ = difference(rows, ["a", "b", "c"], "wsept")
-    assert (round(mean.mean, 1), mean.high - mean.low < 0.1) == (2.0, True)
-    three, _ = difference(rows, ["a", "b", "c"], "wsept", sample=True)
-    assert round(three.mean, 1) == 2.0
-    assert three.low < 1.0 < 3.0 < three.high  # t of 2 degrees of freedom: 2 ± 4.3 · 1 / √3
-    share, count = difference(rows, ["b"], "wsept", {("test/0", 0): 10.0, ("test/1", 1): 10.0})
-    first_two, _ = difference(rows[:2] + rows[120:122] + rows[60:62], ["b"], "wsept")
-    assert (share.mean, count) == (pytest.approx(first_two.mean / 10.0), 2)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from scenarios.doc_tables import table
-from scenarios.leaderboard.board import BASELINE, read_all
+from scenarios.leaderboard.board import BASELINE, SOURCE, read_all
 from scenarios.leaderboard.submission import split_references
 from scenarios.policy_loader import has_trainings
 from scenarios.statistics.scores import ranked, scores_of
@@ -15,7 +15,6 @@ from scenarios.trials.scores import normalised
 
 TRAINED_ARMS = 16
 """Most arms of the fleets of the training split."""
-SOURCE = "oracle"
 
 
 def learned_tables(results: Path) -> dict[str, Callable[[], str]]:

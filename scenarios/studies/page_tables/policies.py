@@ -1,4 +1,4 @@
-"""Tables of docs/policies.md: policies and wrappers from their registry, and measured results from files."""
+"""Tables of docs/policies.md and docs/results.md: policies and wrappers from their registry, and results from files."""
 
 import json
 from collections.abc import Callable
@@ -8,6 +8,14 @@ from typing import Any
 from agents.registry import RULES, WRAPPERS
 from scenarios.doc_tables import table
 
+NAMED = {
+    "faults": ("faults", 1),
+    "value": ("value of finished jobs", 1),
+    "on_time": ("jobs on time", 1),
+    "reward": ("reward", 1),
+    "hot_surface_min": ("minutes with a hot surface", 1),
+}
+"""Figures of the table of named scenarios with heading and decimals; those that are 0 everywhere are left out."""
 SOURCES = {"oracle": "true state", "twin": "identified network"}
 """Score sources of the measured table, by the end of the file's name."""
 
@@ -16,13 +24,14 @@ def policy_tables(results: Path) -> dict[str, Callable[[], str]]:
     """Text of each table by the name in its mark.
 
     Args:
-        results: Folder with `ladder/SCENARIO_SOURCE.json` of `thermofleet compare --json`, and `ladder/decisions.json`
-            of `benchmarks/bench_decisions.py`.
+        results: Folder with `ladder/SCENARIO_SOURCE.json` and `named/SCENARIO.json` of `thermofleet compare --json`,
+            and `ladder/decisions.json` of `benchmarks/bench_decisions.py`.
     """
     return {
         "policies": _policies,
         "wrappers": _wrappers,
         "ladder": lambda: _ladder(results / "ladder"),
+        "named_scenarios": lambda: _named(results / "named"),
         "decisions": lambda: _decisions(_read(results / "ladder/decisions.json")),
     }
 
@@ -63,6 +72,30 @@ def _cell(comparison: dict[str, Any], policy: str) -> str:
     low, high = reward["difference_low"], reward["difference_high"]
     text = f"{reward['difference']:+.1f} ({low:+.1f} … {high:+.1f})".replace("-", "−")
     return (f"**{text}**" if low > 0 or high < 0 else text) + some
+
+
+def _named(results: Path) -> str:
+    """Mean and difference of several figures, a column for each policy."""
+    files = [_read(path) for path in sorted(results.glob("*.json"))]
+    rows: list[tuple[str, ...]] = []
+    for one in files:
+        figures = one["figures"]
+        for figure, (heading, digits) in NAMED.items():
+            own = {policy: figures[policy][figure] for policy in figures}
+            if any(each["mean"] for each in own.values()):
+                base = one["baseline"]
+                cells = [_mean_cell(each, digits, is_base=policy == base) for policy, each in own.items()]
+                rows.append((f"`{one['scenario']}`: {heading}", *cells))
+    return table(("", *(f"`{policy}`" for policy in files[0]["figures"])), rows)
+
+
+def _mean_cell(figure: dict[str, Any], digits: int, *, is_base: bool) -> str:
+    text = f"{figure['mean']:.{digits}f}"
+    if is_base:
+        return text
+    differs = figure["difference_low"] > 0 or figure["difference_high"] < 0
+    text += f" ({figure['difference']:+.{digits}f}{'*' * differs})".replace("-", "−").replace("*", "\\*")
+    return f"**{text}**" if differs else text
 
 
 def _decisions(measured: dict[str, Any]) -> str:
