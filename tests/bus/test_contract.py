@@ -238,7 +238,9 @@ def test_the_committed_documents_are_current():
         "env.md",
         "exchange.md",
         "leaderboard.md",
+        "learning.md",
         "policies.md",
+        "results.md",
     }
 
 

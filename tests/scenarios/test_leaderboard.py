@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -20,7 +20,6 @@ from scenarios.policy_loader import policy_of, scope_of
 from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.suite.splits import manifest
 from scenarios.trials.cases import suite_of
-from scenarios.trials.contest import run_study
 from scenarios.trials.plan import Row, Study
 from scenarios.trials.store import opened
 
@@ -94,9 +93,6 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     assert [cell.strip() for cell in first.split("|")][2:5] == ["`wsept`", "oracle", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text
     assert run("leaderboard", tmp_path / "absent") == 2
-
-
-RESULTS = Path(__file__).parents[2] / "docs" / "results" / "leaderboard"
 
 
 def changed(index: int | None, **fields) -> Callable[[Submission], Submission]:
@@ -215,18 +211,6 @@ def test_a_repetition_finds_other_figures(good: Submission, monkeypatch: pytest.
     with pytest.raises(FleetError, match="does not repeat"):
         check_repeated(of_code, 3)
     assert "not repeated" in check_repeated(changed(None, policy_hash="b" * 16)(good), 3)
-
-
-def test_stored_results_of_built_in_policies_repeat():
-    """One shift of each, with the present code: a change of a policy needs new results."""
-    found = [each for each in read_all(RESULTS, "test") if not each.card.policy_hash]
-    for difficulty in {each.card.difficulty for each in found}:
-        stored = {each.card.policy: each for each in found if each.card.difficulty == difficulty}
-        study = Study(policies=list(stored), cases=suite_of("test/0000", 1), difficulties=[difficulty])
-        for row in run_study(study, workers=1):
-            (before,) = [own.figures for own in stored[row.key.policy].rows if own.instance == "test/0000"]
-            assert row.outcome is not None
-            assert list(asdict(row.outcome).values()) == pytest.approx(before, rel=1e-6, abs=1e-6), row.key
 
 
 def test_without_results_the_table_says_so():
