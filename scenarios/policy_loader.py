@@ -81,8 +81,8 @@ def policy_at(name: str, seed: int) -> Policy:
 
 def is_built_in(name: str) -> bool:
     """Whether a name is that of a rule, perhaps in wrappers; no code is loaded for it."""
-    wrapper, colon, policy = name.partition(":")
-    return is_built_in(policy) if colon and wrapper in WRAPPERS else name in RULES
+    wrapped = _wrapped(name)
+    return is_built_in(wrapped[1]) if wrapped else name in RULES
 
 
 def source_of(name: str) -> Path | None:

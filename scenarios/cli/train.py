@@ -122,13 +122,13 @@ def train_command(
     if suite is not None:
         from scenarios.run.suite_batches import grounds_of
         from scenarios.suite.splits import split
-        from scenarios.trials.plan import Case
+        from scenarios.trials.cases import suite_of
         from scenarios.trials.scores import references_of
 
         usual = (36, 60) if algorithm == "pairs" else (12, 24)
         train = split(suite)[: instances or usual[0]]
         validation = split("validation")[: validation_instances or usual[1]]
-        cases = [Case(name=each.name, scenario=each.scenario, seeds=(each.seed,)) for each in (*train, *validation)]
+        cases = [*suite_of(suite, 1)[: len(train)], *suite_of("validation", 1)[: len(validation)]]
         known = {shift: (each.random, each.hindsight) for shift, each in references_of(cases).items()}
         with progress_bar() as progress:
             grounds = grounds_of(train, **models, known=known, progress=progress)

@@ -119,9 +119,8 @@ def remark_text(board: Board) -> str:
 def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
     mean, difference, stars, *rest = score_cells(scores, name)
     card = entry.card
-    trainings = f", {card.trainings} trainings" if card.trainings > 1 else ""
     own = (
-        f"`{card.policy}`{trainings}",
+        entry.title,
         card.difficulty,
         card.scope,
         mean,

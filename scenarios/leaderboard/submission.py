@@ -92,6 +92,12 @@ class Submission(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.card.split}-{plain}-{self.card.difficulty}"
 
     @property
+    def title(self) -> str:
+        """Its policy in a table, as Markdown."""
+        more = f", {self.card.trainings} trainings" if self.card.trainings > 1 else ""
+        return f"`{self.card.policy}`{more}"
+
+    @property
     def failures(self) -> int:
         """Shifts in which the policy failed."""
         return sum(row.figures is None for row in self.rows)

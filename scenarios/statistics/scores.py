@@ -8,7 +8,7 @@ from rich.table import Table
 
 from scenarios.statistics.holm import holm
 from scenarios.statistics.means import LEVEL, Interval, interval, paired
-from scenarios.statistics.suites import Unit, aggregates, improvement
+from scenarios.statistics.suites import aggregates, improvement
 
 Array = np.ndarray
 
@@ -107,6 +107,7 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
     if len(values.instances) < FEWEST:
         raise ValueError(f"Scores need {FEWEST} instances or more (got {len(values.instances)}).")
     base, names = values.score[baseline], list(values.score)
+    suite = aggregates(values.score, "both")
     differences = [Interval(0.0, 0.0, 0.0) if name == baseline else values.difference(name, baseline) for name in names]
     adjusted = holm([each.p for each in differences]).tolist()
     return Scores(
@@ -120,13 +121,12 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
                 mean=interval(values.score[name][:, None]),
                 difference=difference,
                 p_holm=p_holm,
-                iqm=suite.iqm,
-                optimality_gap=suite.optimality_gap,
-                improvement=improvement(values.score[name], base, sample_of(values.score[name])),
+                iqm=suite[name].iqm,
+                optimality_gap=suite[name].optimality_gap,
+                improvement=improvement(values.score[name], base, "both"),
                 bound_gap=interval(values.to_bound[name][:, None]),
             )
             for name, difference, p_holm in zip(names, differences, adjusted, strict=True)
-            for suite in [aggregates({name: values.score[name]}, sample_of(values.score[name]))[name]]
         },
     )
 
@@ -134,11 +134,6 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
 def and_trainings(count: int) -> str:
     """What a unit says of the trainings of policies."""
     return f" × {count} trainings of a policy" if count > 1 else ""
-
-
-def sample_of(scores: Array) -> Unit:
-    """What is a sample in scores [training, instance]."""
-    return "both" if len(scores) > 1 else "instances"
 
 
 def ranked(scores: Scores) -> list[str]:

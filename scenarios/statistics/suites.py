@@ -6,8 +6,8 @@ is the unit that an interval speaks about:
 
 - `within`: runs of each instance apart (stratified, as in rliable): the same suite with other seeds.
 - `runs`: whole runs: the same suite with other trainings, each of which does all instances.
-- `instances`: instances, with their runs: other instances of the same generator. A single run per instance allows no
-  other unit.
+- `instances`: instances, with their runs: other instances of the same generator.
+- `both`: runs and instances; a single run is given, so that this is the same as `instances`.
 
 Resamples are weights, so every figure of every policy is a product of one matrix. The mean over instances needs none:
 `means.interval` of [instance, 1, run].
@@ -107,7 +107,8 @@ def improvement(scores: ArrayLike, base: ArrayLike, unit: Unit = "instances", *,
 
 def _beyond(shape: tuple[int, ...], unit: Unit, level: float) -> tuple[float, float]:
     """Bounds of a share that is 0 and of one that is 1 in everything that was drawn, which resamples cannot exceed."""
-    most = share_bounds(0, min(shape) if unit == "both" else shape[unit != "runs"], level=level)[1]
+    drawn = min((n for n in shape if n > 1), default=1) if unit == "both" else shape[unit != "runs"]
+    most = share_bounds(0, drawn, level=level)[1]
     return most, 1 - most
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from scenarios.doc_tables import table
 from scenarios.leaderboard.board import BASELINE, SOURCE, read_all
 from scenarios.leaderboard.submission import split_references
-from scenarios.policy_loader import has_trainings
 from scenarios.statistics.scores import ranked, scores_of
 from scenarios.suite.splits import instance
 from scenarios.trials.scores import normalised
@@ -40,8 +39,7 @@ def _by_size(folder: Path) -> str:
     }
     rows: list[tuple[str, ...]] = []
     for name in ranked(next(iter(parts.values()))):
-        trainings = len(values.score[name])
-        cells = [f"`{name}`" + (f", {trainings} trainings" if has_trainings(name) else "")]
+        cells = [found[name].title]
         for scores in parts.values():
             own = scores.policies[name]
             text = own.difference.text()

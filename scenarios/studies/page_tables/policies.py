@@ -7,15 +7,10 @@ from typing import Any
 
 from agents.registry import RULES, WRAPPERS
 from scenarios.doc_tables import table
+from scenarios.run.compare import HEADINGS
 
-NAMED = {
-    "faults": ("faults", 1),
-    "value": ("value of finished jobs", 1),
-    "on_time": ("jobs on time", 1),
-    "reward": ("reward", 1),
-    "hot_surface_min": ("minutes with a hot surface", 1),
-}
-"""Figures of the table of named scenarios with heading and decimals; those that are 0 everywhere are left out."""
+NAMED = ("faults", "value", "on_time", "reward", "hot_surface_min")
+"""Figures of the table of named scenarios; those that are 0 everywhere are left out."""
 SOURCES = {"oracle": "true state", "twin": "identified network"}
 """Score sources of the measured table, by the end of the file's name."""
 
@@ -80,21 +75,22 @@ def _named(results: Path) -> str:
     rows: list[tuple[str, ...]] = []
     for one in files:
         figures = one["figures"]
-        for figure, (heading, digits) in NAMED.items():
+        for figure in NAMED:
             own = {policy: figures[policy][figure] for policy in figures}
             if any(each["mean"] for each in own.values()):
                 base = one["baseline"]
-                cells = [_mean_cell(each, digits, is_base=policy == base) for policy, each in own.items()]
-                rows.append((f"`{one['scenario']}`: {heading}", *cells))
+                cells = [_mean_cell(each, is_base=policy == base) for policy, each in own.items()]
+                rows.append((f"`{one['scenario']}`: {HEADINGS[figure]}", *cells))
     return table(("", *(f"`{policy}`" for policy in files[0]["figures"])), rows)
 
 
-def _mean_cell(figure: dict[str, Any], digits: int, *, is_base: bool) -> str:
-    text = f"{figure['mean']:.{digits}f}"
+def _mean_cell(figure: dict[str, Any], *, is_base: bool) -> str:
+    text = f"{figure['mean']:.1f}"
     if is_base:
         return text
-    differs = figure["difference_low"] > 0 or figure["difference_high"] < 0
-    text += f" ({figure['difference']:+.{digits}f}{'*' * differs})".replace("-", "−").replace("*", "\\*")
+    low, high = figure["difference_low"], figure["difference_high"]
+    differs = low is not None and (low > 0 or high < 0)
+    text += f" ({figure['difference']:+.1f}{'*' * differs})".replace("-", "−").replace("*", "\\*")
     return f"**{text}**" if differs else text
 
 

@@ -11,7 +11,7 @@ from scenarios.report.page import escape, html_page, paragraph, table
 from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
 from scenarios.run.evaluate import FIGURES
 from scenarios.statistics.means import Interval
-from scenarios.statistics.scores import FEWEST, HEADS, Normalised, ranked, sample_of, score_cells, scores_of
+from scenarios.statistics.scores import FEWEST, HEADS, Normalised, ranked, score_cells, scores_of
 from scenarios.statistics.suites import profile
 from scenarios.statistics.tables import LEGEND
 from scenarios.suite.splits import manifest
@@ -134,7 +134,7 @@ def _scores(judged: Judged, values: Normalised) -> Iterator[str]:
     chosen = order[:MOST_CURVES]
     if judged.baseline not in chosen:
         chosen = [*chosen[:-1], judged.baseline]
-    curves = {name: profile(values.score[name], THRESHOLDS, sample_of(values.score[name])) for name in chosen}
+    curves = {name: profile(values.score[name], THRESHOLDS, "both") for name in chosen}
     bands = {label(name): (each.share, each.low, each.high) for name, each in curves.items()}
     banded = {label(chosen[0]), label(judged.baseline)}
     yield lines(THRESHOLDS, bands, banded, "normalised score", "share of instances above")
