@@ -3,11 +3,12 @@
 import re
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from math import isfinite
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from joblib import Parallel, delayed
 
@@ -61,6 +62,8 @@ class Reference:
     """Upper bound before whole jobs and heat budgets."""
     evaluations: int
     """Shifts that the search simulated."""
+    nodes: int
+    """Most nodes of the branch and bound of the upper bound."""
     search_s: float | None
     """CPU time of the search; this and the other times are None if the budget counts evaluations only."""
     upper_s: float | None
@@ -146,6 +149,7 @@ def reference(
         upper=upper.reward if upper else float("inf"),
         linear=upper.linear if upper else float("inf"),
         evaluations=found.evaluations,
+        nodes=budget.nodes if bound else 0,
         search_s=found.seconds if timed else None,
         upper_s=ended_s - bounded_s if timed else None,
         seconds=ended_s - began_s if timed else None,
@@ -181,7 +185,9 @@ def references(
     """
     rows, folder = Rows(path), cache or cache_folder()
     rows.check_writable()
-    left = [task for task in tasks if not _enough(rows.by_key.get(key_of(task, difficulty)), budget)]
+    keys = [key_of(task, difficulty) for task in tasks]
+    known = {(each.instance, each.seed): each for each in load_references(path, keys)}
+    left = [task for task in tasks if not _enough(known.get((task.instance, task.seed)), budget)]
     first: dict[object, Task] = {}
     cells = [first.setdefault(plan_content(task.scenario), task) for task in left]
     order = [task for cell in first.values() for task, own in zip(left, cells, strict=True) if own is cell]
@@ -189,7 +195,7 @@ def references(
         for task in first.values():
             _fleet_of(task, difficulty, folder, progress)  # so that no two processes plan the same motions
     work = (
-        delayed(_bounded)(task, budget, difficulty, rows.by_key.get(key_of(task, difficulty)), folder, policies)
+        delayed(_bounded)(task, budget, difficulty, known.get((task.instance, task.seed)), folder, policies)
         for task in order
     )
     done = len(tasks) - len(left)
@@ -201,7 +207,7 @@ def references(
             done += 1
             progress("bounding", Count(done, len(tasks)))
     rows.sort(_place)
-    return load_references(path, [key_of(task, difficulty) for task in tasks])
+    return load_references(path, keys)
 
 
 _fleets = Fleets()
@@ -214,24 +220,31 @@ def _fleet_of(task: Task, difficulty: DifficultyName, folder: Path, progress: Pr
 
 
 def _bounded(
-    task: Task, budget: Budget, difficulty: DifficultyName, known: Row | None, folder: Path, policies: Sequence[str]
+    task: Task,
+    budget: Budget,
+    difficulty: DifficultyName,
+    known: Reference | None,
+    folder: Path,
+    policies: Sequence[str],
 ) -> Reference:
     """The reference of a task, in whichever process this is."""
     fleet = _fleet_of(task, difficulty, folder)
     try:
-        claims = load_reference(known).claims if known else ()
-        return reference(fleet, task, budget, difficulty=difficulty, known=claims, policies=policies)
+        found = reference(
+            fleet, task, budget, difficulty=difficulty, known=known.claims if known else (), policies=policies
+        )
+        return replace(found, upper=min(found.upper, known.upper)) if known else found
     except ValueError as error:
         raise ScenarioError(f"{task.instance}: {error}") from error
 
 
-def _enough(row: Row | None, budget: Budget) -> bool:
-    """Whether a row is of at least this budget."""
-    if row is None:
+def _enough(known: Reference | None, budget: Budget) -> bool:
+    """Whether a reference is of at least this budget."""
+    if known is None or known.nodes < budget.nodes:
         return False
     if isfinite(budget.seconds):
-        return (row["search_s"] or 0.0) >= 0.9 * budget.seconds
-    return row["evaluations"] >= budget.evaluations
+        return (known.search_s or 0.0) >= 0.9 * budget.seconds
+    return known.evaluations >= budget.evaluations
 
 
 def _place(row: Row) -> list[object]:
@@ -249,15 +262,11 @@ def _key(instance: str, scenario: str, seed: int, difficulty: str) -> str:
 
 
 def load_references(path: Path, keys: Iterable[str] | None = None) -> list[Reference]:
-    """The references in a file: all, or those of some keys."""
+    """The references in a file: all, or those of some keys.
+
+    Raises:
+        FleetError: the file has other rows, or damaged ones.
+    """
     rows = Rows(path)
-    return [load_reference(row) for row in rows.some(rows.by_key if keys is None else keys)]
-
-
-def load_reference(row: dict[str, object]) -> Reference:
-    """A row of a file."""
-    fields = {name: row[name] for name in Reference.__dataclass_fields__}
-    claims = fields["claims"]
-    assert isinstance(claims, list | tuple)
-    fields["claims"] = tuple((int(tick), int(arm), int(action)) for tick, arm, action in claims)
-    return Reference(**fields)  # pyright: ignore[reportArgumentType]  # as they were written
+    with rows.readable():
+        return msgspec.convert(rows.some(rows.by_key if keys is None else keys), list[Reference])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from agents.registry import RULES
 from fleet.engine.reward import RewardWeights
 from fleet.env.random_actions import random_legal
+from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.bounds import references as stored
 from scenarios.bounds.exhaustive import optimum
@@ -184,7 +185,8 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
 
     def counted(fleet, task, budget, *, known, **options):
         calls.append((task.instance, len(known)))
-        return replace(one, instance=task.instance, seed=task.seed, search_s=budget.seconds)
+        found = replace(one, instance=task.instance, seed=task.seed, search_s=budget.seconds, nodes=budget.nodes)
+        return replace(found, upper=100.0 - budget.seconds - budget.nodes / 1e6)
 
     monkeypatch.setattr(stored, "reference", counted)
     monkeypatch.setattr(stored, "_fleet_of", lambda *_: fleet)
@@ -196,6 +198,12 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
     longer = references(tasks, path, Budget(seconds=5.0), difficulty="blind")
     assert calls[2:] == [("three/1", len(one.claims)), ("three/2", len(one.claims))]
     assert [asdict(each) for each in load_references(path)] == [asdict(each) for each in longer]
+    proved = references(tasks, path, Budget(seconds=1.0, nodes=9000), difficulty="blind")  # more nodes, a lower bound
+    assert [each.nodes for each in proved] == [9000, 9000]
+    assert [each.upper for each in proved] == [each.upper for each in longer]
+    path.write_text(path.read_text().replace('"claims": [[', '"claims": [["x", '), encoding="utf-8")
+    with pytest.raises(FleetError, match=r"A row of '.*bounds.jsonl' has a missing or odd value .* remove the row"):
+        references(tasks, path, Budget(seconds=1.0), difficulty="blind")
 
 
 def test_a_budget_of_evaluations_gives_the_same_file_in_any_order(fleet: Fleet, tmp_path: Path):

@@ -95,7 +95,8 @@ def test_charts_place_points_by_value():
     near, far = (float(x) for x in re.findall(r'circle cx="([\d.]+)"', chart))
     assert near < far
     assert "◂ -9.00" in chart
-    assert points([("a", 1.0, 2.0)], "x", "y").count("<circle") == 1
+    drawn = points([("a", (1.0, 0.5, 2.5), (2.0, 2.0, 2.0))], "x", "y")
+    assert (drawn.count("<circle"), drawn.count("stroke-opacity")) == (1, 1)
 
 
 def test_the_command_line_has_what_is_no_default():

@@ -30,7 +30,15 @@ BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0))
 def reference(line) -> Reference:
     """Random has 10, hindsight 30, the bound is 40."""
     more = {"difficulty": "oracle", "random_se": 0.0, "rule": "wspt", "best_rule": 20.0, "linear": 40.0, "claims": ()}
-    times = {"evaluations": 1, "search_s": None, "upper_s": None, "seconds": None, "code": "", "seed": line.seed}
+    times = {
+        "evaluations": 1,
+        "nodes": 0,
+        "search_s": None,
+        "upper_s": None,
+        "seconds": None,
+        "code": "",
+        "seed": line.seed,
+    }
     return Reference(
         instance=line.name, scenario_hash=line.scenario, random=10.0, hindsight=30.0, upper=40.0, **more, **times
     )  # pyright: ignore[reportArgumentType]  # of the dictionaries

@@ -1,5 +1,7 @@
 """Studies: the same rows on any number of processes and after any interruption; failures are told, the rest goes on."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -182,6 +184,21 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     failed = comparison_of(study, rows, names["Raises"])
     assert not failed.figures
     assert result_page(failed)
+
+
+def test_a_policy_that_catches_every_alarm_ends_with_its_process():
+    code = """
+from scenarios.run import decision_limit
+decision_limit.AGAIN_S, limit = 0.05, decision_limit.DecisionLimit(0.05)
+with limit.watching(), limit.decision():
+    while True:
+        try:
+            while True: pass
+        except BaseException: pass
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1
+    assert "longer than 0.05 s, and the policy catches what should end it" in ended.stderr
 
 
 def test_shifts_of_a_process_that_dies_are_run_again(scenario, plans, bad, monkeypatch):

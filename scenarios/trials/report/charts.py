@@ -16,6 +16,8 @@ WIDTH, ROW, LEFT, RIGHT, TOP, BOTTOM = 720, 22, 190, 20, 8, 44
 """Of a chart, px."""
 LETTER = 7.0
 """Width of a letter, px."""
+Range = tuple[float, float, float]
+"""A value with its lower and upper bound."""
 
 
 @dataclass(frozen=True)
@@ -110,18 +112,22 @@ def lines(
     return _svg(height, parts, f"{y_title} against {x_title} of {', '.join(by_name)}")
 
 
-def points(rows: Sequence[tuple[str, float, float]], x_title: str, y_title: str, height: int = 400) -> str:
-    """A point for each name, with its name beside it where there is room.
+def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str, height: int = 400) -> str:
+    """A point for each name with its intervals, and its name beside it where there is room.
 
     Args:
-        rows: Name, x and y.
+        rows: Name, x and y; each of the two with its lower and upper bound.
     """
-    xs, ys = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
+    ranges = np.array([row[1:] for row in rows])  # [name, axis, value and bounds]
+    xs, ys = np.moveaxis(np.where(np.isfinite(ranges), ranges, ranges[..., :1]), 1, 0)
     room_x, room_y = 0.06 * (np.ptp(xs) or 1.0), 0.08 * (np.ptp(ys) or 1.0)
     x = Axis(float(xs.min() - room_x), float(xs.max() + room_x), 60, WIDTH - RIGHT)
     y = Axis(float(ys.min() - room_y), float(ys.max() + room_y), height - BOTTOM, TOP)
     parts, taken = [_ticks(x, TOP, height - BOTTOM, x_title), _y_ticks(y, 60, y_title)], list[tuple[float, ...]]()
-    dots = [(x.at(a), y.at(b)) for _, a, b in rows]
+    dots = [(x.at(a), y.at(b)) for _, (a, *_), (b, *_) in rows]
+    for (a, b), (_, *x_ends), (_, *y_ends) in zip(dots, xs, ys, strict=True):
+        (left, right), (low, high) = map(x.at, x_ends), map(y.at, y_ends)
+        parts.append(f'<path d="M{left} {b}H{right}M{a} {low}V{high}" stroke="{COLOURS[0]}" stroke-opacity=".4"/>')
     taken += [(a - 5, b - 5, a + 5, b + 5) for a, b in dots]
     for (name, *_), (a, b) in zip(rows, dots, strict=True):
         parts.append(f'<circle cx="{a}" cy="{b}" r="4.5" fill="{COLOURS[0]}"><title>{escape(name)}</title></circle>')

@@ -173,7 +173,10 @@ def _cell(instance: str) -> str:
 
 def _heat(judged: Judged) -> Iterator[str]:
     for result in judged.results:
-        rows = [(label(name), each["peak_c"].mean, each["value"].mean) for name, each in result.figures.items()]
+        rows = [
+            (label(name), *((f.mean, f.low, f.high) for f in (each["peak_c"], each["value"])))
+            for name, each in result.figures.items()
+        ]
         if rows:
             yield f"<h2>Value against heat{'' if len(judged.results) == 1 else f': {escape(result.scenario)}'}</h2>"
             yield points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
