@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -44,14 +45,17 @@ def loops(processes: int) -> None:
 
 
 def ray_cluster() -> Callable[[int], str]:
-    """Start a local Ray cluster of one node; returned: what adds nodes up to a number, and gives the address."""
+    """Start a local Ray cluster of one node; returned: what gives it a number of nodes, and returns the address."""
     from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    more: list[Any] = []
 
     def address(nodes: int) -> str:
-        while len(cluster.list_all_nodes()) < nodes:
-            cluster.add_node(num_cpus=1)
+        while 1 + len(more) < nodes:
+            more.append(cluster.add_node(num_cpus=1))
+        while 1 + len(more) > nodes:
+            cluster.remove_node(more.pop())
         cluster.wait_for_nodes()
         return cluster.address
 
@@ -79,8 +83,10 @@ def main() -> None:
             run_unit.fleets = Fleets()  # as in a new process
             rows: list[object] = []
 
-            def study_it(workers: int = workers, rows: list[object] = rows) -> None:
-                rows += run_study(study, workers=workers, ray=address(workers) if address else None)
+            where = address(workers) if address else None
+
+            def study_it(workers: int = workers, rows: list[object] = rows, where: str | None = where) -> None:
+                rows += run_study(study, workers=workers, ray=where)
 
             took[name].append(seconds(study_it))
             expected = expected or rows

@@ -24,7 +24,9 @@ from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 from scenarios.schema import RewardSpec
 
-_PART = re.compile(r"(<!-- made by thermofleet contract: (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+MARK = "<!-- made by thermofleet contract:"
+"""Before the name of each table of a page."""
+_PART = re.compile(rf"({MARK} (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 Tables = Mapping[str, Callable[[], str]]

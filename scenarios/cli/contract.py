@@ -10,20 +10,6 @@ import typer
 from fleet.errors import FleetError
 from scenarios.cli.terminal import out_console, say
 
-PAGES = (
-    "bounds.md",
-    "bus.md",
-    "cli.md",
-    "env.md",
-    "exchange.md",
-    "leaderboard.md",
-    "learning.md",
-    "policies.md",
-    "results.md",
-)
-"""Pages with generated tables."""
-
-
 def contract_command(
     out: Annotated[Path, typer.Option(help="Folder for the documents.")] = Path("docs/contract"),
     check: Annotated[bool, typer.Option("--check", help="Only check whether the documents are current.")] = False,
@@ -46,12 +32,13 @@ def documents(out: Path) -> dict[Path, str]:
     """Text of every document by path, including the pages that are in the folder above."""
     from fleet.bus.protocol.asyncapi import asyncapi
     from fleet.bus.protocol.schemas import schema_document
-    from scenarios.doc_tables import fill_tables
+    from scenarios.doc_tables import MARK, fill_tables
     from scenarios.leaderboard.board import benchmark_tables
     from scenarios.studies.page_tables.channels import channel_tables
     from scenarios.studies.page_tables.learned import learned_tables
     from scenarios.studies.page_tables.policies import policy_tables
     from scenarios.studies.page_tables.sample_efficiency import efficiency_tables
+    from scenarios.studies.page_tables.speed import speed_tables
 
     results = out.parent / "results"
     more = {
@@ -61,12 +48,11 @@ def documents(out: Path) -> dict[Path, str]:
         **benchmark_tables(results),
         **efficiency_tables(results),
         **learned_tables(results),
+        **speed_tables(results / "scaling"),
     }
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}
-    for page in (out.parent / name for name in PAGES):
-        if page.is_file():
-            made[page] = fill_tables(page.read_text(encoding="utf-8"), more)
-    return made
+    pages = {page: page.read_text(encoding="utf-8") for page in sorted(out.parent.glob("*.md"))}
+    return made | {page: fill_tables(text, more) for page, text in pages.items() if MARK in text}
 
 
 def _command_tables() -> str:

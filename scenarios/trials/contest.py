@@ -70,7 +70,8 @@ def run_study(
         # The largest first, so that processes end together; what shares plans follows.
         units = sorted(study.units(set(store.rows)), key=lambda unit: (-unit.size, unit.cell))
         folder = cache_dir or cache_folder()  # here: a worker may have started with another one
-        warm(units, study, folder, here.fleets, progress)
+        if ray is None:  # other machines have caches of their own
+            warm(units, study, folder, here.fleets, progress)
         settings = Settings.of(study, cache_dir if ray else folder)
         done = len(wanted) - sum(len(unit.case.seeds) for unit in units)
         for rows in _run(units, settings, workers, ray, tell):

@@ -1,4 +1,4 @@
-"""Table of docs/learning.md: learned policies on fleets of sizes that they were trained on, and on larger ones."""
+"""Table of docs/learning.md: learned policies on fleets of sizes that they were trained on, and on others."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,11 +9,12 @@ from scenarios.doc_tables import table
 from scenarios.leaderboard.board import BASELINE, SOURCE, read_all
 from scenarios.leaderboard.submission import split_references
 from scenarios.statistics.scores import ranked, scores_of
+from scenarios.suite.cells import CELLS
 from scenarios.suite.splits import instance
 from scenarios.trials.scores import normalised
 
-TRAINED_ARMS = 16
-"""Most arms of the fleets of the training split."""
+TRAINED = {cell.arms for cell in CELLS if cell.split == "train"}
+"""Numbers of arms of the fleets of the training split."""
 
 
 def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
@@ -32,8 +33,13 @@ def _by_size(folder: Path) -> str:
         {name: each.study_rows() for name, each in found.items()}, split_references("test"), failed_as_random=True
     )
     assert values is not None
-    large = np.array([len(instance(name).scenario.arms) > TRAINED_ARMS for name in values.instances])
-    groups = {"all instances": large | True, f"up to {TRAINED_ARMS} arms": ~large, "more arms": large}
+    arms = np.array([len(instance(name).scenario.arms) for name in values.instances])
+    groups = {
+        "all instances": arms > 0,
+        "trained sizes": np.isin(arms, list(TRAINED)),
+        "other sizes": ~np.isin(arms, list(TRAINED)) & (arms < max(TRAINED)),
+        "larger": arms > max(TRAINED),
+    }
     parts = {
         f"{name} ({int(chosen.sum())})": scores_of(values.only(chosen), BASELINE) for name, chosen in groups.items()
     }
