@@ -10,6 +10,7 @@ import typer
 from fleet.errors import FleetError
 from scenarios.cli.terminal import out_console, say
 
+
 def contract_command(
     out: Annotated[Path, typer.Option(help="Folder for the documents.")] = Path("docs/contract"),
     check: Annotated[bool, typer.Option("--check", help="Only check whether the documents are current.")] = False,
