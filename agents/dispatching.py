@@ -83,7 +83,8 @@ class LeastLoaded:
     """
 
     scope: ClassVar = "central"
-    only_choices = True
+    only_choices = False
+    """A claim is known to be lost only in the next interval."""
 
     def __init__(self) -> None:
         self.reset(np.random.default_rng(0))
@@ -95,11 +96,12 @@ class LeastLoaded:
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """One pass over the slots from the oldest job; each goes to the able arm with the least work."""
-        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
-            return dict.fromkeys(observations, WAIT)
         for arm, claimed_s in self._claimed_s.items():
             if arm in observations and observations[arm].last_award < 0:
                 self._load_s[arm] -= claimed_s
+        self._claimed_s = {}
+        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
+            return dict.fromkeys(observations, WAIT)
         actions = oldest_jobs_to(sorted(observations, key=lambda arm: self._load_s.get(arm, 0.0)), observations)
         self._claimed_s = {
             arm: float(observations[arm].duration_s[action - 1]) for arm, action in actions.items() if action != WAIT

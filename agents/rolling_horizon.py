@@ -66,15 +66,17 @@ class Sequences(NamedTuple):
 class RollingHorizon(Wsept):
     """The best sequences of up to two jobs per arm within an hour, by expected worth and tardiness; see the module.
 
-    `solution` is that of the last decision, with its gap. Scope central: it plans for all arms. A decision that reaches
-    `time_limit_s` uses the best sequences so far, and then a shift no longer repeats exactly.
+    `solution` is that of the last decision, with its gap. Scope central: it plans for all arms. A decision ends with
+    the best sequences so far after `nodes` nodes. If it reaches `time_limit_s` before, a shift no longer repeats exactly.
     """
 
     scope: ClassVar = "central"
     only_choices = True
     horizon_s: ClassVar = 3600.0
-    time_limit_s: ClassVar = 0.5
-    """For the solver, at each decision."""
+    nodes: ClassVar = 100
+    """Most nodes of the solver's branch and bound at each decision; nearly all end at the first."""
+    time_limit_s: ClassVar = 1.0
+    """For the solver, at each decision, so that a live fleet never waits for long."""
     tau_s: ClassVar = 1800.0
     """Time constant of a motor with its housing: a nominal joint 2 cools from 75 to 42 °C in 1900 s at 30 °C."""
     discount_s: ClassVar = 1800.0
@@ -99,7 +101,7 @@ class RollingHorizon(Wsept):
         began_s, fleet = time.perf_counter(), list(observations.values())
         home_s = max((float(seen.busy_s) for seen in fleet if seen.working), default=0.0)
         found = [self.sequences(seen, home_s) for seen in fleet]
-        solution = pack(found, len(fleet[0].offered), plans_of(fleet[0]), self.time_limit_s)
+        solution = pack(found, len(fleet[0].offered), plans_of(fleet[0]), self.time_limit_s, self.nodes)
         self.solution = solution._replace(seconds=time.perf_counter() - began_s)
         arm = np.repeat(np.arange(len(found)), [len(each.first) for each in found])
         first, waits = (np.concatenate([getattr(each, name) for each in found]) for name in ("first", "waits"))
@@ -168,10 +170,11 @@ class RollingHorizon(Wsept):
         late_s = np.maximum(self.horizon_s + d - due_s, 0.0) - np.maximum(begin_s + d - due_s, 0.0)
         late = self.tardiness_share * self.tardiness_price * value * late_s / 60.0
         earned = worth * np.exp(-(begin_s + d) / self.discount_s) + late
-        return np.where(worth > 0, earned, -np.inf), later_c
+        expired = (per_option(seen, seen.expires)[options] > 0) & (begin_s >= due_s)
+        return np.where((worth > 0) & ~expired, earned, -np.inf), later_c
 
 
-def pack(sequences: Sequence[Sequences], slots: int, plans: int, time_limit_s: float) -> Solution:
+def pack(sequences: Sequence[Sequences], slots: int, plans: int, time_limit_s: float, nodes: int) -> Solution:
     """The sequences with the most worth, at most one of each arm, and each job in at most one of them."""
     from scipy.optimize import LinearConstraint, milp  # slow import that few processes need
     from scipy.sparse import csr_array
@@ -191,7 +194,7 @@ def pack(sequences: Sequence[Sequences], slots: int, plans: int, time_limit_s: f
         integrality=np.ones(total),
         bounds=(0, 1),
         constraints=LinearConstraint(once, -np.inf, 1.0),
-        options={"time_limit": time_limit_s},
+        options={"time_limit": time_limit_s, "node_limit": nodes},
     )
     if result.x is None:  # no solution within the time limit
         return Solution(_greedy(arm, first // plans, second // plans, worth), 0.0, np.inf, 0.0)

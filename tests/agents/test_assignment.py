@@ -198,6 +198,10 @@ def test_a_job_waits_for_the_arm_that_is_home_soon_and_finishes_it_first() -> No
     assert claim("wsept_ahead", 60.0, duration_s=np.array([850.0])) == {"free": 1, "busy": 0}
     assert claim("wsept_ahead", 60.0, np.zeros(1)) == {"free": 1, "busy": 0}
     assert claim("wsept", 60.0) == {"free": 1, "busy": 0}
+    # Late by 2 min, a job of value 4 costs 0.13 of difficulty: 0.8 is still better than 1, 0.9 is not.
+    late = {"slack_s": np.zeros(1), "duration_s": np.array([900.0])}
+    assert claim("matching_ahead", 120.0, difficulty=np.array([0.8]), **late) == {"free": 0, "busy": 0}
+    assert claim("matching_ahead", 120.0, difficulty=np.array([0.9]), **late) == {"free": 1, "busy": 0}
 
 
 @pytest.mark.parametrize("name", [name for name, rule in RULES.items() if rule.scope == "central"])

@@ -86,5 +86,8 @@ def test_the_arm_with_less_work_gets_the_next_job_and_a_lost_claim_is_no_work() 
     assert policy.act({"a": long, "b": nothing}) == {"a": 1, "b": 0}
     lost = replace(short, last_award=np.array(-1.0))
     assert policy.act({"a": lost, "b": nothing}) == {"a": 1, "b": 0}  # 900 s, and 100 s of this claim
+    policy.act({"a": lost, "b": nothing})  # and once more lost, then nobody may claim
+    assert policy.act({"a": replace(nothing, last_award=np.array(-1.0)), "b": nothing}) == {"a": 0, "b": 0}
+    assert policy.act({"a": short, "b": nothing}) == {"a": 1, "b": 0}
     many = [policy.act({"a": short, "b": short}) for _ in range(9)]
     assert [claims["b"] for claims in many] == [1] * 8 + [0]  # from 200 s to 1000 s, which is equal: the first arm

@@ -72,14 +72,14 @@ def test_the_program_finds_the_best_of_all_selections(seed) -> None:
         taken = [job for job in taken if job != NONE]
         if len(set(taken)) == len(taken):
             best = max(best, sum(float(row.worth[i]) for row, i in zip(rows, choice, strict=True) if i >= 0))
-    solution = pack(rows, jobs, 1, 5.0)
+    solution = pack(rows, jobs, 1, 5.0, 10**6)
     assert solution.worth == pytest.approx(best)
     assert solution.gap == pytest.approx(0.0, abs=1e-4)
 
 
 def test_without_time_for_the_solver_the_sequences_are_still_compatible() -> None:
     row = Sequences(np.array([0, 0, 1]), np.array([NONE, 1, NONE]), np.zeros(3, bool), np.array([1.0, 1.5, 0.9]))
-    solution = pack([row, row], 2, 1, 0.0)
+    solution = pack([row, row], 2, 1, 0.0, 10**6)
     jobs = [job for i in solution.chosen for job in (row.first[i % 3], row.second[i % 3]) if job != NONE]
     assert solution.chosen
     assert len(set(jobs)) == len(jobs)

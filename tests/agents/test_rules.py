@@ -92,8 +92,8 @@ def test_every_rule_waits_where_nothing_is_legal(name) -> None:
     assert act(name, fleet([[1.0, 2.0], [2.0, 1.0]], mask=[[0, 0], [0, 0]])) == [[WAIT, WAIT]]
 
 
-@pytest.mark.parametrize("name", RULES)
-def test_every_rule_need_not_be_asked_where_nothing_is_legal(name) -> None:
+@pytest.mark.parametrize("name", [name for name in RULES if name != "least_loaded"])  # it must hear of lost claims
+def test_a_rule_need_not_be_asked_where_nothing_is_legal(name) -> None:
     """It draws and remembers nothing then, as it says of itself."""
     policy = make_policy(name)
     policy.reset(rng())
