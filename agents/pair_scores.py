@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import ClassVar
 
@@ -119,24 +120,28 @@ def load_pairs(folder: Path) -> PairPolicy:
     Raises:
         CheckpointError: a file is missing, damaged or of another format.
     """
+    return PairPolicy(_parameters(folder))
+
+
+def _parameters(folder: Traversable) -> Array:
+    """Those of a folder; errors as of `load_pairs`."""
     try:
         found = json.loads((folder / PAIRS_CARD).read_text(encoding="utf-8"))["format"]
-        parameters = np.load(folder / PAIRS, allow_pickle=False)
+        with (folder / PAIRS).open("rb") as opened:
+            parameters = np.load(opened, allow_pickle=False)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"There is no policy over pairs in '{folder}' ({error}).") from error
     if found != PAIRS_FORMAT:
         raise CheckpointError(f"{folder / PAIRS_CARD}: format {found} is not {PAIRS_FORMAT}. Train the policy again.")
     if parameters.shape != (PARAMETERS,) or not np.isfinite(parameters).all():
         raise CheckpointError(f"{folder / PAIRS}: must be {PARAMETERS} finite numbers (shape {parameters.shape}).")
-    return PairPolicy(parameters)
+    return parameters
 
 
 @cache
 def shipped_parameters() -> Array:
     """The parameters that come with the project: the best on the validation split of several trainings."""
-    file = resources.files("agents").joinpath(f"weights/{PAIRS}")
-    with file.open("rb") as opened:
-        return np.load(opened, allow_pickle=False)
+    return _parameters(resources.files("agents") / "weights")
 
 
 class WseptLearned(PairPolicy):

@@ -67,7 +67,8 @@ class RollingHorizon(Wsept):
     """The best sequences of up to two jobs per arm within an hour, by expected worth and tardiness; see the module.
 
     `solution` is that of the last decision, with its gap. Scope central: it plans for all arms. A decision ends with
-    the best sequences so far after `nodes` nodes. If it reaches `time_limit_s` before, a shift no longer repeats exactly.
+    the best sequences so far after `nodes` nodes; if it reaches `time_limit_s` before, a shift no longer repeats
+    exactly.
     """
 
     scope: ClassVar = "central"

@@ -233,7 +233,9 @@ def _bounded(
         found = reference(
             fleet, task, budget, difficulty=difficulty, known=known.claims if known else (), policies=policies
         )
-        return replace(found, upper=min(found.upper, known.upper)) if known else found
+        if known and known.code == found.code:
+            found = replace(found, upper=min(found.upper, known.upper))
+        return found
     except ValueError as error:
         raise ScenarioError(f"{task.instance}: {error}") from error
 

@@ -163,7 +163,9 @@ def compare_command(
         with disk_errors(out):
             (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")
             if marl_eval:
-                table = to_marl_eval(map(columns, rows), FIGURES)
+                failed = {(row.key.policy, row.key.difficulty) for row in rows if row.error is not None}
+                whole = [row for row in rows if (row.key.policy, row.key.difficulty) not in failed]
+                table = to_marl_eval(map(columns, whole), FIGURES)
                 (out / "marl_eval.json").write_text(json.dumps(table) + "\n", encoding="utf-8")
     if as_json:
         print_json(results[0] if len(results) == 1 else results)

@@ -82,7 +82,7 @@ def _is_baseline(each: Submission) -> bool:
 def board_text(board: Board | None, split: str) -> str:
     """The board as Markdown: what is best of each scope, the table, and what must be known."""
     if board is None:
-        return f"No results with references on the split {split}."
+        return f"No results on the split {split}."
     scores = board.scores
     parts = [best_text(board)]
     rows = [(str(place), *_cells(scores, name, board.entries[name])) for place, name in enumerate(board.order, start=1)]

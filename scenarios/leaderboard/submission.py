@@ -15,6 +15,7 @@ from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
 from scenarios.bounds.references import Reference
 from scenarios.policy_loader import is_built_in, label, scope_of
+from scenarios.prepare.fleet import RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import FIGURES, Outcome
@@ -38,8 +39,9 @@ MOST_FIGURE = 1e9
 SHOWN = 3
 """Problems that an error names."""
 Text = Annotated[str, msgspec.Meta(max_length=200)]
-Name = Annotated[str, msgspec.Meta(max_length=200, pattern=r"^[^\x00-\x1f\x7f-\x9f|<>\u2028\u2029\ud800-\udfff]*$")]
-"""Text of a table: no control characters, and no | < >."""
+PLAIN = r"^[^\x00-\x1f\x7f-\x9f|<>`\u2028\u2029\ud800-\udfff]*$"
+"""Text of a table: no control characters, and no | < > `."""
+Name = Annotated[str, msgspec.Meta(max_length=200, pattern=PLAIN)]
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
 
 
@@ -47,7 +49,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """The first line of a file."""
 
     format: Literal[1]
-    policy: Annotated[str, msgspec.Meta(min_length=1, max_length=80)]
+    policy: Annotated[str, msgspec.Meta(min_length=1, max_length=80, pattern=PLAIN)]
     difficulty: Literal["twin", "oracle", "blind"]
     split: SplitName
     scope: Literal["arm", "central"]
@@ -61,7 +63,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     code_hash: Hash
     policy_hash: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{16})?$")]
     """Of the policy's files; "" if it belongs to the code."""
-    risk: Text
+    risk: RiskName
     versions: dict[str, str | None]
 
 

@@ -62,6 +62,8 @@ class Comparison:
     seeds: tuple[int, ...]
     unit: str
     """What the intervals speak about."""
+    draws: int
+    """Independent draws that the intervals rest on: the smallest number of fleets, trainings, seeds or instances."""
     baseline: str
     figures: dict[str, dict[str, Figure]]
     """By policy and name of the figure."""
@@ -77,11 +79,18 @@ class Comparison:
     scores: Scores | None = None
     """Normalised scores; None without references of the shifts."""
 
+    @property
+    def title(self) -> str:
+        """What was compared, with the seeds if they follow each other."""
+        first, last = self.seeds[0], self.seeds[-1]
+        seeds = f", seeds {first} to {last}" if self.seeds == tuple(range(first, last + 1)) else ""
+        return f"{self.scenario}{seeds} ({self.unit})"
+
     def _repr_html_(self) -> str:
         head = ("policy", *(HEADINGS[name] for name in FIGURES))
         rows = [[label(policy), *map(self._cell, figures.values())] for policy, figures in self.figures.items()]
         what = f"mean [interval] and paired difference to {label(self.baseline)}; {LEGEND}"
-        more = "".join(f" {each}" for each in remarks(self.figures, len(self.seeds)))
+        more = "".join(f" {each}" for each in remarks(self.figures, self.draws))
         return table(head, rows, caption=f"{self.scenario}, {self.unit}: {what}.{more}")
 
     @staticmethod
@@ -158,10 +167,7 @@ def figures_of_shifts(
 
 def comparison_table(result: Comparison) -> Group:
     """A block per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
-    title = (
-        f"{result.scenario}, seeds {result.seeds[0]} to {result.seeds[-1]} ({result.unit}): mean, paired difference to "
-        f"{result.baseline}, {LEGEND}"
-    )
+    title = f"{result.title}: mean, paired difference to {result.baseline}, {LEGEND}"
     if result.channel != PERFECT.described():
         title += f"\nChannel: {result.channel_text}."
     table = empty_table()
@@ -171,7 +177,7 @@ def comparison_table(result: Comparison) -> Group:
     for name in FIGURES:
         figures = {policy: each[name] for policy, each in result.figures.items()}
         add_block(table, HEADINGS[name], figures, result.baseline, label, LEAST_DIGITS.get(name, 1))
-    below = list(remarks(result.figures, len(result.seeds)))
+    below = list(remarks(result.figures, result.draws))
     central = [label(policy) for policy, scope in result.scopes.items() if scope == "central"]
     if result.channel != PERFECT.described() and central:
         below.append(f"Central policies read no messages: {', '.join(central)}.")

@@ -8,12 +8,14 @@ from rich.table import Table
 
 from scenarios.statistics.holm import holm
 from scenarios.statistics.means import LEVEL, Interval, interval, paired
-from scenarios.statistics.suites import aggregates, improvement
+from scenarios.statistics.suites import aggregates, by_group, improvement
 
 Array = np.ndarray
 
 FEWEST = 2
 """Instances that intervals over instances need."""
+FEWEST_CELLS = 3
+"""Cells that intervals over cells need; fewer are given, not a sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +24,8 @@ class Normalised:
 
     instances: tuple[str, ...]
     """A scenario and a seed each."""
+    cells: tuple[str, ...]
+    """Cell of each instance; instances of one cell have the same arms, stations and tasks."""
     score: Mapping[str, Array]
     """By policy, [training of the policy, instance]; a single training counts as given, not as a sample."""
     to_bound: Mapping[str, Array]
@@ -33,18 +37,42 @@ class Normalised:
 
     def only(self, chosen: Array) -> "Normalised":
         """Some of the instances, bool [instance]."""
-        names = tuple(name for name, own in zip(self.instances, chosen.tolist(), strict=True) if own)
+        names, cells = (tuple(np.array(each)[chosen].tolist()) for each in (self.instances, self.cells))
         score, to_bound = ({name: x[:, chosen] for name, x in each.items()} for each in (self.score, self.to_bound))
-        return replace(self, instances=names, score=score, to_bound=to_bound)
+        return replace(self, instances=names, cells=cells, score=score, to_bound=to_bound)
+
+    @property
+    def groups(self) -> Array | None:
+        """Number of the cell of each instance; None if cells are no sample or each has one instance."""
+        names, groups = np.unique(self.cells, return_inverse=True)
+        return groups if FEWEST_CELLS <= len(names) < len(self.cells) else None
+
+    @property
+    def unit(self) -> str:
+        """What intervals are about, as `200 instances of 9 cells`."""
+        cells, count = len(set(self.cells)), f"{len(self.instances)} instances"
+        if self.groups is not None:
+            return f"{count} of {cells} cells"
+        if cells == len(self.cells):
+            return count
+        return f"{count}, {f'these {cells} cells' if cells > 1 else 'this cell'} only"
+
+    def interval(self, values: Array) -> Interval:
+        """The interval of the mean of values [training, instance] over the sample."""
+        return interval(self._sample(values))
 
     def difference(self, policy: str, other: str) -> Interval:
         """Of the mean scores of two policies, paired by instance, and by training if both have several."""
-        return paired(self.score[policy][:, None], self.score[other][:, None])
+        return paired(self._sample(self.score[policy]), self._sample(self.score[other]))
+
+    def _sample(self, values: Array) -> Array:
+        """As `means.interval` takes them."""
+        return values[:, None] if self.groups is None else by_group(values, self.groups)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """The normalised score of one policy; the unit of all intervals is the instance, and the training if there are
+    """The normalised score of one policy; intervals are over cells and instances, and over trainings if there are
     several."""
 
     mean: Interval
@@ -72,6 +100,8 @@ class Scores:
 
     baseline: str
     instances: int
+    unit: str
+    """As of `Normalised`."""
     missing: int
     flat: tuple[str, ...]
     trainings: int = 1
@@ -88,7 +118,7 @@ class Scores:
     def remarks(self) -> list[str]:
         """What a reader must know of the instances."""
         remarks = [
-            f"Unit: {self.instances} instances{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = "
+            f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = "
             "hindsight, the best schedule that a clairvoyant search found."
         ]
         if self.missing:
@@ -107,24 +137,26 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
     if len(values.instances) < FEWEST:
         raise ValueError(f"Scores need {FEWEST} instances or more (got {len(values.instances)}).")
     base, names = values.score[baseline], list(values.score)
-    suite = aggregates(values.score, "both")
+    groups = values.groups
+    suite = aggregates(values.score, "both", groups=groups)
     differences = [Interval(0.0, 0.0, 0.0) if name == baseline else values.difference(name, baseline) for name in names]
     adjusted = holm([each.p for each in differences]).tolist()
     return Scores(
         baseline=baseline,
         instances=len(values.instances),
+        unit=values.unit,
         missing=values.missing,
         flat=values.flat,
         trainings=max(map(len, values.score.values())),
         policies={
             name: Score(
-                mean=interval(values.score[name][:, None]),
+                mean=values.interval(values.score[name]),
                 difference=difference,
                 p_holm=p_holm,
                 iqm=suite[name].iqm,
                 optimality_gap=suite[name].optimality_gap,
-                improvement=improvement(values.score[name], base, "both"),
-                bound_gap=interval(values.to_bound[name][:, None]),
+                improvement=improvement(values.score[name], base, "both", groups=groups),
+                bound_gap=values.interval(values.to_bound[name]),
             )
             for name, difference, p_holm in zip(names, differences, adjusted, strict=True)
         },

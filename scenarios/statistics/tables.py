@@ -127,12 +127,16 @@ def add_block(
         table.add_row(*cells)
 
 
-def remarks(figures: Mapping[str, Mapping[str, Figure]], seeds: int) -> Iterator[str]:
-    """What a reader of the table must know of cells without variation."""
+def remarks(figures: Mapping[str, Mapping[str, Figure]], draws: int) -> Iterator[str]:
+    """What a reader of the table must know of cells without variation.
+
+    Args:
+        draws: Independent values that the intervals rest on.
+    """
     notes = [note for each in figures.values() for f in each.values() for note in (f.note, f.difference_note)]
     if any(np.isnan(f.low + f.difference_low) for each in figures.values() for f in each.values()):
-        most = share_bounds(0, seeds)[1]
-        yield f"{EQUAL}: no variation in {seeds}, which is not certainty; up to {most:.0%} of all may differ."
+        most = share_bounds(0, draws)[1]
+        yield f"{EQUAL}: no variation in {draws}, which is not certainty; up to {most:.0%} of all may differ."
     if any(note.endswith("Poisson") for note in notes):
         yield "Counts without an event have the exact bound of a Poisson mean."
 

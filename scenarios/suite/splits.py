@@ -93,6 +93,14 @@ def cell_of_instance(row: Row) -> Cell:
     return next(cell for cell in CELLS if cell.name == row.cell)
 
 
+def cell_name(instance: str) -> str:
+    """The cell of an instance of a split by its name; of `SCENARIO/SEED`, the scenario."""
+    name, _, number = instance.rpartition("/")
+    if name in SPLITS:
+        return next((row.cell for row in manifest(name) if row.name == instance), name)
+    return name or number
+
+
 def drawn_rows(name: SplitName) -> Iterator[Row]:
     """The lines of a split, drawn anew: in turns from each of its cells."""
     cells = [cell for cell in CELLS if cell.split == name]

@@ -10,6 +10,7 @@ from joblib import cpu_count
 
 from fleet.files import cache_folder
 from scenarios.extras import require_extra
+from scenarios.policy_loader import is_built_in
 from scenarios.progress import Count, Progress, quiet
 from scenarios.trials import run_unit as here
 from scenarios.trials.fleets import warm
@@ -18,7 +19,8 @@ from scenarios.trials.run_unit import Settings, run_unit
 from scenarios.trials.workers import LocalWorker, Queue, Worker, run_units
 
 HERE_S = 5.0
-"""About the time that a worker process takes to start; this process does work that takes no longer."""
+"""About the time that a worker process takes to start. This process does work that takes no longer, but runs no code of
+users, which might end it."""
 
 
 class Rows(Protocol):
@@ -70,7 +72,7 @@ def run_study(
         # The largest first, so that processes end together; what shares plans follows.
         units = sorted(study.units(set(store.rows)), key=lambda unit: (-unit.size, unit.cell))
         folder = cache_dir or cache_folder()  # here: a worker may have started with another one
-        if ray is None:  # other machines have caches of their own
+        if ray is None or "twin" in study.difficulties:  # other machines may have caches of their own
             warm(units, study, folder, here.fleets, progress)
         settings = Settings.of(study, cache_dir if ray else folder)
         done = len(wanted) - sum(len(unit.case.seeds) for unit in units)
@@ -96,7 +98,7 @@ def _run(
     """The rows of each unit."""
     began_s, todo, left_s = time.monotonic(), list(units), 0.0
     whole = left = sum(unit.size for unit in units)
-    while todo and not ray and (workers == 1 or left_s < HERE_S):
+    while todo and not ray and is_built_in(todo[0].played) and (workers == 1 or left_s < HERE_S):
         unit = todo.pop(0)
         yield run_unit(unit, settings)
         left -= unit.size

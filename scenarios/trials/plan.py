@@ -136,8 +136,14 @@ class Study:
         for policy, own in self.own_trainings.items():
             for each in own:
                 check_policy(each)
-            if len(own) > 1 and self.trainings > 1:
-                raise FleetError(f"'{policy}' has {len(own)} trainings of its own: then --trainings must be 1.")
+            if len(own) > 1 and (self.trainings > 1 or self.fleets > 1):
+                raise FleetError(
+                    f"'{policy}' has {len(own)} trainings of its own: then --trainings and --fleets must be 1."
+                )
+            if len(own) not in (1, self.most_trainings):
+                raise FleetError(
+                    f"'{policy}' has {len(own)} trainings, another policy {self.most_trainings}: give as many of each."
+                )
             if (other := labels.setdefault(label(policy), policy)) != policy:
                 raise FleetError(f"'{other}' and '{policy}' are both called {label(policy)} in results: rename one.")
 

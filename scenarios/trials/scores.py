@@ -10,6 +10,7 @@ import numpy as np
 from scenarios.policy_loader import has_trainings
 from scenarios.scenario_hash import scenario_hash
 from scenarios.statistics.scores import Normalised
+from scenarios.suite.splits import cell_name
 from scenarios.trials.plan import Case, Row
 
 if TYPE_CHECKING:  # slow to import
@@ -86,6 +87,7 @@ def normalised(
         to_bound[policy] = (upper - reward) / (upper - random)
     return Normalised(
         instances=tuple(each.instance for each in known),
+        cells=tuple(cell_name(each.instance) for each in known),
         score=score,
         to_bound=to_bound,
         missing=len({(row.key.fleet, row.key.instance, row.key.seed) for row in first}) - len(scored),

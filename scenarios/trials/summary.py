@@ -73,10 +73,13 @@ def comparison_of(
     failed, count = {each.policy for each in failures}, len({row.key.instance for row in rows})
     whole = {each: repeated(study, of) for each, of in shifts.items() if each not in failed}
     values = normalised({each: shifts[each] for each in whole}, references or {}) if baseline in whole else None
+    fleets, trainings, per_fleet = study.shape
+    several = (count, study.most_trainings) if count > 1 else (fleets if fleets > 1 else trainings, per_fleet)
     return Comparison(
         scenario=name or rows[0].key.instance,
         seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
         unit=unit(study.shape) if count == 1 else f"{count} instances{and_trainings(study.most_trainings)}",
+        draws=min((n for n in several if n > 1), default=1),
         baseline=baseline,
         figures=figures_of_shifts(whole, baseline, (count, *study.shape)) if baseline in whole else {},
         scopes={names[p, d]: scope_of(p) if names[p, d] in whole else "failed" for p, d in names},

@@ -104,7 +104,7 @@ def shown(difference, low, high, p_holm):
     other = replace(same, mean=-0.01, low=-0.04, difference=difference, difference_low=low, difference_high=high,
                     p_holm=p_holm)  # fmt: skip
     figures = {"a": dict.fromkeys(FIGURES, same), "b": dict.fromkeys(FIGURES, other)}
-    result = Comparison("s", (0, 1), "2 seeds", "a", figures, {"a": "arm", "b": "arm"}, PERFECT.described(), "")
+    result = Comparison("s", (0, 1), "2 seeds", 2, "a", figures, {"a": "arm", "b": "arm"}, PERFECT.described(), "")
     page = io.StringIO()
     Console(file=page, width=80).print(comparison_table(result))
     rows = [line.split() for line in page.getvalue().splitlines()]

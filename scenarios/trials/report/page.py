@@ -10,12 +10,11 @@ from scenarios.policy_loader import label
 from scenarios.report.page import escape, html_page, paragraph, table
 from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
 from scenarios.run.evaluate import FIGURES
-from scenarios.statistics.means import Interval
+from scenarios.statistics.means import LEVEL, Interval
 from scenarios.statistics.scores import FEWEST, HEADS, Normalised, ranked, score_cells, scores_of
 from scenarios.statistics.suites import profile
-from scenarios.statistics.tables import LEGEND
-from scenarios.suite.splits import manifest
-from scenarios.trials.report.charts import lines, points, spans
+from scenarios.statistics.tables import LEGEND, Figure
+from scenarios.trials.report.charts import Range, lines, points, spans
 
 Array = np.ndarray
 
@@ -47,13 +46,18 @@ class Judged:
         """That differences refer to."""
         return self.results[0].baseline
 
+    @property
+    def scored(self) -> Normalised | None:
+        """Scores, if there are enough and the baseline has some: it has none if it failed."""
+        values = self.values
+        return values if values and self.baseline in values.score and len(values.instances) >= FEWEST else None
+
 
 def comparison_page(judged: Judged) -> str:
     """The page; the same input gives the same text."""
-    scored = judged.values is not None and len(judged.values.instances) >= FEWEST
     body = [
         *(paragraph(sentence, "verdict") for sentence in verdict(judged)),
-        *(_scores(judged, judged.values) if scored and judged.values else ()),
+        *(_scores(judged, judged.scored) if judged.scored else ()),
         *_by_cell(judged),
         *_heat(judged),
         *(part for result in judged.results for part in _figures(result, alone=len(judged.results) == 1)),
@@ -64,20 +68,23 @@ def comparison_page(judged: Judged) -> str:
 
 
 def verdict(judged: Judged) -> list[str]:
-    """What came out, in sentences: the best policy against the baseline, and against the next one."""
-    values, base = judged.values, judged.baseline
+    """What came out, in sentences: the best policy against the baseline, and against the next one.
+
+    The best one is chosen by its figures, so p-values count as many differences as there are other policies
+    (Bonferroni).
+    """
+    values, base = judged.scored, judged.baseline
     failed = {each.policy for result in judged.results for each in result.failures}
     last = [f"Failed: {', '.join(sorted(map(label, failed)))}; a policy with a failed shift has no figures."] * bool(
         failed
     )
-    if values is None or len(values.instances) < FEWEST:
+    if values is None:
         return [*_reward_verdict(judged.results), *last]
     scores = scores_of(values, base)
     best, *rest = ranked(scores)
-    compared = [_against(best, base, scores.policies[best].difference, "the baseline ")] if best != base else []
-    others = [name for name in rest if name != base]
-    if others:
-        compared.append(_against(best, others[0], values.difference(best, others[0]), "the next one, "))
+    others = {base: "the baseline "} if best != base else {}
+    others |= {name: "the next one, " for name in [name for name in rest if name != base][:1]}
+    compared = [_against(other, values.difference(best, other), role, len(rest)) for other, role in others.items()]
     told = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     told.append(
@@ -87,12 +94,17 @@ def verdict(judged: Judged) -> list[str]:
     return [*told, *last]
 
 
-def _against(best: str, other: str, difference: Interval, role: str) -> str:
+def _against(other: str, difference: Interval, role: str, tests: int) -> str:
     """`beats the baseline wspt by 0.12 [0.08, 0.16] of the way from random to the best known`."""
     by = f"{difference.text()} of the way from random to the best known"
-    if difference.low > 0:
+    if difference.low > 0 and _significant(difference.p, tests):
         return f"beats {role}{label(other)} by {by}"
-    return f"is not shown to beat {role}{label(other)}: the difference is {by}"
+    among = f", not significant among {tests} policies" if difference.low > 0 else ""
+    return f"is not shown to beat {role}{label(other)}: the difference is {by}{among}"
+
+
+def _significant(p: float, tests: int) -> bool:
+    return p * tests < 1 - LEVEL
 
 
 def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
@@ -108,7 +120,8 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
             yield f"{where}no policy has more reward than the baseline {label(best)} ({figure.mean:.1f})."
             continue
         span = Interval(figure.difference, figure.difference_low, figure.difference_high).text(1)
-        more = "more reward than" if figure.excludes_zero else "more than, which is not significant,"
+        significant = figure.excludes_zero and _significant(figure.p, len(result.figures) - 1)
+        more = "more reward than" if significant else "more than, which is not significant,"
         yield f"{where}{label(best)} has the most reward, {figure.mean:.1f}; {span} {more} {label(result.baseline)}."
 
 
@@ -134,7 +147,7 @@ def _scores(judged: Judged, values: Normalised) -> Iterator[str]:
     chosen = order[:MOST_CURVES]
     if judged.baseline not in chosen:
         chosen = [*chosen[:-1], judged.baseline]
-    curves = {name: profile(values.score[name], THRESHOLDS, "both") for name in chosen}
+    curves = {name: profile(values.score[name], THRESHOLDS, "both", groups=values.groups) for name in chosen}
     bands = {label(name): (each.share, each.low, each.high) for name, each in curves.items()}
     banded = {label(chosen[0]), label(judged.baseline)}
     yield lines(THRESHOLDS, bands, banded, "normalised score", "share of instances above")
@@ -142,14 +155,13 @@ def _scores(judged: Judged, values: Normalised) -> Iterator[str]:
 
 def _by_cell(judged: Judged) -> Iterator[str]:
     """Mean score of each policy in each cell of a split, or in each scenario."""
-    values = judged.values
+    values = judged.scored
     if values is None:
         return
-    cells = {name: _cell(name) for name in values.instances}
-    names = sorted(set(cells.values()))
+    names = sorted(set(values.cells))
     if len(names) < 2 or len(names) == len(values.instances):
         return
-    member = {name: np.array([cells[each] == name for each in values.instances]) for name in names}
+    member = {name: np.array(values.cells) == name for name in names}
     order = sorted(values.score, key=lambda policy: -values.score[policy].mean())
     means = {policy: [float(values.score[policy][:, member[name]].mean()) for name in names] for policy in order}
     best = [max(column) for column in zip(*means.values(), strict=True)]
@@ -163,23 +175,16 @@ def _by_cell(judged: Judged) -> Iterator[str]:
     yield table(head, rows, style="numbers scores")
 
 
-def _cell(instance: str) -> str:
-    """The cell of an instance of a split; else its scenario."""
-    split, _, number = instance.rpartition("/")
-    if split in ("train", "validation", "test"):
-        return next((row.cell for row in manifest(split) if row.name == instance), split)
-    return split or number
-
-
 def _heat(judged: Judged) -> Iterator[str]:
     for result in judged.results:
-        rows = [
-            (label(name), *((f.mean, f.low, f.high) for f in (each["peak_c"], each["value"])))
-            for name, each in result.figures.items()
-        ]
+        rows = [(label(name), _range(each["peak_c"]), _range(each["value"])) for name, each in result.figures.items()]
         if rows:
             yield f"<h2>Value against heat{'' if len(judged.results) == 1 else f': {escape(result.scenario)}'}</h2>"
             yield points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
+
+
+def _range(figure: Figure) -> Range:
+    return figure.mean, figure.low, figure.high
 
 
 def _figures(result: Comparison, *, alone: bool) -> Iterator[str]:
