@@ -96,7 +96,7 @@ class PairPolicy:
         return dict(zip(observations, claims(score, plans_of(seen[0])).tolist(), strict=True))
 
 
-PAIRS_FORMAT = 5
+PAIRS_FORMAT = 4
 """Increase it when the numbers of a pair or the network change."""
 
 

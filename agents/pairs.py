@@ -118,11 +118,8 @@ def _features(seen: Observation, at: Places, learned: Worth, rate: Array, scale:
     best = relative.reshape(envs, arms, slots, plans).max(axis=-1)
     soonest = _best_soon(seen, learned, scale)
     can = (seen.feasible > 0).reshape(envs, arms, slots, plans).any(axis=-1)
-    able = np.maximum(can.sum(axis=1), 1)
-    free = (can & (seen.idle > 0)[..., None]).sum(axis=1)
-    load = (can / np.maximum(free, 1)[:, None]).sum(axis=-1)
     waiting_s = np.maximum(slack_s + duration_s, 0.0)
-    offered = seen.offered[:, 0].sum(axis=-1)
+    offered, free = seen.offered[:, 0].sum(axis=-1), seen.idle.sum(axis=1)
     mean_value = np.maximum((seen.value[:, 0] * seen.offered[:, 0]).sum(axis=-1) / np.maximum(offered, 1.0), 1e-6)
     fastest_s = np.full((envs, slots), np.inf)
     np.minimum.at(fastest_s, (env, slot), duration_s)
@@ -145,10 +142,10 @@ def _features(seen: Observation, at: Places, learned: Worth, rate: Array, scale:
         own - _best_of_others(best, axis=1)[env, arm, slot],
         own - _best_of_others(best, axis=2)[env, arm, slot],
         own - soonest[env, slot],
-        1.0 / able[env, slot],
+        can.mean(axis=1)[env, slot],
         np.log1p(can.sum(axis=-1))[env, arm] / 3.0,
-        np.log(np.maximum(load, 0.5))[env, arm],
-        (free / able)[env, slot],
+        np.log((offered + 1.0) / (free + 1.0))[env],
+        (free / arms)[env],
         np.exp(-left_s / 900.0),
         duration_s / np.maximum(left_s, 60.0),
         option % plans > 0,
