@@ -1,6 +1,7 @@
 """Learned scores of pairs of arm and job: they begin as `wsept`, and treat arms and jobs as sets."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from agents.heat_rules import Wsept
 from agents.learned.evolution import Evolution, EvolutionConfig
 from agents.pair_scores import (
     PAIRS,
+    PAIRS_CARD,
     PARAMETERS,
     PairPolicy,
     load_pairs,
@@ -21,6 +23,7 @@ from fleet.observation import FIELDS, LONG_S, Layout, Observation
 from scenarios.policy_loader import policy_of, scope_of
 
 LAYOUT = Layout(5, 6, plans=2)
+ROOT = Path(__file__).parents[2]
 
 
 def drawn(rng: np.random.Generator) -> Observation:
@@ -178,3 +181,11 @@ def test_the_search_finds_a_known_optimum_and_goes_on_where_it_was(tmp_path) -> 
     (tmp_path / "state.npz").write_bytes(b"rubbish")
     with pytest.raises(CheckpointError, match="cannot be resumed"):
         again.load(tmp_path / "state.npz")
+
+
+def test_the_shipped_weights_are_those_of_a_stored_training():
+    shipped, stored = ROOT / "agents" / "weights", ROOT / "docs" / "results" / "learned"
+    assert any(
+        all((folder / name).read_bytes() == (shipped / name).read_bytes() for name in (PAIRS, PAIRS_CARD))
+        for folder in stored.iterdir()
+    )
