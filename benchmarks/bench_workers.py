@@ -13,10 +13,10 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -30,13 +30,6 @@ LOOP = "import numpy as np\na = np.ones((64, 64))\nfor _ in range({n}):\n    a =
 LOOPS = 300_000
 
 
-def seconds(function: Callable[[], object]) -> float:
-    """Seconds that a call takes."""
-    began = time.perf_counter()
-    function()
-    return time.perf_counter() - began
-
-
 def loops(processes: int) -> None:
     """Share the loops among processes that know nothing of each other."""
     code = LOOP.format(n=LOOPS // processes)
@@ -44,22 +37,22 @@ def loops(processes: int) -> None:
         each.wait()
 
 
-def ray_cluster() -> Callable[[int], str]:
-    """Start a local Ray cluster of one node; returned: what gives it a number of nodes, and returns the address."""
+@contextmanager
+def ray_cluster(nodes: int) -> Iterator[str]:
+    """A local Ray cluster of nodes with one CPU each; its address."""
+    import ray  # pyright: ignore[reportMissingImports]
     from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    more: list[Any] = []
-
-    def address(nodes: int) -> str:
-        while 1 + len(more) < nodes:
-            more.append(cluster.add_node(num_cpus=1))
-        while 1 + len(more) > nodes:
-            cluster.remove_node(more.pop())
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        for _ in range(nodes - 1):
+            cluster.add_node(num_cpus=1)
         cluster.wait_for_nodes()
-        return cluster.address
-
-    return address
+        ray.init(cluster.address, log_to_driver=False)
+        yield cluster.address
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
 
 
 def main() -> None:
@@ -74,25 +67,22 @@ def main() -> None:
     arguments = parser.parse_args()
     cases = suite_of(arguments.suite, 1)[: arguments.instances]
     study = Study(policies=arguments.policies.split(","), cases=cases, difficulties=["blind"])
-    address = ray_cluster() if arguments.ray else None
     expected = None
     took: dict[str, list[float]] = {"one": [], "two": [], "loop_one": [], "loop_two": []}
     loads: list[float] = []
     for _ in range(arguments.repeats):
         for workers, name in ((1, "one"), (2, "two")):
             run_unit.fleets = Fleets()  # as in a new process
-            rows: list[object] = []
-
-            where = address(workers) if address else None
-
-            def study_it(workers: int = workers, rows: list[object] = rows, where: str | None = where) -> None:
-                rows += run_study(study, workers=workers, ray=where)
-
-            took[name].append(seconds(study_it))
+            with ray_cluster(workers) if arguments.ray else nullcontext() as where:
+                began_s = time.perf_counter()
+                rows = run_study(study, workers=workers, ray=where)
+                took[name].append(time.perf_counter() - began_s)
             expected = expected or rows
             if rows != expected:
                 raise SystemExit("The rows differ between one worker and two.")
-            took[f"loop_{name}"].append(seconds(lambda n=workers: loops(n)))
+            began_s = time.perf_counter()
+            loops(workers)
+            took[f"loop_{name}"].append(time.perf_counter() - began_s)
             loads.append(os.getloadavg()[0])
     medians = {name: round(median(values), 2) for name, values in took.items()}
     result = {

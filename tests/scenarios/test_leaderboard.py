@@ -222,7 +222,7 @@ def test_a_repetition_finds_other_figures(good: Submission, monkeypatch: pytest.
 
 
 def test_without_results_the_table_says_so():
-    assert board_text(board_of("test", []), "test") == "No results with references on the split test."
+    assert board_text(board_of("test", []), "test") == "No results on the split test."
 
 
 def test_the_policy_of_the_page_can_be_loaded(tmp_path: Path):

@@ -193,10 +193,7 @@ decision_limit.AGAIN_S, limit = 0.05, decision_limit.DecisionLimit(0.05)
 with limit.watching(), limit.decision():
     while True:
         try:
-            while True:  # another alarm may come while the first is caught
-                try:
-                    while True: pass
-                except BaseException: pass
+            while True: id(0)
         except BaseException: pass
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
@@ -285,7 +282,9 @@ def test_folders_of_trainings_are_one_policy(scenario, plans, tmp_path):
     assert rows[3].outcome != rows[6].outcome
     assert len({policy_hash(each) for each in (every, *apart.policies)}) == 4
     for given, said in (
-        ({"trainings": 2, "difficulties": ["twin"]}, "has 3 trainings of its own: then --trainings must be 1"),
+        ({"trainings": 2, "difficulties": ["twin"]}, "has 3 trainings of its own: then --trainings and --fleets must be 1"),
+        ({"fleets": 2}, "then --trainings and --fleets must be 1"),
+        ({"policies": [every, str(tmp_path / "pairs-1*")]}, "has 2 trainings, another policy 3: give as many"),
         ({"policies": [str(tmp_path / "none-*")]}, "There is no folder"),
     ):
         with pytest.raises(FleetError, match=said):

@@ -8,7 +8,8 @@ from scipy import stats
 
 from fleet.errors import FleetError
 from scenarios.statistics.marl_eval import to_marl_eval
-from scenarios.statistics.suites import aggregates, improvement, profile
+from scenarios.statistics.means import interval
+from scenarios.statistics.suites import aggregates, by_group, improvement, profile
 
 THRESHOLDS = np.linspace(0.0, 1.0, 5)
 
@@ -76,6 +77,35 @@ def test_figures_are_those_of_scipy_and_by_hand(scores):
 def test_more_is_drawn_the_wider_the_interval(scores):
     width = {unit: aggregates({"own": scores[0]}, unit)["own"].iqm for unit in ("within", "instances", "both")}
     assert width["within"].margin < width["instances"].margin < width["both"].margin
+
+
+def test_the_mean_over_groups_has_the_clustered_variance(scores):
+    """Liang & Zeger 1986, with groups of unequal size: the sums of the deviations in each group."""
+    x, groups = scores[0][:1], np.repeat(np.arange(5), (9, 1, 4, 8, 2))
+    values = by_group(x, groups)
+    sums = np.bincount(groups, x[0] - x.mean())
+    error = np.sqrt((sums**2).sum() * 5 / 4) / x.size
+    assert values.mean() == pytest.approx(x.mean())
+    assert np.std(values, ddof=1) / np.sqrt(5) == pytest.approx(error)
+    equal = np.repeat(np.arange(6), 4)
+    means = x.reshape(6, 4).mean(axis=1)
+    assert interval(by_group(x, equal)) == pytest.approx(interval(means), nan_ok=True)
+
+
+def test_groups_of_one_instance_are_instances_and_like_groups_widen(scores):
+    own, base = scores
+    alone = np.arange(24)
+    assert aggregates({"own": own}, groups=alone) == aggregates({"own": own})
+    assert improvement(own, base, groups=alone) == improvement(own, base)
+    like, groups = np.repeat(own[:, :8], 3, axis=1), np.repeat(np.arange(8), 3)  # a group says one thing three times
+    for found, few, apart in (
+        (aggregates({"x": like}, groups=groups)["x"].iqm, aggregates({"x": own[:, :8]})["x"].iqm,
+         aggregates({"x": like})["x"].iqm),
+        (improvement(like, np.repeat(base[:, :8], 3, axis=1), groups=groups), improvement(own[:, :8], base[:, :8]),
+         improvement(like, np.repeat(base[:, :8], 3, axis=1))),
+    ):  # fmt: skip
+        assert found.margin == pytest.approx(few.margin, rel=0.1)
+        assert apart.margin < 0.8 * found.margin
 
 
 def test_a_certain_order_has_the_bound_of_a_share():
