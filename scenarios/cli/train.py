@@ -9,7 +9,7 @@ from fleet.errors import FleetError
 from scenarios.cli.options import MAX_SEED, DifficultyOption, RiskOption, number
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
-from scenarios.load import load
+from scenarios.load import INSTANCE, load
 from scenarios.policy_loader import policy_of
 from scenarios.schema_errors import choose
 
@@ -21,7 +21,7 @@ def train_command(
     suite: Annotated[
         str | None,
         typer.Option(
-            help="Train over the instances of this split of the suite, and validate on the split validation.",
+            help="Split of the suite to train over, which must be train; validation is on the split validation.",
             show_default=False,
         ),
     ] = None,
@@ -91,6 +91,8 @@ def train_command(
         raise FleetError("Give either a scenario or --suite SPLIT.")
     if seeds > 1 and out is not None:
         raise FleetError("--seeds makes several trainings: they go to runs/, leave --out away.")
+    if suite is not None or INSTANCE.fullmatch(scenario or ""):
+        choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
     from agents.learned.training_log import CURVE
     from fleet.env.validation import Decisions
     from scenarios.prepare.fleet import DifficultyName, RiskName
@@ -179,3 +181,5 @@ def train_command(
 
 
 Algorithm = Literal["mappo", "ippo", "pairs"]
+TrainingSplit = Literal["train"]
+"""The other splits are for validation and for results."""

@@ -98,7 +98,10 @@ def test_what_cannot_be_is_refused(capsys) -> None:
     for words, reason in (
         ([], "Give either a scenario or --suite SPLIT."),
         (["quickstart", "--suite", "train"], "Give either a scenario or --suite SPLIT."),
-        (["--suite", "trian"], "No split 'trian'; did you mean 'train'?"),
+        (["--suite", "trian"], "No training split 'trian'; did you mean 'train'?"),
+        (["--suite", "validation"], "No training split 'validation'. Allowed: train."),
+        (["--suite", "test", "--algo", "mappo"], "No training split 'test'. Allowed: train."),
+        (["test/0017"], "No training split 'test'. Allowed: train."),
         (["quickstart", "--algo", "pairs"], "give --suite, not a scenario"),
         (["quickstart", "--seeds", "2", "--out", "x"], "leave --out away"),
         (["quickstart", "--lr", "0"], "--lr must be > 0 and at most 10 (got 0)."),
