@@ -17,6 +17,7 @@ from scenarios.cli.main import main
 from scenarios.load import load, override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
+from scenarios.run import suite_batches
 from scenarios.run import train_pairs as pairs
 from scenarios.run.evaluate import outcomes
 from scenarios.run.suite_batches import ground_of, rewards
@@ -181,6 +182,28 @@ def test_time_of_a_session_or_in_total() -> None:
     assert each.share(3, 75.0, 45.0) == pytest.approx(0.5)
     assert total.share(3, 75.0, 45.0) == pytest.approx(1.25)
     assert each.share(9, 75.0, 45.0) == pytest.approx(0.9)
+
+
+def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(suite_batches, "grounds_of", lambda *args, **options: [ground])
+    monkeypatch.setattr("scenarios.trials.scores.references_of", lambda cases: {})
+    words = ["--suite", "train", "--difficulty", "oracle", "--instances", "1", "--validation-instances", "1"]
+
+    def trained(*more: str) -> tuple[list[int], int]:
+        """Iterations of each training, and trainings that were skipped."""
+        with pytest.raises(SystemExit) as stop:
+            main(["train", *words, *more])
+        assert stop.value.code == 0, capsys.readouterr().err
+        folders = sorted((tmp_path / "runs").iterdir())
+        rows = [[json.loads(line) for line in (folder / LOG).read_text().splitlines()] for folder in folders]
+        skipped = " ".join(capsys.readouterr().err.split()).count("because it is complete.")
+        return [max(row["iteration"] for row in each if "iteration" in row) for each in rows], skipped
+
+    assert trained("--iterations", "1") == ([1], 0)
+    assert trained("--iterations", "2", "--seed", "1") == ([1, 2], 0)
+    assert trained("--iterations", "2", "--seeds", "3", "--resume") == ([2, 2, 2], 1)
+    assert trained("--minutes", "0.0001", "--seeds", "3", "--resume") == ([2, 2, 2], 3)
 
 
 def test_what_cannot_be_is_refused(capsys) -> None:
