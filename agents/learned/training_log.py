@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, fields
 from importlib.util import find_spec
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +14,35 @@ LOG, CURVE, BOARD = "progress.jsonl", "curve.png", "tensorboard"
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingLength:
-    """Length of a training; subclasses add counts, which must be positive."""
+    """Length of a training; subclasses add counts, which must be positive.
+
+    Raises:
+        FleetError: a number is not positive.
+    """
 
     minutes: float = 30.0
     iterations: int | None = None
     """Most iterations, those before a resume included."""
+    in_total: bool = False
+    """Whether `minutes` include those before a resume, too, and a complete training is skipped."""
 
     def __post_init__(self) -> None:
         if not self.minutes > 0:
             raise FleetError(f"minutes must be > 0 (got {self.minutes}).")
         for field in fields(self):
             value = getattr(self, field.name)
-            if value is not None and field.name != "minutes" and value < 1:
+            if value is not None and field.name not in ("minutes", "in_total") and value < 1:
                 raise FleetError(f"{field.name} must be >= 1 (got {value}).")
+
+    def share(self, iterations: int, seconds: float, before_s: float) -> float:
+        """Finished share of a training; from 1 on it is complete.
+
+        Args:
+            iterations, seconds: Of all sessions.
+            before_s: Time of the sessions before a resume.
+        """
+        spent_s = seconds - (0.0 if self.in_total else before_s)
+        return max(spent_s / (60.0 * self.minutes), iterations / (self.iterations or inf))
 
 
 class TrainingLog:

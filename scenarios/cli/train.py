@@ -9,7 +9,7 @@ from fleet.errors import FleetError
 from scenarios.cli.options import MAX_SEED, DifficultyOption, RiskOption, number
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
-from scenarios.load import load
+from scenarios.load import INSTANCE, load
 from scenarios.policy_loader import policy_of
 from scenarios.schema_errors import choose
 
@@ -21,7 +21,7 @@ def train_command(
     suite: Annotated[
         str | None,
         typer.Option(
-            help="Train over the instances of this split of the suite, and validate on the split validation.",
+            help="Split of the suite to train over, which must be train; validation is on the split validation.",
             show_default=False,
         ),
     ] = None,
@@ -33,7 +33,16 @@ def train_command(
             show_default=False,
         ),
     ] = None,
-    minutes: Annotated[float, number("Training time excluding the twins, min.", 0, 100_000, above=True)] = 30.0,
+    minutes: Annotated[
+        float,
+        number(
+            "Training time excluding the twins, min. With --resume: additional time; with --resume and --seeds: total "
+            "of each training.",
+            0,
+            100_000,
+            above=True,
+        ),
+    ] = 30.0,
     iterations: Annotated[int | None, number("Maximum number of iterations in total.", 1, 1_000_000)] = None,
     warm_start: Annotated[
         str, typer.Option(help="Rule that the network imitates first, for example wspt; default: none.")
@@ -74,7 +83,14 @@ def train_command(
             help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED or runs/SPLIT-ALGO-SEED. Not with --seeds."
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the training in --out.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Continue the training in --out. With --seeds: continue trainings that have begun, skip complete "
+            "ones, begin the others.",
+        ),
+    ] = False,
     threads: Annotated[int, number("Threads of the network's computations.", 1, 1024)] = 1,
     difficulty: DifficultyOption = "twin",
     risk: RiskOption = "rc",
@@ -91,9 +107,12 @@ def train_command(
         raise FleetError("Give either a scenario or --suite SPLIT.")
     if seeds > 1 and out is not None:
         raise FleetError("--seeds makes several trainings: they go to runs/, leave --out away.")
+    if suite is not None or INSTANCE.fullmatch(scenario or ""):
+        choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
     from agents.learned.training_log import CURVE
     from fleet.env.validation import Decisions
     from scenarios.prepare.fleet import DifficultyName, RiskName
+    from scenarios.run.training_folder import holds_training
 
     models: Any = {
         "difficulty": choose("difficulty", difficulty, DifficultyName),
@@ -108,7 +127,7 @@ def train_command(
     places = [
         out or Path("runs") / f"{suite if chosen is None else chosen.name}-{algorithm}-{seed + k}" for k in range(seeds)
     ]
-    length: Any = {"minutes": minutes, "iterations": iterations}
+    length: Any = {"minutes": minutes, "iterations": iterations, "in_total": seeds > 1}
     grounds, judging, card = [], [], {"suite": suite, **models}
     if algorithm != "pairs":
         require_extra("learn")
@@ -135,12 +154,13 @@ def train_command(
             judging = grounds_of(validation, **models, known=known, progress=progress)
         card |= {"prepared": len(grounds), "judges": len(judging)}
     for k, where in enumerate(places):
+        goes_on = resume and (seeds == 1 or holds_training(where))
         if algorithm == "pairs":
             from agents.learned.evolution import EvolutionConfig
             from scenarios.run.train_pairs import train_pairs
 
             search = EvolutionConfig(seed=seed + k, learning_rate=0.08 if lr is None else lr)
-            done = train_pairs(grounds, judging, search, where, length, card=card, resume=resume, tell=say)
+            done = train_pairs(grounds, judging, search, where, length, card=card, resume=goes_on, tell=say)
         else:
             from agents.learned.ppo import PpoConfig, use_threads
             from scenarios.run.train_policy import train, train_on_split
@@ -160,7 +180,7 @@ def train_command(
             except ValueError as error:
                 raise FleetError(str(error)) from error
             with progress_bar() as progress:
-                common: Any = {"resume": resume, "progress": progress, "tell": say}
+                common: Any = {"resume": goes_on, "progress": progress, "tell": say}
                 if chosen is not None:
                     done = train(chosen, config, where, length, **models, **common)
                 else:
@@ -179,3 +199,5 @@ def train_command(
 
 
 Algorithm = Literal["mappo", "ippo", "pairs"]
+TrainingSplit = Literal["train"]
+"""The other splits are for validation and for results."""

@@ -1,6 +1,5 @@
 """Train scores of arm–job pairs over a split of the suite by evolution, with validation on another split."""
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -11,13 +10,12 @@ import numpy as np
 from agents.learned.evolution import Evolution, EvolutionConfig
 from agents.learned.training_log import CURVE, TrainingLength, TrainingLog, read_log
 from agents.pair_scores import PARAMETERS, first_parameters, save_pairs
-from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.run.suite_batches import Ground, rewards
+from scenarios.run.training_folder import PAIRS_STATE, check_folder, holds_training, skip_complete, write_card
 
 Array = np.ndarray
 
-STATE = "training.npz"
 LEAST_SPAN = 0.04
 """Shortest span of an instance in training, as a share of the value of its jobs."""
 MOST_LOSS = 1.0
@@ -35,10 +33,11 @@ class PairPlan(TrainingLength):
 
 @dataclass(frozen=True)
 class TrainedPairs:
-    """Result of a training, in normalised scores."""
+    """Result of a training in all its sessions, in normalised scores."""
 
     iterations: int
     shifts: int
+    """Simulated in these iterations."""
     teacher: float
     """Of `wsept` in validation."""
     best: float
@@ -61,50 +60,56 @@ def train_pairs(
     """Write into a folder the parameters with the best validation as a policy, the last state, and the curves.
 
     Iteration 0 is `agents.pair_scores.first_parameters`, the teacher is `wsept`. Ctrl-C ends the training early and
-    keeps its result.
+    keeps its result; before the end of the validation of iteration 0 there is none.
 
     Args:
         grounds, judges: Instances of training and of validation.
-        card: What else `policy.json` says; a resume must have the same.
+        card: What else `pairs.json` and `training.json` say; a resume must have the same.
 
     Raises:
-        FleetError: a training in the folder without `resume`, `resume` without a training, or another training.
+        FleetError: a training in the folder without `resume`, `resume` without a training, or another training, or one
+            that has the iterations of the plan.
     """
     card = {**card, "config": asdict(config), "instances": plan.instances}
-    _check_folder(out, card, resume=resume)
+    check_folder(out, card, PAIRS_STATE, resume=resume)
     search = Evolution(first_parameters(), config)
-    began_s, interrupted, shifts = time.monotonic(), False, 0
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-    log = TrainingLog(out)
+    teacher, best, before_s, interrupted = np.nan, -np.inf, 0.0, False
     if resume:
-        numbers = search.load(out / STATE)
-        teacher, best = numbers["teacher"], numbers["best"]
-    else:
-        teacher, best = (validation(judges, each) for each in (np.zeros(PARAMETERS), search.average))
-        save_pairs(search.average, out, **card, iterations=0, validation=best, teacher=teacher)
-        log.add(0, {"iteration": 0, "validation": best, "teacher": teacher})
-        tell(f"Iteration 0: {best:.4f} on the validation shifts, wsept {teacher:.4f}.")
+        numbers = search.load(out / PAIRS_STATE)
+        teacher, best, before_s = numbers["teacher"], numbers["best"], numbers.get("seconds", 0.0)
+    began_s = time.monotonic() - before_s  # as if the sessions had followed each other
+
+    def result() -> TrainedPairs:
+        shifts = search.done * config.samples * min(plan.instances, len(grounds))
+        return TrainedPairs(search.done, shifts, teacher, best, time.monotonic() - began_s, interrupted)
+
+    if resume and skip_complete(out, plan, search.done, before_s, tell):
+        return result()
+    out.mkdir(parents=True, exist_ok=True)
+    log = TrainingLog(out)
 
     def validate() -> None:
         nonlocal best
         found = validation(judges, search.average)
+        if not holds_training(out):
+            search.save(out / PAIRS_STATE, teacher=teacher, best=best)  # without a policy yet
+            write_card(out, card)
         if found > best:
             best = found
             save_pairs(search.average, out, **card, iterations=search.done, validation=best, teacher=teacher)
-        search.save(out / STATE, teacher=teacher, best=best)
+        search.save(out / PAIRS_STATE, teacher=teacher, best=best, seconds=time.monotonic() - began_s)
         log.add(search.done, {"iteration": search.done, "validation": found, "teacher": teacher})
         tell(f"Iteration {search.done}: {found:.4f}, best {best:.4f}, wsept {teacher:.4f}.")
 
+    if not resume:
+        teacher = validation(judges, np.zeros(PARAMETERS))
+    if best == -np.inf:
+        validate()
     validated = search.done
     try:
-        while True:
-            spent = (time.monotonic() - began_s) / (60.0 * plan.minutes)
-            if max(spent, search.done / (plan.iterations or np.inf)) >= 1.0:
-                break
+        while plan.share(search.done, time.monotonic() - began_s, before_s) < 1.0:
             began_iteration_s = time.monotonic()
             fitness = _fitness(grounds, search, plan.instances)
-            shifts += config.samples * min(plan.instances, len(grounds))
             search.tell(fitness)
             row = {"number": search.done, "fitness": float(fitness.mean()), "spread": float(fitness.std())}
             log.add(search.done, {**row, "seconds": time.monotonic() - began_iteration_s})
@@ -116,7 +121,7 @@ def train_pairs(
     if validated < search.done:
         validate()
     draw_curves([out], out / CURVE)
-    return TrainedPairs(search.done, shifts, teacher, best, time.monotonic() - began_s, interrupted)
+    return result()
 
 
 def validation(judges: Sequence[Ground], parameters: Array) -> float:
@@ -160,17 +165,3 @@ def draw_curves(folders: Sequence[Path], picture: Path) -> None:
     axes.grid(alpha=0.3)
     with atomic_path(picture) as draft:
         figure.savefig(draft, dpi=120, format="png")
-
-
-def _check_folder(out: Path, card: dict[str, object], *, resume: bool) -> None:
-    path = out / "training.json"
-    if not resume:
-        if path.exists():
-            raise FleetError(f"'{out}' holds a training already. Continue it with --resume, or choose another --out.")
-        return
-    if not (out / STATE).is_file():
-        raise FleetError(f"'{out}' holds no training to resume.")
-    before = json.loads(path.read_text(encoding="utf-8"))
-    for name, value in json.loads(json.dumps(card)).items():
-        if before.get(name) != value:
-            raise FleetError(f"The training in '{out}' has {name} = {before.get(name)} (got {value}).")

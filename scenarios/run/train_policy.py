@@ -1,6 +1,5 @@
 """Train a policy on a scenario: iterations, checkpoints, validation on separate seeds, and learning curves."""
 
-import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -11,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from agents.learned.imitation import imitate
-from agents.learned.policy import CARD, save_policy
+from agents.learned.policy import save_policy
 from agents.learned.ppo import PpoConfig, Trainer
 from agents.learned.training_log import CURVE, TrainingLength, TrainingLog, read_log
 from agents.policy import WAIT, Policy, only_choices
 from fleet.engine.reward import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Library, Obs
-from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, policy_of
@@ -27,6 +25,7 @@ from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.run.suite_batches import Ground
+from scenarios.run.training_folder import NETWORK_STATE, check_folder, holds_training, skip_complete, write_card
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 
@@ -34,7 +33,6 @@ Array = np.ndarray
 
 VALIDATION_SEED = 2_000_000
 """First validation seed; far from the seeds of comparisons."""
-STATE = "training.pt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +46,7 @@ class TrainingPlan(TrainingLength):
 
 @dataclass(frozen=True)
 class Trained:
-    """Result of a training."""
+    """Result of a training in all its sessions."""
 
     iterations: int
     env_steps: int
@@ -74,7 +72,7 @@ def train(
 ) -> Trained:
     """Write into a folder the best network as a policy, the last state for a resume, and the curves.
 
-    Ctrl-C ends the training early and keeps its result.
+    Ctrl-C ends the training early and keeps its result; before the end of the validation of iteration 0 there is none.
 
     Args:
         randomise: Varies the shifts of training and validation beyond what the scenario draws.
@@ -83,7 +81,7 @@ def train(
 
     Raises:
         FleetError: a training in the folder without `resume`, `resume` without a training, or a training of another
-            scenario or configuration.
+            scenario or configuration, or one that has the iterations of the plan.
     """
     card = {
         "scenario": scenario.name,
@@ -94,7 +92,7 @@ def train(
     }
     if randomise is not None:
         card["randomise"] = repr(randomise)
-    _check_folder(out, card, resume=resume)
+    check_folder(out, card, NETWORK_STATE, resume=resume)
     fleet = prepare(scenario, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
     library, weights = library_of(fleet), weights_of(scenario)
     # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in training.
@@ -123,7 +121,7 @@ def train_on_split(
         card: What else the card says; a resume must have the same.
     """
     card = {**card, "config": asdict(config)}
-    _check_folder(out, card, resume=resume)
+    check_folder(out, card, NETWORK_STATE, resume=resume)
     judging = [
         Judge(BatchEnv(judge.library, len(seeds), weights=judge.weights), seeds, np.array([*map(judge.value, seeds)]))
         for judge in judges
@@ -159,16 +157,17 @@ def _train(
     tell: Callable[[str], None],
 ) -> Trained:
     trainer = trainer_of(cells, config)
-    best = -np.inf
+    best, before_s = -np.inf, 0.0
     if resume:
-        best = trainer.load(out / STATE)["best"]
-        if plan.iterations is not None and trainer.done >= plan.iterations:
-            raise FleetError(f"The training in '{out}' has {trainer.done} iterations: --iterations must be more.")
+        numbers = trainer.load(out / NETWORK_STATE)
+        best, before_s = numbers["best"], numbers.get("seconds", 0.0)
+        if skip_complete(out, plan, trainer.done, before_s, tell):
+            return Trained(trainer.done, trainer.env_steps, best, before_s, interrupted=False)
     elif config.warm_start:
         imitate_rule(trainer, cells, progress)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-    log, began_s, interrupted = TrainingLog(out), time.monotonic(), False
+    log, interrupted = TrainingLog(out), False
+    began_s = time.monotonic() - before_s  # as if the sessions had followed each other
 
     def validate(number: int, env_steps: int) -> None:
         nonlocal best
@@ -179,26 +178,30 @@ def _train(
             return judge.reward(lambda obs: act(obs["observation"], obs["action_mask"]))
 
         reward = float(np.mean([reward_of(judge) for judge in judges]))
+        if not holds_training(out):
+            trainer.save(out / NETWORK_STATE, best=best)  # without a policy yet
+            write_card(out, card)
         if reward > best:
             best = reward
             details = {"algorithm": config.algorithm, "iterations": number, "env_steps": env_steps}
             save_policy(trainer.actor, config.size, out, **card, **details, validation_reward=reward)
-        trainer.save(out / STATE, best=best)
+        trainer.save(out / NETWORK_STATE, best=best, seconds=time.monotonic() - began_s)
         log.add(number, {"iteration": number, "validation_reward": reward})
         tell(f"Iteration {number}: {reward:.4g} per shift on the validation seeds, best {best:.4g}.")
 
     iteration, validated = None, 0
     try:
-        if not resume:
+        if best == -np.inf:
+            teacher: float | None = None
             if rule := config.warm_start:
-                found = [judge.reward(rule_actions(rule, judge.env, judge.seeds)) for judge in judges]
-                log.add(0, {"teacher": float(np.mean(found))})
-                tell(f"Teacher {rule}: {np.mean(found):.4g} per shift on the validation seeds.")
+                teacher = float(np.mean([judge.reward(rule_actions(rule, judge.env, judge.seeds)) for judge in judges]))
+                tell(f"Teacher {rule}: {teacher:.4g} per shift on the validation seeds.")
             validate(0, 0)
+            if teacher is not None:
+                log.add(0, {"teacher": teacher})
         for iteration in trainer.iterate():
             log.add(iteration.number, asdict(iteration))
-            spent_s = time.monotonic() - began_s
-            share = max(spent_s / (60.0 * plan.minutes), iteration.number / (plan.iterations or np.inf))
+            share = plan.share(iteration.number, time.monotonic() - began_s, before_s)
             progress(f"iteration {iteration.number}, best {best:.4g}", min(share, 1.0))
             if iteration.number % plan.validate_every == 0 or share >= 1.0:
                 validate(iteration.number, iteration.env_steps)
@@ -207,9 +210,9 @@ def _train(
                 break
     except KeyboardInterrupt:
         interrupted = True
-        if iteration is None:
+        if best == -np.inf:
             raise
-        if validated < iteration.number:
+        if iteration is not None and validated < iteration.number:
             validate(iteration.number, iteration.env_steps)
     draw_curves(out)
     return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
@@ -315,21 +318,3 @@ def draw_curves(folder: Path) -> None:
         axes.grid(alpha=0.3)
     with atomic_path(folder / CURVE) as draft:
         figure.savefig(draft, dpi=120, format="png")
-
-
-def _check_folder(out: Path, card: dict[str, Any], *, resume: bool) -> None:
-    path = out / "training.json"
-    if not resume:
-        if path.exists() or (out / CARD).exists():
-            raise FleetError(f"'{out}' holds a training already. Continue it with --resume, or choose another --out.")
-        return
-    try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FleetError(f"'{out}' holds no training to resume.") from None
-    if not (out / STATE).is_file():
-        raise FleetError(f"The training in '{out}' ended before its first checkpoint. Start again in another --out.")
-    was, now = (each | each.get("config", {}) | {"config": None} for each in (before, json.loads(json.dumps(card))))
-    for name, value in now.items():
-        if was.get(name) != value:
-            raise FleetError(f"The training in '{out}' has {name} = {was.get(name)} (got {value}).")

@@ -11,7 +11,8 @@ from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.load import load, override
 from scenarios.policy_loader import label, policy_of
-from scenarios.run.train_policy import CURVE, STATE, VALIDATION_SEED, TrainingPlan, train
+from scenarios.run.train_policy import CURVE, VALIDATION_SEED, TrainingPlan, train
+from scenarios.run.training_folder import NETWORK_STATE
 
 SMALL = {"horizon_s": 300.0}
 
@@ -54,7 +55,7 @@ def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> N
     assert done.best >= max(judged)
     with pytest.raises(FleetError, match=r"has discount_s = 7200\.0 \(got 3600\.0\)"):
         trained(out, cache, iterations=4, resume=True, discount_s=3600.0)
-    (out / STATE).write_bytes(b"rubbish")
+    (out / NETWORK_STATE).write_bytes(b"rubbish")
     with pytest.raises(FleetError, match="the training cannot be resumed"):
         trained(out, cache, iterations=4, resume=True)
 

@@ -2,24 +2,28 @@
 
 import json
 from dataclasses import replace
+from itertools import chain, repeat
 
 import numpy as np
 import pytest
 
 from agents.learned.evolution import EvolutionConfig
 from agents.learned.ppo import PpoConfig
-from agents.learned.training_log import LOG
-from agents.pair_scores import PARAMETERS, first_parameters
+from agents.learned.training_log import LOG, TrainingLength
+from agents.pair_scores import PAIRS_CARD, PARAMETERS, first_parameters
 from agents.pairs import Worth
 from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.load import load, override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
+from scenarios.run import suite_batches
+from scenarios.run import train_pairs as pairs
 from scenarios.run.evaluate import outcomes
 from scenarios.run.suite_batches import ground_of, rewards
 from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs, validation
-from scenarios.run.train_policy import TrainingPlan, train_on_split
+from scenarios.run.train_policy import Judge, TrainingPlan, train_on_split
+from scenarios.run.training_folder import PAIRS_STATE, TRAINING, holds_training
 from scenarios.suite.splits import Instance, instance
 
 
@@ -73,11 +77,56 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
     assert scope_of(str(out)) == "central"
     with pytest.raises(FleetError, match="holds a training already"):
         trained(3)
+    with np.load(out / PAIRS_STATE) as saved:
+        assert 0.0 < saved["seconds"] <= done.seconds
+        np.savez(out / PAIRS_STATE, **{**saved, "seconds": np.array(100.0)})
     again = trained(3, resume=True)
-    assert (again.iterations, again.teacher) == (3, done.teacher)
+    assert (again.iterations, again.shifts, again.teacher) == (3, 12, done.teacher)
     assert again.best >= done.best
-    with pytest.raises(FleetError, match="has config"):
+    assert again.seconds > 100.0
+    with pytest.raises(FleetError, match=r"has samples = 4 \(got 6\)"):
         trained(4, resume=True, samples=6)
+    with pytest.raises(FleetError, match="has 3 iterations: --iterations must be more"):
+        trained(3, resume=True)
+    (out / PAIRS_STATE).unlink()
+    for resume, reason in ((False, "holds a policy without a training to resume"), (True, "holds no training to")):
+        with pytest.raises(FleetError, match=reason):
+            trained(4, resume=resume)
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize("calls", range(6))
+def test_a_killed_training_blocks_nothing(tmp_path, ground, monkeypatch, calls) -> None:
+    """After each of its first steps it either has not begun, or can be resumed."""
+    out, left = tmp_path / "pairs", chain(range(calls, 0, -1), repeat(0))
+
+    def mortal(function):
+        def call(*args, **options):
+            if next(left) == 0:
+                raise Killed
+            return function(*args, **options)
+
+        return call
+
+    def trained(*, resume: bool):
+        plan = PairPlan(minutes=5.0, iterations=1)
+        return train_pairs([ground], [ground], EvolutionConfig(samples=2), out, plan, card={}, resume=resume)
+
+    with monkeypatch.context() as patch:
+        for name in ("validation", "write_card", "save_pairs", "_fitness"):
+            patch.setattr(pairs, name, mortal(getattr(pairs, name)))
+        with pytest.raises(Killed):
+            trained(resume=False)
+    assert holds_training(out) == (calls >= 3)
+    with pytest.raises(FleetError, match="holds a training already" if calls >= 3 else "holds no training to resume"):
+        trained(resume=calls < 3)
+    assert trained(resume=calls >= 3).iterations == 1
+    assert (out / PAIRS_CARD).exists()
+    rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
+    assert [row["iteration"] for row in rows if "iteration" in row] == [0, 1]
 
 
 def test_a_split_is_trained_by_ppo_in_turns_of_its_cells(tmp_path, ground) -> None:
@@ -92,13 +141,79 @@ def test_a_split_is_trained_by_ppo_in_turns_of_its_cells(tmp_path, ground) -> No
     assert list(judged) == [0, 2]
     assert done.best == max(judged.values())
     assert 0.0 < max(judged.values()) < 1.0, "shares of the value of all jobs"
+    with pytest.raises(FleetError, match="has 2 iterations: --iterations must be more"):
+        train_on_split([ground, small], [ground], config, tmp_path / "ppo", plan, card=card, resume=True)
+    told: list[str] = []
+    series, out = replace(plan, in_total=True), tmp_path / "ppo"
+    again = train_on_split([ground, small], [ground], config, out, series, card=card, resume=True, tell=told.append)
+    assert (again.iterations, again.best) == (2, done.best)
+    assert told == [f"Skipped the training in '{out}', because it is complete."]
+
+
+def test_ctrl_c_before_the_first_state_of_ppo_leaves_no_training(tmp_path, ground, monkeypatch) -> None:
+    out, plan = tmp_path / "ppo", TrainingPlan(minutes=5.0, iterations=1)
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    def trained(*, resume: bool = False):
+        config = PpoConfig(envs=2, steps=8, epochs=1, warm_start="wspt")
+        return train_on_split([ground], [ground], config, out, plan, card={}, resume=resume)
+
+    monkeypatch.setattr("scenarios.run.train_policy.imitate_rule", lambda *args: None)
+    with monkeypatch.context() as patch:
+        rewards_of = iter([0.5])  # of the teacher, and then an interruption
+        patch.setattr(Judge, "reward", lambda *args: next(rewards_of, None) or interrupt())
+        with pytest.raises(KeyboardInterrupt):
+            trained()
+    assert not (out / TRAINING).exists()
+    with pytest.raises(FleetError, match="holds no training to resume"):
+        trained(resume=True)
+    with monkeypatch.context() as patch:
+        patch.setattr("scenarios.run.train_policy.Trainer.iterate", interrupt)
+        done = trained()
+    assert (done.iterations, done.interrupted) == (0, True)
+    assert trained(resume=True).iterations == 1
+    assert sum("teacher" in row for row in map(json.loads, (out / LOG).read_text().splitlines())) == 1
+
+
+def test_time_of_a_session_or_in_total() -> None:
+    each, total = (TrainingLength(minutes=1.0, iterations=10, in_total=in_total) for in_total in (False, True))
+    assert each.share(3, 75.0, 45.0) == pytest.approx(0.5)
+    assert total.share(3, 75.0, 45.0) == pytest.approx(1.25)
+    assert each.share(9, 75.0, 45.0) == pytest.approx(0.9)
+
+
+def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(suite_batches, "grounds_of", lambda *args, **options: [ground])
+    monkeypatch.setattr("scenarios.trials.scores.references_of", lambda cases: {})
+    words = ["--suite", "train", "--difficulty", "oracle", "--instances", "1", "--validation-instances", "1"]
+
+    def trained(*more: str) -> tuple[list[int], int]:
+        """Iterations of each training, and trainings that were skipped."""
+        with pytest.raises(SystemExit) as stop:
+            main(["train", *words, *more])
+        assert stop.value.code == 0, capsys.readouterr().err
+        folders = sorted((tmp_path / "runs").iterdir())
+        rows = [[json.loads(line) for line in (folder / LOG).read_text().splitlines()] for folder in folders]
+        skipped = " ".join(capsys.readouterr().err.split()).count("because it is complete.")
+        return [max(row["iteration"] for row in each if "iteration" in row) for each in rows], skipped
+
+    assert trained("--iterations", "1") == ([1], 0)
+    assert trained("--iterations", "2", "--seed", "1") == ([1, 2], 0)
+    assert trained("--iterations", "2", "--seeds", "3", "--resume") == ([2, 2, 2], 1)
+    assert trained("--minutes", "0.0001", "--seeds", "3", "--resume") == ([2, 2, 2], 3)
 
 
 def test_what_cannot_be_is_refused(capsys) -> None:
     for words, reason in (
         ([], "Give either a scenario or --suite SPLIT."),
         (["quickstart", "--suite", "train"], "Give either a scenario or --suite SPLIT."),
-        (["--suite", "trian"], "No split 'trian'; did you mean 'train'?"),
+        (["--suite", "trian"], "No training split 'trian'; did you mean 'train'?"),
+        (["--suite", "validation"], "No training split 'validation'. Allowed: train."),
+        (["--suite", "test", "--algo", "mappo"], "No training split 'test'. Allowed: train."),
+        (["test/0017"], "No training split 'test'. Allowed: train."),
         (["quickstart", "--algo", "pairs"], "give --suite, not a scenario"),
         (["quickstart", "--seeds", "2", "--out", "x"], "leave --out away"),
         (["quickstart", "--lr", "0"], "--lr must be > 0 and at most 10 (got 0)."),
