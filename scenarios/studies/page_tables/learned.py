@@ -8,7 +8,7 @@ import numpy as np
 from scenarios.doc_tables import table
 from scenarios.leaderboard.board import BASELINE, SOURCE, read_all
 from scenarios.leaderboard.submission import split_references
-from scenarios.statistics.scores import ranked, scores_of
+from scenarios.statistics.scores import Scores, ranked, scores_of
 from scenarios.suite.cells import CELLS
 from scenarios.suite.splits import instance
 from scenarios.trials.scores import normalised
@@ -40,9 +40,10 @@ def _by_size(folder: Path) -> str:
         "other sizes": ~np.isin(arms, list(TRAINED)) & (arms < max(TRAINED)),
         "larger": arms > max(TRAINED),
     }
-    parts = {
-        f"{name} ({int(chosen.sum())})": scores_of(values.only(chosen), BASELINE) for name, chosen in groups.items()
-    }
+    parts: dict[str, Scores] = {}
+    for name, chosen in groups.items():
+        own = values.only(chosen)
+        parts[f"{name} ({len(own.instances)} in {len(set(own.cells))} cells)"] = scores_of(own, BASELINE)
     rows: list[tuple[str, ...]] = []
     for name in ranked(next(iter(parts.values()))):
         cells = [found[name].title]
