@@ -190,11 +190,14 @@ def test_a_policy_that_catches_every_alarm_ends_with_its_process():
     code = """
 from scenarios.run import decision_limit
 decision_limit.AGAIN_S, limit = 0.05, decision_limit.DecisionLimit(0.05)
-with limit.watching(), limit.decision():
+def turn():
+    while True: pass
+def again(function):
     while True:
-        try:
-            while True: id(0)
+        try: function()
         except BaseException: pass
+with limit.watching(), limit.decision():
+    again(lambda: again(turn))  # one more level, for an alarm that comes while the one before is caught
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 1
