@@ -32,7 +32,7 @@ def measured(arguments: list[str], cache: str) -> dict[str, object]:
         "command": arguments[0],
         "cpu_s": round(used.ru_utime + used.ru_stime, 1),
         "wall_s": round(time.monotonic() - began, 1),
-        "most_mb": round(used.ru_maxrss / 1e3),
+        "most_mb": round(used.ru_maxrss * 1024 / 1e6),
     }
 
 
