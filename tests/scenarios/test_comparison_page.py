@@ -37,15 +37,15 @@ def study() -> Study:
     return Study(policies=[*REWARD, "random"], cases=[case], difficulties=["blind"])
 
 
-def rows_of(study: Study, error: str | None = None) -> list[Row]:
-    """Rewards around those of `REWARD`; random fails in its last shift if there is an error."""
+def rows_of(study: Study, error: str | None = None, failing: str = "random") -> list[Row]:
+    """Rewards around those of `REWARD`; a policy fails in its last shift if there is an error."""
     blank, rng = Outcome(**dict.fromkeys(FIGURES, 0.0)), np.random.default_rng(0)
     rows: list[Row] = []
     for policy in study.policies:
         for seed in study.cases[0].seeds:
             key = Key(policy, study.cases[0].name, 0, 0, "blind", seed)
             reward = REWARD.get(policy, 0.0) + 0.5 * rng.normal()
-            failed = error is not None and policy == "random" and seed == 5
+            failed = error is not None and policy == failing and seed == 5
             rows.append(Row(key, None, 0, error, "line 3") if failed else Row(key, replace(blank, reward=reward), 2))
     return rows
 
@@ -79,6 +79,25 @@ def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
     for chart in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ElementTree.fromstring(chart)
     assert page.count("<svg") == 3
+
+
+def test_a_baseline_that_failed_has_no_differences(study: Study):
+    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
+    about = judged(study, rows_of(study, "Oops", failing="wspt"), known)
+    without, failed = verdict(about)
+    assert without.endswith("no differences, as the baseline wspt failed.")
+    assert failed.startswith("Failed: wspt;")
+    assert "Normalised score" not in comparison_page(about)
+
+
+def test_the_best_of_several_must_be_significant_among_them(study: Study):
+    about = judged(study, rows_of(study), {})
+    (result,) = about.results
+    for p, said in ((0.016, "more reward than wspt"), (0.02, "more than, which is not significant, wspt")):  # of three
+        reward = replace(result.figures["wsept"]["reward"], p=p)
+        figures = result.figures | {"wsept": result.figures["wsept"] | {"reward": reward}}
+        (only,) = verdict(replace(about, results=[replace(result, figures=figures)]))
+        assert said in only
 
 
 def test_without_references_the_verdict_is_of_rewards(study: Study):

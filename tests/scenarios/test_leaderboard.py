@@ -183,7 +183,15 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
     with pytest.raises(FleetError, match="must have the name of its policy and split, test-mine-oracle"):
         read_all(tmp_path, "test")
     lines = (tmp_path / "test-other-oracle.jsonl").read_text(encoding="utf-8").splitlines()
-    for bad in ("", "[1]", lines[1], json.dumps({**json.loads(lines[0]), "split": "own"})):
+    for bad in (
+        "",
+        "[1]",
+        lines[1],
+        *(
+            json.dumps(json.loads(lines[0]) | forged)
+            for forged in ({"split": "own"}, {"policy": "x` | <b>"}, {"risk": "?"})
+        ),
+    ):
         path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
         with pytest.raises(FleetError, match="is no result of `thermofleet submit-result`"):
             read(path)
