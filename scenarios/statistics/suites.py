@@ -19,6 +19,7 @@ Resamples are weights, so every figure of every policy is a product of one matri
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -204,9 +205,14 @@ def _instance_weights(instances: int, unit: Unit, groups: ArrayLike | None) -> A
         return np.ones((DRAWS, instances))
     if instances < 2:
         raise ValueError(f"The unit '{unit}' needs two instances or more (got one).")
-    if groups is None:
-        return _drawn(instances, (DRAWS,), 0)
-    of, rng = np.asarray(groups), np.random.default_rng(np.random.SeedSequence(0, spawn_key=(3,)))
+    return _drawn(instances, (DRAWS,), 0) if groups is None else _grouped(tuple(np.asarray(groups).tolist()))
+
+
+@lru_cache(maxsize=4)
+def _grouped(groups: tuple[int, ...]) -> Array:
+    """Weights of instances that are drawn within drawn groups, [draw, instance]."""
+    of, rng = np.array(groups), np.random.default_rng(np.random.SeedSequence(0, spawn_key=(3,)))
+    instances = len(of)
     weights = np.empty((DRAWS, instances))
     for group, times in enumerate(_drawn(int(of.max()) + 1, (DRAWS,), 0).T):
         own = np.flatnonzero(of == group)

@@ -23,7 +23,6 @@ from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
 from fleet.bus.protocol.schemas import descriptions, schema_document
 from fleet.events import EVENT_KINDS, MEANINGS
 from fleet.live.arm.simulated_body import _REPORTED
-from scenarios.cli.contract import documents
 from scenarios.cli.main import app
 from scenarios.doc_tables import fill_tables
 
@@ -229,8 +228,8 @@ def test_no_binding_is_claimed_that_asyncapi_does_not_know():
 def test_the_committed_documents_are_current():
     done = CliRunner().invoke(app, ["contract", "--check", "--out", str(ROOT / "docs" / "contract")])
     assert done.exit_code == 0, done.exception
-    made = {path.name for path in documents(ROOT / "docs" / "contract")}
-    assert made > {"schemas.json", "asyncapi.json", "bus.md", "cli.md", "env.md", "leaderboard.md", "policies.md"}
+    for name in ("schemas.json", "asyncapi.json", "bus.md", "cli.md", "env.md", "leaderboard.md", "policies.md"):
+        assert name in done.output
 
 
 def test_stale_documents_are_named_and_made_anew(tmp_path):
