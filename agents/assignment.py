@@ -99,8 +99,13 @@ class Ahead:
         mask = seen.action_mask.copy()
         mask[1:-1] = (seen.feasible > 0) & (per_option(seen, seen.station_free) > 0)
         late_s = float(seen.busy_s)
-        later = {"duration_s": seen.duration_s + late_s, "slack_s": seen.slack_s - late_s}
-        return replace(seen, action_mask=mask, busy_s=np.zeros_like(seen.busy_s), **later)
+        return replace(
+            seen,
+            action_mask=mask,
+            busy_s=np.zeros_like(seen.busy_s),
+            duration_s=seen.duration_s + late_s,
+            slack_s=seen.slack_s - late_s,
+        )
 
 
 class MatchingAhead(Ahead, Matching):

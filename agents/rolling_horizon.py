@@ -197,7 +197,7 @@ def pack(sequences: Sequence[Sequences], slots: int, plans: int, time_limit_s: f
         constraints=LinearConstraint(once, -np.inf, 1.0),
         options={"time_limit": time_limit_s, "node_limit": nodes},
     )
-    if result.x is None:  # no solution within the time limit
+    if result.x is None:  # no solution within the limits
         return Solution(_greedy(arm, first // plans, second // plans, worth), 0.0, np.inf, 0.0)
     chosen = np.flatnonzero(result.x > 0.5).tolist()
     return Solution(chosen, float(-result.fun), float(result.mip_gap or 0.0), 0.0)

@@ -186,7 +186,7 @@ def references(
     rows, folder = Rows(path), cache or cache_folder()
     rows.check_writable()
     keys = [key_of(task, difficulty) for task in tasks]
-    known = {(each.instance, each.seed): each for each in load_references(path, keys)}
+    known = {(each.instance, each.seed): each for each in _references_in(rows, keys)}
     left = [task for task in tasks if not _enough(known.get((task.instance, task.seed)), budget)]
     first: dict[object, Task] = {}
     cells = [first.setdefault(plan_content(task.scenario), task) for task in left]
@@ -207,7 +207,7 @@ def references(
             done += 1
             progress("bounding", Count(done, len(tasks)))
     rows.sort(_place)
-    return load_references(path, keys)
+    return _references_in(rows, keys)
 
 
 _fleets = Fleets()
@@ -270,5 +270,9 @@ def load_references(path: Path, keys: Iterable[str] | None = None) -> list[Refer
         FleetError: the file has other rows, or damaged ones.
     """
     rows = Rows(path)
+    return _references_in(rows, rows.by_key if keys is None else keys)
+
+
+def _references_in(rows: Rows, keys: Iterable[str]) -> list[Reference]:
     with rows.readable():
-        return msgspec.convert(rows.some(rows.by_key if keys is None else keys), list[Reference])
+        return msgspec.convert(rows.some(keys), list[Reference])

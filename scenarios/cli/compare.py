@@ -1,6 +1,7 @@
 """`thermofleet compare` and `thermofleet ablate`."""
 
 import json
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -120,7 +121,14 @@ def compare_command(
     from scenarios.trials.plan import Study, columns
     from scenarios.trials.report.page import Judged, comparison_page, verdict
     from scenarios.trials.scores import references_of
-    from scenarios.trials.summary import check_baseline, comparisons, competitors, result_page, scores_over_all
+    from scenarios.trials.summary import (
+        check_baseline,
+        comparisons,
+        competitors,
+        result_page,
+        rows_without_failures,
+        scores_over_all,
+    )
 
     if bool(scenario) == bool(suite):
         raise FleetError("Give either scenarios or --suite.")
@@ -163,8 +171,7 @@ def compare_command(
         with disk_errors(out):
             (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")
             if marl_eval:
-                failed = {(row.key.policy, row.key.difficulty) for row in rows if row.error is not None}
-                whole = [row for row in rows if (row.key.policy, row.key.difficulty) not in failed]
+                whole = chain.from_iterable(rows_without_failures(study, rows).values())
                 table = to_marl_eval(map(columns, whole), FIGURES)
                 (out / "marl_eval.json").write_text(json.dumps(table) + "\n", encoding="utf-8")
     if as_json:

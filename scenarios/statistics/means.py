@@ -137,7 +137,7 @@ def mean_bounds(values: Array, *, level: float = LEVEL) -> Bounds:
     x = np.asarray(values, dtype=float)
     cells = x.mean(axis=-2) if x.shape[-3] > 1 else x[..., 0, :, :]
     mean = cells.mean(axis=(-2, -1))
-    clusters = min((n for n in cells.shape[-2:] if n > 1), default=1)
+    clusters = fewest(cells.shape[-2:])
     variance, third = _moments(cells)
     flat = np.ptp(x, axis=(-3, -2, -1)) <= SAME * np.abs(x).max(axis=(-3, -2, -1))
     if clusters == 1:
@@ -158,7 +158,12 @@ def mean_bounds(values: Array, *, level: float = LEVEL) -> Bounds:
 
 def draws(values: Array) -> int:
     """Independent draws among [seed] or [fleet, training, seed]: the smaller number of clusters, as for a variance."""
-    return min((count for count in (values.shape[0], values.shape[-1]) if count > 1), default=1)
+    return fewest((values.shape[0], values.shape[-1]))
+
+
+def fewest(counts: Iterable[int]) -> int:
+    """The smallest of the numbers of clusters of crossed samples; a single cluster is given, not a sample."""
+    return min((count for count in counts if count > 1), default=1)
 
 
 def unit(shape: tuple[int, ...]) -> str:

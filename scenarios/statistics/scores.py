@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from rich.table import Table
@@ -41,7 +42,7 @@ class Normalised:
         score, to_bound = ({name: x[:, chosen] for name, x in each.items()} for each in (self.score, self.to_bound))
         return replace(self, instances=names, cells=cells, score=score, to_bound=to_bound)
 
-    @property
+    @cached_property
     def groups(self) -> Array | None:
         """Number of the cell of each instance; None if cells are no sample or each has one instance."""
         names, groups = np.unique(self.cells, return_inverse=True)

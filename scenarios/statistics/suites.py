@@ -28,7 +28,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from scenarios.statistics.counts import share_bounds
-from scenarios.statistics.means import LEVEL, SAME, Interval
+from scenarios.statistics.means import LEVEL, SAME, Interval, fewest
 
 Array = np.ndarray
 Unit = Literal["within", "runs", "instances", "both"]
@@ -149,8 +149,7 @@ def _clusters(shape: tuple[int, ...], unit: Unit, groups: ArrayLike | None) -> i
     """Independent draws of a unit with instances, the smaller number of those of instances and of runs; else None."""
     if unit in ("within", "runs"):
         return None
-    several = (shape[1] if groups is None else int(np.max(groups)) + 1, shape[0] if unit == "both" else 1)
-    return min((n for n in several if n > 1), default=1)
+    return fewest((shape[1] if groups is None else int(np.max(groups)) + 1, shape[0] if unit == "both" else 1))
 
 
 def _beyond(shape: tuple[int, ...], unit: Unit, groups: ArrayLike | None, level: float) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from fleet.errors import FleetError
 from scenarios.policy_loader import label, scope_of
 from scenarios.run.compare import Comparison, Failed, comparison_table, figures_of_shifts
 from scenarios.run.evaluate import Outcome
-from scenarios.statistics.means import unit
+from scenarios.statistics.means import fewest, unit
 from scenarios.statistics.scores import FEWEST, Normalised, and_trainings, score_tables, scores_of
 from scenarios.statistics.tables import LEGEND
 from scenarios.trials.cases import suite_label
@@ -79,7 +79,7 @@ def comparison_of(
         scenario=name or rows[0].key.instance,
         seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
         unit=unit(study.shape) if count == 1 else f"{count} instances{and_trainings(study.most_trainings)}",
-        draws=min((n for n in several if n > 1), default=1),
+        draws=fewest(several),
         baseline=baseline,
         figures=figures_of_shifts(whole, baseline, (count, *study.shape)) if baseline in whole else {},
         scopes={names[p, d]: scope_of(p) if names[p, d] in whole else "failed" for p, d in names},
@@ -102,8 +102,13 @@ def rows_of_competitors(study: Study, rows: Iterable[Row]) -> dict[str, list[Row
 
 def scores_over_all(study: Study, rows: Sequence[Row], references: "Mapping[Shift, Reference]") -> Normalised | None:
     """Scores of the policies without a failure over all instances; None without references."""
+    return normalised(rows_without_failures(study, rows), references)
+
+
+def rows_without_failures(study: Study, rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """The rows of those competitors that failed in no shift."""
     shifts = rows_of_competitors(study, rows)
-    return normalised({each: of for each, of in shifts.items() if not any(row.error for row in of)}, references)
+    return {each: of for each, of in shifts.items() if not any(row.error is not None for row in of)}
 
 
 def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:

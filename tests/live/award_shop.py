@@ -13,7 +13,7 @@ VALID_S, LEASE_S = 5.0, 6.0
 
 
 def shop(disk=None, boot_nonce="n", **config):
-    """A executor at its start, and its disk."""
+    """An executor at its start, and its disk."""
     disk = Disk() if disk is None else disk
     history = ArmHistory().replay(disk.records).after_restart("a", 7.0)
     disk.records[:] = history.compact()

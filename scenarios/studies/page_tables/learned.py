@@ -34,10 +34,11 @@ def _by_size(folder: Path) -> str:
     )
     assert values is not None
     arms = np.array([len(instance(name).scenario.arms) for name in values.instances])
+    trained = np.isin(arms, list(TRAINED))
     groups = {
         "all instances": arms > 0,
-        "trained sizes": np.isin(arms, list(TRAINED)),
-        "other sizes": ~np.isin(arms, list(TRAINED)) & (arms < max(TRAINED)),
+        "trained sizes": trained,
+        "other sizes": ~trained & (arms < max(TRAINED)),
         "larger": arms > max(TRAINED),
     }
     parts: dict[str, Scores] = {}

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any  # values of a card
 
 import numpy as np
@@ -11,7 +12,7 @@ from scenarios.report.page import escape, html_page, paragraph, table
 from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
 from scenarios.run.evaluate import FIGURES
 from scenarios.statistics.means import LEVEL, Interval
-from scenarios.statistics.scores import FEWEST, HEADS, Normalised, ranked, score_cells, scores_of
+from scenarios.statistics.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
 from scenarios.statistics.suites import profile
 from scenarios.statistics.tables import LEGEND, Figure
 from scenarios.trials.report.charts import Range, lines, points, spans
@@ -52,12 +53,17 @@ class Judged:
         values = self.values
         return values if values and self.baseline in values.score and len(values.instances) >= FEWEST else None
 
+    @cached_property
+    def scores(self) -> Scores | None:
+        """The figures of `scored`."""
+        return scores_of(self.scored, self.baseline) if self.scored else None
+
 
 def comparison_page(judged: Judged) -> str:
     """The page; the same input gives the same text."""
     body = [
         *(paragraph(sentence, "verdict") for sentence in verdict(judged)),
-        *(_scores(judged, judged.scored) if judged.scored else ()),
+        *_scores(judged),
         *_by_cell(judged),
         *_heat(judged),
         *(part for result in judged.results for part in _figures(result, alone=len(judged.results) == 1)),
@@ -73,14 +79,13 @@ def verdict(judged: Judged) -> list[str]:
     The best one is chosen by its figures, so p-values count as many differences as there are other policies
     (Bonferroni).
     """
-    values, base = judged.scored, judged.baseline
+    values, scores, base = judged.scored, judged.scores, judged.baseline
     failed = {each.policy for result in judged.results for each in result.failures}
     last = [f"Failed: {', '.join(sorted(map(label, failed)))}; a policy with a failed shift has no figures."] * bool(
         failed
     )
-    if values is None:
+    if values is None or scores is None:
         return [*_reward_verdict(judged.results), *last]
-    scores = scores_of(values, base)
     best, *rest = ranked(scores)
     others = {base: "the baseline "} if best != base else {}
     others |= {name: "the next one, " for name in [name for name in rest if name != base][:1]}
@@ -125,8 +130,10 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
         yield f"{where}{label(best)} has the most reward, {figure.mean:.1f}; {span} {more} {label(result.baseline)}."
 
 
-def _scores(judged: Judged, values: Normalised) -> Iterator[str]:
-    scores = scores_of(values, judged.baseline)
+def _scores(judged: Judged) -> Iterator[str]:
+    values, scores = judged.scored, judged.scores
+    if values is None or scores is None:
+        return
     order = ranked(scores)
     yield "<h2>Normalised score</h2>"
     yield from (paragraph(sentence, "faint") for sentence in scores.remarks)
