@@ -12,8 +12,8 @@ from scenarios.schema import ArmSpec
 from scenarios.suite.layouts import Layout, LayoutName, layout_of
 from scenarios.suite.trades import TradeName
 
-SplitName = Literal["train", "validation", "test"]
-SPLITS: tuple[SplitName, ...] = ("train", "validation", "test")
+SplitName = Literal["train", "validation", "test", "sizes"]
+SPLITS: tuple[SplitName, ...] = ("train", "validation", "test", "sizes")
 Unlike = Literal["alike", "usual", "mixed"]
 SPREAD: dict[Unlike, float] = {"alike": 0.2, "usual": 0.7, "mixed": 0.7}
 """`spread.scale` of the arms."""
@@ -115,5 +115,21 @@ CELLS: tuple[Cell, ...] = (
         _of("line", 16, "kitting", seed=29306, pitch_m=0.79, hours=1.0, slots=48, unlike="mixed", instances=12),
         _of("ring", 32, "gluing", seed=4307, pitch_m=0.82, hours=1.0, slots=64, unlike="mixed", instances=8),
         _of("line", 64, "screwdriving", seed=29308, pitch_m=0.79, hours=1.0, slots=96, instances=6),
+    ),
+    # No other split has cells of these sizes.
+    *_cells(
+        "sizes",
+        _of("line", 7, "gluing", seed=400, instances=4),
+        _of("ring", 7, "palletising", seed=5401, stations=3, instances=4),
+        _of("gantry", 9, "machine_tending", seed=60402, unlike="mixed", instances=4),
+        _of("wall_ceiling", 9, "screwdriving", seed=1403, instances=4),
+        _of("bench", 10, "kitting", seed=76404, hours=1.0, slots=48, unlike="mixed", instances=4),
+        _of("line", 11, "polishing", seed=9405, hours=1.0, slots=48, instances=4),
+        _of("ring", 12, "inspection", seed=6406, hours=1.0, slots=48, instances=4),
+        _of("gantry", 12, "assembly", seed=9407, stations=3, hours=1.0, slots=48, instances=4),
+        _of("wall_ceiling", 14, "palletising", seed=3408, hours=1.0, slots=48, instances=4),
+        _of("line", 20, "machine_tending", seed=356409, hours=1.0, slots=64, unlike="mixed", instances=4),
+        _of("bench", 20, "gluing", seed=11410, stations=3, hours=1.0, slots=64, instances=4),
+        _of("ring", 24, "polishing", seed=6411, hours=1.0, slots=64, instances=4),
     ),
 )
