@@ -22,7 +22,7 @@ MOST_BYTES = 10_000_000
 """Of a scenario file."""
 MOST_JOBS = 100_000
 """Largest number of expected jobs in a shift: a mistyped gap would give billions."""
-INSTANCE = re.compile(r"(train|validation|test)/\d+")
+INSTANCE = re.compile(r"(train|validation|test|sizes)/\d+")
 """Names of the suite's instances."""
 APART_M = 0.2
 """Smallest distance of two bases: a Gen3 base is 0.09 m wide, and its first joint must turn freely."""

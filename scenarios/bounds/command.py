@@ -27,7 +27,7 @@ def bounds_command(
         ),
     ] = None,
     suite: Annotated[
-        str | None, typer.Option(help="All instances of a split: train, validation or test.", show_default=False)
+        str | None, typer.Option(help="All instances of a split: train, validation, test or sizes.", show_default=False)
     ] = None,
     seeds: Annotated[int, options.number("Number of seeds of each scenario.", 1, 10_000)] = 5,
     first_seed: Annotated[int, options.number("First seed.", 0, options.MAX_SEED)] = 0,

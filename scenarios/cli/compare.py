@@ -38,8 +38,8 @@ def compare_command(
     suite: Annotated[
         str | None,
         typer.Option(
-            help="Instances that are judged together: train, validation or test; or instances of a split (test/0017), "
-            "library names and .toml files, separated by commas.",
+            help="Instances that are judged together: train, validation, test or sizes; or instances of a split "
+            "(test/0017), library names and .toml files, separated by commas.",
             show_default=False,
         ),
     ] = None,

@@ -28,7 +28,7 @@ def list_command(as_json: JsonOption = False) -> None:
 def suite_command(
     split: Annotated[
         str | None,
-        typer.Option(help="List the instances of this split: train, validation or test.", show_default=False),
+        typer.Option(help="List the instances of this split: train, validation, test or sizes.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

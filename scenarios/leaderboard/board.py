@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from fleet.errors import FleetError
@@ -10,6 +11,7 @@ from scenarios.bounds.references import Reference, load_references
 from scenarios.doc_tables import table
 from scenarios.leaderboard.submission import Submission, check, read, split_references
 from scenarios.statistics.scores import FEWEST, Scores, ranked, score_cells, scores_of
+from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import manifest
 from scenarios.trials.scores import Shift, normalised
 
@@ -148,6 +150,5 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
 
     return {
         "bounds": lambda: markdown(load_references(results / "bounds_library.jsonl")),
-        "leaderboard_test": lambda: board("test"),
-        "leaderboard_validation": lambda: board("validation"),
+        **{f"leaderboard_{split}": partial(board, split) for split in JUDGED},
     }

@@ -19,7 +19,7 @@ FOLDER = Path("docs/results/leaderboard")
 
 def leaderboard_command(
     folder: Annotated[Path, typer.Argument(help="Folder of results, one file for each policy.")] = FOLDER,
-    split: Annotated[str, typer.Option(help="Split of the suite: test or validation.")] = "test",
+    split: Annotated[str, typer.Option(help="Split of the suite: test, sizes or validation.")] = "test",
     verify: Annotated[
         int, options.number("Number of shifts to repeat of each result of a built-in policy.", 0, 200)
     ] = 0,

@@ -19,7 +19,7 @@ from scenarios.prepare.fleet import RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import FIGURES, Outcome
-from scenarios.suite.cells import SplitName
+from scenarios.suite.cells import JUDGED, SplitName
 from scenarios.suite.splits import Row as Line
 from scenarios.suite.splits import line_of, manifest
 from scenarios.trials.cases import suite_of
@@ -270,9 +270,9 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
         raise FleetError("Results of the leaderboard have no randomisation, and the bus of each instance.")
     if card["decision_limit_s"] is None or card["decision_limit_s"] > DECISION_LIMIT_S:
         raise FleetError(f"Results of the leaderboard have a decision limit of at most {DECISION_LIMIT_S:g} s.")
-    splits = sorted({name.partition("/")[0] for name in card["instances"] if "/" in name} & {"validation", "test"})
+    splits = sorted({name.partition("/")[0] for name in card["instances"] if "/" in name} & set[str](JUDGED))
     if not splits:
-        raise FleetError("The study has no instance of the split validation or test; compare with --suite test.")
+        raise FleetError("The study has no instance of a split that policies are judged on; compare with --suite test.")
     made: list[Submission] = []
     for split in splits:
         seeds = {line.name: line.seed for line in manifest(split)}

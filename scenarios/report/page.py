@@ -135,12 +135,12 @@ def html_page(
 def _figure_parts(figure: Mapping[str, Any]) -> list[str]:
     from plotly.offline import get_plotlyjs
 
-    return [_data("plotly", compressed(get_plotlyjs())), _data("drawn", _json(figure))]
+    return [_data("plotly", compressed([get_plotlyjs().encode()])), _data("drawn", _json(figure))]
 
 
 def _replay_parts(replay: Replay) -> list[str]:
     return [
-        _data("three", compressed(three_js())),
+        _data("three", compressed([three_js().encode()])),
         _data("cell-model", _json(replay.model)),
         _data("playback", replay.playback),
     ]

@@ -2,8 +2,10 @@
 
 import base64
 import gzip
+import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any  # plain values of JSON
 
 import numpy as np
@@ -38,32 +40,41 @@ def packed(telemetry: Telemetry, payload_kg: Array | None = None) -> str:
     step_s = float(np.median(np.diff(time_s))) if samples > 1 else 1.0
     dense = max(1, -(-telemetry.q.size // MOST_VALUES))
     sparse = max(1, round(HEAT_STEP_S / step_s))
-    absent = ~np.isfinite(telemetry.q).all(axis=2)
-    mode = np.where(absent, -1, telemetry.mode)
-    load = np.zeros((samples, arms)) if payload_kg is None else payload_kg
+    mode = np.where(np.isfinite(telemetry.q[..., 0]), telemetry.mode, np.int8(-1))
+    load = np.zeros((samples, arms), np.float32) if payload_kg is None else payload_kg
     arrays = [
         ("q", telemetry.q, ANGLE_RAD, dense),
         ("temp_c", telemetry.temp_c, HEAT_C, sparse),
         ("mode", mode, 1.0, dense),
         ("payload_kg", load, LOAD_KG, dense),
     ]
-    listed: list[dict[str, Any]] = []
-    body = bytearray()
-    for name, values, scale, stride in arrays:
-        shape = (arms, *values.shape[2:], len(time_s[::stride]))
-        first, step = float(time_s[0]), stride * step_s
-        listed.append({"name": name, "shape": shape, "scale": scale, "first_s": first, "step_s": step})
-        for arm in range(arms):  # one at a time, as large fleets have much
-            steps = np.clip(np.round(_held(values[::stride, arm]) / scale), -(2**15), 2**15 - 1)
-            body += np.diff(steps.astype(np.int32).T, axis=-1, prepend=0).astype("<i2").tobytes()
-    head = json.dumps(listed, separators=(",", ":")).encode()
-    return compressed(bytes(head + b"\n" + body))
+    listed: list[dict[str, Any]] = [
+        {
+            "name": name,
+            "shape": (arms, *values.shape[2:], len(time_s[::stride])),
+            "scale": scale,
+            "first_s": float(time_s[0]),
+            "step_s": stride * step_s,
+        }
+        for name, values, scale, stride in arrays
+    ]
+
+    def body() -> Iterator[bytes]:
+        for _, values, scale, stride in arrays:
+            for arm in range(arms):  # one at a time, as large fleets have much
+                steps = np.clip(np.round(_held(values[::stride, arm]) / scale), -(2**15), 2**15 - 1)
+                yield np.diff(steps.astype(np.int32).T, axis=-1, prepend=0).astype("<i2").tobytes()
+
+    return compressed(chain([json.dumps(listed, separators=(",", ":")).encode() + b"\n"], body()))
 
 
-def compressed(content: bytes | str) -> str:
-    """Bytes or text as base64 of a gzip stream; the same content gives the same text."""
-    raw = content.encode() if isinstance(content, str) else content
-    return base64.b64encode(gzip.compress(raw, 9, mtime=0)).decode("ascii")
+def compressed(content: Iterable[bytes]) -> str:
+    """Bytes, in pieces, as base64 of a gzip stream; the same content gives the same text."""
+    packed = io.BytesIO()
+    with gzip.GzipFile(fileobj=packed, mode="wb", compresslevel=9, mtime=0) as file:
+        for piece in content:
+            file.write(piece)
+    return base64.b64encode(packed.getbuffer()).decode("ascii")
 
 
 def payloads(telemetry: Telemetry, plan: Schedule, arms: Sequence[str], payload_of: Mapping[str, float]) -> Array:

@@ -23,7 +23,7 @@ from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer
 
 FILES = ("run.json", "telemetry.parquet", "events.parquet", "jobs.parquet", "offers.parquet", "report.html")
-ROWS_AT_ONCE = 30_000
+ROWS_AT_ONCE = 10_000
 RUN = ResultKind(name="run", card="run.json", files=FILES)
 
 

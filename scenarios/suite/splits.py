@@ -53,7 +53,7 @@ class Row:
 
 @lru_cache(maxsize=len(SPLITS))
 def split(name: str) -> tuple[Instance, ...]:
-    """The instances of a split: train, validation or test.
+    """The instances of a split: train, validation, test or sizes.
 
     Cells that several instances share have equal plans, space and twins. The first instances are of different cells.
 

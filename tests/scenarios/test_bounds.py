@@ -26,6 +26,7 @@ from scenarios.load import parse_scenario
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare
 from scenarios.run.evaluate import outcomes
+from scenarios.suite.cells import SPLITS
 from scenarios.suite.splits import instance, manifest
 from scenarios.trials.scores import split_file
 
@@ -226,7 +227,7 @@ def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):
 
 
 def test_references_of_the_splits_are_of_their_instances():
-    for split in ("train", "validation", "test"):
+    for split in SPLITS:
         lines = {line.name: line for line in manifest(split)}
         path = split_file(split)
         rows = load_references(path) if path.is_file() else []

@@ -26,7 +26,7 @@ PLAIN = Axes(
 def test_a_split_never_changes(name) -> None:
     """Draw every instance anew; the manifest has the hashes of its scenario and of its jobs."""
     frozen = manifest(name)
-    assert len(frozen) >= 200
+    assert len(frozen) >= (48 if name == "sizes" else 200)
     assert frozen == tuple(drawn_rows(name))
 
 

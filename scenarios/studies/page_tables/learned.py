@@ -1,6 +1,6 @@
 """Table of docs/learning.md: learned policies on fleets of sizes that they were trained on, and on others."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,8 @@ from scenarios.suite.cells import CELLS
 from scenarios.suite.splits import instance
 from scenarios.trials.scores import normalised
 
+Array = np.ndarray
+
 TRAINED = {cell.arms for cell in CELLS if cell.split == "train"}
 """Numbers of arms of the fleets of the training split."""
 
@@ -23,27 +25,37 @@ def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
     Args:
         results: docs/results, with the files of the leaderboard.
     """
-    return {"learned_test": lambda: _by_size(results / "leaderboard")}
+    return {
+        "learned_test": lambda: _by_size(
+            results / "leaderboard", "test", {
+                "all instances": lambda arms: arms > 0,
+                "trained sizes": lambda arms: np.isin(arms, list(TRAINED)),
+                "other sizes": lambda arms: ~np.isin(arms, list(TRAINED)) & (arms < max(TRAINED)),
+                "larger": lambda arms: arms > max(TRAINED),
+            },
+        ),
+        "learned_sizes": lambda: _by_size(
+            results / "leaderboard", "sizes", {
+                "all instances": lambda arms: arms > 0,
+                "7 to 10 arms": lambda arms: arms <= 10,
+                "11 to 14 arms": lambda arms: (arms > 10) & (arms < max(TRAINED)),
+                "20 and 24 arms": lambda arms: arms > max(TRAINED),
+            },
+        ),
+    }  # fmt: skip
 
 
-def _by_size(folder: Path) -> str:
-    """Differences of normalised scores to the best rule, on all instances and by the number of arms."""
-    found = {each.card.policy: each for each in read_all(folder, "test") if each.card.difficulty == SOURCE}
+def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Array]]) -> str:
+    """Differences of normalised scores to the best rule on a split, by groups of numbers of arms."""
+    found = {each.card.policy: each for each in read_all(folder, split) if each.card.difficulty == SOURCE}
     values = normalised(
-        {name: each.study_rows() for name, each in found.items()}, split_references("test"), failed_as_random=True
+        {name: each.study_rows() for name, each in found.items()}, split_references(split), failed_as_random=True
     )
     assert values is not None
     arms = np.array([len(instance(name).scenario.arms) for name in values.instances])
-    trained = np.isin(arms, list(TRAINED))
-    groups = {
-        "all instances": arms > 0,
-        "trained sizes": trained,
-        "other sizes": ~trained & (arms < max(TRAINED)),
-        "larger": arms > max(TRAINED),
-    }
     parts: dict[str, Scores] = {}
     for name, chosen in groups.items():
-        own = values.only(chosen)
+        own = values.only(chosen(arms))
         parts[f"{name} ({len(own.instances)} in {len(set(own.cells))} cells)"] = scores_of(own, BASELINE)
     rows: list[tuple[str, ...]] = []
     for name in ranked(next(iter(parts.values()))):
