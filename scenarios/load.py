@@ -99,7 +99,7 @@ def override(scenario: Scenario, **changes: object) -> Scenario:
     """
     where = f"{scenario.name} with overrides"
     try:
-        plain = msgspec.to_builtins(changes, enc_hook=_plain)
+        plain = plain_values(changes)
     except TypeError as error:
         raise ScenarioError(f"{where}: {error}.") from error
     return parse_scenario({**msgspec.to_builtins(scenario), **plain}, Path(where))
@@ -128,6 +128,15 @@ def scenario_with(
             allowed = nearest(name, [*fields, *options])
             raise ScenarioError(f"{chosen.name} with overrides: unknown key '{name}'{allowed}")
     return override(chosen, **overrides) if overrides else chosen
+
+
+def plain_values(fields: Mapping[str, object]) -> dict[str, Any]:
+    """The values of a mapping as those of a TOML or JSON file.
+
+    Raises:
+        TypeError: a value is neither a number, a text, a list nor a table.
+    """
+    return msgspec.to_builtins(dict(fields), enc_hook=_plain)
 
 
 def _plain(value: object) -> object:

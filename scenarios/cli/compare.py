@@ -70,6 +70,7 @@ def compare_command(
         ),
     ] = "twin",
     risk: options.RiskOption = "rc",
+    randomise: options.RandomiseOption = None,
     decision_limit: Annotated[
         float, options.number("Longest time for one decision of a policy, s. A slower policy fails.", 0.001, 86_400)
     ] = 60.0,
@@ -138,6 +139,9 @@ def compare_command(
         raise FleetError("--marl-eval needs --out, the folder that it writes to.")
     if references is not None and not references.is_file():
         raise FleetError(f"There is no file of references '{references}'; make it with `thermofleet bounds`.")
+    varied = options.parse_randomisation(randomise)
+    if references is not None and varied:
+        raise FleetError("Give either --references or --randomise: references are of shifts without randomisation.")
     out = out and out.resolve()  # a policy may change the folder of the process
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
     channels = [
@@ -154,6 +158,7 @@ def compare_command(
         trainings=trainings,
         difficulties=[choose("difficulty", name.strip(), DifficultyName) for name in difficulty.split(",")],
         risk=choose("risk", risk, RiskName),
+        randomise=varied,
         channel=channels[0],  # the same of all; each scenario has the arms that it names
         decision_limit_s=decision_limit,
     )

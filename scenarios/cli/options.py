@@ -1,16 +1,19 @@
 """Options that several commands share."""
 
 import shlex
+import tomllib
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from agents.registry import WRAPPERS_HELP, names_of
-from fleet.errors import NAME_RULE, FleetError, LogError, is_name, printable
+from fleet.errors import NAME_RULE, FleetError, LogError, is_name, nearest, printable
 
 if TYPE_CHECKING:  # slow to import
     from fleet.bus.exchange.channel import Channel, Partition
+    from scenarios.prepare.randomisation import Randomisation
     from scenarios.schema import Scenario
     from twin.logs.recording import Recording
 
@@ -79,6 +82,16 @@ RiskOption = Annotated[
         help="With --difficulty twin, model of P(saturation): rc (peak predicted by the arm's own thermal network), "
         "rc-nominal (peak predicted by that of a nominal arm), excess, load, errors (regression on errors of the "
         "learned twin), or torque (regression on mean squared torque)."
+    ),
+]
+RandomiseOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="FIELD=VALUE",
+        help="Randomise every shift of a scenario; the value is TOML: ambient_k=[LOW,HIGH] (K, added to the ambient "
+        "temperature), arrivals=[LOW,HIGH] (factor of the arrival rate), variants=[{...},...] (fleets to choose from, "
+        "as overrides of the scenario). May be repeated.",
+        show_default=False,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -185,6 +198,36 @@ def parse_partition(text: str) -> "Partition":
         ) from None
     arms = (tuple(arm.strip() for arm in group.split(",") if arm.strip()) for group in groups.split("|"))
     return Partition(from_s, to_s, tuple(arms))
+
+
+def parse_randomisation(texts: list[str] | None) -> "Randomisation | None":
+    """The randomisation of texts such as `ambient_k=[-2, 8]`, each a TOML document; None without any.
+
+    Raises:
+        FleetError: says what was given and what is allowed.
+    """
+    from scenarios.prepare.randomisation import Randomisation
+
+    if not texts:
+        return None
+    allowed, given = [field.name for field in fields(Randomisation)], dict[str, Any]()
+    for text in texts:
+        try:
+            found = tomllib.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise FleetError(
+                f"--randomise must be FIELD=VALUE in TOML, as in 'ambient_k=[-2,8]' (got '{printable(text)}')."
+            ) from error
+        for name in found:
+            if name not in allowed:
+                raise FleetError(f"--randomise has no field '{printable(name)}'{nearest(name, allowed)}")
+            if name in given:
+                raise FleetError(f"--randomise {name} is given twice; give it once.")
+        given |= found
+    try:
+        return Randomisation(**given)
+    except ValueError as error:
+        raise FleetError(str(error).replace("Randomisation.", "--randomise ")) from error
 
 
 def the_fleet(name: str, endpoint: str) -> str:

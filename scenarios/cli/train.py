@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from fleet.errors import FleetError
-from scenarios.cli.options import MAX_SEED, DifficultyOption, RiskOption, number
+from scenarios.cli.options import MAX_SEED, DifficultyOption, RandomiseOption, RiskOption, number, parse_randomisation
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.load import INSTANCE, load
@@ -94,6 +94,7 @@ def train_command(
     threads: Annotated[int, number("Threads of the network's computations.", 1, 1024)] = 1,
     difficulty: DifficultyOption = "twin",
     risk: RiskOption = "rc",
+    randomise: RandomiseOption = None,
 ) -> None:
     """Train a policy by reinforcement learning or evolution, with checkpoints and learning curves.
 
@@ -105,6 +106,11 @@ def train_command(
     """
     if (scenario is None) == (suite is None):
         raise FleetError("Give either a scenario or --suite SPLIT.")
+    if randomise and suite is not None:
+        raise FleetError(
+            "--randomise needs a scenario: the instances of --suite are fixed. Give a scenario instead of --suite."
+        )
+    varied = parse_randomisation(randomise)
     if seeds > 1 and out is not None:
         raise FleetError("--seeds makes several trainings: they go to runs/, leave --out away.")
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
@@ -182,7 +188,7 @@ def train_command(
             with progress_bar() as progress:
                 common: Any = {"resume": goes_on, "progress": progress, "tell": say}
                 if chosen is not None:
-                    done = train(chosen, config, where, length, **models, **common)
+                    done = train(chosen, config, where, length, randomise=varied, **models, **common)
                 else:
                     done = train_on_split(grounds, judging, config, where, length, card=card, **common)
         unit = "" if algorithm == "pairs" else " a shift" if chosen else " of the value of all jobs"

@@ -32,7 +32,7 @@ from scenarios.job_stream import JobSampler, all_works, rehearsal_works
 from scenarios.load import scenario_with
 from scenarios.prepare.planned_arm import PlannedArm, air_offsets, plan_arms
 from scenarios.prepare.problems import problems_of
-from scenarios.prepare.randomisation import Randomisation, Variation
+from scenarios.prepare.randomisation import Randomisation, Variation, randomisation_of
 from scenarios.progress import Progress, check_progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
@@ -100,10 +100,8 @@ def prepare(
             the same arms and jobs.
         MissingExtra: twins are wanted, and their libraries are not installed.
     """
-    if not isinstance(randomise, Randomisation | None):
-        raise ScenarioError(f"randomise must be a scenarios.run.batch.Randomisation (got {randomise!r}).")
+    randomise = randomisation_of(randomise)
     check_progress(progress)
-    randomise = randomise or Randomisation()
     specs = randomise.scenarios_of(scenario)
     fleets: list[Fleet] = []
     for i, spec in enumerate(specs):

@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import inf
 from numbers import Real
+from sys import float_info
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fleet.errors import ScenarioError
 from fleet.seeding import child
-from scenarios.load import override
+from scenarios.load import override, plain_values
 from scenarios.schema import Ambient, Scenario
 
 MOST_ARRIVALS = 100.0
@@ -33,17 +33,38 @@ class Randomisation:
         for name in ("ambient_k", "arrivals"):
             given = getattr(self, name)
             numbers = isinstance(given, tuple | list) and all(isinstance(end, Real) for end in given)
-            if not (numbers and len(given) == 2 and -inf < given[0] <= given[1] < inf):
+            if not (numbers and len(given) == 2 and -float_info.max <= given[0] <= given[1] <= float_info.max):
                 raise ValueError(f"Randomisation.{name} must be two finite numbers, low <= high (got {given!r}).")
+            object.__setattr__(self, name, (float(given[0]), float(given[1])))
         if not 0 < self.arrivals[0] <= self.arrivals[1] <= MOST_ARRIVALS:
             raise ValueError(f"Randomisation.arrivals must be > 0 and at most {MOST_ARRIVALS:g} (got {self.arrivals}).")
         if not isinstance(self.variants, list | tuple) or not all(isinstance(v, Mapping) for v in self.variants):
             raise ValueError(
                 f"Randomisation.variants must be a list of dictionaries, one for each fleet (got {self.variants!r})."
             )
+        try:
+            object.__setattr__(self, "variants", tuple(plain_values(variant) for variant in self.variants))
+        except TypeError as error:
+            raise ValueError(f"Randomisation.variants: {error}.") from error
+
+    def __bool__(self) -> bool:
+        """Whether anything is randomised."""
+        return self != Randomisation()
 
     def __hash__(self) -> int:
         return hash((self.ambient_k, self.arrivals, repr(self.variants)))
+
+    @property
+    def text(self) -> str:
+        """What is randomised, in words."""
+        default, parts = Randomisation(), list[str]()
+        if self.ambient_k != default.ambient_k:
+            parts.append("ambient temperature {:+g} to {:+g} K".format(*self.ambient_k))
+        if self.arrivals != default.arrivals:
+            parts.append("arrival rate times {:g} to {:g}".format(*self.arrivals))
+        if self.variants:
+            parts.append(f"one of {1 + len(self.variants)} fleets")
+        return ", ".join(parts) or "none"
 
     def scenarios_of(self, scenario: Scenario) -> tuple[Scenario, ...]:
         """The scenario and its variants.
@@ -66,7 +87,7 @@ class Randomisation:
 
     def drawn(self, seed: np.random.SeedSequence, fleets: int) -> "Variation":
         """The variation of the shift of a seed, among a number of fleets."""
-        if fleets == 1 and self == Randomisation():
+        if fleets == 1 and not self:
             return Variation(0, 0.0, 1.0)
         rng = np.random.default_rng(child(seed, 2))
         warmer_k, rate = rng.uniform(*self.ambient_k), rng.uniform(*self.arrivals)
@@ -80,6 +101,17 @@ class Randomisation:
                 raise ScenarioError(
                     f"{scenario.name}: Randomisation.ambient_k {self.ambient_k} goes too far: {error}."
                 ) from error
+
+
+def randomisation_of(given: object) -> Randomisation:
+    """The randomisation that was given; None is one that changes nothing.
+
+    Raises:
+        ScenarioError: something else was given.
+    """
+    if not isinstance(given, Randomisation | None):
+        raise ScenarioError(f"randomise must be a scenarios.run.batch.Randomisation (got {given!r}).")
+    return given or Randomisation()
 
 
 class Variation(NamedTuple):

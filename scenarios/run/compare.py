@@ -78,6 +78,8 @@ class Comparison:
     """Shifts in which a policy failed. A policy with one has no figures."""
     scores: Scores | None = None
     """Normalised scores; None without references of the shifts."""
+    randomise: Randomisation = field(default_factory=Randomisation)
+    """Of every shift, the same for every policy."""
 
     @property
     def title(self) -> str:
@@ -170,6 +172,8 @@ def comparison_table(result: Comparison) -> Group:
     title = f"{result.title}: mean, paired difference to {result.baseline}, {LEGEND}"
     if result.channel != PERFECT.described():
         title += f"\nChannel: {result.channel_text}."
+    if result.randomise:
+        title += f"\nRandomisation: {result.randomise.text}."
     table = empty_table()
     table.add_row("[bold]scope[/bold]")
     for policy, scope in result.scopes.items():

@@ -21,7 +21,7 @@ from fleet.files import atomic_path
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
-from scenarios.prepare.randomisation import Randomisation
+from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.run.suite_batches import Ground
@@ -81,17 +81,17 @@ def train(
 
     Raises:
         FleetError: a training in the folder without `resume`, `resume` without a training, or a training of another
-            scenario or configuration, or one that has the iterations of the plan.
+            scenario, configuration or randomisation, or one that has the iterations of the plan.
     """
+    randomise = randomisation_of(randomise)
     card = {
         "scenario": scenario.name,
         "scenario_hash": scenario_hash(scenario),
         "difficulty": difficulty,
         "risk": risk,
+        "randomise": asdict(randomise) if randomise else None,  # always there, so that a resume compares it
         "config": asdict(config),
     }
-    if randomise is not None:
-        card["randomise"] = repr(randomise)
     check_folder(out, card, NETWORK_STATE, resume=resume)
     fleet = prepare(scenario, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
     library, weights = library_of(fleet), weights_of(scenario)

@@ -58,7 +58,10 @@ class Fleets:
             while len(self._cells) > MOST_FLEETS:
                 self._cells.popitem(last=False)
         self._cells.move_to_end(cell)
-        found = replace(self._cells[cell][1], scenario=scenario)
+        fleet = self._cells[cell][1]
+        _, *specs = (randomise or Randomisation()).scenarios_of(scenario)
+        variants = [replace(each, scenario=spec) for each, spec in zip(fleet.variants, specs, strict=True)]
+        found = replace(fleet, scenario=scenario, variants=tuple(variants))
         self._last = asked, found
         return found
 

@@ -15,7 +15,7 @@ from fleet.errors import FleetError
 from fleet.seeding import child
 from scenarios.policy_loader import Unusable, label, policy_of, source_of, trainings_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
-from scenarios.prepare.randomisation import Randomisation
+from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.run.provenance import code_hash
 from scenarios.scenario_hash import scenario_hash
@@ -132,6 +132,9 @@ class Study:
             for i, name in enumerate(given):
                 if name in given[:i]:
                     raise FleetError(f"The {what} '{name}' is given twice; names must be unique.")
+        randomise = randomisation_of(self.randomise)
+        for case in self.cases:
+            randomise.scenarios_of(case.scenario)  # before the first shift, as an error of a late one comes late
         labels: dict[str, str] = {}
         for policy, own in self.own_trainings.items():
             for each in own:

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from fleet.errors import FleetError
 from scenarios.policy_loader import label, scope_of
+from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.compare import Comparison, Failed, comparison_table, figures_of_shifts
 from scenarios.run.evaluate import Outcome
 from scenarios.statistics.means import fewest, unit
@@ -25,6 +26,7 @@ NO_SCORES = (
     f"No normalised scores: fewer than {FEWEST} of these shifts have references. Make them with thermofleet "
     "bounds, then compare with --references FILE."
 )
+NO_SCORES_RANDOMISED = "No normalised scores: references are of shifts without randomisation."
 MOST_FAILURES = 8
 """Failed policies whose first failure a table tells."""
 
@@ -72,7 +74,7 @@ def comparison_of(
     ]
     failed, count = {each.policy for each in failures}, len({row.key.instance for row in rows})
     whole = {each: repeated(study, of) for each, of in shifts.items() if each not in failed}
-    values = normalised({each: shifts[each] for each in whole}, references or {}) if baseline in whole else None
+    values = _scores(study, {each: shifts[each] for each in whole}, references) if baseline in whole else None
     fleets, trainings, per_fleet = study.shape
     several = (count, study.most_trainings) if count > 1 else (fleets if fleets > 1 else trainings, per_fleet)
     return Comparison(
@@ -88,6 +90,7 @@ def comparison_of(
         illegal={each: sum(row.illegal for row in of) for each, of in shifts.items()},
         failures=tuple(failures),
         scores=scores_of(values, baseline) if values and len(values.instances) >= FEWEST else None,
+        randomise=study.randomise or Randomisation(),
     )
 
 
@@ -101,8 +104,15 @@ def rows_of_competitors(study: Study, rows: Iterable[Row]) -> dict[str, list[Row
 
 
 def scores_over_all(study: Study, rows: Sequence[Row], references: "Mapping[Shift, Reference]") -> Normalised | None:
-    """Scores of the policies without a failure over all instances; None without references."""
-    return normalised(rows_without_failures(study, rows), references)
+    """Scores of the policies without a failure over all instances; None without references of the shifts."""
+    return _scores(study, rows_without_failures(study, rows), references)
+
+
+def _scores(
+    study: Study, by_policy: Mapping[str, Sequence[Row]], references: "Mapping[Shift, Reference] | None"
+) -> Normalised | None:
+    """As `normalised`; None with a randomisation, because references are of the shifts without one."""
+    return None if study.randomise else normalised(by_policy, references or {})
 
 
 def rows_without_failures(study: Study, rows: Iterable[Row]) -> dict[str, list[Row]]:
@@ -150,7 +160,7 @@ def result_page(result: Comparison) -> Group:
         title = f"\nNormalised scores, paired difference to {label(result.baseline)}, {LEGEND}"
         parts += [Text(title), *score_tables(result.scores, names), *map(Text, result.scores.remarks)]
     elif result.figures:
-        parts.append(Text(NO_SCORES))
+        parts.append(Text(NO_SCORES_RANDOMISED if result.randomise else NO_SCORES))
     if any(result.illegal.values()):
         told = ", ".join(f"{label(policy)} {count}" for policy, count in result.illegal.items() if count)
         parts.append(Text(f"Illegal actions, which count as waits: {told}."))

@@ -11,6 +11,7 @@ import typer
 
 from scenarios.cli import options
 from scenarios.load import load
+from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.trials.plan import Case, Key, Row, Study
 from scenarios.trials.report.charts import points, spans
@@ -58,6 +59,17 @@ def judged(study: Study, rows: list[Row], known: dict[Shift, Known]) -> Judged:
         card=study.card,
         command="thermofleet compare quickstart",
     )
+
+
+def test_randomised_shifts_have_no_normalised_scores(study: Study):
+    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
+    warmer = replace(study, randomise=Randomisation(ambient_k=(0.0, 5.0)))
+    plain, varied = (judged(each, rows_of(each), known) for each in (study, warmer))
+    assert plain.results[0].scores is not None
+    assert varied.results[0].scores is None
+    assert varied.values is None
+    assert "Randomisation: ambient temperature +0 to +5 K." in comparison_page(varied)
+    assert "Randomisation: none." in comparison_page(plain)
 
 
 def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):

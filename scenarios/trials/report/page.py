@@ -200,8 +200,9 @@ def _figures(result: Comparison, *, alone: bool) -> Iterator[str]:
     if not result.figures:
         yield paragraph(f"None: the baseline {label(result.baseline)} failed.", "status bad")
         return
-    about = f"{result.scenario}, {result.unit}. Mean [interval] and paired difference to "
-    yield paragraph(f"{about}{label(result.baseline)}; {LEGEND}. Channel: {result.channel_text}.", "faint")
+    about = f"{result.scenario}, {result.unit}. Mean [interval] and paired difference to {label(result.baseline)}"
+    settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
+    yield paragraph(f"{about}; {LEGEND}. {settings}", "faint")
     order = sorted(result.figures, key=lambda name: -result.figures[name]["reward"].mean)
     for name in FIGURES:
         digits = LEAST_DIGITS.get(name, 1)
