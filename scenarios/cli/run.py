@@ -1,5 +1,6 @@
 """`thermofleet run` and `thermofleet demo`."""
 
+import gc
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -191,6 +192,7 @@ def _run_into(
         with stop_on_interrupt() as stopped:
             result = run(fleet, spec, progress=progress, stopped=stopped, endpoint=endpoint)
             progress("writing", 0.0)
+            gc.collect()  # the environment of a large fleet, which the page needs no more
             write(result, folder)
     return fleet, result
 

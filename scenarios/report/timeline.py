@@ -145,8 +145,9 @@ def heat_map(
     """The hottest motor of each arm over time, one row per arm; y axis `axis`, x axis 3."""
     samples = len(telemetry.time_s)
     edges = np.unique(np.linspace(0, samples, min(samples, HEAT_BINS) + 1).astype(int))[:-1]
-    hottest = np.fmax.reduce(telemetry.temp_c, axis=2, initial=-np.inf)
-    peak_c = np.maximum.reduceat(hottest, edges, axis=0).T if samples else np.zeros((len(arms), 0))
+    peak_c = np.zeros((len(arms), len(edges)))
+    if samples:
+        peak_c = np.fmax.reduce(np.fmax.reduceat(telemetry.temp_c, edges, axis=0), axis=2, initial=-np.inf).T
     marks = heat_marks(warning_c, error_c)
     low, high = float(marks[0]), float(marks[-1])
     kelvin = np.clip(np.round((peak_c - low) * 2), 0, 255).astype(np.uint8)
