@@ -7,7 +7,7 @@ smaller number of clusters minus one (Cameron, Gelbach & Miller, Journal of Busi
 Student's t covers too rarely where values are skewed: .88 instead of .95 for ten lognormal values. So each bound is the
 outer one of Student's and of Hall's transformation, which removes the skewness of t (Journal of the Royal Statistical
 Society B 54, 1992). Both are in closed form: no resampling, and p-values as small as a table of many tests needs.
-`tests/statistics/test_coverage.py` measures how often the intervals contain the mean.
+`benchmarks/statistics/interval_coverage.py` measures how often the intervals contain the mean.
 """
 
 import math
