@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.pair_scores import claims, scores
+from agents.assignment import matched_options
+from agents.pair_scores import scores
 from agents.policy import WAIT
 from fleet.engine.reward import RewardWeights
 from fleet.env.vector import BatchEnv, Library
@@ -115,7 +116,8 @@ def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
             seen = env.layout.read(obs["observation"][asked], obs["action_mask"][asked])
             score = scores(seen, parameters[asked])
             for k in np.flatnonzero(np.isfinite(score).any(axis=(1, 2))).tolist():
-                actions[asked[k]] = claims(score[k], env.layout.plans)
+                for arm, option in matched_options(-score[k], env.layout.plans):
+                    actions[asked[k], arm] = 1 + option
         obs, reward, terminated, truncated, _ = env.step(actions)
         total += np.where(over, 0.0, reward)
         over |= terminated | truncated
