@@ -124,8 +124,8 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
         if best == result.baseline:
             yield f"{where}no policy has more reward than the baseline {label(best)} ({figure.mean:.1f})."
             continue
-        span = Interval(figure.difference, figure.difference_low, figure.difference_high).text(1)
-        significant = figure.excludes_zero and _significant(figure.p, len(result.figures) - 1)
+        span = figure.to_base.text(1)
+        significant = figure.to_base.excludes_zero and _significant(figure.p, len(result.figures) - 1)
         more = "more reward than" if significant else "more than, which is not significant,"
         yield f"{where}{label(best)} has the most reward, {figure.mean:.1f}; {span} {more} {label(result.baseline)}."
 
@@ -209,8 +209,8 @@ def _figures(result: Comparison, *, alone: bool) -> Iterator[str]:
         for policy in order:
             f = result.figures[policy][name]
             own = Interval(f.mean, f.low, f.high).text(digits)
-            to_base = Interval(f.difference, f.difference_low, f.difference_high).text(digits)
-            rows.append((label(policy), own, "" if policy == result.baseline else f"{to_base} {f.stars}".rstrip()))
+            to_base = "" if policy == result.baseline else f"{f.to_base.text(digits)} {f.stars}".rstrip()
+            rows.append((label(policy), own, to_base))
         summary = f"{HEADINGS[name]}"
         inner = table(("policy", "mean", "difference"), rows, style="numbers scores")
         yield f"<details{' open' if name == 'reward' else ''}><summary>{escape(summary)}</summary>{inner}</details>"
