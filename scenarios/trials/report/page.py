@@ -12,7 +12,7 @@ from scenarios.report.page import escape, html_page, paragraph, table
 from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
 from scenarios.run.evaluate import FIGURES
 from scenarios.statistics.means import LEVEL, Interval
-from scenarios.statistics.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
+from scenarios.statistics.scores import HEADS, Normalised, Scores, ranked, score_cells, scores_of
 from scenarios.statistics.suites import profile
 from scenarios.statistics.tables import LEGEND, Figure
 from scenarios.trials.report.charts import Range, lines, points, spans
@@ -49,13 +49,14 @@ class Judged:
 
     @property
     def scored(self) -> Normalised | None:
-        """Scores, if there are enough and the baseline has some: it has none if it failed."""
-        values = self.values
-        return values if values and self.baseline in values.score and len(values.instances) >= FEWEST else None
+        """Scores, if there are some of the baseline: it has none if it failed."""
+        return self.values if self.values and self.baseline in self.values.score else None
 
     @cached_property
     def scores(self) -> Scores | None:
-        """The figures of `scored`."""
+        """The figures of `scored`, which a single comparison has made."""
+        if len(self.results) == 1:
+            return self.results[0].scores
         return scores_of(self.scored, self.baseline) if self.scored else None
 
 
