@@ -157,8 +157,8 @@ def compare_command(
         channel=channels[0],  # the same of all; each scenario has the arms that it names
         decision_limit_s=decision_limit,
     )
-    names = list(competitors(study).values())
-    base = baseline or next((name for name in names if name.partition("@")[0] == "round_robin"), names[0])
+    names = competitors(study)
+    base = baseline or names.get(("round_robin", study.difficulties[0]), next(iter(names.values())))
     check_baseline(study, base)
     known = references_of(cases, references)
     with progress_bar(kept="Finished shifts are" if out else KEPT, file=out) as progress:
