@@ -187,6 +187,11 @@ def parse_partition(text: str) -> "Partition":
     return Partition(from_s, to_s, tuple(arms))
 
 
+def split_names(text: str) -> list[str]:
+    """Names that are separated by commas."""
+    return [name.strip() for name in text.split(",")]
+
+
 def the_fleet(name: str, endpoint: str) -> str:
     """The named fleet, or the only one at the router.
 
