@@ -52,10 +52,8 @@ class Matching(Ssi):
     only_choices = True
 
     def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
-        """Pairs (arm, option) of a cost matrix [arm, option]: each arm has the cheapest plan for its job."""
-        by_slot = cost.reshape(len(cost), -1, plans)
-        best = by_slot.argmin(axis=2)
-        return [(arm, slot * plans + int(best[arm, slot])) for arm, slot in matching(by_slot.min(axis=2))]
+        """Pairs (arm, option) of a cost matrix [arm, option]."""
+        return matched_options(cost, plans)
 
 
 class QuickestSsi(Ssi):
@@ -112,6 +110,13 @@ class MatchingAhead(Ahead, Matching):
     """As `matching`, and an arm that is home soon takes part. Scope central, as `matching`."""
 
     only_choices = True
+
+
+def matched_options(cost: Array, plans: int) -> list[tuple[int, int]]:
+    """As `matching`, pairs (arm, option) of a cost matrix [arm, option]: each arm has the cheapest plan for its job."""
+    by_slot = cost.reshape(len(cost), -1, plans)
+    best = by_slot.argmin(axis=2)
+    return [(arm, slot * plans + int(best[arm, slot])) for arm, slot in matching(by_slot.min(axis=2))]
 
 
 def matching(cost: Array) -> list[tuple[int, int]]:

@@ -13,6 +13,7 @@ from agents.policy import per_option
 from fleet.observation import Observation
 
 Array = np.ndarray
+Floats = Array | float
 
 
 class Thermometer(Matching):
@@ -63,24 +64,39 @@ class Wsept(Thermometer):
     the suite among 1, 1.5, 2.5 and 5."""
     minute_price: ClassVar = 0.05
     """Price of a minute above the warning limit, as in the default reward."""
+    tardiness_price: ClassVar = 0.01
+    """Price of a minute of tardiness for each unit of a job's value, as in the default reward: for others, as the worth
+    of `wsept` has no tardiness."""
 
     def _rate(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
         value, hottest_c = per_option(seen, seen.value), float(seen.temp_c.max())
-        peak_c, limits_c = self.predicted_peak_c(seen), (warning_of(seen), error_of(seen))
-        worth = self.worth_of(value, seen.duration_s, peak_c, hottest_c, *limits_c)
+        warning_c, error_c = warning_of(seen), error_of(seen)
+        peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
+        worth = self.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c)
         return _per_second(seen, worth, worth > 0)
 
-    def predicted_peak_c(self, seen: Observation) -> Array:
-        """Predicted peak of every option begun now, or the one that P(saturation) gives, °C, [option]."""
+    @classmethod
+    def predicted_peak_c(cls, peak_c: Array, p_saturation: Array, warning_c: Floats) -> Array:
+        """Predicted peaks, or those that P(saturation) gives where they are unknown (0), °C, [n]."""
+        if (peak_c > 0).all():
+            return peak_c
         from scipy.special import logit  # slow import that few processes need
 
         # An unknown peak is placed so far from the limit that its error gives P(saturation).
-        margin_k = self.peak_sd_k * logit(np.clip(seen.p_saturation, LEAST_P, 1.0 - LEAST_P))
-        return np.where(seen.peak_c > 0, seen.peak_c, warning_of(seen) + margin_k)
+        margin_k = cls.peak_sd_k * logit(np.clip(p_saturation, LEAST_P, 1.0 - LEAST_P))
+        return np.where(peak_c > 0, peak_c, warning_c + margin_k)
 
+    @classmethod
     def worth_of(
-        self, value: Array, duration_s: Array, peak_c: Array, hottest_c: Array | float, warning_c: float, error_c: float
+        cls,
+        value: Array,
+        duration_s: Array,
+        peak_c: Array,
+        hottest_c: Floats,
+        warning_c: Floats,
+        error_c: Floats,
+        factors: Sequence[Floats] = (1.0, 1.0, 1.0),
     ) -> Array:
         """Expected value of jobs less the expected cost of heat, [n].
 
@@ -88,13 +104,15 @@ class Wsept(Thermometer):
             value, duration_s, peak_c: Of each job, [n], with the predicted peak.
             hottest_c: Hottest motor at the beginning, [n] or one for all.
             warning_c, error_c: The limits.
+            factors: On `peak_sd_k`, `fault_price` and `minute_price`.
         """
         from scipy.special import ndtr  # slow import that few processes need
 
-        p_fault = ndtr((peak_c - error_c) / self.peak_sd_k)
+        spread, fault, minute = factors
+        p_fault = ndtr((peak_c - error_c) / (cls.peak_sd_k * spread))
         # Approximation: the temperature rises linearly to its peak.
         above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
-        heat = p_fault * self.fault_price + self.minute_price * above_share * duration_s / 60.0
+        heat = p_fault * cls.fault_price * fault + cls.minute_price * minute * above_share * duration_s / 60.0
         return (1.0 - p_fault) * value - heat
 
 

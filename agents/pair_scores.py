@@ -6,19 +6,18 @@ score = rate · exp(f) + g · mean rate, where `rate` is the expected worth per 
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
-from agents.assignment import matching
+from agents.assignment import Matching
 from agents.pairs import FILLS, PAIR_FEATURES, Worth, pairs_of
-from agents.policy import WAIT, plans_of
+from agents.policy import plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import FIELDS, Observation
@@ -61,39 +60,21 @@ def scores(seen: Observation, parameters: Array) -> Array:
     return result
 
 
-def claims(score: Array, plans: int) -> Array:
-    """Actions int [arm] of scores [arm, option]: as many jobs as possible with the largest total score."""
-    actions = np.full(len(score), WAIT)
-    by_slot = score.reshape(len(score), -1, plans)
-    best = by_slot.argmax(axis=2)
-    for arm, slot in matching(-by_slot.max(axis=2)):
-        actions[arm] = 1 + slot * plans + best[arm, slot]
-    return actions
-
-
-class PairPolicy:
+class PairPolicy(Matching):
     """Matching by learned scores of arms and jobs. Scope central: it compares all pairs.
 
     Args:
         parameters: float [PARAMETERS], as a training found them.
     """
 
-    scope: ClassVar = "central"
     only_choices = True
 
     def __init__(self, parameters: Array) -> None:
         self._parameters = np.asarray(parameters, dtype=float)[None]
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Begin a shift: nothing to do."""
-
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """The claims of the matched pairs."""
-        seen = list(observations.values())
-        if not any(each.action_mask[1:-1].any() for each in seen):
-            return dict.fromkeys(observations, WAIT)
-        score = scores(_stacked(seen), self._parameters)[0]
-        return dict(zip(observations, claims(score, plans_of(seen[0])).tolist(), strict=True))
+    def cost(self, observations: Sequence[Observation]) -> Array:
+        """Minus the scores, [arm, option]; inf for claims that are not wanted."""
+        return -scores(_stacked(observations), self._parameters)[0]
 
 
 PAIRS_FORMAT = 4

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.heat_rules import LEAST_P, Wsept
+from agents.heat_rules import Wsept
 from agents.policy import plans_of
 from fleet.observation import Observation
 
@@ -58,10 +58,6 @@ class Pairs(NamedTuple):
     """[pair, PAIR_FEATURES]."""
 
 
-TARDINESS_PRICE = 0.01
-"""Per unit of value and minute, as in the default reward."""
-
-
 def worth_per_second(seen: Observation, at: Places, learned: Worth) -> Array:
     """Expected worth per second of some pairs, [pair].
 
@@ -69,27 +65,19 @@ def worth_per_second(seen: Observation, at: Places, learned: Worth) -> Array:
         seen: Observations [env, arm].
         at: Env, arm and option of each pair.
     """
-    from scipy.special import logit, ndtr  # slow import that few processes need
-
     env, arm, option = at
     value, duration_s = seen.value[env, arm, option // plans_of(seen)], seen.duration_s[at].astype(float)
     hottest_c = seen.temp_c.max(axis=-1)[env, arm]
     warning_c = seen.headroom_k[env, arm] + hottest_c
-    peak_c = seen.peak_c[at]
-    if (peak_c <= 0).any():
-        # As `Wsept.predicted_peak_c` of one arm.
-        margin_k = Wsept.peak_sd_k * logit(np.clip(seen.p_saturation[at], LEAST_P, 1.0 - LEAST_P))
-        peak_c = np.where(peak_c > 0, peak_c, warning_c + margin_k)
+    peak_c = Wsept.predicted_peak_c(seen.peak_c[at], seen.p_saturation[at], warning_c)
     error_c = seen.error_headroom_k[env, arm] + hottest_c + 10.0 * learned.margin[env]
-    p_fault = ndtr((peak_c - error_c) / (Wsept.peak_sd_k * np.exp(learned.spread[env])))
-    above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
-    minute_price = Wsept.minute_price * np.exp(learned.minute[env])
-    heat = p_fault * Wsept.fault_price * np.exp(learned.fault[env]) + minute_price * above_share * duration_s / 60.0
     ends = _step((seen.left_s[env, arm] - duration_s) / 20.0)
     value_left = value * (1.0 - np.clip(learned.end[env], 0.0, 1.0) * (1.0 - ends))
-    late = TARDINESS_PRICE * value * np.maximum(-seen.slack_s[at], 0.0) / 60.0
-    worth = (1.0 - p_fault) * value_left - heat - learned.tardiness[env] * late
-    return worth / np.maximum(duration_s + 120.0 * np.maximum(learned.overhead[env], -0.2), 1.0)
+    factors = [np.exp(each[env]) for each in (learned.spread, learned.fault, learned.minute)]
+    worth = Wsept.worth_of(value_left, duration_s, peak_c, hottest_c, warning_c, error_c, factors)
+    late = Wsept.tardiness_price * value * np.maximum(-seen.slack_s[at], 0.0) / 60.0
+    duration_s = duration_s + 120.0 * np.maximum(learned.overhead[env], -0.2)
+    return (worth - learned.tardiness[env] * late) / np.maximum(duration_s, 1.0)
 
 
 def pairs_of(seen: Observation, learned: Worth) -> Pairs:

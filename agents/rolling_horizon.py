@@ -82,8 +82,6 @@ class RollingHorizon(Wsept):
     """Time constant of a motor with its housing: a nominal joint 2 cools from 75 to 42 °C in 1900 s at 30 °C."""
     discount_s: ClassVar = 1800.0
     """Time in which the worth of a later finish falls to 1/e."""
-    tardiness_price: ClassVar = 0.01
-    """Price of a minute of tardiness for each unit of a job's value, as in the default reward."""
     tardiness_share: ClassVar = 0.2
     firsts: ClassVar = 16
     """Plans per arm with the most worth that may be the first of a sequence; half as many may be the second."""
@@ -121,7 +119,8 @@ class RollingHorizon(Wsept):
         open_now = ((seen.space_free > 0) | (seen.working > 0)) & (per_option(seen, seen.station_free) > 0)
         begin_s = np.maximum(free_s, np.where(open_now, 0.0, home_s))
         can = (seen.feasible > 0) & (per_option(seen, seen.offered) > 0) & (seen.faulted == 0)
-        peak_c, d = self.predicted_peak_c(seen).astype(float), seen.duration_s.astype(float)
+        peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_of(seen)).astype(float)
+        d = seen.duration_s.astype(float)
         one, one_c = self._earn(seen, peak_c, begin_s, self._cooled(free_c, seen, begin_s - free_s), hottest_c)
         one = np.where(can & (begin_s < self.horizon_s), one, -np.inf)
         rank = np.argsort(-one, kind="stable")

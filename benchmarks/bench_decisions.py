@@ -19,7 +19,6 @@ import numpy as np
 
 from agents.assignment import Ssi
 from agents.consensus import Consensus
-from agents.pair_scores import PairPolicy
 from agents.registry import RULES
 from agents.rolling_horizon import RollingHorizon
 from fleet.observation import Layout, Observation
@@ -36,7 +35,7 @@ def limit_ms(name: str) -> float:
     kind = RULES[name].kind if name in RULES else None
     if kind is None or issubclass(kind, RollingHorizon):
         return HORIZON_MS
-    return MATCHING_MS if issubclass(kind, Ssi | Consensus | PairPolicy) else RULE_MS
+    return MATCHING_MS if issubclass(kind, Ssi | Consensus) else RULE_MS
 
 
 def draw(rng: np.random.Generator, arms: int, jobs: int) -> dict[str, Observation]:

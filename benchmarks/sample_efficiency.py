@@ -41,11 +41,11 @@ from scenarios.load import load
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.batch import library_of
 from scenarios.run.provenance import code_hash
-from scenarios.run.train_policy import returns, rule_actions
+from scenarios.run.suite_batches import Act, returns
+from scenarios.run.train_policy import rule_actions
 from scenarios.studies.page_tables.sample_efficiency import course, trainings
 
 Array = np.ndarray
-Act = Callable[[Obs], Array]
 Training = tuple[list[dict[str, float]], dict[str, Any]]
 """Its points and its configuration."""
 
@@ -113,7 +113,7 @@ def train_here(algorithm: Any, seed: int, warm_start: str = "") -> Training:
         imitate_rule(trainer, cells)
     rng = np.random.default_rng(np.random.SeedSequence([seed, SHIFTS[0]]))
 
-    def act(obs: Obs) -> Array:
+    def act(obs: Obs, _: Array) -> Array:
         return trainer.act(curve.env.layout, obs["observation"], obs["action_mask"], rng)
 
     curve.add(0, 0.0, act)
@@ -179,7 +179,7 @@ def train_benchmarl(algorithm: str, seed: int) -> Training:
         def __reduce__(self) -> Any:  # BenchMARL pickles tasks and callbacks
             return dict, ()
 
-    def act(obs: Obs) -> Array:
+    def act(obs: Obs, _: Array) -> Array:
         lead = obs["observation"].shape[:2]
         inner = TensorDict({"observation": torch.from_numpy(standardise(obs["observation"]))}, lead)
         arms = TensorDict({"observation": inner, "action_mask": torch.from_numpy(obs["action_mask"]).bool()}, lead)

@@ -85,7 +85,7 @@ def bounds_command(
         if evaluations is not None:
             limit = Budget(seconds=inf, evaluations=evaluations, nodes=nodes)
         source = choose("difficulty", difficulty, DifficultyName)
-        policies = starts.split(",") if starts else STARTS
+        policies = options.split_names(starts) if starts else STARTS
         for name in policies:
             scope_of(name)
         chosen: Any = {"difficulty": source, "jobs": jobs, "policies": policies}

@@ -152,18 +152,18 @@ def compare_command(
         for case in cases
     ]  # fmt: skip
     study = Study(
-        policies=[name.strip() for name in policies.split(",")],
+        policies=options.split_names(policies),
         cases=cases,
         fleets=fleets,
         trainings=trainings,
-        difficulties=[choose("difficulty", name.strip(), DifficultyName) for name in difficulty.split(",")],
+        difficulties=[choose("difficulty", name, DifficultyName) for name in options.split_names(difficulty)],
         risk=choose("risk", risk, RiskName),
         randomise=varied,
         channel=channels[0],  # the same of all; each scenario has the arms that it names
         decision_limit_s=decision_limit,
     )
-    names = list(competitors(study).values())
-    base = baseline or next((name for name in names if name.partition("@")[0] == "round_robin"), names[0])
+    names = competitors(study)
+    base = baseline or names.get(("round_robin", study.difficulties[0]), next(iter(names.values())))
     check_baseline(study, base)
     known = references_of(cases, references)
     with progress_bar(kept="Finished shifts are" if out else KEPT, file=out) as progress:
@@ -231,7 +231,7 @@ def ablate_command(
     from scenarios.studies.ablation import AblationPlan, ablate, ablation_table
 
     chosen = load(scenario)
-    given = {} if scores is None else {"scores": tuple(name.strip() for name in scores.split(","))}
+    given = {} if scores is None else {"scores": tuple(options.split_names(scores))}
     plan = AblationPlan(policy=policy, fleets=fleets, trainings=trainings, seeds=seeds, first_seed=first_seed, **given)
     folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy).replace(':', '-')}")
     with progress_bar(kept="Finished shifts are", file=folder) as progress:

@@ -36,6 +36,7 @@ def documents(out: Path) -> dict[Path, str]:
     from scenarios.doc_tables import MARK, fill_tables
     from scenarios.leaderboard.board import benchmark_tables
     from scenarios.studies.page_tables.channels import channel_tables
+    from scenarios.studies.page_tables.coverage import coverage_tables
     from scenarios.studies.page_tables.learned import learned_tables
     from scenarios.studies.page_tables.policies import policy_tables
     from scenarios.studies.page_tables.sample_efficiency import efficiency_tables
@@ -46,6 +47,7 @@ def documents(out: Path) -> dict[Path, str]:
         "commands": _command_tables,
         **policy_tables(results),
         **channel_tables(results / "channels"),
+        **coverage_tables(results / "coverage.json"),
         **benchmark_tables(results),
         **efficiency_tables(results),
         **learned_tables(results),

@@ -230,6 +230,11 @@ def parse_randomisation(texts: list[str] | None) -> "Randomisation | None":
         raise FleetError(str(error).replace("Randomisation.", "--randomise ")) from error
 
 
+def split_names(text: str) -> list[str]:
+    """Names that are separated by commas."""
+    return [name.strip() for name in text.split(",")]
+
+
 def the_fleet(name: str, endpoint: str) -> str:
     """The named fleet, or the only one at the router.
 

@@ -9,7 +9,7 @@ import typer
 
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, number, the_fleet
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, number, split_names, the_fleet
 from scenarios.cli.terminal import echo
 from scenarios.extras import require_extra
 
@@ -162,7 +162,7 @@ def names_of(joints: str) -> tuple[str, ...]:
 
     if not joints:
         return joint_names(JOINTS)
-    names = tuple(name.strip() for name in joints.split(","))
+    names = tuple(split_names(joints))
     if "" in names or len(set(names)) != len(names):
         raise FleetError(f"--joints needs different names, as joint_1,joint_2 (got {joints}).")
     return names

@@ -10,7 +10,7 @@ from scenarios.bounds.command import markdown
 from scenarios.bounds.references import Reference, load_references
 from scenarios.doc_tables import table
 from scenarios.leaderboard.submission import Submission, check, read, split_references
-from scenarios.statistics.scores import FEWEST, Scores, ranked, score_cells, scores_of
+from scenarios.statistics.scores import Scores, ranked, score_cells, scores_of
 from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import manifest
 from scenarios.trials.scores import Shift, normalised
@@ -69,7 +69,7 @@ def board_of(
     entries = {each.name: each for each in submissions}
     rows = {name: each.study_rows() for name, each in entries.items()}
     values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
-    if values is None or len(values.instances) < FEWEST:
+    if values is None:
         return None
     base = next((name for name, each in entries.items() if _is_baseline(each)), None)
     last = min(entries, key=lambda name: values.score[name].mean())

@@ -83,7 +83,7 @@ def submit_command(
     except (KeyError, TypeError, AttributeError) as error:
         raise FleetError(f"'{results}' is damaged: study.json lacks {error}. Run the comparison again.") from error
     if policies is not None:
-        wanted = [label(name.strip()) for name in policies.split(",")]
+        wanted = [label(name) for name in options.split_names(policies)]
         unknown = [name for name in wanted if name not in {each.card.policy for each in made}]
         if unknown:
             raise FleetError(f"'{results}' has no results of {', '.join(unknown)}.")

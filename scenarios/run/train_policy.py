@@ -24,7 +24,7 @@ from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
-from scenarios.run.suite_batches import Ground
+from scenarios.run.suite_batches import Act, Ground, returns
 from scenarios.run.training_folder import NETWORK_STATE, check_folder, holds_training, skip_complete, write_card
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
@@ -140,7 +140,7 @@ class Judge:
     units: Array
     """What the reward of each shift is divided by, [env]."""
 
-    def reward(self, act: Callable[[Obs], Array]) -> float:
+    def reward(self, act: Act) -> float:
         """Mean reward of a shift, in its unit."""
         return float((returns(self.env, act, self.seeds) / self.units).mean())
 
@@ -175,7 +175,7 @@ def _train(
 
         def reward_of(judge: Judge) -> float:
             act = partial(trainer.act, judge.env.layout, rng=rng)
-            return judge.reward(lambda obs: act(obs["observation"], obs["action_mask"]))
+            return judge.reward(lambda obs, _: act(obs["observation"], obs["action_mask"]))
 
         reward = float(np.mean([reward_of(judge) for judge in judges]))
         if not holds_training(out):
@@ -268,30 +268,19 @@ def _actions_of(policy: Policy, env: BatchEnv, obs: Obs, e: int) -> list[int]:
     return [actions[arm] for arm in env.agents]
 
 
-def rule_actions(rule: str, env: BatchEnv, seeds: Sequence[int]) -> Callable[[Obs], Array]:
+def rule_actions(rule: str, env: BatchEnv, seeds: Sequence[int]) -> Act:
     """Actions of a rule, one instance for each env, [env, arm]."""
     policies = [policy_at(rule, seed) for seed in seeds]
     when_asked = only_choices(policies[0])
 
-    def act(obs: Obs) -> Array:
+    def act(obs: Obs, over: Array) -> Array:
         actions = np.full(obs["action_mask"].shape[:2], WAIT)
         for e, policy in enumerate(policies):
-            if not when_asked or obs["action_mask"][e, :, 1:-1].any():
+            if not over[e] and (not when_asked or obs["action_mask"][e, :, 1:-1].any()):
                 actions[e] = _actions_of(policy, env, obs, e)
         return actions
 
     return act
-
-
-def returns(env: BatchEnv, act: Callable[[Obs], Array], seeds: Sequence[int]) -> Array:
-    """Total reward of the shift of each seed, [env]."""
-    obs, _ = env.reset(seed=list(seeds))
-    total, over = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
-    while not over.all():
-        obs, reward, terminated, truncated, _ = env.step(act(obs))
-        total += np.where(over, 0.0, reward)
-        over |= terminated | truncated
-    return total
 
 
 def draw_curves(folder: Path) -> None:

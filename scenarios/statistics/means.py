@@ -7,7 +7,7 @@ smaller number of clusters minus one (Cameron, Gelbach & Miller, Journal of Busi
 Student's t covers too rarely where values are skewed: .88 instead of .95 for ten lognormal values. So each bound is the
 outer one of Student's and of Hall's transformation, which removes the skewness of t (Journal of the Royal Statistical
 Society B 54, 1992). Both are in closed form: no resampling, and p-values as small as a table of many tests needs.
-`tests/statistics/test_coverage.py` measures how often the intervals contain the mean.
+`benchmarks/statistics/interval_coverage.py` measures how often the intervals contain the mean.
 """
 
 import math
@@ -57,10 +57,14 @@ class Interval:
         """Distance from the mean to the farther bound."""
         return max(self.high - self.mean, self.mean - self.low)
 
-    def text(self, digits: int = 2) -> str:
-        """`0.41 [0.35, 0.47]`; the mean alone without bounds."""
+    def stars(self, p_holm: float) -> str:
+        """`*` if it excludes 0, `**` if also after Holm's correction of its p-value."""
+        return "*" * (self.excludes_zero + (p_holm < 1 - LEVEL))
+
+    def text(self, digits: int = 2, sign: str = "") -> str:
+        """`0.41 [0.35, 0.47]`; the mean alone without bounds. With the sign "+", a mean above 0 has one."""
         bounds = f" [{self.low:z.{digits}f}, {self.high:z.{digits}f}]" if np.isfinite(self.low + self.high) else ""
-        return f"{self.mean:z.{digits}f}{bounds}"
+        return f"{self.mean:{sign}z.{digits}f}{bounds}"
 
 
 class Bounds(NamedTuple):

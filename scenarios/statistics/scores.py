@@ -8,7 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from scenarios.statistics.holm import holm
-from scenarios.statistics.means import LEVEL, Interval, interval, paired
+from scenarios.statistics.means import Interval, interval, paired
 from scenarios.statistics.suites import aggregates, by_group, improvement
 
 Array = np.ndarray
@@ -92,7 +92,7 @@ class Score:
     @property
     def stars(self) -> str:
         """As `tables.LEGEND` says."""
-        return "*" * (self.difference.excludes_zero + (self.p_holm < 1 - LEVEL))
+        return self.difference.stars(self.p_holm)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from scipy.stats import trim_mean
 
 from scenarios.statistics.counts import count_interval, paired_counts, share_bounds
 from scenarios.statistics.holm import holm
-from scenarios.statistics.means import LEVEL, Interval, interval, paired
+from scenarios.statistics.means import Interval, interval, paired
 
 Array = np.ndarray
 
@@ -43,14 +43,14 @@ class Figure:
     """Adjusted for all differences of the table."""
 
     @property
-    def excludes_zero(self) -> bool:
-        """Whether the interval of the difference excludes 0."""
-        return self.difference_low > 0 or self.difference_high < 0
+    def to_base(self) -> Interval:
+        """The difference to the baseline."""
+        return Interval(self.difference, self.difference_low, self.difference_high, self.p, self.difference_note)
 
     @property
     def stars(self) -> str:
         """As `LEGEND` says."""
-        return "*" * (self.excludes_zero + (self.p_holm < 1 - LEVEL))
+        return self.to_base.stars(self.p_holm)
 
 
 def figures_of(
@@ -147,6 +147,6 @@ def _span(low: float, high: float, digits: int, sign: str = "") -> str:
 
 def _digits(figures: Sequence[Figure], least: int) -> int:
     """Decimals, up to `MORE_DIGITS` more than the least, with which no interval that excludes 0 seems to include it."""
-    nearest = [min(abs(f.difference_low), abs(f.difference_high)) for f in figures if f.excludes_zero]
+    nearest = [min(abs(f.difference_low), abs(f.difference_high)) for f in figures if f.to_base.excludes_zero]
     enough = (n for n in range(least, least + MORE_DIGITS) if all(round(bound, n) for bound in nearest))
     return next(enough, least + MORE_DIGITS)

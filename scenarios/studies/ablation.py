@@ -7,7 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ from scenarios.schema import Scenario
 from scenarios.statistics.means import unit
 from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
 from scenarios.studies.score_sources import ALL_SOURCES, SOURCES, DrawnFleet
+from scenarios.trials.cells import drawn
 
 Array = np.ndarray
 
@@ -105,17 +106,16 @@ def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progr
         for name in plan.scores
         for training in range(plan.trainings if ALL_SOURCES[plan.parts(name)[1]].trained else 1)
     ]
-    seeds, drawn, drawn_index = range(plan.first_seed, plan.first_seed + plan.seeds), None, -1
+    seeds, drawn_fleet, drawn_index = range(plan.first_seed, plan.first_seed + plan.seeds), None, -1
     for n, (name, fleet, training) in enumerate(draws):
         missing = [seed for seed in seeds if (name, fleet, training, seed) not in rows]
         if not missing:
             continue
         policy, source = plan.parts(name)
         progress(f"{COUNTED}fleet {fleet + 1}, training {training + 1}: {plan.label(name)}", Count(n, len(draws)))
-        if drawn is None or drawn_index != fleet:
-            spread = replace(scenario.spread, seed=scenario.spread.seed + fleet)
-            drawn, drawn_index = DrawnFleet(replace(scenario, spread=spread), cache_folder(), quiet), fleet
-        results = outcomes(ALL_SOURCES[source].make(drawn, training), policy, missing)
+        if drawn_fleet is None or drawn_index != fleet:
+            drawn_fleet, drawn_index = DrawnFleet(drawn(scenario, fleet), cache_folder(), quiet), fleet
+        results = outcomes(ALL_SOURCES[source].make(drawn_fleet, training), policy, missing)
         made = [
             Row(name, fleet, training, seed, *(float(getattr(result, figure)) for figure in FIGURES))
             for seed, result in zip(missing, results, strict=True)

@@ -12,11 +12,11 @@ from fleet.difficulty import SETTLING_S
 from fleet.engine.shift import StepRecord
 from fleet.events import Event
 from fleet.thermal import WINDING
-from scenarios.load import override
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import RISK, Fleet, RiskName, env_of, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
+from scenarios.trials.cells import drawn
 from twin.saturation.reliability import Reliability, brier, reliability
 
 Array = np.ndarray
@@ -131,8 +131,7 @@ def shift_reliability(
     found: dict[str, list[Awards]] = {policy: [] for policy in policies}
     runs = len(seeds) * len(policies)
     for draw in range(fleets):
-        spread = {"scale": scenario.spread.scale, "seed": scenario.spread.seed + draw}
-        fleet = make(override(scenario, spread=spread), risk=risk, progress=progress)
+        fleet = make(drawn(scenario, draw), risk=risk, progress=progress)
         for i, (policy, seed) in enumerate((policy, seed) for policy in policies for seed in seeds):
             progress("working", (draw + i / runs) / fleets)
             found[policy].append(awards_of_shift(fleet, policy, seed))

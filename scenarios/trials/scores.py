@@ -9,7 +9,7 @@ import numpy as np
 
 from scenarios.policy_loader import has_trainings
 from scenarios.scenario_hash import scenario_hash
-from scenarios.statistics.scores import Normalised
+from scenarios.statistics.scores import FEWEST, Normalised
 from scenarios.suite.splits import cell_name
 from scenarios.trials.plan import Case, Row
 
@@ -54,7 +54,7 @@ def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shif
 def normalised(
     by_policy: Mapping[str, Sequence[Row]], references: "Mapping[Shift, Reference]", *, failed_as_random: bool = False
 ) -> Normalised | None:
-    """The scores of policies on the shifts that have a reference; None if there are none.
+    """The scores of policies on the shifts that have a reference; None if there are fewer than `FEWEST`.
 
     An instance is a scenario and a seed, with the mean reward over trainings of its twins; trainings of a policy, which
     do all instances, are kept apart. References are of the first fleet.
@@ -67,7 +67,7 @@ def normalised(
     shifts = list(dict.fromkeys((row.key.instance, row.key.seed) for row in first if row.key.fleet == 0))
     scored = [shift for shift in shifts if shift in references]
     spread = [shift for shift in scored if references[shift].hindsight > references[shift].random]
-    if not spread:
+    if len(spread) < FEWEST:
         return None
     known = [references[shift] for shift in spread]
     random, best, upper = (

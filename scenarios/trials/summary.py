@@ -89,7 +89,7 @@ def comparison_of(
         channel_text=study.channel_text,
         illegal={each: sum(row.illegal for row in of) for each, of in shifts.items()},
         failures=tuple(failures),
-        scores=scores_of(values, baseline) if values and len(values.instances) >= FEWEST else None,
+        scores=scores_of(values, baseline) if values else None,
         randomise=study.randomise or Randomisation(),
     )
 

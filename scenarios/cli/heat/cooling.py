@@ -47,7 +47,7 @@ def cooling_command(
     from scenarios.prepare.fleet import DifficultyName
     from scenarios.studies.heat.cooling import fleet_rows, joint_rows, motor_rows
 
-    chosen, names = load(scenario), tuple(name.strip() for name in policies.split(","))
+    chosen, names = load(scenario), tuple(options.split_names(policies))
     if len(set(names)) < len(names):
         raise FleetError(f"--policies must name each policy once (got '{policies}').")
     source = choose("difficulty", difficulty, DifficultyName)

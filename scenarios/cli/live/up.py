@@ -20,7 +20,7 @@ from scenarios.cli.live.options import (
     SeedOption,
     SpeedOption,
 )
-from scenarios.cli.options import PolicyOption, RiskOption, ScenarioArg, number
+from scenarios.cli.options import PolicyOption, RiskOption, ScenarioArg, number, split_names
 from scenarios.cli.router import PORT, check_roster
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
@@ -240,7 +240,7 @@ def chosen_arms(text: str, names: tuple[str, ...]) -> tuple[str, ...]:
     Raises:
         FleetError: the scenario has no such arm.
     """
-    wanted = [name.strip() for name in text.split(",")] if text else list(names)
+    wanted = split_names(text) if text else list(names)
     if unknown := [name for name in wanted if name not in names]:
         raise FleetError(f"--arms: the scenario has no arm '{unknown[0]}'{nearest(unknown[0], names)}")
     return tuple(name for name in names if name in wanted)

@@ -56,7 +56,7 @@ def sweep_command(
 
     whole = {name for name, each in CONFIGURATIONS.items() if carrier_only and each.config.scope == "arm"}
     every = [name for name in CONFIGURATIONS if name not in whole]
-    names = every if only is None else list(dict.fromkeys(name.strip() for name in only.split(",")))
+    names = every if only is None else list(dict.fromkeys(options.split_names(only)))
     for name in names:
         if name not in CONFIGURATIONS:
             raise FleetError(f"No configuration '{name}'{nearest(name, CONFIGURATIONS)}")
@@ -154,7 +154,7 @@ def subjects_from(scenarios: str, arms: str, seeds: int, test: int, *, carrier_o
     """The subjects that the options name."""
     from scenarios.studies.sweep.subjects import Sizes, subjects_of
 
-    chosen = {name: load(name) for name in (part.strip() for part in scenarios.split(","))}
+    chosen = {name: load(name) for name in options.split_names(scenarios)}
     wanted, most = places(arms), max(len(scenario.arms) for scenario in chosen.values()) - 1
     if max(wanted) > most:
         raise FleetError(f"--arms must be 0 to {most}, as the scenarios have arms (got '{arms}').")

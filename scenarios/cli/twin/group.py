@@ -178,7 +178,7 @@ def reliability_command(
     from scenarios.prepare.fleet import RISK, RiskName
     from scenarios.studies.shift_reliability import awards_as_json, shift_reliability
 
-    chosen, names = load(scenario), [name.strip() for name in policies.split(",")]
+    chosen, names = load(scenario), options.split_names(policies)
     found = {}
     with progress_bar() as progress:
         for kind in risk or [RISK]:

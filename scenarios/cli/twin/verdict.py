@@ -120,7 +120,7 @@ def readings_command(
 
     choose("size", size, Literal["quick", "full"])
     config = TwinConfig.quick() if size == "quick" else TwinConfig()
-    chosen = [load(name) for name in dict.fromkeys(part.strip() for part in scenarios.split(","))]
+    chosen = [load(name) for name in dict.fromkeys(options.split_names(scenarios))]
     with disk_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar(kept="Finished arms are", file=out) as progress:

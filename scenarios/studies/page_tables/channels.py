@@ -55,6 +55,5 @@ def _cell(name: str, x: np.ndarray, base: np.ndarray) -> str:
     if np.array_equal(x, base):
         return mean
     d = (paired_counts if name == "faults" else paired)(x, base)
-    text = f"{d.mean:+z.{digits}f} [{d.low:z.{digits}f}, {d.high:z.{digits}f}]"
-    text = text if np.isfinite(d.low) else f"{d.mean:+z.{digits}f}"
+    text = d.text(digits, "+")
     return f"{mean} ({f'**{text}**' if d.excludes_zero else text})"

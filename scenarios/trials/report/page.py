@@ -12,7 +12,7 @@ from scenarios.report.page import escape, html_page, paragraph, table
 from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
 from scenarios.run.evaluate import FIGURES
 from scenarios.statistics.means import LEVEL, Interval
-from scenarios.statistics.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
+from scenarios.statistics.scores import HEADS, Normalised, Scores, ranked, score_cells, scores_of
 from scenarios.statistics.suites import profile
 from scenarios.statistics.tables import LEGEND, Figure
 from scenarios.trials.report.charts import Range, lines, points, spans
@@ -49,13 +49,14 @@ class Judged:
 
     @property
     def scored(self) -> Normalised | None:
-        """Scores, if there are enough and the baseline has some: it has none if it failed."""
-        values = self.values
-        return values if values and self.baseline in values.score and len(values.instances) >= FEWEST else None
+        """Scores, if there are some of the baseline: it has none if it failed."""
+        return self.values if self.values and self.baseline in self.values.score else None
 
     @cached_property
     def scores(self) -> Scores | None:
-        """The figures of `scored`."""
+        """The figures of `scored`, which a single comparison has made."""
+        if len(self.results) == 1:
+            return self.results[0].scores
         return scores_of(self.scored, self.baseline) if self.scored else None
 
 
@@ -124,8 +125,8 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
         if best == result.baseline:
             yield f"{where}no policy has more reward than the baseline {label(best)} ({figure.mean:.1f})."
             continue
-        span = Interval(figure.difference, figure.difference_low, figure.difference_high).text(1)
-        significant = figure.excludes_zero and _significant(figure.p, len(result.figures) - 1)
+        span = figure.to_base.text(1)
+        significant = figure.to_base.excludes_zero and _significant(figure.p, len(result.figures) - 1)
         more = "more reward than" if significant else "more than, which is not significant,"
         yield f"{where}{label(best)} has the most reward, {figure.mean:.1f}; {span} {more} {label(result.baseline)}."
 
@@ -210,8 +211,8 @@ def _figures(result: Comparison, *, alone: bool) -> Iterator[str]:
         for policy in order:
             f = result.figures[policy][name]
             own = Interval(f.mean, f.low, f.high).text(digits)
-            to_base = Interval(f.difference, f.difference_low, f.difference_high).text(digits)
-            rows.append((label(policy), own, "" if policy == result.baseline else f"{to_base} {f.stars}".rstrip()))
+            to_base = "" if policy == result.baseline else f"{f.to_base.text(digits)} {f.stars}".rstrip()
+            rows.append((label(policy), own, to_base))
         summary = f"{HEADINGS[name]}"
         inner = table(("policy", "mean", "difference"), rows, style="numbers scores")
         yield f"<details{' open' if name == 'reward' else ''}><summary>{escape(summary)}</summary>{inner}</details>"

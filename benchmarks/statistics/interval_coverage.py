@@ -1,0 +1,110 @@
+"""Share of 95 % intervals that contain the true mean, by simulation: the tables of docs/results.md.
+
+python benchmarks/statistics/interval_coverage.py [--out docs/results/coverage.json]   # a minute of one core
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from scenarios.statistics.means import mean_bounds
+from scenarios.statistics.suites import aggregates, by_group
+
+Array = np.ndarray
+Law = tuple[Callable[[np.random.Generator, tuple[int, ...]], Array], float]
+"""Draws of a distribution in some shape, and its mean."""
+
+LAWS: dict[str, Law] = {
+    "normal": (lambda rng, size: rng.normal(size=size), 0.0),
+    "uniform": (lambda rng, size: rng.uniform(size=size), 0.5),
+    "exponential": (lambda rng, size: rng.exponential(size=size), 1.0),
+    "Poisson, mean 0.5": (lambda rng, size: rng.poisson(0.5, size), 0.5),
+    "Poisson, mean 3": (lambda rng, size: rng.poisson(3.0, size), 3.0),
+    "lognormal, σ = 0.75": (lambda rng, size: rng.lognormal(0.0, 0.75, size), float(np.exp(0.75**2 / 2))),
+}
+VERY_SKEWED: Law = (lambda rng, size: rng.lognormal(0.0, 1.0, size), float(np.exp(0.5)))
+SEEDS = (3, 5, 10, 20, 40)
+SIZES = ((4, 2, 10), (8, 2, 20), (10, 1, 10))
+"""Fleets, trainings and seeds."""
+MORE_SIZES = ((2, 2, 20), (3, 2, 20), (200, 1, 5))
+CELLS = (30, 30, 30, 30, 30, 24, 12, 8, 6)
+"""Instances of each cell, about as in the test split."""
+
+
+def coverage(values: Array, mean: float) -> float:
+    """Of [trial, fleet, training, seed]; trials without variation have no interval and do not count."""
+    bounds = mean_bounds(values)
+    some = np.isfinite(bounds.low)
+    return float(((bounds.low <= mean) & (mean <= bounds.high))[some].mean())
+
+
+def law_coverage(rng: np.random.Generator, law: Law, seeds: int, trials: int = 200_000) -> float:
+    """Of the mean over seeds."""
+    draw, mean = law
+    return coverage(draw(rng, (trials, 1, 1, seeds)), mean)
+
+
+def effects(rng: np.random.Generator, size: tuple[int, ...], skewed: bool) -> Array:
+    """Normal or exponential values with mean 0."""
+    return rng.exponential(size=size) - 1.0 if skewed else rng.normal(size=size)
+
+
+def shifts(rng: np.random.Generator, trials: int, size: tuple[int, int, int], skewed: bool) -> Array:
+    """Values with mean 0: fleets, trainings within fleets, seeds and single shifts all differ."""
+    fleets, trainings, seeds = size
+
+    def draw(*shape: int) -> Array:
+        return effects(rng, (trials, *shape), skewed)
+
+    by_fleet = draw(fleets, 1, 1) + 0.5 * draw(fleets, trainings, 1)
+    return by_fleet + 0.7 * draw(1, 1, seeds) + draw(fleets, trainings, seeds)
+
+
+def cells_coverage(rng: np.random.Generator, skewed: bool, trials: int = 20_000) -> float:
+    """Of the mean over instances of several cells: cells and instances differ alike."""
+    groups = np.repeat(np.arange(len(CELLS)), CELLS)
+    values = effects(rng, (trials, len(CELLS)), skewed)[:, groups] + effects(rng, (trials, len(groups)), skewed)
+    return coverage(np.stack([by_group(each[None], groups) for each in values]), 0.0)
+
+
+def iqm_coverage(rng: np.random.Generator, instances: int, trials: int = 500) -> float:
+    """Of the percentile interval of the IQM of exponential scores, whose true value is a mean of quantiles."""
+    true = float(np.mean(stats.expon.ppf(np.linspace(0.25, 0.75, 20_001))))
+    found = [aggregates({"x": rng.exponential(size=(1, instances))})["x"].iqm for _ in range(trials)]
+    return float(np.mean([each.low <= true <= each.high for each in found]))
+
+
+def measure() -> dict[str, Any]:
+    """Shares by law and number of seeds, by fleets × trainings × seeds, of IQMs by instances, and over cells.
+
+    The pairs are of normal and of exponential effects.
+    """
+    rng = np.random.default_rng(2)
+    laws = {**LAWS, "lognormal, σ = 1": VERY_SKEWED}
+    return {
+        "seeds": list(SEEDS),
+        "laws": {name: [law_coverage(rng, law, n) for n in SEEDS] for name, law in laws.items()},
+        "sizes": {
+            " × ".join(map(str, size)): [coverage(shifts(rng, 20_000, size, skewed), 0.0) for skewed in (False, True)]
+            for size in (*SIZES, *MORE_SIZES)
+        },
+        "iqm": {str(n): iqm_coverage(rng, n) for n in (10, 50, 200)},
+        "cells": [cells_coverage(rng, skewed) for skewed in (False, True)],
+    }
+
+
+def main() -> None:
+    """Write the shares as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/coverage.json"))
+    out = parser.parse_args().out
+    out.write_text(json.dumps(measure(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
