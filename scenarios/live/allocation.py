@@ -23,6 +23,7 @@ class CentralAllocation:
         """Take a policy that was reset."""
         self._policy, self._fleet = policy, fleet
         self._last: dict[str, int] = {}
+        self._problem = ""
 
     def __call__(self, bidding: Bidding) -> dict[str, Assignment]:
         """Arm and plan of each job that is assigned: the claims of the policy, resolved as in simulation.
@@ -33,8 +34,13 @@ class CentralAllocation:
         try:
             actions = actions_of(list(seen), self._policy.act(seen)).tolist()
         except BusError as error:
-            _LOG.error("Nothing is awarded in this round: %s", error)
+            if str(error) != self._problem:  # once, not in every round
+                _LOG.error("Nothing is awarded until the policy replies: %s", error)
+            self._problem = str(error)
             return {}
+        if self._problem:
+            _LOG.warning("The policy replies again.")
+            self._problem = ""
         claims = claimed_jobs(bidding, seen, dict(zip(seen, actions, strict=True)))
         awarded = resolve_claims(bidding, claims, self._fleet.order(bidding.quotes))
         winners = {assignment.arm for assignment in awarded.values()}
