@@ -78,20 +78,20 @@ class PolicyClient:
 
     def _reply_in(self, replies: Replies[ActReply], request: ActRequest) -> ActReply:
         """The only reply."""
-        count = len(replies.messages) + len(replies.refused)
-        if count > 1:
+        refusals = [reason for reason in replies.refused.values() if reason]
+        if (count := len(replies.messages) + len(refusals)) > 1:
             raise BusError(f"{count} processes reply as {self._whose}: stop all but one.")
-        if replies.messages:
+        if refusals:
+            raise BusError(f"The {self._whose} gave no actions: {printable(refusals[0])}")
+        if replies.messages and not replies.refused:
             return next(iter(replies.messages.values()))
-        if reason := next(iter(replies.refused.values()), ""):
-            raise BusError(f"The {self._whose} gave no actions: {printable(reason)}")
         if (size := len(encode(request))) > MOST_REQUEST_BYTES:
             raise BusError(
                 f"The observations of {len(request.observations)} arms have {size:,} bytes, and a request to a policy "
                 f"at most {MOST_REQUEST_BYTES:,}: choose a policy in Python, or a scenario with fewer arms or slots."
             )
         if replies.refused or replies.took_s >= self._limit_s:
-            raise BusError(f"The {self._whose} did not reply within {self._limit_s:g} s.")
+            raise BusError(f"The {self._whose} did not reply and finish the query within {self._limit_s:g} s.")
         raise BusError(f"No process serves the {self._whose}: start it; it must declare a queryable of '{self._key}'.")
 
 

@@ -143,7 +143,7 @@ def test_shifts_have_different_names_and_the_same_seed_and_count_their_decisions
         ('{"actions": {}}', "text/plain", "gave no actions: It is encoded as 'text/plain'"),
         ('{"actions": {"arm_9": 1}}', ACT_REPLY, r"replied for the arm 'arm_9'\. Arms: arm_0, arm_1\."),
         ('{"actions": {"arm_0": 8}}', ACT_REPLY, "chose the action 8 for 'arm_0', which has the actions 0 to 7"),
-        (None, ACT_REPLY, rf"did not reply within {LIMIT_S} s\."),
+        (None, ACT_REPLY, rf"did not reply and finish the query within {LIMIT_S} s\."),
     ],
 )
 def test_a_reply_that_cannot_be_used_is_an_error_within_the_limit(router, served, payload, sent_as, said):
