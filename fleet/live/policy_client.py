@@ -2,6 +2,7 @@
 
 import uuid
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import ClassVar
 
 import numpy as np
@@ -24,8 +25,8 @@ _FIELDS = ArmObservation.__struct_fields__[1:]
 class PolicyClient:
     """A policy of scope `central` whose decisions another process makes: one query each.
 
-    It connects with the first decision, in the process that makes it, and disconnects when it is deleted or the process
-    exits.
+    It connects with the first decision, in the process that makes it, and disconnects after a failed one, when it is
+    deleted, and when the process exits.
     """
 
     scope: ClassVar = "central"
@@ -56,7 +57,17 @@ class PolicyClient:
                 malformed or has unknown arms or actions.
         """
         seen = [_message(arm, observation) for arm, observation in observations.items()]
-        request = ActRequest(self._shift, self._seed, self._decision, seen)
+        try:
+            actions = self._query(ActRequest(self._shift, self._seed, self._decision, seen), observations)
+        except BaseException:  # also of a time limit
+            # Not when it is deleted: a traceback may keep it until any thread collects garbage, one of Zenoh's, too.
+            with suppress(BusError):
+                self._client.close()
+            raise
+        self._decision += 1
+        return actions
+
+    def _query(self, request: ActRequest, observations: Mapping[str, Observation]) -> dict[str, int]:
         try:
             client = self._client.open()
         except NoRouter as error:
@@ -73,7 +84,6 @@ class PolicyClient:
                 raise BusError(
                     f"The {self._whose} chose the action {action} for '{arm}', which has the actions 0 to {count - 1}."
                 )
-        self._decision += 1
         return actions
 
     def _reply_in(self, replies: Replies[ActReply], request: ActRequest) -> ActReply:

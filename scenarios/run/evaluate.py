@@ -163,6 +163,7 @@ def play(
             running &= ~over
             if running.any():
                 obs, _ = env.reset(rows=over)  # the policy is not called for these envs any more
+    policies.clear()  # the traceback of an error keeps this frame, and a policy may have an open connection
     return [results[e] for e in range(len(seeds))]
 
 

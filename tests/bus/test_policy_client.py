@@ -176,6 +176,17 @@ def test_nobody_two_and_no_router_are_told_apart_at_once(router, served):
         nowhere.act(seen())
 
 
+def test_a_router_that_ends_in_a_shift_is_an_error_within_the_limit():
+    with Router() as router, open_client(router.endpoint, timeout_s=PATIENT_S) as session:
+        server, policy = Server(session, '{"actions": {}}'), client(router, LIMIT_S)
+        assert policy.act(seen()) == {}
+        router.close()
+        for said in ("policy 'mine'", "No router answered"):
+            with refused(said, LIMIT_S + 3.0):
+                policy.act(seen())
+        assert server.requests.qsize() == 1
+
+
 def test_large_fleets_fit_and_larger_ones_are_told_to(router, served):
     server = served('{"actions": {}}')
     assert client(router).act(seen(16, 50, np.random.default_rng(2))) == {}
