@@ -85,7 +85,8 @@ def names_of(scope: str) -> str:
 
 WRAPPERS_HELP = " or ".join(f"{name}:POLICY" for name in WRAPPERS).replace(" or ", ", ", len(WRAPPERS) - 2)
 WRAPPERS_HELP += " limits one by temperature"
-NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}."
+NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, bus:NAME in another process, or a folder "
+NAMES_HELP += f"of `thermofleet train`; {WRAPPERS_HELP}."
 """Allowed names of a policy, for `--help`."""
 
 

@@ -19,6 +19,7 @@ Axis = Literal["joint", "slot", "option", "peer"]
 
 LONG_S = 1e5
 """Times are clipped to this, s: a little over a day."""
+MOST_SLOTS = 256
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol import messages
 from fleet.bus.protocol.auction import MOST_JOBS, ArmEvent
 from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.protocol.registry import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, Channel, MessageType
 from fleet.bus.protocol.schemas import Schema, descriptions, schemas
 from fleet.engine.reward import RewardWeights
@@ -215,7 +216,11 @@ def _limit_table() -> str:
     state = CHANNEL["arm", "state"]
     longest = schemas()["JobSpec"]["properties"]["name"]["maxLength"]
     rows = [
-        (f"{Limits().message_bytes:,} bytes", "any message with its attachment; the router silently drops larger ones"),
+        (
+            f"{Limits().message_bytes:,} bytes",
+            "any other message with its attachment; the router drops larger ones silently",
+        ),
+        (f"{MOST_REQUEST_BYTES:,} bytes", "a request to `policy/{policy}/act`"),
         (f"{state.limit_hz:g} a second", "`state` messages of one session; the router drops more (`--state-hz`)"),
         (f"{MOST_JOBS}", "jobs in one message; a `Status` lists open jobs before closed ones"),
         (f"{MAX_OPEN_JOBS:,}", "open jobs of one auctioneer"),

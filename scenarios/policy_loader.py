@@ -1,10 +1,12 @@
-"""Policies by name: one of `agents.registry`, your own as `FILE.py:OBJECT` or `MODULE:OBJECT`, the folder of a trained
-one, or any of these in a wrapper, as `WRAPPER:POLICY`. An object is a class or a function that returns a new policy."""
+"""Policies by name: one of `agents.registry`, your own as `FILE.py:OBJECT` or `MODULE:OBJECT`, one in another process
+as `bus:NAME` or `bus:NAME@ENDPOINT`, the folder of a trained one, or any of these in a wrapper, as `WRAPPER:POLICY`. An
+object is a class or a function that returns a new policy."""
 
 import importlib
 import importlib.util
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from inspect import signature
 from pathlib import Path
 from traceback import extract_tb
@@ -16,7 +18,8 @@ from agents.heat_guards import guarded
 from agents.pair_scores import PAIRS, load_pairs
 from agents.policy import SCOPES, ArmPolicy, Policy, for_all_arms
 from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
-from fleet.errors import FleetError, nearest
+from fleet.bus.protocol.keys import ENDPOINT
+from fleet.errors import NAME_RULE, FleetError, is_name, nearest, printable
 from fleet.seeding import child
 
 MOST_WRAPPERS = 8
@@ -28,18 +31,37 @@ METHODS = {
 """Methods, and their arguments, that a policy of each scope must have."""
 
 
+BUS = "bus:"
+"""Before the name of a policy in another process."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnBus:
+    """How a policy in another process is queried."""
+
+    fleet: str = "simulation"
+    """Name of the fleet in its key."""
+    endpoint: str = ENDPOINT
+    """Of the router, unless the name of the policy has one."""
+    limit_s: float = 60.0
+    """Most real seconds for a decision."""
+
+
+ON_BUS = OnBus()
+
+
 class Unusable(FleetError):
     """The class of a policy that cannot be made without arguments."""
 
 
-def policy_of(name: str) -> Policy:
+def policy_of(name: str, bus: OnBus = ON_BUS) -> Policy:
     """A fresh policy for all arms.
 
     Raises:
         FleetError: no such rule, file, module, class or folder, or one that is not a policy.
         Unusable: its class needs arguments.
     """
-    return for_all_arms(_maker(name))
+    return for_all_arms(_maker(name, bus))
 
 
 def arm_policy_of(name: str) -> ArmPolicy:
@@ -50,7 +72,7 @@ def arm_policy_of(name: str) -> ArmPolicy:
     """
     if scope_of(name) != "arm":
         raise FleetError(f"'{name}' is a central policy: it needs the observations of all arms, not of one.")
-    return _maker(name)()  # pyright: ignore[reportReturnType]  # by its scope
+    return _maker(name, ON_BUS)()  # pyright: ignore[reportReturnType]  # by its scope
 
 
 def scope_of(name: str) -> str:
@@ -61,6 +83,8 @@ def scope_of(name: str) -> str:
     """
     if wrapped := _wrapped(name):
         return scope_of(wrapped[1])
+    if is_on_bus(name):
+        return "central"
     if has_trainings(name):
         return scope_of(trainings_of(name)[0])
     if _is_folder(name):
@@ -68,13 +92,13 @@ def scope_of(name: str) -> str:
     return _made_by(name)[1]
 
 
-def policy_at(name: str, seed: int) -> Policy:
+def policy_at(name: str, seed: int, bus: OnBus = ON_BUS) -> Policy:
     """A fresh policy at the beginning of the shift of a seed, with its random generator.
 
     Raises:
         FleetError: as `policy_of`.
     """
-    policy = policy_of(name)
+    policy = policy_of(name, bus)
     policy.reset(np.random.default_rng(child(np.random.SeedSequence([seed, 1]), 0)))
     return policy
 
@@ -85,14 +109,22 @@ def is_built_in(name: str) -> bool:
     return is_built_in(wrapped[1]) if wrapped else name in RULES
 
 
+def is_on_bus(name: str) -> bool:
+    """Whether a policy runs in another process, perhaps in wrappers."""
+    wrapped = _wrapped(name)
+    return is_on_bus(wrapped[1]) if wrapped else name.startswith(BUS)
+
+
 def source_of(name: str) -> Path | None:
-    """The file or folder of a policy of one's own; None for a rule.
+    """The file or folder of a policy of one's own; None for a rule, and for one in another process.
 
     Raises:
         FleetError: there is no such module.
     """
     if wrapped := _wrapped(name):
         return source_of(wrapped[1])
+    if is_on_bus(name):
+        return None
     if _is_folder(name):
         return Path(name)
     where = name.rpartition(":")[0]
@@ -121,13 +153,15 @@ def trainings_of(name: str) -> tuple[str, ...]:
 
 def has_trainings(name: str) -> bool:
     """Whether a name stands for several trainings."""
-    return "*" in name
+    return "*" in name and not is_on_bus(name)
 
 
 def label(name: str) -> str:
     """What a table calls a policy: the rule, the class, or the last folder, after its wrapper."""
     if wrapped := _wrapped(name):
         return f"{name.partition(':')[0]}:{label(wrapped[1])}"
+    if is_on_bus(name):
+        return name.partition("@")[0]
     if _is_folder(name) or has_trainings(name):
         return Path(os.path.abspath(name)).name
     return name.rpartition(":")[2]
@@ -147,12 +181,14 @@ def _has_pairs(name: str) -> bool:
     return (Path(name) / PAIRS).is_file()
 
 
-def _maker(name: str, depth: int = 0) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
+def _maker(name: str, bus: OnBus, depth: int = 0) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
     if depth > MOST_WRAPPERS:
         raise FleetError(f"A policy has at most {MOST_WRAPPERS} wrappers round it ({', '.join(WRAPPERS)}).")
     if wrapped := _wrapped(name):
-        wrapper, inner = wrapped[0], _maker(wrapped[1], depth + 1)
+        wrapper, inner = wrapped[0], _maker(wrapped[1], bus, depth + 1)
         return lambda: guarded(wrapper.kind, inner())  # pyright: ignore[reportReturnType]  # as the policy in it
+    if is_on_bus(name):
+        return _client_maker(name, bus)
     if _is_folder(name) and _has_pairs(name):
         return lambda: load_pairs(Path(name))
     if _is_folder(name):
@@ -160,6 +196,15 @@ def _maker(name: str, depth: int = 0) -> Callable[[], Policy] | Callable[[], Arm
 
         return lambda: load_policy(Path(name))
     return _made_by(name)[0]
+
+
+def _client_maker(name: str, bus: OnBus) -> Callable[[], Policy]:
+    policy, at, endpoint = name.removeprefix(BUS).partition("@")
+    if not is_name(policy):
+        raise FleetError(f"After '{BUS}' the name of a policy must have {NAME_RULE}, no @ (got '{printable(policy)}').")
+    from fleet.live.policy_client import PolicyClient  # loads zenoh
+
+    return lambda: PolicyClient(policy, fleet=bus.fleet, endpoint=endpoint if at else bus.endpoint, limit_s=bus.limit_s)
 
 
 def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy], str]:

@@ -13,11 +13,11 @@ from fleet.env.validation import Decisions
 from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
 from fleet.heat.touch import LONGEST_CONTACT_S, SHORTEST_CONTACT_S, burn_threshold_c
 from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_dwell, check_places
+from fleet.observation import MOST_SLOTS
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
 MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one per second."""
-MOST_SLOTS = 256
 MOST_CLEARANCE_M = 0.2
 MOST_FIXTURES = 64
 MOST_EXPLORATION = 10_000

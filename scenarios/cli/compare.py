@@ -29,8 +29,8 @@ def compare_command(
     policies: Annotated[
         str,
         typer.Option(
-            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train` "
-            "('FOLDER-*': one policy with several trainings); "
+            help="Policies, separated by commas: names, FILE.py:CLASS, bus:NAME in another process, or folders of "
+            "`thermofleet train` ('FOLDER-*': one policy with several trainings); "
             f"{WRAPPERS_HELP}. Default: {', '.join(RULES)}.",
             show_default=False,
         ),

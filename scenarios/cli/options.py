@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from agents.registry import WRAPPERS_HELP, names_of
+from fleet.bus.protocol.keys import ENDPOINT as ENDPOINT
 from fleet.errors import NAME_RULE, FleetError, LogError, is_name, nearest, printable
 
 if TYPE_CHECKING:  # slow to import
@@ -132,14 +133,13 @@ PartitionOption = Annotated[
 ]
 
 # Live fleets.
-ENDPOINT = "tcp/127.0.0.1:7447"
 EndpointOption = Annotated[str, typer.Option(envvar="THERMOFLEET_ENDPOINT", help="Endpoint of the fleet's router.")]
 PolicyOption = Annotated[
     str,
     typer.Option(
         help=f"Allocation policy. Run by the auctioneer: {names_of('central')}. Run by each arm, without an "
         f"auctioneer: {names_of('arm')}, or a folder of `thermofleet train`. Your own as FILE.py:CLASS, run "
-        f"according to its scope. {WRAPPERS_HELP}."
+        f"according to its scope, or bus:NAME in another process. {WRAPPERS_HELP}."
     ),
 ]
 FleetOption = Annotated[

@@ -14,7 +14,7 @@ from fleet.bus.exchange.channel import PERFECT
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
 from scenarios.bounds.references import Reference
-from scenarios.policy_loader import is_built_in, label, scope_of
+from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.fleet import RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
@@ -62,7 +62,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Of the split."""
     code_hash: Hash
     policy_hash: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{16})?$")]
-    """Of the policy's files; "" if it belongs to the code."""
+    """Of the policy's files; "" if it belongs to the code, or ran in another process."""
     risk: RiskName
     versions: dict[str, str | None]
 
@@ -157,8 +157,11 @@ def problems(submission: Submission, references: Mapping[Shift, Reference]) -> I
     """
     card, rows = submission.card, submission.rows
     lines = {line.name: line for line in manifest(card.split)}
-    if is_built_in(card.policy) == bool(card.policy_hash):
-        yield f"its policy '{card.policy}' must be built-in and have no hash, or have another name and one"
+    if (is_built_in(card.policy) or is_on_bus(card.policy)) == bool(card.policy_hash):
+        yield (
+            f"its policy '{card.policy}' must be built-in and have no hash, or have another name and one "
+            "(bus:NAME has none)"
+        )
     if card.manifest != manifest_hash(card.split):
         yield f"its manifest of the split {card.split} is another one (hash {card.manifest})"
     missing = [name for name in NEEDED if not card.versions.get(name)]

@@ -14,7 +14,7 @@ from fleet.bus.exchange.memory import MemoryExchange
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
 from scenarios.fault_price import weights_of
-from scenarios.policy_loader import policy_at
+from scenarios.policy_loader import OnBus, policy_at
 from scenarios.prepare.fleet import Fleet
 from scenarios.run.batch import library_of
 from scenarios.run.decision_limit import DecisionLimit
@@ -129,7 +129,7 @@ def play(
     with limit.watching():
         for e, seed in enumerate(seeds):
             with guarded(e, 0.0):
-                policies[e] = policy_at(policy, seed)
+                policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
         only_when_asked = bool(policies) and only_choices(next(iter(policies.values())))
         tick = 0
         while running.any():
@@ -163,6 +163,7 @@ def play(
             running &= ~over
             if running.any():
                 obs, _ = env.reset(rows=over)  # the policy is not called for these envs any more
+    policies.clear()  # the traceback of an error keeps this frame, and a policy may have an open connection
     return [results[e] for e in range(len(seeds))]
 
 

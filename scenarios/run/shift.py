@@ -15,7 +15,7 @@ from fleet.env.allocation_v1 import VERSION, AllocationEnv
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
-from scenarios.policy_loader import policy_at
+from scenarios.policy_loader import OnBus, policy_at
 from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
 from scenarios.progress import Progress, quiet
 from scenarios.run.heat_use import HeatUse
@@ -89,7 +89,7 @@ def run(
         record: Keep telemetry.
         endpoint: Zenoh router on loopback, for other listeners; by default the fleet has its own.
     """
-    policy = policy_at(spec.policy, spec.seed)
+    policy = policy_at(spec.policy, spec.seed, OnBus(fleet=fleet.scenario.name))
     recorder = _Recorder(fleet.scenario, record)
     env = env_of(
         fleet,

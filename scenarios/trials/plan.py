@@ -244,7 +244,8 @@ def check_policy(name: str) -> None:
 
 
 def policy_hash(name: str) -> str:
-    """Hash of the files of a policy with all its trainings; "" of a rule, which belongs to the code."""
+    """Hash of the files of a policy with all its trainings; "" of a rule, which belongs to the code, and of a policy in
+    another process, which has no files here."""
     sources = [source for each in trainings_of(name) if (source := source_of(each)) is not None]
     if not sources:
         return ""

@@ -66,7 +66,7 @@ def test_every_key_of_the_bus_is_in_the_contract():
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
 def test_an_address_filled_in_is_a_key(channel):
-    key = channel.address.format(fleet="f", arm="a", auctioneer="a", peer="b")
+    key = channel.address.format(fleet="f", arm="a", auctioneer="a", policy="a", peer="b")
     parsed = keys.parse(key)
     assert (parsed.role, parsed.topic) == (channel.role, channel.topic)
 
@@ -209,7 +209,7 @@ def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
 def test_a_key_is_used_as_the_registry_says_or_not_at_all(channel):
-    key = channel.address.format(fleet="f", arm="a", auctioneer="a", peer="b")
+    key = channel.address.format(fleet="f", arm="a", auctioneer="a", policy="a", peer="b")
     assert channel_of(key) is channel
     assert channel_of(key.replace("/a/", "/*/")) is channel
     client = BusClient("tcp/127.0.0.1:1", "f")

@@ -209,6 +209,17 @@ def started(folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
+def policy(port: int) -> Iterator[None]:
+    """The example of a policy in another process, on a router that is there."""
+    process = subprocess.Popen([sys.executable, str(ROOT / "examples" / "own_policy_process.py"), str(port), "mine"])
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(PATIENCE_S)
+
+
+@contextmanager
 def outside(port: int, fleet: str) -> Iterator[Outsider]:
     """An outsider on the router of a fleet, which may not be there yet."""
     config = {
@@ -235,8 +246,9 @@ def test_a_simulated_shift_is_as_the_contract_says(folder, port):
 
 def test_a_live_fleet_is_as_the_contract_says(folder, port):
     words = ("up", folder / "cell.toml", "--difficulty", "blind", "--speed", 20, "--jobs", "none", "--port", port)
+    words += ("--policy", "bus:mine", "--out", folder / "up")
     channels = set(CHANNELS) - CONSENSUS - {"jobs_clear"}  # all arms are present, and say themselves where they are
-    with started(folder, *words, "--out", folder / "up") as fleet, outside(port, "cell") as outsider:
+    with started(folder, *words) as fleet, outside(port, "cell") as outsider, policy(port):
         deadline_s = time.monotonic() + PATIENCE_S
         while outsider.missing(channels) and fleet.poll() is None and time.monotonic() < deadline_s:
             outsider.work()

@@ -16,11 +16,12 @@ from fleet.errors import BusError
 
 DOCS = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
 ARMS = ("arm_0", "arm_1", "arm 2+*@", "arm_10")
+NAMES = {"auction": ("auctioneer", "other"), "policy": ("mine", "other")}
 EVERY_KEY = [
     str(keys.Key("f", role, name, topic, asker))
     for role, topics in TOPICS.items()
     for topic in topics
-    for name in ([""] if role in NAMELESS else ["auctioneer", "other"] if role == "auction" else ARMS)
+    for name in ([""] if role in NAMELESS else NAMES.get(role, ARMS))
     for asker in (ARMS if topic in ASKED else [""])
 ]
 
@@ -54,11 +55,13 @@ def allowed(rules: dict, who: str, flow: str, message: str, key: str) -> bool:
 
 @pytest.mark.parametrize("message", ["put", "liveliness_token", "declare_queryable", "reply"])
 def test_every_key_has_the_speakers_that_it_should_have(message):
-    """Of all keys there are: those of an arm belong to that arm, all others to the auctioneer they name, or to any."""
-    rules = access_control(of_arms("f", ARMS))
-    for key, participant in product(EVERY_KEY, of_arms("f", ARMS).participants):
+    """Of all keys there are: those of an arm belong to that arm, those of a policy to that policy, all others to the
+    auctioneer they name, or to any."""
+    roster = of_arms("f", ARMS, [Participant("mine", "policy")])
+    rules = access_control(roster)
+    for key, participant in product(EVERY_KEY, roster.participants):
         place = keys.parse(key)
-        owner = {"arm": place.name, "auction": place.name}.get(place.role, "auctioneer")
+        owner = "auctioneer" if place.role in NAMELESS else place.name
         may = allowed(rules, participant.common_name, "ingress", message, key)
         assert may == (participant.name == owner), (participant, key)
         cache = f"{key}/@adv/pub/1/2"

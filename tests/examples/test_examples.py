@@ -47,7 +47,7 @@ def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:
 
 
 def test_every_example_for_outsiders_imports_nothing_of_ours():
-    for name in ("monitor", "submit_jobs", "own_arm", "own_allocator"):
+    for name in ("monitor", "submit_jobs", "own_arm", "own_allocator", "own_policy_process"):
         source = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
         imported = set(re.findall(r"^(?:import|from) (\w+)", source, re.MULTILINE))
         assert imported - set(sys.stdlib_module_names) == {"zenoh"}

@@ -14,6 +14,7 @@ from fleet.bus.protocol.auction import JobEstimate as Estimate
 from fleet.bus.protocol.auction import JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
 from fleet.env.allocation_v1 import parallel_env
+from fleet.errors import BusError
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Assignment, Bidding, Choice, offers_of, resolve_claims
 from fleet.observation import FIELDS, LONG_S, Observation
@@ -245,6 +246,29 @@ def test_every_central_policy_completes_the_jobs_of_an_auctioneer(live, name) ->
         fleet.run_without_faults(1.0)
         fleet.check()
     fleet.check_settled()
+
+
+def test_without_a_policy_in_another_process_nothing_is_awarded_until_it_replies(live, caplog) -> None:
+    class Returns:
+        scope = "central"
+        asked = 0
+
+        def act(self, observations):
+            self.asked += 1
+            if self.asked <= 3 or 5 <= self.asked <= 6:
+                raise BusError("No process serves it.")
+            return fresh("matching").act(observations)
+
+    policy = Returns()
+    fleet = live.Fleet([live.Arm("arm_0")], allocate=CentralAllocation(policy, LiveFleet(arms=("arm_0",))))
+    fleet.submit(*(JobSpec(name=f"j{i}", kind="hold", places=("x",), repetitions=2) for i in range(3)))
+    for _ in range(40):
+        fleet.run_without_faults(1.0)
+        fleet.check()
+    fleet.check_settled()
+    assert policy.asked > 6
+    assert caplog.text.count("Nothing is awarded until the policy replies: No process serves it.") == 2
+    assert caplog.text.count("The policy replies again.") == 2
 
 
 def test_the_lower_difficulty_wins_a_job_or_station_then_the_first_arm() -> None:

@@ -156,6 +156,6 @@ def press_ctrl_c() -> Callable[..., AbstractContextManager[object]]:
     """A function that has the shifts within a block interrupted at their fourth step."""
 
     def press(times: int = 1) -> AbstractContextManager[object]:
-        return patch("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC(step=4, times=times))
+        return patch("scenarios.policy_loader.policy_of", lambda *name: PressingCtrlC(step=4, times=times))
 
     return press

@@ -86,7 +86,7 @@ def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plan
             def reset(self, rng): pass
             def act(self, observations): os.kill(os.getpid(), signal.SIGKILL)
 
-        scenarios.policy_loader.policy_of = lambda name: Killed()
+        scenarios.policy_loader.policy_of = lambda *name: Killed()
         main(sys.argv[1:])
     """)
     where = tmp_path / "runs"

@@ -142,6 +142,8 @@ FORGED = {
     "more jobs than there are": (changed(7, finished=1e4), "test/0007 has 10000 finished jobs"),
     "the name of a rule": (changed(None, policy="wsept"), "must be built-in and have no hash"),
     "code of its author": (changed(None, policy="this:x", policy_hash=""), "must be built-in and have no hash"),
+    "another process": (changed(None, policy="bus:mine", policy_hash=""), None),
+    "files of another process": (changed(None, policy="bus:mine"), r"\(bus:NAME has none\)"),
     "no number": (changed(7, value=float("nan")), "needs 11 figures of at most 1e\\+09"),
     "below 0": (changed(7, faults=-1.0), "a figure below 0"),
     "neither figures nor error": (changed(7, figures=None), "needs either figures or an error"),

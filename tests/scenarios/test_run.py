@@ -98,7 +98,7 @@ def test_ctrl_c_outside_the_steps_is_not_taken_for_a_result(fleet, monkeypatch):
         def act(self, observations):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda name: Broken())
+    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda *name: Broken())
     with pytest.raises(KeyboardInterrupt):
         run(fleet, spec())
 
@@ -123,7 +123,7 @@ def test_telemetry_at_the_end_of_a_step_is_what_the_policy_observes_next(fleet, 
             seen.append(np.stack([each.temp_c for each in observations.values()]))
             return {arm: int(each.action_mask[1]) for arm, each in observations.items()}
 
-    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda name: Watching())
+    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda *name: Watching())
     telemetry = run(fleet, spec()).telemetry
     assert telemetry is not None
     ends = telemetry.time_s % fleet.scenario.decision_interval_s == 0

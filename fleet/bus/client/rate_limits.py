@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.security.access_control import Roster
 
 
@@ -12,7 +13,8 @@ class Limits:
     """What a router forwards from each session; the rest is dropped silently."""
 
     message_bytes: int = 65_536
-    """Largest payload with its attachment, of a publication, a request or a reply."""
+    """Largest payload with its attachment, of a publication, a request or a reply; a request to a policy, or with a
+    wildcard or an unknown role in its key, may have `MOST_REQUEST_BYTES`."""
     state_hz: float | None = None
     """Telemetry messages a second, real time, of each session, or with TLS of each arm; None for any number. A steady
     stream needs a limit of twice its rate, as Zenoh limits the gap between two messages, which varies."""
@@ -30,14 +32,16 @@ class Limits:
             roster: Participants, if each is held to its own keys. The rate is then limited by key: one session, that of
                 a linked router, may carry the telemetry of many arms.
         """
-        size = {
-            "flows": ["ingress"],
-            "messages": ["put", "delete", "query", "reply"],
-            "key_exprs": ["**", keys.caches_of("**")],
-            "size_limit": self.message_bytes,
-        }
+        all_keys = ["**", keys.caches_of("**")]
+        # Of two filters that apply, the smaller one counts; only requests to policies may be larger.
+        others = [f"{keys.PREFIX}/*/{role}/**" for role in keys.TOPICS if role != "policy"]
+        sizes = [
+            _size(["put", "delete", "reply"], all_keys, self.message_bytes),
+            _size(["query"], [*others, keys.caches_of("**")], self.message_bytes),
+            _size(["query"], all_keys, max(self.message_bytes, MOST_REQUEST_BYTES)),
+        ]
         if self.state_hz is None:
-            return {"low_pass_filter": [size]}
+            return {"low_pass_filter": sizes}
         limited = (
             [keys.STATES]
             if roster is None
@@ -48,9 +52,13 @@ class Limits:
             "messages": ["put", "delete"],
             "rules": [{"key_expr": key, "freq": self.state_hz} for key in limited],
         }
-        return {"low_pass_filter": [size], "downsampling": [rate]}
+        return {"low_pass_filter": sizes, "downsampling": [rate]}
 
     @property
     def assembled_bytes(self) -> int:
         """Largest fragmented message that the router assembles in memory before it checks its size."""
-        return 2 * self.message_bytes + 65_536
+        return max(2 * self.message_bytes, MOST_REQUEST_BYTES) + 65_536
+
+
+def _size(messages: list[str], expressions: list[str], most_bytes: int) -> dict[str, Any]:
+    return {"flows": ["ingress"], "messages": messages, "key_exprs": expressions, "size_limit": most_bytes}

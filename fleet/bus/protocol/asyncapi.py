@@ -14,6 +14,7 @@ _PARAMETERS = {
     "arm": "Name of the arm",
     "peer": "Name of the arm that sends the query",
     "auctioneer": "Name of the auctioneer",
+    "policy": "Name of the policy",
     "fleet": "Name of the fleet",
 }
 

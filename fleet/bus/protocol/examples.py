@@ -44,6 +44,7 @@ from fleet.bus.protocol.operator import (
     ResetReply,
     ResetRequest,
 )
+from fleet.bus.protocol.policy import ActReply, ActRequest, ArmObservation
 
 CRATE = JobSpec(
     name="crate_1",
@@ -95,6 +96,54 @@ _CELL = Cell(
     error_c=75.0,
     jobs_in_message=128,
     fixtures=(CellFixture("table", (0.4, 0.0, -0.05), (0.6, 0.9, 0.1), (0.0, 0.0, 0.0)),),
+)
+_SEEN = ArmObservation(
+    arm=_ARM,
+    clock=0.25,
+    left_s=5400.0,
+    idle=1.0,
+    working=0.0,
+    faulted=0.0,
+    busy_s=0.0,
+    last_award=0.0,
+    temp_c=[31.25, 48.5, 35.0, 40.0, 30.25, 29.75, 30.0],
+    housing_c=[29.5, 41.0, 32.5, 36.25, 28.75, 28.5, 28.75],
+    ambient_c=24.5,
+    headroom_k=11.5,
+    error_headroom_k=26.5,
+    job_value=0.0,
+    job_cycles=0.0,
+    job_peak_c=0.0,
+    job_p=0.0,
+    offered=[1.0],
+    station_free=[1.0],
+    too_heavy=[0.0],
+    feasible=[1.0, 1.0],
+    space_free=[1.0, 1.0],
+    known=[1.0, 1.0],
+    difficulty=[0.5, 0.25],
+    peak_c=[51.5, 48.25],
+    p_saturation=[0.125, 0.0],
+    duration_s=[212.0, 252.0],
+    slack_s=[938.0, 898.0],
+    age_s=[30.0],
+    payload_kg=[1.5],
+    value=[2.0],
+    returns=[0.0],
+    expires=[0.0],
+    peer_heard=[1.0],
+    peer_age_s=[2.0],
+    peer_working=[1.0],
+    peer_faulted=[0.0],
+    peer_headroom_k=[3.5],
+    peer_busy_s=[52.5],
+    peer_known=[[1.0]],
+    peer_difficulty=[[0.75]],
+    peer_blocks=[[0.0]],
+    action_mask=[1, 1, 1, 0],
+)
+_PEER = msgspec.structs.replace(
+    _SEEN, arm="arm_1", idle=0.0, working=1.0, busy_s=52.5, headroom_k=3.5, peer_working=[0.0], action_mask=[1, 0, 0, 1]
 )
 _CANCEL = ControlRequest(request="5f0c2b1e", action=Cancel(job="crate_1"), by="shop floor")
 
@@ -220,5 +269,7 @@ _ALL: tuple[msgspec.Struct, ...] = (
     _CELL,
     ClockRequest(),
     Clock(time_s=600.0, speed=60.0, epoch=_EPOCH),
+    ActRequest(shift="8c1f6f0e", seed=3405691582, decision=180, observations=[_SEEN, _PEER]),
+    ActReply(actions={_ARM: 2}),
 )
 EXAMPLES: Mapping[type[msgspec.Struct], msgspec.Struct] = {type(word): word for word in _ALL}

@@ -1,6 +1,7 @@
 """Keys of the bus: built and parsed here, and nowhere else.
 
-`thermofleet/v4/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}` and `clock/now`.
+`thermofleet/v4/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}`, `clock/now` and
+`policy/{policy}/act`.
 An arm queries an auctioneer under `auction/{auctioneer}/{topic}/{arm}`, and another arm under
 `arm/{other}/{topic}/{arm}`: access control sees only keys, so the querier must be part of the key.
 
@@ -15,7 +16,7 @@ from urllib.parse import quote, unquote
 
 from fleet.errors import NAME_RULE, is_name, printable
 
-Role = Literal["arm", "auction", "jobs", "clock"]
+Role = Literal["arm", "auction", "jobs", "clock", "policy"]
 ArmTopic = Literal[
     "alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history", "reset", "operation"
 ]
@@ -24,6 +25,8 @@ AskedTopic = Literal["lease", "report", "claim"]
 JobsTopic = Literal["submit", "status", "clear", "control", "cell"]
 
 PREFIX = "thermofleet/v4"
+ENDPOINT = "tcp/127.0.0.1:7447"
+"""Of the router, by default."""
 STATES = f"{PREFIX}/*/arm/*/state"
 """Key expression of the telemetry of every arm of every fleet; for router rules, not for publications."""
 TOPICS: dict[Role, tuple[str, ...]] = {
@@ -31,6 +34,7 @@ TOPICS: dict[Role, tuple[str, ...]] = {
     "auction": (*get_args(AuctionTopic), "lease", "report"),
     "jobs": get_args(JobsTopic),
     "clock": ("now",),
+    "policy": ("act",),
 }
 NAMELESS: tuple[Role, ...] = ("jobs", "clock")
 """Roles whose keys name no participant."""
@@ -50,7 +54,7 @@ class Key:
     fleet: str
     role: Role
     name: str
-    """Of the arm or the auctioneer; "" for jobs and clock."""
+    """Of the arm, the auctioneer or the policy; "" for jobs and clock."""
     topic: str
     asker: str = ""
     """The querying arm, for the topics in `ASKED`; "" for all others."""
@@ -139,13 +143,23 @@ def of_clock(fleet: str) -> str:
     return str(Key(fleet, "clock", "", "now"))
 
 
+def of_policy(fleet: str, policy: str) -> str:
+    """Key at which a policy in another process is queried: `thermofleet/v4/{fleet}/policy/{policy}/act`."""
+    return str(Key(fleet, "policy", policy, "act"))
+
+
+def of_every_policy(fleet: str) -> str:
+    """Key expression that matches every policy of one fleet; for router rules."""
+    return of_policy(fleet, "x").replace("/policy/x/", "/policy/*/")
+
+
 def all_of_fleet(fleet: str) -> str:
     """Key expression of everything in one fleet; for subscribers and router rules, not for publications."""
     return f"{PREFIX}/{chunk(fleet)}/**"
 
 
 def all_of(fleet: str, role: Role, name: str = "") -> str:
-    """Key expression of everything of one arm or auctioneer, or of a role without names."""
+    """Key expression of everything of one arm, auctioneer or policy, or of a role without names."""
     start = f"{PREFIX}/{chunk(fleet)}/{role}"
     return f"{start}/**" if role in NAMELESS else f"{start}/{chunk(name)}/**"
 
@@ -190,7 +204,8 @@ def _parse(key: str) -> Key:
     role = _ROLES.get(parts[3])
     if role is None or named == (role in NAMELESS):
         raise ValueError(
-            f"'{key}' is not a key of this bus: expected arm/{{arm}}/…, auction/{{auctioneer}}/…, jobs/… or clock/now."
+            f"'{key}' is not a key of this bus: expected arm/{{arm}}/…, auction/{{auctioneer}}/…, policy/{{policy}}/…, "
+            "jobs/… or clock/now."
         )
     try:
         chunks = (parts[2], parts[4] if named else "", parts[6] if asked else "")

@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator
+from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator, policy
 from fleet.bus.protocol.keys import Role
 
 MessageType = type[msgspec.Struct]
@@ -56,9 +56,9 @@ class Channel:
     priority: Priority = "DATA"
 
     @property
-    def sender(self) -> Literal["arm", "auctioneer"]:
+    def sender(self) -> Literal["arm", "auctioneer", "policy"]:
         """Who publishes, replies or shows the token."""
-        return "arm" if self.role == "arm" else "auctioneer"
+        return self.role if self.role in ("arm", "policy") else "auctioneer"
 
     @property
     def congestion(self) -> Literal["DROP", "BLOCK"]:
@@ -74,7 +74,7 @@ class Channel:
     @property
     def address(self) -> str:
         """The key with its parameters in braces."""
-        owner = {"arm": "/{arm}", "auction": "/{auctioneer}"}.get(self.role, "")
+        owner = {"arm": "/{arm}", "auction": "/{auctioneer}", "policy": "/{policy}"}.get(self.role, "")
         querier = "" if self.topic not in keys.ASKED else "/{peer}" if self.role == "arm" else "/{arm}"
         return f"{keys.PREFIX}/{{fleet}}/{self.role}{owner}/{self.topic}{querier}"
 
@@ -112,6 +112,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("jobs", "control", "query", operator.ControlRequest, operator.Controlled, receiver="operator"),
     Channel("jobs", "cell", "query", cell.CellRequest, cell.Cell),
     Channel("clock", "now", "query", auction.ClockRequest, auction.Clock),
+    Channel("policy", "act", "query", policy.ActRequest, policy.ActReply, receiver="auctioneer, or simulated shift"),
 )
 CHANNEL: Mapping[tuple[str, str], Channel] = {(channel.role, channel.topic): channel for channel in CHANNELS}
 """By role and topic."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator
+from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator, policy
 from fleet.bus.protocol.registry import MESSAGES, MessageType
 from fleet.job import Job, Work
 
@@ -55,15 +55,12 @@ def schema_document() -> Schema:
 @cache
 def descriptions(kind: type) -> Mapping[str, str]:
     """The text under each field of a class in its source, in one line each; fields without text are left out."""
-    body = next(
-        node.body
-        for node in ast.parse(inspect.getsource(sys.modules[kind.__module__])).body
-        if isinstance(node, ast.ClassDef) and node.name == kind.__name__
-    )
+    tree = ast.parse(inspect.getsource(sys.modules[kind.__module__]))
+    body = next((node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__), ())
     texts: dict[str, str] = {}
     for source in FIELD_SOURCES.get(kind, ()):
         texts |= descriptions(source)
-    for field, text in pairwise(body):
+    for field, text in pairwise(body):  # none of `ArmObservation`, which is made of a table
         if (
             isinstance(field, ast.AnnAssign)
             and isinstance(field.target, ast.Name)
@@ -79,7 +76,7 @@ def _structs() -> Mapping[str, MessageType]:
     """Every struct that occurs in the schemas, by name."""
     return {
         name: value
-        for module in (messages, auction, cell, consensus, history, operator)
+        for module in (messages, auction, cell, consensus, history, operator, policy)
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, msgspec.Struct)
     }

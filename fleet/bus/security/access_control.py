@@ -14,7 +14,7 @@ import msgspec
 from fleet.bus.protocol import keys
 from fleet.errors import BusError, nearest
 
-Role = Literal["router", "arm", "auctioneer", "submitter", "operator", "monitor", "recorder"]
+Role = Literal["router", "arm", "auctioneer", "submitter", "operator", "monitor", "recorder", "policy"]
 ROLES: tuple[str, ...] = get_args(Role)
 LONGEST_COMMON_NAME = 64
 """Characters (X.520, ub-common-name)."""
@@ -32,7 +32,7 @@ class Participant(msgspec.Struct, frozen=True):
     """A participant that may connect."""
 
     name: str
-    """The name in the keys of an arm or an auctioneer."""
+    """The name in the keys of an arm, an auctioneer or a policy."""
     role: Role
 
     def __post_init__(self) -> None:
@@ -91,7 +91,8 @@ class Roster(msgspec.Struct, frozen=True):
 
 
 def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = (), *, auctioneer: bool = True) -> Roster:
-    """The roster of a fleet: these arms, one participant of every other role, named like the role, and the extra ones.
+    """The roster of a fleet: these arms, one participant of every other role but `policy`, named like the role, and
+    the extra ones.
 
     Args:
         auctioneer: Whether the fleet has one.
@@ -99,7 +100,8 @@ def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = (), 
     Raises:
         ValueError: a name occurs twice, is empty, or is too long.
     """
-    roles = [role for role in get_args(Role) if role != "arm" and (auctioneer or role != "auctioneer")]
+    left_out = ("arm", "policy") if auctioneer else ("arm", "policy", "auctioneer")
+    roles = [role for role in get_args(Role) if role not in left_out]
     others = tuple(Participant(role, role) for role in roles)
     return Roster(fleet, (*others, *(Participant(arm, "arm") for arm in arms), *extra))
 
@@ -158,7 +160,7 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
         own = keys.all_of(fleet, "auction", participant.name)
         return Rights(
             publishes=(own, keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")),
-            queries=(quotes, awards, history, time, status),
+            queries=(quotes, awards, history, time, status, keys.of_every_policy(fleet)),
         )
     if participant.role in ("submitter", "operator"):
         reset = keys.of_every_arm(fleet, "reset")
@@ -167,6 +169,8 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
         return Rights(queries=(keys.of_jobs(fleet, "submit"), *operator, status, cell, quotes, time))
     if participant.role in ("monitor", "recorder"):
         return Rights(queries=(status, cell, time))
+    if participant.role == "policy":
+        return Rights(publishes=(keys.all_of(fleet, "policy", participant.name),))
     return Rights()
 
 

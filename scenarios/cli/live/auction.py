@@ -33,10 +33,11 @@ from scenarios.cli.options import ENDPOINT, EndpointOption, PolicyOption, Scenar
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, progress_bar
 from scenarios.job_stream import draw_jobs
-from scenarios.live.allocation import central_allocation
+from scenarios.live.allocation import ON_BUS_S, central_allocation
 from scenarios.live.cell import cell_message
 from scenarios.live.space import cell_space
 from scenarios.load import load
+from scenarios.policy_loader import OnBus
 from scenarios.schema import Scenario
 
 log = logging.getLogger(__name__)
@@ -64,7 +65,8 @@ def auction_command(
 ) -> None:
     """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
     chosen = load(scenario)
-    allocate = central_allocation(policy, chosen, seed, ends=jobs == "scenario")
+    bus = OnBus(fleet=fleet or chosen.name, endpoint=endpoint, limit_s=ON_BUS_S)
+    allocate = central_allocation(policy, chosen, seed, ends=jobs == "scenario", bus=bus)
     own = own_jobs(chosen, seed) if jobs == "scenario" else []
     fleet, folder = folder_of(journal, fleet, chosen)
     refuse_other_way(folder, (arm.name for arm in chosen.arms), alone=False)

@@ -7,7 +7,7 @@ from typing import Any  # values of a card
 
 import numpy as np
 
-from scenarios.policy_loader import label
+from scenarios.policy_loader import is_on_bus, label
 from scenarios.report.page import escape, html_page, paragraph, table
 from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
 from scenarios.run.evaluate import FIGURES
@@ -244,11 +244,15 @@ def _repeat(judged: Judged) -> Iterator[str]:
     card = judged.card
     rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
     rows += [(name, _plain(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
-    rows += [(f"policy {label(name)}", digest or "of the code") for name, digest in card["policies"].items()]
+    rows += [(f"policy {label(name)}", digest or _without_file(name)) for name, digest in card["policies"].items()]
     yield table((), rows)
     hashes = [(name, digest) for name, digest in card["instances"].items()]
     yield f"<details><summary>Hashes of {len(hashes)} scenarios</summary>{table((), hashes)}</details>"
     yield paragraph("Every shift is a row of results.parquet beside this page; study.json has these hashes.", "faint")
+
+
+def _without_file(policy: str) -> str:
+    return "in another process, no file" if is_on_bus(policy) else "of the code"
 
 
 def _plain(value: object) -> str:
