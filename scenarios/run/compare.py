@@ -85,7 +85,8 @@ class Comparison:
     def title(self) -> str:
         """What was compared, with the seeds if they follow each other."""
         first, last = self.seeds[0], self.seeds[-1]
-        seeds = f", seeds {first} to {last}" if self.seeds == tuple(range(first, last + 1)) else ""
+        consecutive = self.seeds == tuple(range(first, first + len(self.seeds)))
+        seeds = f", seeds {first} to {last}" if consecutive else ""
         return f"{self.scenario}{seeds} ({self.unit})"
 
     def _repr_html_(self) -> str:
