@@ -135,3 +135,12 @@ def test_the_scope_of_every_policy_is_shown_and_which_read_no_messages(scenario,
         lines = [" ".join(line.split()) for line in page.getvalue().splitlines()]
         assert {"random arm", "round_robin central"} <= set(lines)
         assert ("Central policies read no messages: round_robin." in lines) is said
+
+
+@pytest.mark.parametrize(
+    ("seeds", "title"), [((3, 4, 5), "s, seeds 3 to 5 (u)"), ((1, 7), "s (u)"), ((0, 10**15), "s (u)")]
+)
+def test_a_title_names_seeds_that_follow_each_other(seeds, title):
+    """Seeds of the suite's instances are 32-bit numbers; a range from the first to the last would take all memory."""
+    result = Comparison("s", seeds, "u", 2, "a", {}, {}, PERFECT.described(), "")
+    assert result.title == title
