@@ -209,7 +209,7 @@ def test_studies_of_other_settings_are_refused(study: Study, tmp_path: Path):
         ({"status": "interrupted"}, "not finished"),
         ({"randomise": {**card["randomise"], "ambient_k": [1, 2]}}, "no randomisation"),
         ({"channel": {**card["channel"], "loss": 0.5}}, "bus of each instance"),
-        ({"instances": {"quickstart": "0" * 16}}, "no instance of the split"),
+        ({"instances": {"quickstart": "0" * 16}}, "no instance of a split"),
     ):
         with pytest.raises(FleetError, match=said):
             submission.submissions_of(card | change, [], "Ann", "")
