@@ -127,7 +127,7 @@ def test_everybody_has_a_pair_and_the_roster_names_them(folder):
     assert roster == of_arms("f", ARMS)
     files = {participant.file for participant in roster.participants} | {"ca"}
     assert {p.name for p in folder.iterdir()} == {f"{f}.{end}" for f in files for end in ("pem", "key")} | {ROSTER}
-    assert set(lifetimes(folder, roster)) == {*ARMS, "ca", *get_args(Role)} - {"arm"}
+    assert set(lifetimes(folder, roster)) == {*ARMS, "ca", *get_args(Role)} - {"arm", "policy"}
     for participant in roster.participants:
         assert certificates.common_name(check(folder, participant.file)) == participant.common_name
 
