@@ -17,12 +17,13 @@ import numpy as np
 from fleet.errors import ScenarioError, nearest, printable
 from scenarios.schema import Scenario
 from scenarios.schema_errors import check_finite, plain_kind, readable_error
+from scenarios.suite.cells import SPLITS
 
 MOST_BYTES = 10_000_000
 """Of a scenario file."""
 MOST_JOBS = 100_000
 """Largest number of expected jobs in a shift: a mistyped gap would give billions."""
-INSTANCE = re.compile(r"(train|validation|test|sizes)/\d+")
+INSTANCE = re.compile(rf"({'|'.join(SPLITS)})/\d+")
 """Names of the suite's instances."""
 APART_M = 0.2
 """Smallest distance of two bases: a Gen3 base is 0.09 m wide, and its first joint must turn freely."""

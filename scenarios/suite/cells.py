@@ -14,7 +14,7 @@ from scenarios.suite.trades import TradeName
 
 SplitName = Literal["train", "validation", "test", "sizes"]
 SPLITS: tuple[SplitName, ...] = ("train", "validation", "test", "sizes")
-JUDGED: tuple[SplitName, ...] = ("validation", "test", "sizes")
+JUDGED = SPLITS[1:]
 """On which policies are judged."""
 Unlike = Literal["alike", "usual", "mixed"]
 SPREAD: dict[Unlike, float] = {"alike": 0.2, "usual": 0.7, "mixed": 0.7}

@@ -125,8 +125,8 @@ def test_shifts_have_different_names_and_the_same_seed_and_count_their_decisions
         policy.act(seen())
     one.reset(np.random.default_rng(6))
     one.act(seen())
-    told = [json.loads(server.requests.get(timeout=PATIENT_S)[2]) for _ in range(4)]
-    shifts, seeds, decisions = zip(*((each["shift"], each["seed"], each["decision"]) for each in told), strict=True)
+    requests = [json.loads(server.requests.get(timeout=PATIENT_S)[2]) for _ in range(4)]
+    shifts, seeds, decisions = zip(*((each["shift"], each["seed"], each["decision"]) for each in requests), strict=True)
     assert decisions == (0, 0, 1, 0)
     assert shifts[0] == shifts[2]
     assert len(set(shifts)) == 3

@@ -115,9 +115,9 @@ def test_compare_tells_the_failure_and_goes_on(small_toml):
         options = ["--policies", f"wspt,bus:mine@{router.endpoint}", "--difficulty", "blind", "--seeds", "2", "--json"]
         command = [*COMMAND, "compare", str(small_toml), *options]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S * 4, check=False)
-    told = json.loads(done.stdout)
-    assert "No process serves the policy 'mine' at tcp/127.0.0.1" in json.dumps(told)
-    assert "policy_client.py" in json.dumps(told)
+    comparison = json.loads(done.stdout)
+    assert "No process serves the policy 'mine' at tcp/127.0.0.1" in json.dumps(comparison)
+    assert "policy_client.py" in json.dumps(comparison)
 
 
 def test_names_of_policies_on_the_bus():

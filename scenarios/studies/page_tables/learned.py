@@ -28,7 +28,6 @@ def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
     return {
         "learned_test": lambda: _by_size(
             results / "leaderboard", "test", {
-                "all instances": lambda arms: arms > 0,
                 "trained sizes": lambda arms: np.isin(arms, list(TRAINED)),
                 "other sizes": lambda arms: ~np.isin(arms, list(TRAINED)) & (arms < max(TRAINED)),
                 "larger": lambda arms: arms > max(TRAINED),
@@ -36,7 +35,6 @@ def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
         ),
         "learned_sizes": lambda: _by_size(
             results / "leaderboard", "sizes", {
-                "all instances": lambda arms: arms > 0,
                 "7 to 10 arms": lambda arms: arms <= 10,
                 "11 to 14 arms": lambda arms: (arms > 10) & (arms < max(TRAINED)),
                 "20 and 24 arms": lambda arms: arms > max(TRAINED),
@@ -46,7 +44,7 @@ def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
 
 
 def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Array]]) -> str:
-    """Differences of normalised scores to the best rule on a split, by groups of numbers of arms."""
+    """Differences of normalised scores to the best rule on a split: on all instances, and by numbers of arms."""
     found = {each.card.policy: each for each in read_all(folder, split) if each.card.difficulty == SOURCE}
     values = normalised(
         {name: each.study_rows() for name, each in found.items()}, split_references(split), failed_as_random=True
@@ -54,8 +52,8 @@ def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Ar
     assert values is not None
     arms = np.array([len(instance(name).scenario.arms) for name in values.instances])
     parts: dict[str, Scores] = {}
-    for name, chosen in groups.items():
-        own = values.only(chosen(arms))
+    for name, chosen in {"all instances": np.ones_like, **groups}.items():
+        own = values.only(chosen(arms).astype(bool))
         parts[f"{name} ({len(own.instances)} in {len(set(own.cells))} cells)"] = scores_of(own, BASELINE)
     rows: list[tuple[str, ...]] = []
     for name in ranked(next(iter(parts.values()))):
