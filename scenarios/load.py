@@ -9,7 +9,7 @@ from inspect import Parameter, signature
 from itertools import combinations, pairwise
 from math import dist, isfinite
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -17,12 +17,14 @@ import numpy as np
 from fleet.errors import ScenarioError, nearest, printable
 from scenarios.schema import Scenario
 from scenarios.schema_errors import check_finite, plain_kind, readable_error
-from scenarios.suite.cells import SPLITS
 
 MOST_BYTES = 10_000_000
 """Of a scenario file."""
 MOST_JOBS = 100_000
 """Largest number of expected jobs in a shift: a mistyped gap would give billions."""
+SplitName = Literal["train", "validation", "test", "sizes"]
+SPLITS: tuple[SplitName, ...] = get_args(SplitName)
+"""Of the suite."""
 INSTANCE = re.compile(rf"({'|'.join(SPLITS)})/\d+")
 """Names of the suite's instances."""
 APART_M = 0.2

@@ -34,8 +34,8 @@ def leaderboard_command(
     as the mean of random. With --verify, repeated shifts must give equal figures.
     """
     from scenarios.leaderboard.board import best_text, board_of, board_text, read_all, remark_text
+    from scenarios.load import SplitName
     from scenarios.statistics.scores import score_tables
-    from scenarios.suite.cells import SplitName
 
     split = choose("split", split, SplitName)
     if not folder.is_dir():

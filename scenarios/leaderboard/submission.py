@@ -14,12 +14,13 @@ from fleet.bus.exchange.channel import PERFECT
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
 from scenarios.bounds.references import Reference
+from scenarios.load import SplitName
 from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.fleet import RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import FIGURES, Outcome
-from scenarios.suite.cells import JUDGED, SplitName
+from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import Row as Line
 from scenarios.suite.splits import line_of, manifest
 from scenarios.trials.cases import suite_of

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
+from scenarios.load import SPLITS, SplitName
 from scenarios.schema import ArmSpec
 from scenarios.suite.layouts import Layout, LayoutName, layout_of
 from scenarios.suite.trades import TradeName
 
-SplitName = Literal["train", "validation", "test", "sizes"]
-SPLITS: tuple[SplitName, ...] = ("train", "validation", "test", "sizes")
 JUDGED = SPLITS[1:]
 """On which policies are judged."""
 Unlike = Literal["alike", "usual", "mixed"]

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 
 from fleet.errors import FleetError, nearest
-from scenarios.load import INSTANCE, library, load
-from scenarios.suite.cells import SPLITS
+from scenarios.load import INSTANCE, SPLITS, library, load
 from scenarios.suite.splits import Instance, instance, split
 from scenarios.trials.plan import Case, seeds_of_instance
 

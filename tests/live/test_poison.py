@@ -156,7 +156,10 @@ def participants(tmp_path_factory, small):
             arms=("arm_0",),
         )
         arm.estimate((JOB,))
+        gc.collect()
+        gc.freeze()  # what other tests left would be searched again for each message
         yield arm, auction
+        gc.unfreeze()
 
 
 def odd(draw, message):
