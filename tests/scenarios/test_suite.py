@@ -7,13 +7,13 @@ import pytest
 
 from fleet.errors import ScenarioError
 from scenarios.job_stream import all_works
-from scenarios.load import load
+from scenarios.load import SPLITS, load
 from scenarios.prepare.fleet import prepare
 from scenarios.report.load_factor import load_factor
 from scenarios.scenario_hash import scenario_content
 from scenarios.schema import BusSpec, Scenario
 from scenarios.suite.axes import BUSES, DUE, Axes, scenario_of
-from scenarios.suite.cells import CELLS, SPLITS, layout
+from scenarios.suite.cells import CELLS, layout
 from scenarios.suite.layouts import layout_of
 from scenarios.suite.splits import cell_of_instance, drawn_rows, instance, manifest, split
 
