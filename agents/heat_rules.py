@@ -1,6 +1,6 @@
-"""Central rules that consider heat and value: one by measured temperatures, one by predicted peak temperatures.
+"""Rules that consider heat and value: one by measured temperatures, the others by predicted peak temperatures.
 
-Both match arms and jobs by value per time. Warning and error limit follow from the observed headrooms.
+All take the jobs with the most value per time. Warning and error limit follow from the observed headrooms.
 """
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from agents.assignment import Ahead, Matching
-from agents.policy import per_option
+from agents.policy import Local, per_option
 from fleet.observation import Observation
 
 Array = np.ndarray
@@ -122,6 +122,13 @@ class WseptAhead(Ahead, Wsept):
     Scope central, as `wsept`.
     """
 
+    only_choices = True
+
+
+class WseptLocal(Local):
+    """As `wsept` for a fleet of one: every arm claims the job that is worth most per time to it. Scope arm."""
+
+    central = Wsept
     only_choices = True
 
 

@@ -50,6 +50,28 @@ class ArmPolicy(_Resettable, Protocol):
         ...
 
 
+class Local:
+    """Base of policies of scope `arm`: a central policy that is given the arm's own observation only.
+
+    It needs no message of a peer. Arms may claim the same job; then the env decides, and the others claim again.
+    """
+
+    scope: ClassVar = "arm"
+    central: ClassVar[Callable[[], Policy]]
+    """Makes the central policy."""
+
+    def __init__(self) -> None:
+        self._policy = type(self).central()
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+        self._policy.reset(rng)
+
+    def choose(self, observation: Observation, place: int) -> int:
+        """The action of the central policy for a fleet of this arm."""
+        return self._policy.act({"": observation})[""]
+
+
 class EveryArm:
     """Runs an arm policy for all arms: one instance per arm, which sees this arm's observation only."""
 
