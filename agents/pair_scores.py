@@ -17,7 +17,7 @@ import numpy as np
 
 from agents.assignment import Matching
 from agents.pairs import FILLS, PAIR_FEATURES, Worth, pairs_of
-from agents.policy import plans_of
+from agents.policy import Local, plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import FIELDS, Observation
@@ -132,6 +132,13 @@ class WseptLearned(PairPolicy):
 
     def __init__(self) -> None:
         super().__init__(shipped_parameters())
+
+
+class WseptLearnedLocal(Local):
+    """As `wsept_learned` for a fleet of one: every arm claims the job with the highest score for it. Scope arm."""
+
+    central = WseptLearned
+    only_choices = True
 
 
 def _without_empty(seen: Observation) -> Observation:

@@ -8,7 +8,7 @@ from agents.consensus import Consensus
 from agents.dispatching import Atc, Edd, Fifo, LeastLoaded, Spt
 from agents.heat_guards import FuzzySpeed, Guard, Shutdown, TorqueLimiter
 from agents.heat_rules import Thermometer, Wsept, WseptAhead, WseptLocal
-from agents.pair_scores import WseptLearned
+from agents.pair_scores import WseptLearned, WseptLearnedLocal
 from agents.policy import ArmPolicy, Policy, for_all_arms
 from agents.rolling_horizon import RollingHorizon
 from agents.rules import CoolestFirst, LeastDifficulty, RandomLegal, RoundRobin, Wspt, WsptCool
@@ -51,6 +51,9 @@ RULES: dict[str, Rule] = {
     "wsept_ahead": Rule(WseptAhead, "time per expected worth, with arms that are home soon", "Rothkopf 1966"),
     "wsept_local": Rule(WseptLocal, "time per expected worth, each arm for itself", "Rothkopf 1966"),
     "wsept_learned": Rule(WseptLearned, "time per learned worth", "Salimans et al. 2017"),
+    "wsept_learned_local": Rule(
+        WseptLearnedLocal, "time per learned worth, each arm for itself", "Salimans et al. 2017"
+    ),
     "auction": Rule(Auction, "time per expected worth, within n · ε", "Bertsekas 1988"),
     "rolling_horizon": Rule(RollingHorizon, "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"),
     "ssi": Rule(Ssi, _THERMAL, _SSI),

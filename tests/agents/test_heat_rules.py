@@ -101,9 +101,10 @@ def test_claims_of_two_arms_are_matched_by_total_worth() -> None:
 
 
 def test_without_other_arms_the_rule_of_one_arm_is_the_central_one() -> None:
-    """The second arm, too, takes the first job, which a matching leaves to the first arm; it does not read its peers."""
+    """Without a matching both arms take the first job; no arm reads its peers."""
     one, other = seen([4.0, 3.9], [50.0] * 4), seen([4.0, 3.8], [50.0] * 4)
     assert list(make_policy("wsept").act({"a": one, "b": other}).values()) == [3, 1]
     assert list(make_policy("wsept_local").act({"a": one, "b": other}).values()) == [1, 1]
-    for alone in (one, other):
-        assert make_policy("wsept_local").act({"a": alone}) == make_policy("wsept").act({"a": alone})
+    for rule in ("wsept", "wsept_learned"):
+        for alone in (one, other):
+            assert make_policy(f"{rule}_local").act({"a": alone}) == make_policy(rule).act({"a": alone})
