@@ -57,11 +57,11 @@ class Local:
     """
 
     scope: ClassVar = "arm"
-    central: ClassVar[Callable[[], Policy]]
-    """Makes the central policy."""
+    central: ClassVar[type[Policy]]
+    """The central policy."""
 
     def __init__(self) -> None:
-        self._policy = type(self).central()
+        self._policy = self.central()
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift."""
