@@ -195,11 +195,12 @@ class Engine:
         """Put what the arms of some envs know now into `out`, float32 [env, arm, size]."""
         self._run(OBSERVE, _NO_ACTIONS, _NO_TERMS, envs, out)
 
-    def step(self, actions: Array, out: Array, until: Array | None = None) -> tuple[Array, Array, Array]:
+    def step(self, actions: Array | None, out: Array, until: Array | None = None) -> tuple[Array, Array, Array]:
         """One decision interval of every env, or more.
 
         Args:
-            actions: int64 [env, arm]; anything outside the mask is a wait, and counted.
+            actions: int64 [env, arm]; anything outside the mask is a wait, and counted. None: nobody is asked, and the
+                outcome of the last claims remains.
             out: Receives what the arms know afterwards, float32 [env, arm, size].
             until: Go on while no arm has a `choice`, to this tick at most, int64 [env]. The events and the trace are
                 then those of the last interval alone.
@@ -207,12 +208,16 @@ class Engine:
         Returns:
             Weighted reward terms [env, term], their sum [env], and which envs have done all their jobs, bool [env].
         """
+        self._clear_events()
+        if actions is None:
+            return self._stepped(MOVE + OBSERVE, _NO_ACTIONS, out, until)
         return self._stepped(CLAIM + MOVE + OBSERVE, actions, out, until)
 
-    def claim(self, actions: Array) -> None:
+    def claim(self, actions: Array | None) -> None:
         """The first part of `step` alone: award jobs. `move` must follow."""
         self._clear_events()
-        self._run(CLAIM, actions, _NO_TERMS, self._all, _NO_VECTORS)
+        if actions is not None:
+            self._run(CLAIM, actions, _NO_TERMS, self._all, _NO_VECTORS)
 
     def move(self, drive: Drive, out: Array) -> tuple[Array, Array, Array]:
         """The rest of `step`, for arms that were seen to move.
@@ -233,8 +238,6 @@ class Engine:
         self, parts: int, actions: Array, out: Array, until: Array | None = None
     ) -> tuple[Array, Array, Array]:
         terms = np.empty((self.envs, len(TERMS) + 1))
-        if parts & CLAIM:
-            self._clear_events()
         if self._pool is None:
             self._run(parts, actions, terms, self._all, out, until)
         else:

@@ -189,14 +189,15 @@ class ShiftRunner:
         """Decision intervals that are over."""
         return int(self._engine.state.tick[0])
 
-    def step(self, actions: Array) -> tuple[Array, float, bool]:
+    def step(self, actions: Array | None) -> tuple[Array, float, bool]:
         """One decision interval: weighted reward terms [term], their sum, and whether all jobs are done.
 
         Args:
-            actions: int64 [arm].
+            actions: int64 [arm]. None: nobody is asked, and the outcome of the last claims remains.
         """
         engine, world, plant = self._engine, self._episode.world, self._episode.plant
-        terms, reward, finished = _stepped(engine, world, plant, actions[None], self._vectors)
+        chosen = None if actions is None else actions[None]
+        terms, reward, finished = _stepped(engine, world, plant, chosen, self._vectors)
         if len(engine.events.what):
             self.events += events_of(world, engine.state, engine.events)
         if self._reports_contacts:
@@ -216,7 +217,9 @@ class ShiftRunner:
 _FIRST = np.zeros(1, dtype=int)
 
 
-def _stepped(engine: Engine, world: World, plant: Plant, actions: Array, out: Array) -> tuple[Array, Array, Array]:
+def _stepped(
+    engine: Engine, world: World, plant: Plant, actions: Array | None, out: Array
+) -> tuple[Array, Array, Array]:
     if plant.follows_plans:
         return engine.step(actions, out)
     engine.claim(actions)

@@ -193,7 +193,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         last_tick, before = min(self.world.ticks, self._max_cycles or self.world.ticks), shift.tick
         parts, reward, finished = shift.step(chosen)
         while self._until_choice and not finished and shift.tick < last_tick and not shift.choice:
-            more, earned, finished = shift.step(np.zeros_like(chosen))
+            more, earned, finished = shift.step(None)
             parts, reward = parts + more, reward + earned
         over = not finished and shift.tick >= last_tick
         observations, masks = self._observations()

@@ -32,7 +32,7 @@ class Hindsight:
     """For `scenarios.bounds.schedule.Replay`."""
     evaluations: int
     seconds: float
-    """CPU time of the search."""
+    """CPU time of the search after its first simulation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class Budget:
     """
 
     seconds: float = 30.0
-    """CPU time; inf for no limit."""
+    """CPU time after the first simulation, which may compile the simulator; inf for no limit."""
     evaluations: int = 1_000_000
     """Simulated shifts."""
     nodes: int = 2000
@@ -68,8 +68,7 @@ def hindsight(
         starts: Results in the same shift of policies, for example.
         seed: Of the changes.
     """
-    budget, began_s = budget or Budget(), time.process_time()
-    rng, first = np.random.default_rng(seed), int(starts.reward.argmax())
+    budget, rng, first = budget or Budget(), np.random.default_rng(seed), int(starts.reward.argmax())
     best, best_claims = float(starts.reward[first]), starts.claims[first]
     changes = _Changes(simulator, rng)
     if changes.none:
@@ -78,6 +77,7 @@ def hindsight(
     value = float(simulator.world.jobs.value[0][simulator.world.jobs.exists[0]].sum())
     tried = stack([present, changes.freed(present)])
     result = simulator.run(tried)
+    began_s = time.process_time()  # that run may have compiled the simulator, for a minute
     at = int(result.reward.argmax())
     current, score = changes.in_order(tried, result, at), float(result.reward[at])
     record, since, begun = current, 0, simulator.evaluations

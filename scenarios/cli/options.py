@@ -214,10 +214,12 @@ def parse_randomisation(texts: list[str] | None) -> "Randomisation | None":
     for text in texts:
         try:
             found = tomllib.loads(text)
-        except (ValueError, RecursionError) as error:
+        except (ValueError, RecursionError):
+            found = None
+        if not found:
             raise FleetError(
                 f"--randomise must be FIELD=VALUE in TOML, as in 'ambient_k=[-2,8]' (got '{printable(text)}')."
-            ) from error
+            )
         for name in found:
             if name not in allowed:
                 raise FleetError(f"--randomise has no field '{printable(name)}'{nearest(name, allowed)}")

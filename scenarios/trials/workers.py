@@ -1,5 +1,8 @@
 """Run units on several processes, here or on a Ray cluster; those of a process that dies are run again."""
 
+import os
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -19,7 +22,9 @@ MOST_DEATHS = 3
 
 
 IDLE_S = 120.0
-"""A process without work ends after this time, also that of a command that was killed."""
+"""A process without work ends after this time."""
+PARENT_CHECK_S = 1.0
+"""A process looks this often whether the command that began it was killed."""
 
 
 class Worker(Protocol):
@@ -50,7 +55,8 @@ class LocalWorker:
         self._pool = self._new()
 
     def _new(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, context=get_context("loky"), env={"OMP_NUM_THREADS": "1"}, timeout=IDLE_S)
+        how = {"context": get_context("loky"), "env": {"OMP_NUM_THREADS": "1"}, "timeout": IDLE_S}
+        return ProcessPoolExecutor(1, initializer=_end_with, initargs=(os.getpid(),), **how)
 
     def submit(self, unit: Unit) -> "Future[list[Row]]":
         """Begin a unit."""
@@ -69,6 +75,17 @@ class LocalWorker:
     def close(self) -> None:
         """End the process."""
         self._pool.shutdown(wait=True, kill_workers=True)
+
+
+def _end_with(parent: int) -> None:
+    """End this process soon after its parent, also in the middle of a unit."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_CHECK_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 class Queue:

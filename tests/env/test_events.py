@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from agents.registry import RULES, make_policy
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.engine.state import State
 from fleet.env.allocation_v1 import parallel_env
@@ -42,6 +43,21 @@ def test_an_episode_ends_the_same_in_fewer_steps(small, seed) -> None:
     assert sum(seconds) == sum(intervals)
     assert len(seconds) < len(intervals) / 2
     assert set(intervals) == {10.0}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_policy_plays_the_same_shift_with_both_lengths_of_steps(small, name) -> None:
+    """Also one that reads which claims lost, which is known at once and not only at the next choice."""
+    ends = []
+    for decisions in ("interval", "events"):
+        env, policy = parallel_env(small.Shifts(ticks=80, crowding=0.5), decisions=decisions), make_policy(name)
+        for seed in range(3):
+            env.reset(seed=seed)
+            policy.reset(np.random.default_rng(seed))
+            while env.agents:
+                env.step(policy.act(env.knowledge()))
+            ends.append(env.truth.finished_s)
+    np.testing.assert_array_equal(ends[:3], ends[3:])
 
 
 def test_a_step_ends_as_soon_as_an_arm_may_claim_a_job(small) -> None:

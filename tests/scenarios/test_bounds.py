@@ -1,5 +1,6 @@
 """Bounds of the reward: no play exceeds the upper one, the search is between its start and the proven optimum."""
 
+import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -87,6 +88,27 @@ def test_search_finds_the_proven_optimum_of_tiny_shifts(small, seed, jobs):
     assert starts.reward.max() <= found.reward <= best + 1e-9
     assert found.reward == pytest.approx(best, abs=1e-9)
     assert best <= upper_bound(Relaxation(world, weights, 10.0)).reward
+
+
+def test_time_to_compile_is_no_part_of_the_search(small, monkeypatch):
+    clock_s = 0.0
+    monkeypatch.setattr(time, "process_time", lambda: clock_s)
+
+    class Compiling(ShiftSimulator):
+        """Takes a minute for its first simulation and a second for each other one."""
+
+        def run(self, schedules):
+            nonlocal clock_s
+            clock_s += 1.0 if clock_s else 60.0
+            return super().run(schedules)
+
+    world, _ = small.Shifts().shop(small.Shifts().drawn(np.random.SeedSequence(1))[0])
+    starts = played(world, DEAR, 1)
+    simulator, budget = Compiling(world, DEAR, 8), Budget(seconds=10.0)
+    found = hindsight(simulator, starts, np.random.SeedSequence(0), budget)
+    assert found.seconds == 10.0
+    assert found.evaluations >= 10 * 8
+    assert clock_s == 70.0
 
 
 def test_a_schedule_runs_the_same_compiled_and_not(small):
