@@ -4,12 +4,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from statistics import median
 
 from fleet.errors import FleetError
 from scenarios.bounds.command import markdown
 from scenarios.bounds.references import Reference, load_references
 from scenarios.doc_tables import table
 from scenarios.leaderboard.submission import Submission, check, read, split_references
+from scenarios.load import SPLITS
 from scenarios.statistics.scores import Scores, ranked, score_cells, scores_of
 from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import manifest
@@ -138,6 +140,35 @@ def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
     )
 
 
+def references_text() -> str:
+    """A line for each split: how its references were found, and how far their two bounds are apart, as Markdown."""
+    rows: list[tuple[str, ...]] = []
+    for split in SPLITS:
+        found = list(split_references(split).values())
+        effort = [(each.evaluations, each.nodes) for each in found]
+        least, most = min(effort), max(effort)
+        rows.append(
+            (
+                split,
+                f"{len(found)} of {len(manifest(split))}",
+                *(f"{a:,}" if a == b else f"{a:,} to {b:,}" for a, b in zip(least, most, strict=True)),
+                f"{median(each.gap for each in found):.2f}",
+                f"{median(each.normalised(each.best_rule) for each in found):.2f}",
+                f"{sum(each.hindsight > each.best_rule for each in found)}",
+            )
+        )
+    heads = (
+        "split",
+        "instances",
+        "shifts of a search",
+        "nodes",
+        "gap, median",
+        "best policy, median",
+        "search is better",
+    )
+    return table(heads, rows)
+
+
 def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
     """Text of each table of docs/leaderboard.md and docs/bounds.md by the name in its mark.
 
@@ -150,5 +181,6 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
 
     return {
         "bounds": lambda: markdown(load_references(results / "bounds_library.jsonl")),
+        "references": references_text,
         **{f"leaderboard_{split}": partial(board, split) for split in JUDGED},
     }
