@@ -1,9 +1,9 @@
 """CPU time and memory of `thermofleet show` and `run` for 100 arms, 1 000 jobs and eight hours.
 
-    python benchmarks/scaling/commands.py [--arms 100] [--hours 8] [--jobs 1000] [--bus memory] [--out FILE]
+    python benchmarks/scaling/commands.py [--arms 100] [--hours 8] [--jobs 1000] [--out FILE]
 
-`show` runs twice: with an empty cache, when it plans the work of all arms, and again. CPU time is that of all threads
-of the command; memory is the most that it held.
+`show` runs twice: with an empty cache, when it plans the work of all arms, and again. `run` shares over Zenoh, and then
+in memory. CPU time is that of all threads of the command; memory is the most that it held.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from hall import hall, toml_of
 COMMAND = [sys.executable, "-c", "from scenarios.cli.main import main; main()"]
 
 
-def measured(arguments: list[str], cache: str) -> dict[str, object]:
+def measured(arguments: list[str], cache: str) -> dict[str, float]:
     """Wall and CPU seconds and MB of a command."""
     began = time.monotonic()
     environment = os.environ | {"THERMOFLEET_CACHE": cache, "OMP_NUM_THREADS": "1"}
@@ -29,7 +29,6 @@ def measured(arguments: list[str], cache: str) -> dict[str, object]:
     if status:
         raise SystemExit(f"thermofleet {' '.join(arguments)} failed: {process.stderr and process.stderr.read()}")
     return {
-        "command": arguments[0],
         "cpu_s": round(used.ru_utime + used.ru_stime, 1),
         "wall_s": round(time.monotonic() - began, 1),
         "most_mb": round(used.ru_maxrss * 1024 / 1e6),
@@ -42,21 +41,23 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=100)
     parser.add_argument("--hours", type=float, default=8.0)
     parser.add_argument("--jobs", type=int, default=1000)
-    parser.add_argument("--bus", choices=("memory", "zenoh"), default="memory")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         file, cache = Path(folder) / "hall.toml", str(Path(folder) / "cache")
         file.write_text(toml_of(hall(given.arms, hours=given.hours, jobs=given.jobs, cycles=(100, 200))), "utf-8")
-        how = ["--policy", "matching", "--difficulty", "blind", "--bus", given.bus, "--out", str(Path(folder) / "run")]
-        commands = [["show", str(file)], ["show", str(file)], ["run", str(file), *how]]
-        rows = [measured(each, cache) for each in commands]
-    rows[0]["command"] = "show, plans included"
+        run = ["run", str(file), "--policy", "matching", "--difficulty", "blind", "--out"]
+        commands = {
+            "show, plans included": ["show", str(file)],
+            "show": ["show", str(file)],
+            "run": [*run, str(Path(folder) / "zenoh")],
+            "run --bus memory": [*run, str(Path(folder) / "memory"), "--bus", "memory"],
+        }
+        rows = [{"command": name, **measured(command, cache)} for name, command in commands.items()]
     result = {
         "arms": given.arms,
         "hours": given.hours,
         "jobs": given.jobs,
-        "bus": given.bus,
         "cores": os.cpu_count(),
         "load_average": [round(load, 2) for load in os.getloadavg()],
         "commands": rows,

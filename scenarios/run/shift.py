@@ -28,7 +28,7 @@ from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
 
 RUN_FORMAT = 6
 """Raised when run.json or the columns of the recordings change so that an earlier version cannot be read."""
-AT_ONCE = 50_000
+AT_ONCE = 20_000
 """Readings of an arm that are computed at a time."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 

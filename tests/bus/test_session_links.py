@@ -124,6 +124,19 @@ def test_a_word_that_does_not_come_leaves_the_last_one_with_its_age(gate, make_w
         until_all_is_heard(bus, make_words, 1e6 + 20.0)
 
 
+def test_messages_of_arms_that_share_a_session_pass_the_router(gate, make_words):
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=SHORT_S, sessions=1) as bus:
+        until_all_is_heard(bus, make_words, 0.0)
+        bus.share(make_words(np.random.default_rng(0), 3, 1e6))
+        late = bus.late
+        gate.says[0].clear()
+        heard = bus.share(make_words(np.random.default_rng(1), 3, 1e6 + 10.0))
+        np.testing.assert_array_equal(heard.age_s, 10.0 * (1 - np.eye(3)))
+        assert bus.late == late + 6
+        gate.says[0].set()
+        until_all_is_heard(bus, make_words, 1e6 + 20.0)
+
+
 def test_in_a_new_episode_nothing_is_known_of_an_arm_that_is_silent(gate, make_words):
     rng = np.random.default_rng(0)
     with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=SHORT_S) as bus:

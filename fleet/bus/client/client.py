@@ -263,8 +263,8 @@ class BusClient:
         Args:
             history: Also receive what publishers have cached, now and after a break, and messages lost in transit.
             own: Also receive what this client publishes.
-            wake: Wake `serve` for a message. Otherwise it waits in Zenoh, without Python's global lock, until `serve`
-                handles another one.
+            wake: Wake `serve` for a message. Otherwise it waits in Zenoh, without Python's global lock, for the next
+                call of `serve`.
         """
         channel = channel_for(expression, "publish", kind)
         origin = zenoh.Locality.ANY if own else zenoh.Locality.REMOTE

@@ -13,7 +13,8 @@ from fleet.telemetry import MODES
 
 Message = TypeVar("Message", State, DifficultyScores)
 
-_POLL_S = 0.002
+_SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.002
+"""Between two looks at what has arrived. Waking for every message costs more, as it takes the GIL from publishers."""
 SILENT_AFTER = 3
 """A peer that missed this many steps in a row is not waited for until one of its messages arrives."""
 
@@ -67,15 +68,19 @@ class _Latest(Generic[Message]):
 
 
 class Group:
-    """The arms that share one client, and the messages they received; in small fleets one arm.
+    """The arms that share clients, and the messages they received; in small fleets one arm.
 
     Attributes:
         members: Indices of these arms in the fleet.
+        reader: The client that receives.
     """
 
-    def __init__(self, client: BusClient, arms: tuple[str, ...], members: Sequence[int]) -> None:
-        """Declare the publishers, subscribers and tokens of these arms."""
-        self.client, self.members = client, tuple(members)
+    def __init__(self, client: BusClient, reader: BusClient, arms: tuple[str, ...], members: Sequence[int]) -> None:
+        """Declare the publishers and tokens of these arms with `client`, their subscribers with `reader`.
+
+        Several arms need two clients, so that what they receive of each other passes the router, too.
+        """
+        self.reader, self.members = reader, tuple(members)
         self._index = {arm: index for index, arm in enumerate(arms)}
         self._tick, self._now_s = -1, -math.inf
         self._present: set[int] = set()
@@ -85,18 +90,18 @@ class Group:
         self.scores = _Latest[DifficultyScores](len(arms))
         self._misses = [0] * len(arms)
         """Steps in a row in which a peer was not received."""
+        fleet = client.fleet
         # A single arm has its own messages without the bus.
-        own, fleet = len(self.members) > 1, client.fleet
-        # A state travels ahead of its scores, which wake the reader for both.
-        client.subscribe(keys.of_every_arm(fleet, "state"), State, self._receive, own=own, wake=False)
-        client.subscribe(keys.of_every_arm(fleet, "difficulty"), DifficultyScores, self._receive, history=True, own=own)
-        client.watch_tokens(keys.of_every_arm(fleet, "alive"), self._token)
+        states, scores = keys.of_every_arm(fleet, "state"), keys.of_every_arm(fleet, "difficulty")
+        reader.subscribe(states, State, self._receive, own=False, wake=False)
+        reader.subscribe(scores, DifficultyScores, self._receive, history=True, own=False, wake=False)
+        reader.watch_tokens(keys.of_every_arm(fleet, "alive"), self._token)
         self._publishers = [_Publishers(client, arms[index]) for index in self.members]
 
     def begin_step(self, tick: int, now_s: float) -> None:
         """Handle the messages that arrived since the last step, `tick`, and choose the peers to wait for."""
         self._tick, self._now_s = tick, now_s
-        self.client.serve()
+        self.reader.serve()
         self._awaited = {sender for sender in self._present if self._misses[sender] < SILENT_AFTER}
 
     def publish(self, tick: int, now_s: float, messages: Sequence[tuple[State, DifficultyScores]]) -> None:
@@ -117,18 +122,18 @@ class Group:
     def await_peers(self, deadline_s: float) -> list[int]:
         """Wait for the token of every arm, and return the arms without one at the deadline."""
         while (missing := len(self._misses) - len(self._present)) and time.monotonic() < deadline_s:
-            self.client.serve(deadline_s, at_least=missing)
+            self.reader.serve(deadline_s, at_least=missing)
         return [index for index in range(len(self._misses)) if index not in self._present]
 
     def await_messages(self, deadline_s: float) -> list[int]:
         """Wait for the messages of this step, and return the peers of which one is missing."""
-        late = False
-        while (missing := self._missing(self.scores.ticks)) and not late:
+        pause_s, late = _SHORTEST_PAUSE_S, False
+        self.reader.serve()
+        while self._missing() and not late:
             late = time.monotonic() >= deadline_s  # what has arrived by then is handled once more
-            self.client.serve(deadline_s, at_least=missing)
-        # Only if a state is lost: no other message of this step will wake the reader.
-        while self._missing(self.conditions.ticks) and time.monotonic() < deadline_s:
-            self.client.serve(min(deadline_s, time.monotonic() + _POLL_S))
+            time.sleep(0.0 if late else pause_s)
+            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+            self.reader.serve()
         missed = []
         for sender, tick in enumerate(map(min, self.scores.ticks, self.conditions.ticks)):
             self._misses[sender] = self._misses[sender] + 1 if tick < self._tick else 0
@@ -136,9 +141,10 @@ class Group:
                 missed.append(sender)
         return missed
 
-    def _missing(self, ticks: list[int]) -> int:
-        """Number of peers whose message of this step is awaited, given the last step received of each sender."""
-        return sum(ticks[sender] < self._tick for sender in self._awaited)
+    def _missing(self) -> bool:
+        """Whether a message of this step is awaited."""
+        ticks = self.conditions.ticks, self.scores.ticks
+        return any(of[sender] < self._tick for of in ticks for sender in self._awaited)
 
     def _receive(self, arm: str, message: State | DifficultyScores) -> None:
         sender = self._index.get(arm)
@@ -146,7 +152,7 @@ class Group:
             return
         tick, time_s = message.tick, message.time_s
         if tick > self._tick or time_s > self._now_s or (tick == self._tick and time_s != self._now_s):
-            self.client.reject(
+            self.reader.reject(
                 f"{type(message).__name__} of '{arm}' is of step {tick} at {time_s} s, but it is step {self._tick} at "
                 f"{self._now_s} s."
             )

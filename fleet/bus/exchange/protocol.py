@@ -5,11 +5,12 @@ the same arrays.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.telemetry import MODES, Mode
@@ -45,7 +46,10 @@ class Broadcast:
 
 @dataclass(frozen=True, eq=False)
 class PeerView:
-    """What every arm knows of every arm after a step, [receiver, sender, ...]; of itself, its own broadcast."""
+    """What every arm knows of every arm after a step, [receiver, sender, ...]; of itself, its own broadcast.
+
+    Do not write to the arrays: receivers with the same knowledge share memory.
+    """
 
     mode: Array
     """int, [receiver, sender]; UNHEARD if nothing was received."""
@@ -128,19 +132,18 @@ def assemble(now_s: float, jobs: tuple[str, ...], conditions: AllConditions, sco
 
     The age is that of the older of both contents.
     """
-    row, states = _distinct(conditions)
-    mode = np.array([*(MODES.index(state.mode) for state in states), UNHEARD])[row]
-    headroom_k = np.array([*(state.headroom_k for state in states), math.nan])[row]
-    busy_s = np.array([*(state.busy_s for state in states), math.nan])[row]
-    state_s = np.array([*(state.time_s for state in states), -math.inf])[row]
+    spread, states = _distinct(conditions)
+    mode = spread([*(MODES.index(state.mode) for state in states), UNHEARD])
+    headroom_k = spread([*(state.headroom_k for state in states), math.nan])
+    busy_s = spread([*(state.busy_s for state in states), math.nan])
+    state_s = spread([*(state.time_s for state in states), -math.inf])
 
-    row, contents = _distinct(scores)
+    spread, contents = _distinct(scores)
     table = np.full((2, len(contents) + 1, len(jobs)), np.nan)
-    together: dict[int, list[int]] = {}  # contents of one broadcast share its jobs
+    together: dict[tuple[str, ...], list[int]] = {}  # in most steps all contents have the same jobs
     for index, content in enumerate(contents):
-        together.setdefault(id(content.jobs), []).append(index)
-    for indices in together.values():
-        known = contents[indices[0]].jobs
+        together.setdefault(content.jobs, []).append(index)
+    for known, indices in together.items():
         values = np.array([(contents[i].difficulty, contents[i].p_saturation) for i in indices], dtype=float)
         values = values.swapaxes(0, 1)  # None became NaN
         if known == jobs:
@@ -150,8 +153,8 @@ def assemble(now_s: float, jobs: tuple[str, ...], conditions: AllConditions, sco
         slots = [slot for slot, name in enumerate(jobs) if name in columns]
         table[:, np.array(indices)[:, None], slots] = values[:, :, [columns[jobs[slot]] for slot in slots]]
     table[:, :, [slot for slot, name in enumerate(jobs) if not name]] = np.nan
-    scores_s = np.array([*(content.time_s for content in contents), -math.inf])[row]
-    difficulty, p_saturation = table[:, row]
+    scores_s = spread([*(content.time_s for content in contents), -math.inf])
+    difficulty, p_saturation = map(spread, table)
     return PeerView(mode, headroom_k, busy_s, difficulty, p_saturation, now_s - np.minimum(state_s, scores_s))
 
 
@@ -215,9 +218,12 @@ def check_order(time_s: float, last_s: float) -> None:
         raise ValueError(f"Broadcast of {time_s:g} s after that of {last_s:g} s; begin() starts a new episode.")
 
 
-def _distinct(contents: Sequence[Sequence[Content | None]]) -> tuple[Array, list[Content]]:
-    """[receiver, sender] index of each content in the list of distinct ones; -1 (its end) for None."""
-    rows = {id(row): row for row in contents}  # arms that share a client share one list
+def _distinct(contents: Sequence[Sequence[Content | None]]) -> tuple[Callable[[ArrayLike], Array], list[Content]]:
+    """The distinct contents, and a function from their values, and one for None, to [receiver, sender, ...].
+
+    Receivers that share one list, as those that share a client, share memory in its result.
+    """
+    rows = {id(row): row for row in contents}
     flat = [content for row in rows.values() for content in row]
     ids = np.fromiter(map(id, flat), np.int64, len(flat))
     _, first, which = np.unique(ids, return_index=True, return_inverse=True)
@@ -225,4 +231,10 @@ def _distinct(contents: Sequence[Sequence[Content | None]]) -> tuple[Array, list
     there = np.array([content is not None for content in found])
     number = np.where(there, np.cumsum(there) - 1, -1)[which].reshape(len(rows), -1)
     place = {key: i for i, key in enumerate(rows)}
-    return number[[place[id(row)] for row in contents]], [content for content in found if content is not None]
+    row = [place[id(row)] for row in contents]
+
+    def spread(values: ArrayLike) -> Array:
+        of_rows = np.asarray(values)[number]
+        return of_rows[row] if len(rows) > 1 else np.broadcast_to(of_rows[0], (len(row), *of_rows.shape[1:]))
+
+    return spread, [content for content in found if content is not None]

@@ -1,7 +1,7 @@
 """The exchange over Zenoh: what an arm knows of its peers arrived over the bus.
 
-In small fleets every arm has its own client. In large ones arms share a few, as the messages that n sessions receive
-from n arms grow with n², and with them memory and the time for discovery.
+In small fleets every arm has its own client. In large ones all arms publish with one and receive with another, as the
+messages that n sessions receive from n arms grow with n², and with them memory and the time for discovery.
 
 At each step an arm publishes its `state` and then its `difficulty`, over the same connection. It publishes `info` when
 it changes, and a liveliness token shows that the arm is present.
@@ -35,23 +35,24 @@ from fleet.bus.exchange.protocol import (
     checked_arms,
 )
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
 
-Message = TypeVar("Message")
+Message = TypeVar("Message", State, DifficultyScores)
 
-MOST_OWN_SESSIONS, SHARED_SESSIONS = 8, 4
-"""Largest fleet whose arms have a session each, and the number of sessions that a larger one shares."""
+MOST_OWN_SESSIONS = 8
+"""Largest fleet whose arms have a session each; a larger one has two, one to publish and one to receive."""
 MOST_NAMED = 8
 """Arms listed in one message."""
 _OPEN_TIMEOUT_S = 20.0
 
 
 def sessions_for(arms: int) -> int:
-    """Number of sessions of a fleet without certificates."""
-    return arms if arms <= MOST_OWN_SESSIONS else SHARED_SESSIONS
+    """Number of sessions from which a fleet without certificates publishes."""
+    return arms if arms <= MOST_OWN_SESSIONS else 1
 
 
 class ZenohExchange:
@@ -82,7 +83,8 @@ class ZenohExchange:
             tls: Folder with a certificate of every arm, and of `router` to start one. The endpoint then begins with
                 `tls/`, and may be on any host.
             timeout_s: Longest wait of `share` for missing messages.
-            sessions: Most sessions that the arms share; by default `sessions_for` them. With `tls` each has its own.
+            sessions: Most sessions from which the arms publish; by default `sessions_for` them. Arms that share one
+                receive with another. With `tls` each has its own.
 
         Raises:
             BusError: the endpoint is not on loopback.
@@ -106,8 +108,8 @@ class ZenohExchange:
         self._timeout_s = timeout_s
         self._delivery = None if channel.perfect else Delivery(self.arms, channel)
         self._groups: list[Group] = []
-        # Every client receives the messages of every arm; the first one decodes them.
-        self._read = lru_cache(4 * count)(read_message)
+        # Where several clients receive the messages of every arm, the first one decodes them.
+        self._read = read_message if self._sessions == 1 else lru_cache(4 * count)(read_message)
         self._tick = -1
         self._now_s = -math.inf
         self._missed: set[tuple[int, int]] = set()
@@ -137,7 +139,11 @@ class ZenohExchange:
             clients = [self._resources.enter_context(self._client(arm)) for arm in self.arms[: self._sessions]]
             self._refuse_namesakes(clients[0])
             everybody = range(len(self.arms))
-            self._groups = [Group(client, self.arms, everybody[i :: len(clients)]) for i, client in enumerate(clients)]
+            for i, client in enumerate(clients):
+                members = everybody[i :: len(clients)]
+                alone = len(members) == 1
+                reader = client if alone else self._resources.enter_context(self._client(self.arms[i]))
+                self._groups.append(Group(client, reader, self.arms, members))
             deadline_s = time.monotonic() + _OPEN_TIMEOUT_S
             for group in self._groups:
                 if missing := group.await_peers(deadline_s):
@@ -196,14 +202,15 @@ class ZenohExchange:
                 if receiver != sender
             }
         )
-        self.malformed = sum(group.client.malformed for group in self._groups)
+        self.malformed = sum(group.reader.malformed for group in self._groups)
+        states, difficulties = zip(*messages, strict=True)
         if self._delivery is None:
-            conditions = self._by_receiver([group.conditions.last for group in self._groups])
-            scores = self._by_receiver([group.scores.last for group in self._groups])
+            conditions = self._by_receiver([group.conditions.last for group in self._groups], states)
+            scores = self._by_receiver([group.scores.last for group in self._groups], difficulties)
             return assemble(self._now_s, broadcast.jobs, conditions, scores)
         # On a channel that is not perfect, a message that the bus itself delivers a step late is lost.
-        conditions = self._by_receiver([group.conditions.of(self._tick) for group in self._groups])
-        scores = self._by_receiver([group.scores.of(self._tick) for group in self._groups])
+        conditions = self._by_receiver([group.conditions.of(self._tick) for group in self._groups], states)
+        scores = self._by_receiver([group.scores.of(self._tick) for group in self._groups], difficulties)
         self._delivery.carry(self._now_s, conditions, scores)
         self.delivered, self.late = self._delivery.delivered, self._delivery.late
         return assemble(self._now_s, broadcast.jobs, self._delivery.conditions, self._delivery.scores)
@@ -246,9 +253,16 @@ class ZenohExchange:
         except BusError:
             _LOG.exception("While closing after another error:")
 
-    def _by_receiver(self, of_groups: list[list[Message | None]]) -> list[list[Message | None]]:
-        """[receiver][sender], from what each group received."""
-        return [of_groups[i % len(of_groups)] for i in range(len(self.arms))]
+    def _by_receiver(self, of_groups: list[list[Message | None]], own: Sequence[Message]) -> list[list[Message | None]]:
+        """[receiver][sender], from what each group received and the messages of this step, [arm].
+
+        An arm has its own message, also when the bus did not bring it back.
+        """
+        rows = [of_groups[i % len(of_groups)] for i in range(len(self.arms))]
+        return [
+            row if (last := row[i]) is not None and last.tick == self._tick else [*row[:i], own[i], *row[i + 1 :]]
+            for i, row in enumerate(rows)
+        ]
 
     def _refuse_namesakes(self, client: BusClient) -> None:
         present = client.tokens(keys.of_every_arm(self._fleet, "alive"), timeout_s=self._timeout_s)
