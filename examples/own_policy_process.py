@@ -14,6 +14,9 @@ from urllib.parse import quote
 
 import zenoh
 
+MOST_WAITING = 32
+"""Requests, of up to 4 MiB; when more wait, the oldest is dropped."""
+
 
 def act(request):
     """Return the actions of arms by name; those that are left out wait."""
@@ -63,7 +66,7 @@ def main(port, policy):
         sys.exit(f"No router at port {port}.")
     with session:  # an open session could keep the process from exiting
         key = f"thermofleet/v4/*/policy/{quote(policy, safe='')}/act"  # of any fleet
-        queries = session.declare_queryable(key, complete=True)
+        queries = session.declare_queryable(key, zenoh.handlers.RingChannel(MOST_WAITING), complete=True)
         print(f"ready {policy}", flush=True)
         for query in queries:
             with query:  # finishes it

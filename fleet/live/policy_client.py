@@ -74,7 +74,7 @@ class PolicyClient:
             raise BusError(
                 f"{error} The {self._whose} is reached there: start a router with thermofleet router, then its process."
             ) from error
-        replies = client.query_and_wait(self._key, request, ActReply, timeout_s=self._limit_s)
+        replies = client.query_and_wait(self._key, request, ActReply, timeout_s=self._limit_s, most=2)
         actions = dict(self._reply_in(replies, request).actions)
         for arm, action in actions.items():
             if arm not in observations:
@@ -89,8 +89,8 @@ class PolicyClient:
     def _reply_in(self, replies: Replies[ActReply], request: ActRequest) -> ActReply:
         """The only reply."""
         refusals = [reason for reason in replies.refused.values() if reason]
-        if (count := len(replies.messages) + len(refusals)) > 1:
-            raise BusError(f"{count} processes reply as {self._whose}: stop all but one.")
+        if len(replies.messages) + len(refusals) > 1:
+            raise BusError(f"Several processes reply as {self._whose}: stop all but one.")
         if refusals:
             raise BusError(f"The {self._whose} gave no actions: {printable(refusals[0])}")
         if replies.messages and not replies.refused:
@@ -102,7 +102,10 @@ class PolicyClient:
             )
         if replies.refused or replies.took_s >= self._limit_s:
             raise BusError(f"The {self._whose} did not reply and finish the query within {self._limit_s:g} s.")
-        raise BusError(f"No process serves the {self._whose}: start it; it must declare a queryable of '{self._key}'.")
+        raise BusError(
+            f"No process serves the {self._whose}, or it dropped the request: start it; it must declare a queryable of "
+            f"'{self._key}', and reply soon enough that few requests wait."
+        )
 
 
 def _message(arm: str, observation: Observation) -> ArmObservation:

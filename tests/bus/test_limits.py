@@ -12,7 +12,7 @@ import zenoh
 from fleet.bus.client.rate_limits import Limits
 from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol import keys
-from fleet.bus.security.access_control import of_arms
+from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
 
@@ -127,6 +127,33 @@ def test_a_question_and_an_answer_that_are_too_big_are_dropped(connect):
     assert answers(LIMIT - 1) == [LIMIT, 2]
     assert asked == [LIMIT, LIMIT - 1]
     queryable.undeclare()
+
+
+@pytest.mark.parametrize("asked", [f"{EVENT}/@adv/pub/1", "thermofleet/v4/f/**/@adv/**"])
+def test_a_question_to_a_cache_is_not_larger_than_others(connect, asked):
+    sizes: queue.Queue[int] = queue.Queue()
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            sizes.put(0 if query.payload is None else len(query.payload))
+
+    queryable = connect("arm_0").declare_queryable(f"{EVENT}/@adv/pub/1", reply)
+    settled(connect("arm_0"))
+    for size in (LIMIT + 1, 2 * LIMIT, LIMIT):
+        assert list(connect("monitor").get(asked, payload=b"q" * size, timeout=PATIENT_S)) == []
+    assert sizes.get(timeout=PATIENT_S) == LIMIT
+    queryable.undeclare()
+
+
+def test_without_a_policy_in_the_roster_no_request_may_be_large():
+    """Only of parameters does the router not know the size: it does not assemble them."""
+    without, policy = of_arms("f", ["arm_0"]), of_arms("f", ["arm_0"], [Participant("mine", "policy")])
+    largest = [
+        (max(size["size_limit"] for size in limits.settings(roster)["low_pass_filter"]), limits.assembled_bytes(roster))
+        for limits in [Limits()]
+        for roster in (without, policy, None)
+    ]
+    assert largest == [(LIMIT, 3 * LIMIT), *2 * [(64 * LIMIT, 65 * LIMIT)]]
 
 
 def test_telemetry_too_often_is_thinned_to_the_limit(connect):

@@ -9,10 +9,12 @@ from contextlib import ExitStack
 import pytest
 
 from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.client.query import MOST_REPLIES
+from fleet.bus.client.replies import Replies
 from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, ArmEvent, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
-from fleet.bus.protocol.messages import Refusal, encoding
+from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, decode, encode, encoding
 from fleet.errors import BusError
 from tests.waiting import serve_until
 
@@ -72,6 +74,46 @@ def test_a_refusal_is_told_in_words(bus):
     asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
     serve_until(lambda: got, asker, teller)
     assert got[0].refused == {keys.of_clock("f"): "No clock here."}
+
+
+@pytest.mark.parametrize("part", ["payload", "attachment", "parameters"])
+def test_a_large_question_is_refused_before_it_waits(bus, part):
+    """To a key with a wildcard, as the router lets it through; nobody serves the one who is asked."""
+    asker, teller = bus(), bus()
+    asked = []
+    teller.reply_to(keys.of_clock("f"), ClockRequest, asked.append)
+    meet(asker, teller)
+    key, large = "thermofleet/v4/f/*/now", "x" * (MOST_BYTES + 1)
+    options = {} if part == "parameters" else {part: large}
+    (reply,) = raw(asker).get(f"{key}?{large}" if part == "parameters" else key, **options, timeout=PATIENCE_S)
+    assert str(reply.ok.encoding) == encoding(Refusal)
+    assert decode(Refusal, reply.ok.payload.to_bytes()).reason == (
+        "The request has 65,537 bytes, and at most 65,536 are allowed."
+    )
+    teller.serve()
+    assert (teller.malformed, asked) == (1, [])
+
+
+@pytest.mark.parametrize("most", [2, MOST_REPLIES])
+def test_a_flood_of_answers_ends_the_question(bus, most):
+    asker, flooder = bus(), bus()
+    held = []
+
+    def flood(query):
+        held.append(query)  # so that it does not end
+        for _ in range(most + 1):
+            query.reply(keys.of_clock("f"), encode(Clock(1.0, 1.0)), encoding=encoding(Clock))
+
+    raw(flooder).declare_queryable(keys.of_clock("f"), flood, complete=True)
+    meet(asker, flooder)
+    got = asker.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENCE_S, most=most)
+    assert len(got.messages) == most
+    assert got.refused == {"?": f"More than {most} replies to one query; no more are read."}
+
+
+def test_a_large_answer_is_not_decoded():
+    with pytest.raises(MalformedMessage, match="It has 65,537 bytes, and at most 65,536 are allowed"):
+        Replies().take(keys.of_clock("f"), encoding(Clock), encode(Clock(1.0, 1.0)).ljust(MOST_BYTES + 1), Clock)
 
 
 def test_two_that_ask_each_other_do_not_block(bus):

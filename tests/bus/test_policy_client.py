@@ -152,6 +152,20 @@ def test_a_reply_that_cannot_be_used_is_an_error_within_the_limit(router, served
         client(router, LIMIT_S).act(seen())
 
 
+def test_a_flood_of_replies_is_not_waited_for(router):
+    held = []
+
+    def flood(query):
+        held.append(query)  # so that it is not finished
+        for _ in range(3):
+            query.reply(str(query.key_expr), '{"actions": {}}', encoding=ACT_REPLY)
+
+    with open_client(router.endpoint, timeout_s=PATIENT_S) as impostor:
+        impostor.declare_queryable(KEY, flood, complete=True)
+        with refused("Several processes reply as policy 'mine'", 2.0):
+            client(router).act(seen())
+
+
 def test_a_decision_without_a_valid_reply_is_requested_again(router, served):
     broken = served("nonsense")
     policy = client(router)
@@ -169,7 +183,7 @@ def test_nobody_two_and_no_router_are_told_apart_at_once(router, served):
         client(router).act(seen())
     for _ in range(2):
         served('{"actions": {}}')
-    with refused("2 processes reply as policy 'mine' at tcp/.*: stop all but one", 2.0):
+    with refused("Several processes reply as policy 'mine' at tcp/.*: stop all but one", 2.0):
         client(router).act(seen())
     nowhere = PolicyClient("mine", fleet="f", endpoint="tcp/127.0.0.1:1", limit_s=PATIENT_S)
     with refused("No router answered at tcp/127.0.0.1:1 .* start a router with thermofleet router", CONNECT_S + 2.0):

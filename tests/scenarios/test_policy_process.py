@@ -2,17 +2,23 @@
 
 import json
 import os
+import queue
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zenoh
 
-from fleet.bus.client.router import Router
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol.messages import encoding
+from fleet.bus.protocol.policy import ActRequest
 from fleet.errors import BusError, FleetError
 from scenarios.load import load
 from scenarios.policy_loader import is_built_in, is_on_bus, label, policy_of, scope_of, source_of
@@ -21,10 +27,11 @@ from scenarios.run.evaluate import outcomes, play
 from scenarios.run.shift import RunSpec, run
 from scenarios.trials import contest
 from scenarios.trials.plan import Case, Study, policy_hash
-from tests.bus.test_policy_client import seen
-from tests.examples.programs import COMMAND, ROOT, running
+from tests.bus.test_policy_client import KEY, seen
+from tests.examples.programs import COMMAND, ROOT, running, started
 from tests.waiting import PATIENCE_S
 
+MOST_WAITING = 32
 SAME_RULE = """
 class Quickest:
     scope = "central"
@@ -108,6 +115,21 @@ def test_a_process_that_ends_or_hangs_in_a_shift_fails_the_shift(fleet, served):
     process.wait(PATIENCE_S)
     ended = play(fleet, on_bus, [0, 1])
     assert all("No process serves the policy 'mine'" in str(shift.error) for shift in ended)
+
+
+def test_few_requests_wait_for_a_process_and_the_oldest_are_dropped():
+    busy = "import threading, own_policy_process as p; p.act = lambda _: threading.Event().wait(); p.main({}, 'mine')"
+    ended: queue.Queue[int] = queue.Queue()
+    with Router() as router, open_client(router.endpoint, timeout_s=PATIENCE_S) as session:
+        command = [sys.executable, "-c", busy.format(router.endpoint.rsplit(":", 1)[1])]
+        with started(command, cwd=ROOT / "examples") as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready mine\n"
+            for number in range(1 + MOST_WAITING + 3):
+                handler = zenoh.handlers.Callback(lambda _: None, partial(ended.put, number))
+                session.get(KEY, handler, payload="{}", encoding=encoding(ActRequest), timeout=2 * PATIENCE_S)
+            assert [ended.get(timeout=PATIENCE_S) for _ in range(3)] == [1, 2, 3]
+            assert ended.empty()
 
 
 def test_compare_tells_the_failure_and_goes_on(small_toml):

@@ -23,11 +23,12 @@ import msgspec
 import zenoh
 from zenoh import ext as advanced
 
+from fleet.bus.client.query import MOST_REPLIES, PendingQuery
 from fleet.bus.client.queue import Mailbox
 from fleet.bus.client.replies import AnotherReplies, Replies, read_message
 from fleet.bus.client.router import connect, plain_reason
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode_as, encode, encoding
+from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode_as, encode, encoding
 from fleet.bus.protocol.registry import Channel, channel_for
 from fleet.bus.security.access_control import Participant, rights_by_role
 from fleet.bus.security.tls import participant_at
@@ -176,6 +177,7 @@ class BusClient:
         *,
         timeout_s: float,
         each: Callable[[Reply], None] = lambda reply: None,
+        most: int = MOST_REPLIES,
     ) -> None:
         """Query all that reply under a key or key expression; `done` gets the replies, complete or after the timeout.
 
@@ -183,6 +185,7 @@ class BusClient:
             kind: Message type of the replies; one that names another sender than its key is malformed.
             timeout_s: Real seconds. A stopped process costs this long, unless `each` has enough replies before.
             each: Called with every reply as it arrives.
+            most: Replies that are read; the next one ends the query, with a reason in `refused`.
 
         Raises:
             BusError: the client is not open, or its certificate does not allow the query: a router would drop it.
@@ -191,46 +194,27 @@ class BusClient:
         if channel.reply is not kind:
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
         self._check_may_query(key)
-        replies: Replies[Reply] = Replies()
-        start_s = time.monotonic()
-
-        def take(reply: zenoh.Reply) -> None:
-            if reply.ok is None:
-                replies.miss("" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace"))
-                return
-            replier = str(reply.ok.key_expr)
-            try:
-                message = replies.take(replier, str(reply.ok.encoding), reply.ok.payload.to_bytes(), kind)
-            except MalformedMessage as error:
-                self.reject(f"reply under '{replier}': {error}")
-            else:
-                if message is not None:
-                    each(message)
-
-        def finish() -> None:
-            replies.took_s = time.monotonic() - start_s
-            done(replies)
-
-        handler = _direct(partial(self.post, take), partial(self.post, finish))
+        pending = PendingQuery(kind, most=most, post=self.post, each=each, reject=self.reject, done=done)
         try:
             self._open().get(
                 key,
-                handler,
+                _direct(pending.receive, pending.finish),
                 payload=encode(request),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
+                cancellation_token=pending.token,
                 **_settings(channel, type(request)),
             )
         except zenoh.ZError as error:
             raise BusError(f"The query of '{key}' failed: {error}") from error
 
     def query_and_wait(
-        self, key: str, request: msgspec.Struct, kind: type[Reply], *, timeout_s: float
+        self, key: str, request: msgspec.Struct, kind: type[Reply], *, timeout_s: float, most: int = MOST_REPLIES
     ) -> Replies[Reply]:
         """As `query`, and serve until the replies are complete."""
         complete: list[Replies[Reply]] = []
-        self.query(key, request, kind, complete.append, timeout_s=timeout_s)
+        self.query(key, request, kind, complete.append, timeout_s=timeout_s, most=most)
         deadline_s = time.monotonic() + timeout_s + 1.0
         while not complete and time.monotonic() < deadline_s:
             self.serve(deadline_s)
@@ -245,7 +229,7 @@ class BusClient:
         request that names another arm than that key is malformed.
         """
         channel_for(key, "query", kind)
-        receive = _direct(lambda query: self.post(self._reply, key, query, kind, handle))
+        receive = _direct(partial(self._receive, key, kind, handle))
         self._keep(self._open().declare_queryable(key, receive, complete=True))
 
     def subscribe(
@@ -355,6 +339,19 @@ class BusClient:
             self.reject(str(error))
         else:
             handle(name, present)
+
+    def _receive(
+        self, key: str, kind: type[Request], handle: Callable[[Request], msgspec.Struct], query: zenoh.Query
+    ) -> None:
+        """Queue a request; on Zenoh's thread. A large one is refused at once: many that wait would fill the memory."""
+        parts = (query.payload, query.attachment, str(query.parameters))
+        if (size := sum(len(part) for part in parts if part is not None)) <= MOST_BYTES:
+            self.post(self._reply, key, query, kind, handle)
+            return
+        refusal = Refusal(f"The request has {size:,} bytes, and at most {MOST_BYTES:,} are allowed.")
+        self.post(self.reject, f"query of '{key}': {refusal.reason}")
+        with query, suppress(ValueError):  # if there is no key to reply under
+            query.reply(keys.answered(key, str(query.key_expr)), encode(refusal), encoding=encoding(Refusal))
 
     def _reply(
         self, key: str, query: zenoh.Query, kind: type[Request], handle: Callable[[Request], msgspec.Struct]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import MOST_BYTES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.security.access_control import Roster
 
@@ -12,9 +13,9 @@ from fleet.bus.security.access_control import Roster
 class Limits:
     """What a router forwards from each session; the rest is dropped silently."""
 
-    message_bytes: int = 65_536
-    """Largest payload with its attachment, of a publication, a request or a reply; a request to a policy, or with a
-    wildcard or an unknown role in its key, may have `MOST_REQUEST_BYTES`."""
+    message_bytes: int = MOST_BYTES
+    """Largest payload with its attachment, of a publication, a request or a reply; with plain TCP, or a policy in the
+    roster, a request to a policy, or with a wildcard or an unknown role in its key, may have `MOST_REQUEST_BYTES`."""
     state_hz: float | None = None
     """Telemetry messages a second, real time, of each session, or with TLS of each arm; None for any number. A steady
     stream needs a limit of twice its rate, as Zenoh limits the gap between two messages, which varies."""
@@ -35,10 +36,11 @@ class Limits:
         all_keys = ["**", keys.caches_of("**")]
         # Of two filters that apply, the smaller one counts; only requests to policies may be larger.
         others = [f"{keys.PREFIX}/*/{role}/**" for role in keys.TOPICS if role != "policy"]
+        # Of two limits of one key expression the last one counts, so each has one.
         sizes = [
             _size(["put", "delete", "reply"], all_keys, self.message_bytes),
             _size(["query"], [*others, keys.caches_of("**")], self.message_bytes),
-            _size(["query"], all_keys, max(self.message_bytes, MOST_REQUEST_BYTES)),
+            _size(["query"], ["**"], self._request_bytes(roster)),
         ]
         if self.state_hz is None:
             return {"low_pass_filter": sizes}
@@ -54,10 +56,14 @@ class Limits:
         }
         return {"low_pass_filter": sizes, "downsampling": [rate]}
 
-    @property
-    def assembled_bytes(self) -> int:
+    def assembled_bytes(self, roster: Roster | None = None) -> int:
         """Largest fragmented message that the router assembles in memory before it checks its size."""
-        return max(2 * self.message_bytes, MOST_REQUEST_BYTES) + 65_536
+        return max(2 * self.message_bytes, self._request_bytes(roster)) + MOST_BYTES
+
+    def _request_bytes(self, roster: Roster | None) -> int:
+        """Largest request to a policy, if there may be one."""
+        without = roster is not None and not roster.of_role("policy")
+        return self.message_bytes if without else max(self.message_bytes, MOST_REQUEST_BYTES)
 
 
 def _size(messages: list[str], expressions: list[str], most_bytes: int) -> dict[str, Any]:

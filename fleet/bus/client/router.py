@@ -274,6 +274,10 @@ class Router:
         self.close()
 
     def _settings(self) -> zenoh.Config:
+        roster = None
+        if self._tls is not None:
+            self._tls.check(serves=True, links=bool(self._connect))
+            roster = read_roster(self._tls.folder)
         own = {
             "mode": "router",
             "listen": {"endpoints": [self._listen]},
@@ -281,17 +285,14 @@ class Router:
             "connect": {"endpoints": self._connect, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
             # The admin space holds the port that the system chose.
             "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
-            **self._limits.settings(),
+            **self._limits.settings(roster),
         }
-        link = {"tx": _SENDING, "rx": {"max_message_size": self._limits.assembled_bytes}}
-        if self._tls is not None:
-            self._tls.check(serves=True, links=bool(self._connect))
+        link = {"tx": _SENDING, "rx": {"max_message_size": self._limits.assembled_bytes(roster)}}
+        if self._tls is not None and roster is not None:
             link["tls"] = self._tls.link(serves=True)
             if self._connect:
                 link["tls"] |= self._tls.link(serves=False)
-            roster = read_roster(self._tls.folder)
             own["access_control"] = access_control(roster, self._tls.name)
-            own |= self._limits.settings(roster)
         return _config(own, link)
 
     def _where(self, session: zenoh.Session) -> str:

@@ -15,6 +15,8 @@ from fleet.errors import BusError
 from fleet.telemetry import Mode
 
 VERSION = 4
+MOST_BYTES = 65_536
+"""Of any message, with its attachment, but a request to a policy."""
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
 Person = Annotated[str, msgspec.Meta(max_length=128)]
 """Who requests something."""
@@ -176,8 +178,10 @@ def decode_as(kind: type[Message], sent_encoding: str, payload: bytes) -> Messag
     """The message of this type in a payload that was sent with an encoding.
 
     Raises:
-        MalformedMessage: another encoding, or not of this type.
+        MalformedMessage: larger than `MOST_BYTES`, another encoding, or not of this type.
     """
+    if len(payload) > MOST_BYTES:
+        raise MalformedMessage(f"It has {len(payload):,} bytes, and at most {MOST_BYTES:,} are allowed.")
     if sent_encoding != encoding(kind):
         raise MalformedMessage(f"It is encoded as '{sent_encoding}', not as '{encoding(kind)}'.")
     return decode(kind, payload)
