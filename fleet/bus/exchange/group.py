@@ -131,9 +131,8 @@ class Group:
         self.reader.serve()
         while self._missing() and not late:
             late = time.monotonic() >= deadline_s  # what has arrived by then is handled once more
-            time.sleep(0.0 if late else pause_s)
+            self.reader.serve(min(deadline_s, time.monotonic() + pause_s))
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-            self.reader.serve()
         missed = []
         for sender, tick in enumerate(map(min, self.scores.ticks, self.conditions.ticks)):
             self._misses[sender] = self._misses[sender] + 1 if tick < self._tick else 0
