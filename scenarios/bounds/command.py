@@ -97,9 +97,9 @@ def bounds_command(
     if format_ == "markdown":
         echo(markdown(found))
         return
-    shown = plain_table(*HEADS)
+    shown = plain_table(*heads_of(found))
     for each in found:
-        shown.add_row(*cells(each))
+        shown.add_row(*cells(each)[: len(shown.columns)])
     out_console.print(shown)
     if not show_only:
         say(f"Written to {out}.")
@@ -125,6 +125,11 @@ def tasks_of(names: str, seeds: int, first_seed: int) -> "list[Task]":
 HEADS = ("instance", "random", "best rule", "reward", "hindsight", "upper bound", "score of the rule", "gap", "CPU s")
 
 
+def heads_of(references: "Sequence[Reference]") -> tuple[str, ...]:
+    """Heads of their table: times, which come last, only where they are known."""
+    return HEADS if any(each.seconds is not None for each in references) else HEADS[:-1]
+
+
 def cells(each: "Reference") -> tuple[str, ...]:
     """One line of the table."""
     rewards = [f"{value:.1f}" for value in (each.best_rule, each.hindsight, each.upper)]
@@ -148,4 +153,5 @@ def markdown(references: "Sequence[Reference]") -> str:
         times = [each.seconds for each in own if each.seconds is not None]
         seconds = f"{sum(times) / len(times):.0f}" if times else ""
         lines.append((f"**{scenario}**, mean", random, "", *rewards, f"**{score:.3f}**", f"**{gap:.3f}**", seconds))
-    return table(HEADS, lines)
+    heads = heads_of(references)
+    return table(heads, [line[: len(heads)] for line in lines])

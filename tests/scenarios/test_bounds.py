@@ -15,6 +15,7 @@ from fleet.env.random_actions import random_legal
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.bounds import references as stored
+from scenarios.bounds.command import markdown
 from scenarios.bounds.exhaustive import optimum
 from scenarios.bounds.heat_budget import HeatBudget
 from scenarios.bounds.hindsight import Budget, hindsight
@@ -236,6 +237,8 @@ def test_a_budget_of_evaluations_gives_the_same_file_in_any_order(fleet: Fleet, 
         references([task], tmp_path / "twice.jsonl", budget, difficulty="blind", cache=plans)
     assert (tmp_path / "once.jsonl").read_bytes() == (tmp_path / "twice.jsonl").read_bytes()
     assert [each.instance for each in once] == ["three/2", "three/10"]
+    assert "CPU s" not in markdown(once)  # times would depend on other load, so they are unknown
+    assert "CPU s" in markdown([replace(once[0], seconds=1.0)])
 
 
 def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):
