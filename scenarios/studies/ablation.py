@@ -7,7 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -183,10 +183,15 @@ def stored(folder: Path, first: str) -> Ablation:
     Raises:
         FleetError: as `ablate`.
     """
+    scenario, plan = stored_plan(folder)
+    plan = replace(plan, scores=(first, *(name for name in plan.scores if name != first)))
+    return Ablation(scenario, plan, _effects(plan, _read_rows(folder)))
+
+
+def stored_plan(folder: Path) -> tuple[str, AblationPlan]:
+    """Scenario and plan of a finished ablation."""
     card = json.loads((folder / CARD).read_text(encoding="utf-8"))
-    scores = (first, *(name for name in card["plan"]["scores"] if name != first))
-    plan = msgspec.convert({**card["plan"], "scores": scores}, AblationPlan)
-    return Ablation(card["scenario"], plan, _effects(plan, _read_rows(folder)))
+    return card["scenario"], msgspec.convert(card["plan"], AblationPlan)
 
 
 def _append(out: Path, rows: Sequence[Row]) -> None:

@@ -12,7 +12,8 @@ from scenarios.studies.page_tables.steps import steps_table
 
 def cells(text: str) -> list[list[str]]:
     """The rows of a Markdown table without its headings."""
-    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()[2:]]
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:]]
 
 
 def test_a_difference_is_bold_if_its_interval_excludes_zero() -> None:
@@ -36,12 +37,14 @@ def test_an_ablation_has_means_and_differences_to_the_first_source(tmp_path) -> 
     head = "scores,fleet,training,seed,faults,value,reward"
     (folder / "ablation.csv").write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]) + "\n")
     (tmp_path / "twin_windows" / "active_waiting").symlink_to(folder)
-    faults, value, reward, *_ = cells(ablation_tables(tmp_path)["twin_windows"]())
+    text = ablation_tables(tmp_path)["twin_windows"]()
+    faults, value, reward, *_ = cells(text)
     assert faults[:2] == ["`heat_wave`: faults", "0.00"]
     assert value[1] == "10.5"  # of 5, 6, 15 and 16
     assert value[4].startswith("+2.0")
     assert value[2:4] == ["–", "–"]  # sources that were not measured
     assert reward[1] == "7.0"
+    assert "`heat_wave`: 2 fleets × 2 seeds" in text
 
 
 def test_cooling_has_differences_of_value_to_the_first_way(tmp_path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from scenarios.doc_tables import table
 from scenarios.run.compare import HEADINGS
+from scenarios.statistics.means import unit
 from scenarios.studies.page_tables.cells import difference
 
 SCENARIOS = ("heat_wave", "active_waiting")
@@ -18,12 +19,13 @@ def ablation_tables(results: Path) -> dict[str, Callable[[], str]]:
     """Text of each table by the name in its mark.
 
     Args:
-        results: With the folders `ablations/sources_SCENARIO`, `ablations/difficulty_SCENARIO` and
-            `twin_windows/SCENARIO` of `thermofleet ablate --out`.
+        results: With the folders `ablations/sources_SCENARIO` and `twin_windows/SCENARIO` of `thermofleet ablate
+            --out`, for one or more of `SCENARIOS`.
     """
-    sources = {name: results / f"ablations/sources_{name}" for name in SCENARIOS}
-    alone = {name: results / f"ablations/difficulty_{name}" for name in SCENARIOS}
-    windows = {name: results / "twin_windows" / name for name in SCENARIOS}
+    sources, windows = (
+        {name: path for name in SCENARIOS if (path := results / each.format(name)).is_dir()}
+        for each in ("ablations/sources_{}", "twin_windows/{}")
+    )
     return {
         "wrappers_measured": lambda: _wrappers(sources),
         "score_sources": lambda: _table(
@@ -33,18 +35,8 @@ def ablation_tables(results: Path) -> dict[str, Callable[[], str]]:
                 "wsept@blind": "blind",
                 "wsept@oracle": "oracle",
                 "thermometer@blind": "`thermometer`, blind",
-            },
-        ),
-        "difficulty_alone": lambda: _table(
-            alone,
-            {
-                "trained": "trained VAE",
-                "unweighted": "unweighted",
-                "untrained": "untrained VAE",
-                "torque": "RMS torque",
-                "weighted-torque": "RMS torque, weighted",
-                "random": "random",
-                "blind": "blind",
+                "limited:wspt@blind": "`limited:wspt`, blind",
+                "fuzzy:wspt@blind": "`fuzzy:wspt`, blind",
             },
         ),
         "twin_windows": lambda: _table(
@@ -65,7 +57,7 @@ def _wrappers(folders: Mapping[str, Path]) -> str:
         for name, folder in folders.items():
             scores = (bare, f"limited:{bare}", f"fuzzy:{bare}")
             rows += [(f"`{policy}`, `{name}`: {figure}", *cells) for figure, cells in _rows(folder, scores)]
-    return table(("policy, scenario", "bare", "`limited:`", "`fuzzy:`"), rows)
+    return table(("policy, scenario", "bare", "`limited:`", "`fuzzy:`"), rows) + _sizes(folders)
 
 
 def _table(folders: Mapping[str, Path], columns: Mapping[str, str]) -> str:
@@ -75,7 +67,16 @@ def _table(folders: Mapping[str, Path], columns: Mapping[str, str]) -> str:
         for name, folder in folders.items()
         for figure, cells in _rows(folder, tuple(columns))
     ]
-    return table(("", *columns.values()), rows)
+    return table(("", *columns.values()), rows) + _sizes(folders)
+
+
+def _sizes(folders: Mapping[str, Path]) -> str:
+    """A line on the numbers of fleets, trainings and seeds."""
+    from scenarios.studies.ablation import stored_plan
+
+    plans = {name: stored_plan(folder)[1] for name, folder in folders.items()}
+    sizes = {name: unit((plan.fleets, plan.trainings, plan.seeds)) for name, plan in plans.items()}
+    return "\n\n" + "; ".join(f"`{name}`: {size}" for name, size in sizes.items()) + "."
 
 
 def _rows(folder: Path, scores: tuple[str, ...]) -> Iterator[tuple[str, list[str]]]:
