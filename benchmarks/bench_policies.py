@@ -1,33 +1,38 @@
 """One shift of every policy, simulated and live: jobs finished and faults.
 
-    python benchmarks/bench_policies.py [quickstart] [--speed 240] [--seed 0] [--policies a,b]
-    python benchmarks/bench_policies.py --steps [--difficulty oracle]
+    python benchmarks/bench_policies.py [quickstart] [--speed 240] [--seed 0] [--policies a,b] [--out FILE]
+    python benchmarks/bench_policies.py --steps [--difficulty oracle] [--policies a,b] [--out FILE]
 
-Prints Markdown for docs/policies.md. A live shift is `thermofleet up` with a process for every participant; a shift of
-2 h at speed 240 takes 30 s. Policies are blind: no twin is trained.
+Writes the figures, and prints them as the tables of docs/policies.md and docs/learning.md that `thermofleet contract`
+makes of docs/results/live_policies.json and docs/results/steps.json. A live shift is `thermofleet up` with a process
+for every participant; a shift of 2 h at speed 240 takes 30 s. Policies are blind: no twin is trained.
 
-With --steps: the number of steps of a shift with `decisions="interval"` and `"events"`, and the share of them with a
-choice, for every scenario of the library and every policy, for docs/learning.md; also the share of the interval steps
-with a job in every slot. Exits with an error if the two kinds of steps give different results.
+With --steps: the number of steps of a shift with `decisions="interval"` and `"events"`, and how many of them have a
+choice and a job in every slot, for every scenario of the library and every policy. Exits with an error if the two kinds
+of steps give different results.
 """
 
 import argparse
+import json
 import subprocess
 import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import pyarrow.parquet as pq
 
 from agents.registry import RULES
 from fleet.env.validation import Decisions
+from fleet.files import atomic_path
 from scenarios.load import library, load
 from scenarios.policy_loader import label, policy_at, scope_of
 from scenarios.prepare.fleet import DifficultyName, Fleet, env_of, prepare
 from scenarios.run.shift import RunSpec, run
+from scenarios.studies.page_tables.policies import live_table
+from scenarios.studies.page_tables.steps import steps_table
 
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 PATIENCE_S = 120.0
@@ -84,40 +89,46 @@ def steps_of(fleet: Fleet, policy: str, seed: int, decisions: Decisions) -> Step
     return Steps(*counts, full, reward, env.truth.finished_s.tobytes())
 
 
-def print_steps(scenarios: list[str], policies: list[str], seed: int, difficulty: DifficultyName) -> None:
-    """Print the steps of a shift as a Markdown table.
+def measure_steps(scenarios: list[str], policies: list[str], seed: int, difficulty: DifficultyName) -> dict[str, Any]:
+    """The steps of a shift, as `steps_table` takes them.
 
     Raises:
         SystemExit: the two kinds of steps give different results.
     """
-    titles = ["scenario", "policy", "steps: interval", "events", "ratio", "env steps with a choice: interval", "events"]
-    titles += ["arm steps with a choice: interval", "events", "all slots filled"]
-    print(f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}")
+    rows: list[dict[str, Any]] = []
     for name in scenarios:
         fleet = prepare(load(name), difficulty=difficulty)
         for policy in policies:
             every, some = (steps_of(fleet, policy, seed, decisions) for decisions in ("interval", "events"))
             if every.finished_s != some.finished_s or not np.isclose(every.reward, some.reward, rtol=1e-9):
                 raise SystemExit(f"{name}, {policy}: events and interval give different results.")
-            shares = [
-                each
-                for part, whole in (("env_choices", "env"), ("arm_choices", "arm"))
-                for each in (f"{getattr(steps, part) / getattr(steps, whole):.1%}" for steps in (every, some))
-            ]
-            row = (
-                name,
-                f"`{label(policy)}`",
-                every.env,
-                some.env,
-                f"{every.env / some.env:.1f}",
-                *shares,
-                f"{every.full / every.env:.1%}",
-            )
-            print(f"| {' | '.join(map(str, row))} |", flush=True)
+            counts = {
+                decisions: {field: getattr(steps, field) for field in Steps._fields[:5]}
+                for decisions, steps in (("interval", every), ("events", some))
+            }
+            rows.append({"scenario": name, "policy": label(policy), **counts})
+    return {"seed": seed, "difficulty": difficulty, "rows": rows}
+
+
+def measure_live(scenario: str, policies: list[str], seed: int, speed: float) -> dict[str, Any]:
+    """Simulated and live shifts, as `live_table` takes them."""
+    fleet, rows = prepare(load(scenario), difficulty="blind"), list[dict[str, Any]]()
+    for policy in policies:
+        finished, faults = simulated(fleet, policy, seed)
+        done, lost = live(scenario, policy, seed, speed, fleet.scenario.horizon_s)
+        rows.append(
+            {
+                "policy": label(policy),
+                "scope": scope_of(policy),
+                "simulated": {"finished": finished, "faults": faults},
+                "live": {"finished": done, "faults": lost},
+            }
+        )
+    return {"scenario": scenario, "seed": seed, "speed": speed, "rows": rows}
 
 
 def main() -> None:
-    """Print the tables."""
+    """Measure, write and print."""
     parser = argparse.ArgumentParser()
     parser.add_argument("scenario", nargs="?", help="default: quickstart, with --steps all of the library")
     parser.add_argument("--speed", type=float, default=240.0)
@@ -125,20 +136,19 @@ def main() -> None:
     parser.add_argument("--policies", default=",".join(RULES))
     parser.add_argument("--steps", action="store_true")
     parser.add_argument("--difficulty", choices=get_args(DifficultyName), default="blind", help="with --steps")
+    parser.add_argument("--out", type=Path, help="JSON file of the figures")
     options = parser.parse_args()
     policies = options.policies.split(",")
     if options.steps:
         scenarios = [options.scenario] if options.scenario else list(library())
-        print_steps(scenarios, policies, options.seed, options.difficulty)
-        return
-    scenario = load(options.scenario or "quickstart")
-    fleet = prepare(scenario, difficulty="blind")
-    print("| policy | scope | simulated: finished | faults | live: finished | faults |\n|---|---|---|---|---|---|")
-    for policy in policies:
-        finished, faults = simulated(fleet, policy, options.seed)
-        done, lost = live(options.scenario or "quickstart", policy, options.seed, options.speed, scenario.horizon_s)
-        row = (f"`{label(policy)}`", scope_of(policy), finished, faults, done, lost)
-        print(f"| {' | '.join(map(str, row))} |", flush=True)
+        measured = measure_steps(scenarios, policies, options.seed, options.difficulty)
+        print(steps_table(measured))
+    else:
+        measured = measure_live(options.scenario or "quickstart", policies, options.seed, options.speed)
+        print(live_table(measured))
+    if options.out:
+        with atomic_path(options.out) as draft:
+            draft.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -35,12 +35,16 @@ def documents(out: Path) -> dict[Path, str]:
     from fleet.bus.protocol.schemas import schema_document
     from scenarios.doc_tables import MARK, fill_tables
     from scenarios.leaderboard.board import benchmark_tables
+    from scenarios.studies.page_tables.ablations import ablation_tables
     from scenarios.studies.page_tables.channels import channel_tables
+    from scenarios.studies.page_tables.cooling import cooling_tables
     from scenarios.studies.page_tables.coverage import coverage_tables
     from scenarios.studies.page_tables.learned import learned_tables
     from scenarios.studies.page_tables.policies import policy_tables
     from scenarios.studies.page_tables.sample_efficiency import efficiency_tables
     from scenarios.studies.page_tables.speed import speed_tables
+    from scenarios.studies.page_tables.steps import steps_tables
+    from scenarios.studies.page_tables.twin import twin_tables
 
     results = out.parent / "results"
     more = {
@@ -52,9 +56,13 @@ def documents(out: Path) -> dict[Path, str]:
         **efficiency_tables(results),
         **learned_tables(results),
         **speed_tables(results / "scaling"),
+        **ablation_tables(results),
+        **cooling_tables(results),
+        **steps_tables(results),
+        **twin_tables(results),
     }
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}
-    pages = {page: page.read_text(encoding="utf-8") for page in sorted(out.parent.glob("*.md"))}
+    pages = {page: page.read_text(encoding="utf-8") for page in sorted(out.parent.rglob("*.md"))}
     return made | {page: fill_tables(text, more) for page, text in pages.items() if MARK in text}
 
 

@@ -7,7 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -148,19 +148,50 @@ def _earlier_rows(out: Path, card: dict[str, str]) -> dict[tuple[str, int, int, 
             held = known.get(name) if isinstance(known, dict) else None
             if held != value:
                 raise FleetError(f"'{out}' holds an ablation with {name} {held!r}, not {value!r}; give another --out.")
-        if not (out / ROWS).exists():
+    return _read_rows(out)
+
+
+def _read_rows(folder: Path) -> dict[tuple[str, int, int, int], Row]:
+    """Finished shifts in a folder, by source, fleet, training and seed; an unfinished last line is removed.
+
+    Raises:
+        FleetError: a line is damaged.
+    """
+    with disk_errors(folder):
+        if not (folder / ROWS).exists():
             return {}
-        written = (out / ROWS).read_bytes()
+        written = (folder / ROWS).read_bytes()
         whole = written[: written.rfind(b"\n") + 1]  # a row without its end may have a shorter number
         if whole != written:
-            with atomic_path(out / ROWS) as file:
+            with atomic_path(folder / ROWS) as file:
                 file.write_bytes(whole)
     try:
         kept = list(csv.DictReader(io.StringIO(whole.decode("utf-8"), newline="")))
         rows = [Row(r["scores"], *(int(r[n]) for n in Row._fields[1:4]), *(float(r[n]) for n in FIGURES)) for r in kept]
     except (KeyError, TypeError, ValueError) as error:
-        raise FleetError(f"'{out / ROWS}' is damaged ({error}); give another --out.") from error
+        raise FleetError(f"'{folder / ROWS}' is damaged ({error}); give another --out.") from error
     return {row[:4]: row for row in rows}
+
+
+def stored(folder: Path, first: str) -> Ablation:
+    """A finished ablation, with differences to one of its sources.
+
+    Args:
+        folder: `--out` of the ablation.
+        first: Name of the source.
+
+    Raises:
+        FleetError: as `ablate`.
+    """
+    scenario, plan = stored_plan(folder)
+    plan = replace(plan, scores=(first, *(name for name in plan.scores if name != first)))
+    return Ablation(scenario, plan, _effects(plan, _read_rows(folder)))
+
+
+def stored_plan(folder: Path) -> tuple[str, AblationPlan]:
+    """Scenario and plan of a finished ablation."""
+    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    return card["scenario"], msgspec.convert(card["plan"], AblationPlan)
 
 
 def _append(out: Path, rows: Sequence[Row]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 from agents.registry import RULES, WRAPPERS
 from scenarios.doc_tables import table
 from scenarios.run.compare import HEADINGS
+from scenarios.studies.page_tables.cells import difference
 
 NAMED = ("faults", "value", "on_time", "reward", "hot_surface_min")
 """Figures of the table of named scenarios; those that are 0 everywhere are left out."""
@@ -20,7 +21,8 @@ def policy_tables(results: Path) -> dict[str, Callable[[], str]]:
 
     Args:
         results: Folder with `ladder/SCENARIO_SOURCE.json` and `named/SCENARIO.json` of `thermofleet compare --json`,
-            and `ladder/decisions.json` of `benchmarks/bench_decisions.py`.
+            `ladder/decisions.json` of `benchmarks/bench_decisions.py`, and `live_policies.json` of
+            `benchmarks/bench_policies.py`.
     """
     return {
         "policies": _policies,
@@ -28,6 +30,7 @@ def policy_tables(results: Path) -> dict[str, Callable[[], str]]:
         "ladder": lambda: _ladder(results / "ladder"),
         "named_scenarios": lambda: _named(results / "named"),
         "decisions": lambda: _decisions(_read(results / "ladder/decisions.json")),
+        "live_policies": lambda: live_table(_read(results / "live_policies.json")),
     }
 
 
@@ -64,9 +67,7 @@ def _cell(comparison: dict[str, Any], policy: str) -> str:
     some = f"; {faults:.2f} faults" if faults else ""
     if policy == comparison["baseline"]:
         return f"{reward['mean']:.1f}{some}"
-    low, high = reward["difference_low"], reward["difference_high"]
-    text = f"{reward['difference']:+.1f} ({low:+.1f} … {high:+.1f})".replace("-", "−")
-    return (f"**{text}**" if low > 0 or high < 0 else text) + some
+    return difference(*(reward[name] for name in ("difference", "difference_low", "difference_high"))) + some
 
 
 def _named(results: Path) -> str:
@@ -97,3 +98,16 @@ def _mean_cell(figure: dict[str, Any], *, is_base: bool) -> str:
 def _decisions(measured: dict[str, Any]) -> str:
     rows = [(f"`{row['policy']}`", row["scope"], f"{row['median_ms']:.2f}") for row in measured["rows"]]
     return table(("policy", "scope", "median, ms of CPU time"), rows)
+
+
+def live_table(measured: dict[str, Any]) -> str:
+    """Jobs finished and faults of each policy, simulated and live.
+
+    Args:
+        measured: A result of `benchmarks/bench_policies.py`.
+    """
+    rows = [
+        (f"`{row['policy']}`", row["scope"], *(str(n) for kind in ("simulated", "live") for n in row[kind].values()))
+        for row in measured["rows"]
+    ]
+    return table(("policy", "scope", "simulated: finished", "faults", "live: finished", "faults"), rows)

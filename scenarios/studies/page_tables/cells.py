@@ -1,0 +1,17 @@
+"""Cells that several tables of results share."""
+
+import math
+
+
+def difference(mean: float, low: float | None, high: float | None, digits: int = 1) -> str:
+    """`**−6.0 (−10.4 … −2.5)**`: a difference with its interval, bold if that excludes 0; else the mean."""
+    text = signed(mean, digits)
+    if low is None or high is None or math.isnan(low + high):
+        return text
+    text += f" ({signed(low, digits)} … {signed(high, digits)})"
+    return f"**{text}**" if low > 0 or high < 0 else text
+
+
+def signed(value: float, digits: int = 1) -> str:
+    """A number with its sign."""
+    return f"{value:+.{digits}f}".replace("-", "−")
