@@ -134,6 +134,15 @@ class WseptLearned(PairPolicy):
         super().__init__(shipped_parameters())
 
 
+class WseptUntrained(PairPolicy):
+    """As `wsept_learned`, with the parameters that a training begins with: its ablation. Scope central."""
+
+    only_choices = True
+
+    def __init__(self) -> None:
+        super().__init__(first_parameters())
+
+
 class WseptLearnedLocal(Local):
     """As `wsept_learned` for a fleet of one: every arm claims the job with the highest score for it. Scope arm."""
 

@@ -8,7 +8,7 @@ from agents.consensus import Consensus
 from agents.dispatching import Atc, Edd, Fifo, LeastLoaded, Spt
 from agents.heat_guards import FuzzySpeed, Guard, Shutdown, TorqueLimiter
 from agents.heat_rules import Thermometer, Wsept, WseptAhead, WseptLocal
-from agents.pair_scores import WseptLearned, WseptLearnedLocal
+from agents.pair_scores import WseptLearned, WseptLearnedLocal, WseptUntrained
 from agents.policy import ArmPolicy, Policy, for_all_arms
 from agents.rolling_horizon import RollingHorizon
 from agents.rules import CoolestFirst, LeastDifficulty, RandomLegal, RoundRobin, Wspt, WsptCool
@@ -50,6 +50,7 @@ RULES: dict[str, Rule] = {
     "wsept": Rule(Wsept, "time per expected worth", "Rothkopf 1966"),
     "wsept_ahead": Rule(WseptAhead, "time per expected worth, with arms that are home soon", "Rothkopf 1966"),
     "wsept_local": Rule(WseptLocal, "time per expected worth, each arm for itself", "Rothkopf 1966"),
+    "wsept_untrained": Rule(WseptUntrained, "time per worth with the first parameters of a training"),
     "wsept_learned": Rule(WseptLearned, "time per learned worth", "Salimans et al. 2017"),
     "wsept_learned_local": Rule(
         WseptLearnedLocal, "time per learned worth, each arm for itself", "Salimans et al. 2017"
