@@ -1,10 +1,11 @@
-"""Table of docs/learning.md: learned policies on fleets of sizes that they were trained on, and on others."""
+"""Tables of docs/learning.md: trainings, and learned policies on fleets of sizes of the training and on others."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from agents.learned.training_log import read_log
 from scenarios.doc_tables import table
 from scenarios.leaderboard.board import BASELINE, SOURCE, read_all
 from scenarios.leaderboard.submission import split_references
@@ -26,6 +27,7 @@ def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
         results: docs/results, with the files of the leaderboard.
     """
     return {
+        "trainings": lambda: _trainings(results / "learned"),
         "learned_test": lambda: _by_size(
             results / "leaderboard", "test", {
                 "trained sizes": lambda arms: np.isin(arms, list(TRAINED)),
@@ -41,6 +43,19 @@ def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
             },
         ),
     }  # fmt: skip
+
+
+def _trainings(folder: Path) -> str:
+    """Scores in validation of the trainings in a folder: at the beginning, and the best."""
+    rows: list[tuple[str, ...]] = []
+    for training in sorted(path for path in folder.iterdir() if path.is_dir()):
+        log = read_log(training)
+        validated = [row for row in log if "validation" in row]
+        best = max(validated, key=lambda row: row["validation"])
+        iterations = max(row.get("number", 0) for row in log)
+        scores = (validated[0]["validation"], best["validation"], validated[-1]["teacher"])
+        rows.append((training.name.rpartition("-")[2], str(iterations), *(f"{score:.3f}" for score in scores)))
+    return table(("training", "iterations", "first parameters", "best", "`wsept`"), rows)
 
 
 def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Array]]) -> str:
