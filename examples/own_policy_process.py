@@ -15,7 +15,7 @@ from urllib.parse import quote
 import zenoh
 
 MOST_WAITING = 32
-"""Requests, of up to 4 MiB; when more wait, the oldest is dropped."""
+"""Waiting requests, each of up to 4 MiB; when more wait, the oldest is dropped."""
 
 
 def act(request):

@@ -2,8 +2,8 @@
 
     python benchmarks/scaling/commands.py [--arms 100] [--hours 8] [--jobs 1000] [--out FILE]
 
-`show` runs twice: with an empty cache, when it plans the work of all arms, and again. `run` shares over Zenoh, and then
-in memory. CPU time is that of all threads of the command; memory is the most that it held.
+`show` runs twice: with an empty cache, when it plans the work of all arms, and again. `run` exchanges messages over
+Zenoh, and then in memory. CPU time is that of all threads of the command; memory is the most that it held.
 """
 
 import argparse

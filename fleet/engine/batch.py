@@ -199,7 +199,7 @@ class Engine:
         """One decision interval of every env, or more.
 
         Args:
-            actions: int64 [env, arm]; anything outside the mask is a wait, and counted. None: nobody is asked, and the
+            actions: int64 [env, arm]; anything outside the mask is a wait, and counted. None: no claims, and the
                 outcome of the last claims remains.
             out: Receives what the arms know afterwards, float32 [env, arm, size].
             until: Go on while no arm has a `choice`, to this tick at most, int64 [env]. The events and the trace are

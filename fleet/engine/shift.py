@@ -193,7 +193,7 @@ class ShiftRunner:
         """One decision interval: weighted reward terms [term], their sum, and whether all jobs are done.
 
         Args:
-            actions: int64 [arm]. None: nobody is asked, and the outcome of the last claims remains.
+            actions: int64 [arm]. None: no claims, and the outcome of the last ones remains.
         """
         engine, world, plant = self._engine, self._episode.world, self._episode.plant
         chosen = None if actions is None else actions[None]

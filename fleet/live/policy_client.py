@@ -104,7 +104,7 @@ class PolicyClient:
             raise BusError(f"The {self._whose} did not reply and finish the query within {self._limit_s:g} s.")
         raise BusError(
             f"No process serves the {self._whose}, or it dropped the request: start it; it must declare a queryable of "
-            f"'{self._key}', and reply soon enough that few requests wait."
+            f"'{self._key}'. If it is running, too many requests wait: it must reply sooner."
         )
 
 

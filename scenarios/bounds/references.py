@@ -34,7 +34,7 @@ from scenarios.trials.plan import Case, Unit
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""
 STARTS = tuple(name for name in RULES if name != "random")
-"""Policies that the search starts from."""
+"""Policies that the search starts from by default."""
 
 
 @dataclass(frozen=True, kw_only=True)

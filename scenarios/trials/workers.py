@@ -18,13 +18,13 @@ from scenarios.trials.plan import Row, Unit
 from scenarios.trials.run_unit import Settings, died, run_unit
 
 MOST_DEATHS = 3
-"""So many processes may die of a unit; then its shifts have failed."""
+"""Processes that may exit during a unit before its shifts have failed."""
 
 
 IDLE_S = 120.0
 """A process without work ends after this time."""
 PARENT_CHECK_S = 1.0
-"""A process looks this often whether the command that began it was killed."""
+"""Time between two checks of a process that the command that started it still runs."""
 
 
 class Worker(Protocol):

@@ -343,7 +343,7 @@ class BusClient:
     def _receive(
         self, key: str, kind: type[Request], handle: Callable[[Request], msgspec.Struct], query: zenoh.Query
     ) -> None:
-        """Queue a request; on Zenoh's thread. A large one is refused at once: many that wait would fill the memory."""
+        """Queue a request; on Zenoh's thread. A large one is refused at once, because queued ones fill the memory."""
         parts = (query.payload, query.attachment, str(query.parameters))
         if (size := sum(len(part) for part in parts if part is not None)) <= MOST_BYTES:
             self.post(self._reply, key, query, kind, handle)

@@ -1,4 +1,4 @@
-"""The replies to one query as they arrive, of which only so many are read."""
+"""The replies to one query as they arrive, up to a largest number."""
 
 import time
 from collections.abc import Callable
@@ -13,14 +13,14 @@ from fleet.bus.protocol.messages import MalformedMessage
 Reply = TypeVar("Reply", bound=msgspec.Struct)
 
 MOST_REPLIES = 1024
-"""That are read of one query: one of each arm of the largest fleet."""
+"""Replies to one query that are read: one of each arm of the largest fleet."""
 
 
 class PendingQuery(Generic[Reply]):
-    """A query that is not complete. Zenoh's thread calls `receive` and `finish`, which only queue.
+    """A query that is not complete. Zenoh's thread calls `receive` and `finish`, which only queue calls.
 
     Attributes:
-        token: Ends the query early, when more replies arrive than are read: a flood of them is not waited for.
+        token: Cancels the query when more replies arrive than are read.
     """
 
     def __init__(
@@ -81,6 +81,6 @@ class PendingQuery(Generic[Reply]):
 
 
 def _error_in(reply: zenoh.Reply) -> str:
-    # Any: Zenoh's stubs do not say that one of the two is there.
+    # Any: Zenoh's stubs do not state that a reply has either `ok` or `err`.
     error: Any = reply.err
     return "" if error is None else error.payload.to_bytes().decode(errors="replace")

@@ -14,8 +14,8 @@ class Limits:
     """What a router forwards from each session; the rest is dropped silently."""
 
     message_bytes: int = MOST_BYTES
-    """Largest payload with its attachment, of a publication, a request or a reply; with plain TCP, or a policy in the
-    roster, a request to a policy, or with a wildcard or an unknown role in its key, may have `MOST_REQUEST_BYTES`."""
+    """Largest payload with its attachment, of a publication, a request or a reply. A request to a policy, or with a
+    wildcard or an unknown role in its key, may have `MOST_REQUEST_BYTES` with plain TCP or a policy in the roster."""
     state_hz: float | None = None
     """Telemetry messages a second, real time, of each session, or with TLS of each arm; None for any number. A steady
     stream needs a limit of twice its rate, as Zenoh limits the gap between two messages, which varies."""

@@ -1,4 +1,4 @@
-"""Arms of a simulated shift that share one client: their publications and the messages they received."""
+"""Arms of a simulated shift that share clients: their publications and the messages they received."""
 
 import math
 import time
@@ -14,7 +14,7 @@ from fleet.telemetry import MODES
 Message = TypeVar("Message", State, DifficultyScores)
 
 _SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.002
-"""Between two looks at what has arrived. Waking for every message costs more, as it takes the GIL from publishers."""
+"""Pauses between two checks for new messages. Waking for every message costs more: it takes the GIL from publishers."""
 SILENT_AFTER = 3
 """A peer that missed this many steps in a row is not waited for until one of its messages arrives."""
 

@@ -16,7 +16,7 @@ from fleet.telemetry import Mode
 
 VERSION = 4
 MOST_BYTES = 65_536
-"""Of any message, with its attachment, but a request to a policy."""
+"""Largest message with its attachment, in bytes; a request to a policy may be larger."""
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
 Person = Annotated[str, msgspec.Meta(max_length=128)]
 """Who requests something."""
