@@ -126,7 +126,7 @@ HEADS = ("instance", "random", "best rule", "reward", "hindsight", "upper bound"
 
 
 def heads_of(references: "Sequence[Reference]") -> tuple[str, ...]:
-    """Heads of their table: times, which come last, only where they are known."""
+    """Heads of the table of these references; that of times, the last one, only if times are known."""
     return HEADS if any(each.seconds is not None for each in references) else HEADS[:-1]
 
 
