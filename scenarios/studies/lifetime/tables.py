@@ -58,8 +58,9 @@ def transfer_tables(cells: Sequence[Cell]) -> tuple[Table, ...]:
                 "AUROC of d_2",
             ),
             rows=tuple(saved),
-            caption=f"Error of the first twin; data: number of jobs that give the error of {jobs[-1]} jobs from nothing, "
-            f"divided by {jobs[-1]} (at least {jobs[0] / jobs[-1]:g}); CPU seconds and AUROC with {jobs[-1]} jobs, {NOTHING} → {FURTHER}",
+            caption=f"Error of the first twin; data: number of jobs that give the error of {jobs[-1]} jobs from "
+            f"nothing, divided by {jobs[-1]} (at least {jobs[0] / jobs[-1]:g}); CPU seconds and AUROC with {jobs[-1]} "
+            f"jobs, {NOTHING} → {FURTHER}",
         ),
     )
 
