@@ -21,6 +21,7 @@ def own(tmp_path):
         "class Old:\n def reset(self, rng): ...\n def act(self, o): return dict.fromkeys(o, 0)\n"
         "class No:\n scope = 'central'\n"
         "def make(): return Idle()\n"
+        "from agents.policy import Local\nclass Unset(Local): ...\n"
         "class Needy(Idle):\n def __init__(self, size): ...\n"
     )
     return file
@@ -88,6 +89,7 @@ def test_an_own_class_from_a_file_or_a_module(own):
             "{own}:Needy",
             r"must be a class or function that is called without arguments \(missing a required argument: 'size'\)",
         ),
+        ("{own}:Unset", r"has no central policy \(got None\)\. Add to the class: central = a class with act"),
         ("nowhere.py:Idle", "there is no file 'nowhere.py'"),
         ("no_such_module:Idle", "cannot import 'no_such_module'"),
     ],
