@@ -9,7 +9,7 @@ MADE = re.compile(r"<!-- made by thermofleet contract: \w+ -->.*?<!-- end -->", 
 FIGURE = re.compile(r"^\W*\d|\d\.\d")
 """In a cell: it begins with a number (after a sign, `**` and the like), or has a decimal one."""
 SHARE = 1 / 6
-"""A table is one of figures if so many of its cells are, without the first column."""
+"""Least share of figures among the cells of a table of figures, without the first column."""
 
 BY_HAND = {
     (

@@ -1,6 +1,9 @@
-"""Cells that several tables of results share."""
+"""Cells that several tables of results share, and the files that they are made from."""
 
+import json
 import math
+from pathlib import Path
+from typing import Any  # JSON values
 
 
 def difference(mean: float, low: float | None, high: float | None, digits: int = 1) -> str:
@@ -15,3 +18,8 @@ def difference(mean: float, low: float | None, high: float | None, digits: int =
 def signed(value: float, digits: int = 1) -> str:
     """A number with its sign."""
     return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def read_json(path: Path) -> Any:
+    """The content of a file of results."""
+    return json.loads(path.read_text(encoding="utf-8"))

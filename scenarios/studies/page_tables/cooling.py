@@ -1,13 +1,11 @@
 """Tables of docs/concepts/cooling.md, from `thermofleet cooling SCENARIO --json`."""
 
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any  # JSON values
 
 from scenarios.doc_tables import table
-from scenarios.studies.page_tables.cells import difference
+from scenarios.studies.page_tables.cells import difference, read_json
 
 FIGURES = {
     "no_interface_s": "without thermal interface material (TIM) between winding and housing, s",
@@ -39,12 +37,10 @@ def cooling_tables(results: Path) -> dict[str, Callable[[], str]]:
     return {name: partial(_fleet, path) for name, path in files.items()} | more
 
 
-def _read(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
 def _motor(path: Path) -> str:
-    rows = [(FIGURES[row["figure"]], f"{row['published']:g}", f"{row['modelled']:.2f}") for row in _read(path)["motor"]]
+    rows = [
+        (FIGURES[row["figure"]], f"{row['published']:g}", f"{row['modelled']:.2f}") for row in read_json(path)["motor"]
+    ]
     return table(("time to 125 °C, or temperature", "published", "here"), rows)
 
 
@@ -61,7 +57,7 @@ def _joint(path: Path) -> str:
             shown(row["error_min"], "min"),
             shown(row["steady_c"], "°C", 0),
         )
-        for row in _read(path)["joint"]
+        for row in read_json(path)["joint"]
     ]
     hold = "3 kg held outstretched: 60 °C after"
     return table(("`cooling`", "what changes", "winding to air, W/K", hold, "75 °C after", "settles at"), rows)
@@ -69,7 +65,7 @@ def _joint(path: Path) -> str:
 
 def _fleet(path: Path) -> str:
     """A line for each way of cooling; differences of value to the first one."""
-    measured = _read(path)
+    measured = read_json(path)
     policies = dict.fromkeys(row["policy"] for row in measured["fleet"])
     found = {(row["cooling"], row["policy"]): row["figures"] for row in measured["fleet"]}
     coolings = dict.fromkeys(cooling for cooling, _ in found)

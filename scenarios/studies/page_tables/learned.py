@@ -9,6 +9,7 @@ from agents.learned.training_log import read_log
 from scenarios.doc_tables import table
 from scenarios.leaderboard.board import BASELINE, SOURCE, read_all
 from scenarios.leaderboard.submission import split_references
+from scenarios.policy_loader import trainings_of
 from scenarios.statistics.scores import Scores, ranked, scores_of
 from scenarios.suite.cells import CELLS
 from scenarios.suite.splits import instance
@@ -48,7 +49,7 @@ def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
 def _trainings(folder: Path) -> str:
     """Scores in validation of the trainings in a folder: at the beginning, and the best."""
     rows: list[tuple[str, ...]] = []
-    for training in sorted(path for path in folder.iterdir() if path.is_dir()):
+    for training in map(Path, trainings_of(str(folder / "train-pairs-*"))):
         log = read_log(training)
         validated = [row for row in log if "validation" in row]
         best = max(validated, key=lambda row: row["validation"])

@@ -1,6 +1,5 @@
 """Tables of docs/policies.md and docs/results.md: policies and wrappers from their registry, and results from files."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 from agents.registry import RULES, WRAPPERS
 from scenarios.doc_tables import table
 from scenarios.run.compare import HEADINGS
-from scenarios.studies.page_tables.cells import difference
+from scenarios.studies.page_tables.cells import difference, read_json
 
 NAMED = ("faults", "value", "on_time", "reward", "hot_surface_min")
 """Figures of the table of named scenarios; those that are 0 everywhere are left out."""
@@ -29,13 +28,9 @@ def policy_tables(results: Path) -> dict[str, Callable[[], str]]:
         "wrappers": _wrappers,
         "ladder": lambda: _ladder(results / "ladder"),
         "named_scenarios": lambda: _named(results / "named"),
-        "decisions": lambda: _decisions(_read(results / "ladder/decisions.json")),
-        "live_policies": lambda: live_table(_read(results / "live_policies.json")),
+        "decisions": lambda: _decisions(read_json(results / "ladder/decisions.json")),
+        "live_policies": lambda: live_table(read_json(results / "live_policies.json")),
     }
-
-
-def _read(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def _policies() -> str:
@@ -50,7 +45,7 @@ def _wrappers() -> str:
 
 def _ladder(results: Path) -> str:
     """Rewards and their differences to the baseline, a column for each file, the best mean of the first file first."""
-    files = {path.stem: _read(path) for path in sorted(results.glob("*_*.json"))}
+    files = {path.stem: read_json(path) for path in sorted(results.glob("*_*.json"))}
     head = ["policy"]
     for stem, one in files.items():
         scores = SOURCES[stem.removeprefix(f"{one['scenario']}_")]
@@ -72,7 +67,7 @@ def _cell(comparison: dict[str, Any], policy: str) -> str:
 
 def _named(results: Path) -> str:
     """Mean and difference of several figures, a column for each policy."""
-    files = [_read(path) for path in sorted(results.glob("*.json"))]
+    files = [read_json(path) for path in sorted(results.glob("*.json"))]
     rows: list[tuple[str, ...]] = []
     for one in files:
         figures = one["figures"]

@@ -1,11 +1,11 @@
 """Table of docs/learning.md: steps of a shift from interval to interval, and from event to event."""
 
-import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from scenarios.doc_tables import table
+from scenarios.studies.page_tables.cells import read_json
 
 KINDS = ("interval", "events")
 SHARES = (("env_choices", "env"), ("arm_choices", "arm"))
@@ -19,7 +19,7 @@ def steps_tables(results: Path) -> dict[str, Callable[[], str]]:
     Args:
         results: With `steps.json` of `benchmarks/bench_policies.py --steps`.
     """
-    return {"steps": lambda: steps_table(json.loads((results / "steps.json").read_text(encoding="utf-8")))}
+    return {"steps": lambda: steps_table(read_json(results / "steps.json"))}
 
 
 def steps_table(measured: dict[str, Any]) -> str:

@@ -1,6 +1,5 @@
 """Tables of docs/twin.md, docs/twin_studies.md and docs/paper.md, from stored studies of the twin."""
 
-import json
 import math
 from collections.abc import Callable
 from functools import partial
@@ -12,6 +11,7 @@ import msgspec
 from scenarios.doc_tables import table
 from scenarios.json_rows import Rows
 from scenarios.statistics.means import Interval
+from scenarios.studies.page_tables.cells import read_json
 
 READING_HEADS = ("AUROC", "AUPRC", "Spearman", "overheating jobs found", "false alarms, new work", "before")
 PAYLOADS = {"own": "as the source", "common": "2 kg for all"}
@@ -52,15 +52,11 @@ STUDY_TABLES = {
 """Names of the tables of each study, in the order of `scenarios.studies.lifetime.tables`."""
 
 
-def _read(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
 def _readings(path: Path, question: str, title: str) -> str:
     from scenarios.studies.verdict.readings import summary
 
     rows: list[tuple[str, ...]] = []
-    for reading, measured in summary(_read(path), question):
+    for reading, measured in summary(read_json(path), question):
         shown = [measured[name] for name in ("auroc", "auprc", "spearman", "hits", "false_work", "false_before")]
         with_bounds = {"auroc": shown[0], "false_work": shown[4]}.values()
         rows.append((reading, *(each.text(3) if each in with_bounds else f"{each.mean:.3f}" for each in shown)))
@@ -68,7 +64,7 @@ def _readings(path: Path, question: str, title: str) -> str:
 
 
 def _sides(path: Path) -> str:
-    measured = _read(path)
+    measured = read_json(path)
     rows = [
         (
             f"{text}, {side} side",
@@ -84,7 +80,7 @@ def _sides(path: Path) -> str:
 
 def _questions(path: Path) -> str:
     rows: list[tuple[str, ...]] = []
-    for question, answer in _read(path)["0"].items():
+    for question, answer in read_json(path)["0"].items():
         auroc = [Interval(*each).text() for each in answer["auroc"].values()]
         windows = f"{answer['events']} of {answer['windows']} ({answer['files_with']})"
         leads = [Interval(*each).text(sign="+") for each in answer["lead"].values()]
@@ -116,7 +112,7 @@ def _study(path: Path, place: int) -> str:
     from scenarios.studies.lifetime.drift import DriftSize, Life
     from scenarios.studies.lifetime.latent_features import Estimate
 
-    stored = _with_nan(_read(path))
+    stored = _with_nan(read_json(path))
     rows = stored["rows"]
     made = {
         "transfer": lambda: tables.transfer_tables(msgspec.convert(rows, list[Cell])),
