@@ -110,7 +110,7 @@ class InverseKinematics:
         seeds = [
             nearest_turn(_angles(elbow, wrist, target.rotation, flips), near) for flips in product((1, -1), repeat=3)
         ]
-        seeds.sort(key=lambda q: float(np.max(np.abs(q - near) / GEN3.velocity)))
+        seeds.sort(key=lambda q: _travel_s(q, near))
         low, high = self._arm.position_range.T
         # Joint stops are symmetric, so either all flips are within them or none.
         beyond = np.maximum(low - seeds[0], seeds[0] - high)
@@ -161,6 +161,13 @@ class InverseKinematics:
         if tool_m > _FULL * REACH_M or wrist_m > _FULL * _WRIST_M:
             return _out_of_reach(tool_m, wrist_m)
         return f"no IK solution: the tool is {short} off after {_STEPS} steps"
+
+
+def _travel_s(q: Array, near: Array) -> tuple[float, float]:
+    """Time of the slowest joint and of all joints together, s, rounded: often several flips differ in other joints
+    than the slowest, and then the last digit, which depends on the processor, must not choose."""
+    times_s = np.abs(q - near) / GEN3.velocity
+    return round(float(times_s.max()), 6), round(float(times_s.sum()), 6)
 
 
 def _from_shoulder(target: Pose) -> tuple[Array, Array]:

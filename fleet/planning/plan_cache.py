@@ -7,7 +7,7 @@ import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -18,6 +18,7 @@ from fleet.files import atomic_path
 from fleet.job import Fixture, Work
 from fleet.motion import RATE_HZ, Phase, Plan, distinct, stored_once
 from fleet.physics.gen3 import ELBOW_ANGLES_DEG, GRAVITY_M_S2, gen3_xml
+from fleet.planning.own_frame import ARM, OwnFrame
 from fleet.planning.task_phases import GRASP_S
 from fleet.robot import GEN3, RATING, Robot
 
@@ -31,7 +32,7 @@ log = logging.getLogger(__name__)
 _written: dict[Path, int] = {}
 """Bytes that this process wrote to a folder since it looked at its files; no folder that it never looked at."""
 
-PLANNER_VERSION = 3
+PLANNER_VERSION = 4
 """Increment it whenever the plans of the same work change."""
 MAX_CACHE_BYTES = 2_000_000_000
 """Of all files in a folder; after new ones the least recently used ones are removed."""
@@ -41,8 +42,15 @@ MAX_SAMPLES = 1_000_000
 """Of one phase in a file; a longer one is damage."""
 
 
+LoadedPlans = dict[Path, tuple[Plan, ...] | InfeasibleJob]
+"""Content of files of plans."""
+
+
 class CachedPlanner:
-    """A `fleet.planning.planner.Planner` with the same arguments that computes each set of plans once."""
+    """A `fleet.planning.planner.Planner` with the same arguments that computes each set of plans once.
+
+    Like arms have the same plans (`fleet.planning.own_frame`).
+    """
 
     def __init__(
         self,
@@ -52,8 +60,18 @@ class CachedPlanner:
         elbows: int = 3,
         speeds: tuple[float, ...] = (1.0, 0.6),
         cache_dir: Path,
+        loaded: LoadedPlans | None = None,
     ) -> None:
-        self._robot, self._fixtures, self._elbows, self._folder = robot, tuple(fixtures), elbows, cache_dir
+        """Load nothing yet.
+
+        Args:
+            loaded: Where planners of several arms keep what they read, so that like arms share its memory; None: not
+                kept.
+        """
+        self._loaded = loaded
+        self._name, self._frame = robot.name, OwnFrame(robot.mount)
+        self._robot, self._fixtures = self._frame.robot(robot), self._frame.fixtures(fixtures)
+        self._elbows, self._folder = elbows, cache_dir
         self._speeds = tuple(sorted(set(speeds), reverse=True))
         self._planner: Planner | None = None
 
@@ -63,6 +81,7 @@ class CachedPlanner:
         Raises:
             InfeasibleJob: there is none.
         """
+        own = self._frame.work(work)
         key = {
             "planner": PLANNER_VERSION,
             "rate_hz": RATE_HZ,
@@ -70,7 +89,7 @@ class CachedPlanner:
             "rating": asdict(RATING),
             "payload_limit_kg": self._robot.payload_limit_kg,
             **_torque_key(self._robot),
-            "work": asdict(work),
+            "work": asdict(own),
             "grasp_s": GRASP_S,
             "elbow_angles_deg": ELBOW_ANGLES_DEG,
             "elbows": self._elbows,
@@ -79,13 +98,17 @@ class CachedPlanner:
         if self._fixtures:
             key["fixtures"] = [asdict(fixture) for fixture in self._fixtures]
         path = _path(self._folder, key)
-        plans = _read(path, lambda arrays: _unpack(arrays, self._robot.name, work))
+        plans = self._loaded.get(path) if self._loaded else None
+        plans = plans or _read(path, lambda arrays: _unpack(arrays, own))
         if plans is None:
-            plans = self._compute(work)
+            plans = self._compute(own)
             _write(path, _pack(plans))
+        if self._loaded is not None:
+            self._loaded[path] = plans
         if isinstance(plans, InfeasibleJob):
-            raise plans
-        return plans
+            place = work.places[int(plans.place)].name
+            raise InfeasibleJob(self._name, place, plans.reason, too_heavy=plans.too_heavy)
+        return tuple(replace(plan, arm=self._name, work=work) for plan in plans)
 
     def _compute(self, work: Work) -> tuple[Plan, ...] | InfeasibleJob:
         if self._planner is None:
@@ -207,11 +230,11 @@ def _phase(length: int, profile: Array, payload_kg: Array) -> Phase:
     return stored_once(Phase(profile, payload_kg))
 
 
-def _unpack(arrays: Mapping[str, Array], arm: str, work: Work) -> tuple[Plan, ...] | InfeasibleJob:
-    """The inverse of `_pack`, for an arm and work of these names."""
+def _unpack(arrays: Mapping[str, Array], work: Work) -> tuple[Plan, ...] | InfeasibleJob:
+    """The inverse of `_pack`, for this work and a nameless arm."""
     if "infeasible" in arrays:
         place, reason, load = arrays["infeasible"].tolist()
-        return InfeasibleJob(arm, place, reason, too_heavy=bool(load))
+        return InfeasibleJob(ARM, place, reason, too_heavy=bool(load))
     profile, lengths, variants = arrays["profile"], arrays["lengths"], arrays["variants"]
     stored = arrays.get("stored", lengths)
     if stored.sum() != len(profile) or len(lengths) != len(variants) or stored.shape != lengths.shape:
@@ -222,5 +245,5 @@ def _unpack(arrays: Mapping[str, Array], arm: str, work: Work) -> tuple[Plan, ..
     parts = zip(lengths.ravel(), np.split(profile, ends), np.split(arrays["payload_kg"], ends), strict=True)
     phases = iter([_phase(int(length), *part) for length, *part in parts])
     return tuple(
-        Plan(arm, work, int(elbow), float(speed), next(phases), next(phases), next(phases)) for elbow, speed in variants
+        Plan(ARM, work, int(elbow), float(speed), next(phases), next(phases), next(phases)) for elbow, speed in variants
     )

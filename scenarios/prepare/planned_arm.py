@@ -12,7 +12,7 @@ from fleet.errors import InfeasibleJob
 from fleet.job import Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors, thermal_data
-from fleet.planning.plan_cache import CachedPlanner
+from fleet.planning.plan_cache import CachedPlanner, LoadedPlans
 from fleet.planning.space import FARTHEST_M, conflicts_with_homes
 from fleet.robot import JOINTS, Robot
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
@@ -77,12 +77,12 @@ def air_offsets(scenario: Scenario) -> np.ndarray:
 class CellPlanner:
     """Plans of one arm of a scenario that keep clear of the other arms at home; cached in a folder."""
 
-    def __init__(self, robot: Robot, scenario: Scenario, folder: Path) -> None:
+    def __init__(self, robot: Robot, scenario: Scenario, folder: Path, loaded: LoadedPlans | None = None) -> None:
         spec = scenario.planning
         self._robot, self._folder, self._clearance_m = robot, folder / "plans", scenario.clearance_m
         self._others = [arm.robot() for arm in scenario.arms if arm.name != robot.name]
         self._planner = CachedPlanner(
-            robot, scenario.fixtures, elbows=spec.elbows, speeds=spec.speeds, cache_dir=self._folder
+            robot, scenario.fixtures, elbows=spec.elbows, speeds=spec.speeds, cache_dir=self._folder, loaded=loaded
         )
 
     def plan(self, work: Work) -> tuple[Plan, ...]:
@@ -123,10 +123,10 @@ def plan_arms(
     scenario: Scenario, indices: Sequence[int], works: Sequence[Work], folder: Path, progress: Progress
 ) -> list[PlannedArm]:
     """The arms at these places of the scenario, each with its plans for the works (cached in `folder`)."""
-    planned = []
+    planned, loaded = [], LoadedPlans()
     for done, index in enumerate(indices):
         hardware = hardware_of(scenario, index)
-        planner = CellPlanner(hardware.robot, scenario, folder)
+        planner = CellPlanner(hardware.robot, scenario, folder, loaded)
         plans: dict[Work, tuple[Plan, ...]] = {}
         infeasible: list[InfeasibleJob] = []
         too_heavy: set[Work] = set()

@@ -6,17 +6,22 @@ import threading
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from fleet.errors import InfeasibleJob
 from fleet.job import KINDS, Fixture, Place, Work
 from fleet.motion import Plan
-from fleet.planning.plan_cache import CachedPlanner
+from fleet.physics.models import ArmModel
+from fleet.planning.plan_cache import CachedPlanner, LoadedPlans
 from fleet.planning.planner import Planner
 from fleet.planning.time_limit import PlanningTimeout, check_time, time_limit
-from fleet.robot import Mount, Robot
+from fleet.robot import Mount, Robot, rotation
 
 ROBOT = Robot(name="floor")
 NEAR = Place(name="near", position_m=(0.45, 0.15, 0.25))
@@ -55,6 +60,75 @@ def test_cached_plans_equal_computed_ones(kind, tmp_path, no_planning):
     cached = CachedPlanner(replace(ROBOT, name="other"), elbows=2, cache_dir=folder).plan(WORKS[kind])
     assert {plan.arm for plan in cached} == {"other"}
     assert_same(tuple(replace(plan, arm="floor") for plan in cached), fresh)
+
+
+OVEN = Fixture(name="oven", position_m=(0.9, 0.0, 0.3), size_m=(0.2, 0.4, 0.6), tilt_deg=(0.0, 0.0, 20.0))
+
+
+def moved(by_m: tuple[float, float], turn_deg: float) -> tuple[Robot, Fixture, Work]:
+    """The arm, the oven and the work at another place of the hall, all turned about the vertical."""
+    turn = rotation((0.0, 0.0, turn_deg))
+
+    def at(position_m: tuple[float, ...]) -> tuple[float, float, float]:
+        x, y, z = (turn @ position_m + (*by_m, 0.0)).tolist()
+        return x, y, z
+
+    def turned(angles_deg: tuple[float, float, float]) -> tuple[float, float, float]:
+        return (*angles_deg[:2], angles_deg[2] + turn_deg)
+
+    places = tuple(
+        replace(place, name=f"there_{place.name}", position_m=at(place.position_m), tool_deg=turned(place.tool_deg))
+        for place in WORKS["pick_place"].places
+    )
+    return (
+        Robot(name="there", mount=Mount(position_m=at((0.0, 0.0, 0.0)), tilt_deg=(0.0, 0.0, turn_deg))),
+        replace(OVEN, position_m=at(OVEN.position_m), tilt_deg=turned(OVEN.tilt_deg)),
+        replace(WORKS["pick_place"], places=places),
+    )
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.tuples(*[st.floats(-8.0, 8.0)] * 2), st.floats(-180.0, 180.0))
+def test_an_arm_that_stands_alike_elsewhere_has_the_same_plans(by_m, turn_deg):
+    """The physics know no place and no compass: gravity and floor are the same after a move and a turn."""
+    there, oven, work = moved(by_m, turn_deg)
+    with TemporaryDirectory() as folder:
+        options = {"elbows": 2, "speeds": (1.0,), "cache_dir": Path(folder)}
+        here = CachedPlanner(ROBOT, [OVEN], **options).plan(WORKS["pick_place"])
+        plans = CachedPlanner(there, [oven], **options).plan(work)
+        assert len(list(Path(folder).iterdir())) == 1
+    assert {(plan.arm, plan.work) for plan in plans} == {("there", work)}
+    assert_same(tuple(replace(plan, arm="floor", work=WORKS["pick_place"]) for plan in plans), here)
+
+
+@pytest.mark.parametrize("turn_deg", [37.0, 180.0])
+def test_the_plan_of_a_moved_arm_brings_its_tool_to_the_place(turn_deg, tmp_path):
+    """By the kinematics of the arm where it stands, which know nothing of its own frame."""
+    there, oven, work = moved((3.0, -2.0), turn_deg)
+    plan = CachedPlanner(there, [oven], elbows=1, speeds=(1.0,), cache_dir=tmp_path).plan(work)[0]
+    still = plan.cycle.profile[(plan.cycle.profile[:, 1] == 0).all(axis=1), 0].astype(float)
+    model = ArmModel(there)
+    for place in work.places:
+        errors_m = [np.linalg.norm(model.tool_pose(q)[0] - place.position_m) for q in still]
+        turn = model.tool_pose(still[int(np.argmin(errors_m))])[1]
+        assert min(errors_m) < 1e-3
+        np.testing.assert_allclose(turn, rotation(place.tool_deg), atol=0.01)
+
+
+def test_an_error_names_the_place_of_the_moved_arm(tmp_path):
+    there, _, work = moved((3.0, -2.0), 90.0)
+    far = replace(work.places[1], position_m=(3.0, 0.0, 0.3))
+    for _ in range(2):
+        with pytest.raises(InfeasibleJob, match="Arm 'there' cannot work at 'there_far': reach"):
+            CachedPlanner(there, elbows=1, cache_dir=tmp_path).plan(replace(work, places=(work.places[0], far)))
+
+
+def test_like_arms_share_the_memory_of_their_plans(tmp_path):
+    loaded, (there, _, work) = LoadedPlans(), moved((1.5, 0.0), 180.0)
+    options = {"elbows": 1, "speeds": (1.0,), "cache_dir": tmp_path}
+    (here,) = CachedPlanner(ROBOT, **options, loaded=loaded).plan(WORKS["pick_place"])
+    (plan,) = CachedPlanner(there, **options, loaded=loaded).plan(work)
+    assert all(one.profile is other.profile for one, other in zip(plan.phases, here.phases, strict=True))
 
 
 def test_other_fixtures_are_another_file(tmp_path, no_planning):
