@@ -82,13 +82,20 @@ def arms_in_reach(robots: Sequence[Robot], margin_m: float) -> frozenset[frozens
     return frozenset(frozenset((one.name, other.name)) for one, other in pairs if _in_reach(one, other, margin_m))
 
 
-def space_table(robots: Sequence[Robot], plans: Sequence[Plan], margin_m: float, cache_dir: Path) -> SpaceTable:
+def space_table(
+    robots: Sequence[Robot],
+    plans: Sequence[Plan],
+    margin_m: float,
+    cache_dir: Path,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> SpaceTable:
     """The volumes of the plans of a cell and their conflicts; cached for each pair of arms.
 
     Args:
         robots: The arms of the cell.
         plans: All plans of these arms that `SpaceTable.rows` will look up.
         margin_m: Two volumes that come closer than this exclude each other.
+        report: Called with the number of pairs of arms that are done, and of all.
     """
     paths = [_Paths(robot, plans) for robot in robots]
     ends = np.cumsum([0, *(len(own.heaviest) for own in paths)])
@@ -97,9 +104,13 @@ def space_table(robots: Sequence[Robot], plans: Sequence[Plan], margin_m: float,
     for i, own in enumerate(paths):
         conflicts[ends[i] : ends[i + 1], ends[i] : ends[i + 1]] = True
         volume.update({key: int(ends[i] + row) for key, row in own.row.items()})
-    for (i, one), (j, other) in combinations(enumerate(paths), 2):
-        if not _in_reach(one.robot, other.robot, margin_m):
-            continue
+    pairs = [
+        (one, other)
+        for one, other in combinations(enumerate(paths), 2)
+        if _in_reach(one[1].robot, other[1].robot, margin_m)
+    ]
+    for done, ((i, one), (j, other)) in enumerate(pairs):
+        report(done, len(pairs))
         key = {"what": "conflicts", "margin_m": margin_m, "arms": [one.content(), other.content()]}
         block = cached_arrays(cache_dir, key, _comparison(one, other, margin_m))["conflicts"]
         conflicts[ends[i] : ends[i + 1], ends[j] : ends[j + 1]] = block

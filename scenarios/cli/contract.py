@@ -41,6 +41,7 @@ def documents(out: Path) -> dict[Path, str]:
     from scenarios.studies.page_tables.coverage import coverage_tables
     from scenarios.studies.page_tables.learned import learned_tables
     from scenarios.studies.page_tables.policies import policy_tables
+    from scenarios.studies.page_tables.processors import processor_tables
     from scenarios.studies.page_tables.sample_efficiency import efficiency_tables
     from scenarios.studies.page_tables.speed import speed_tables
     from scenarios.studies.page_tables.steps import steps_tables
@@ -50,6 +51,7 @@ def documents(out: Path) -> dict[Path, str]:
     more = {
         "commands": _command_tables,
         **policy_tables(results),
+        **processor_tables(results / "processors.json"),
         **channel_tables(results / "channels"),
         **coverage_tables(results / "coverage.json"),
         **benchmark_tables(results),

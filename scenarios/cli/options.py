@@ -227,9 +227,12 @@ def parse_randomisation(texts: list[str] | None) -> "Randomisation | None":
                 raise FleetError(f"--randomise {name} is given twice; give it once.")
         given |= found
     try:
-        return Randomisation(**given)
+        varied = Randomisation(**given)
     except ValueError as error:
         raise FleetError(str(error).replace("Randomisation.", "--randomise ")) from error
+    if not varied:
+        raise FleetError(f"--randomise changes nothing (got '{printable(', '.join(texts))}'); leave it out.")
+    return varied
 
 
 def split_names(text: str) -> list[str]:

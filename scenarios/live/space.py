@@ -22,7 +22,7 @@ def cell_space(scenario: Scenario, *, cache: Path | None = None, progress: Progr
     robots = [arm.robot() for arm in scenario.arms]
     planned = plan_arms(scenario, range(len(robots)), all_works(scenario), folder, progress)
     plans = [plan for arm in planned for plan in arm.all_plans]
-    table = space_of(scenario, robots, plans, folder)
+    table = space_of(scenario, robots, plans, folder, progress)
     return CellSpace(
         volume={space_name(key): volume for key, volume in table.volume.items()},
         conflicts=table.conflicts,

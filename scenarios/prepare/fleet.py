@@ -33,7 +33,7 @@ from scenarios.load import scenario_with
 from scenarios.prepare.planned_arm import PlannedArm, air_offsets, plan_arms
 from scenarios.prepare.problems import problems_of
 from scenarios.prepare.randomisation import Randomisation, Variation, randomisation_of
-from scenarios.progress import Progress, check_progress, quiet
+from scenarios.progress import Count, Progress, check_progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
 
@@ -111,22 +111,33 @@ def prepare(
         arms, planned = _arms(
             spec, every, difficulty, risk, cache, share, every_work=True, training=training, like=made
         )
-        fleets.append(_fleet(spec, arms, planned, _folder(cache), made))
+        fleets.append(_fleet(spec, arms, planned, _folder(cache), made, share))
     return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))
 
 
 def _fleet(
-    scenario: Scenario, arms: Sequence[Arm], planned: Sequence[PlannedArm], folder: Path, like: Fleet | None = None
+    scenario: Scenario,
+    arms: Sequence[Arm],
+    planned: Sequence[PlannedArm],
+    folder: Path,
+    like: Fleet | None = None,
+    progress: Progress = quiet,
 ) -> Fleet:
     plans = [plan for arm in arms for variants in arm.plans.values() for plan in variants]
-    space = like.space if like else space_of(scenario, [arm.robot for arm in arms], plans, folder)
+    space = like.space if like else space_of(scenario, [arm.robot for arm in arms], plans, folder, progress)
     refused = [error for arm in planned for error in arm.infeasible]
     return Fleet(scenario, tuple(arms), tuple(refused), space, planned=tuple(planned))
 
 
-def space_of(scenario: Scenario, robots: Sequence[Robot], plans: Sequence[Plan], folder: Path) -> SpaceTable:
+def space_of(
+    scenario: Scenario, robots: Sequence[Robot], plans: Sequence[Plan], folder: Path, progress: Progress = quiet
+) -> SpaceTable:
     """Space of the plans of a scenario's arms; cached in `folder`."""
-    return space_table(robots, plans, scenario.clearance_m, folder / "plans")
+
+    def report(done: int, total: int) -> None:
+        progress("space", Count(done, total))
+
+    return space_table(robots, plans, scenario.clearance_m, folder / "plans", report)
 
 
 def prepare_arm(

@@ -102,6 +102,8 @@ def test_results_say_how_they_were_randomised(thermofleet, small_toml, tmp_path)
         (["ambient_k=5"], r"--randomise ambient_k must be two finite numbers, low <= high \(got 5\)"),
         (["ambient_k=[0,1" + "0" * 400 + "]"], "--randomise ambient_k must be two finite numbers"),
         (["arrivals=[0,1]"], "--randomise arrivals must be > 0 and at most 100"),
+        (["variants=[]"], r"--randomise changes nothing \(got 'variants=\[\]'\); leave it out"),
+        (["ambient_k=[0,0]"], "--randomise changes nothing"),
         (["variants={slots=3}"], "--randomise variants must be a list of dictionaries"),
     ],
 )

@@ -85,19 +85,12 @@ def cooling_command(
         out_console.print()
 
 
-_FIGURES = {
-    "no_interface_s": "without TIM, 26 to 125 °C, s",
-    "forced_air_s": "with TIM and forced air, s",
-    "forced_water_s": "with TIM and forced water, s",
-    "immersed_c": "immersion, settles at, °C",
-    "immersed_ratio": "conductance of immersion / forced water",
-}
-
-
 def _motor_table(rows: "Sequence[MotorRow]") -> Table:
+    from scenarios.studies.heat.cooling import MOTOR_FIGURES
+
     table = plain_table("motor of Zhu et al.", "published", "here", "deviation")
     for row in rows:
-        table.add_row(_FIGURES[row.figure], f"{row.published:g}", f"{row.modelled:.2f}", f"{row.deviation:+.2%}")
+        table.add_row(MOTOR_FIGURES[row.figure], f"{row.published:g}", f"{row.modelled:.2f}", f"{row.deviation:+.2%}")
     return table
 
 

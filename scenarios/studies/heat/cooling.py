@@ -24,6 +24,16 @@ JOINT, PAYLOAD_KG, AMBIENT_C = 1, 3.0, 25.0
 """The hold that is compared: joint 2 of an outstretched arm."""
 
 
+MOTOR_FIGURES = {
+    "no_interface_s": "without thermal interface material (TIM), s",
+    "forced_air_s": "with TIM and forced air, s",
+    "forced_water_s": "with TIM and forced water, s",
+    "immersed_c": "immersed: never; settles at, °C",
+    "immersed_ratio": "conductance of immersion / forced water",
+}
+"""What the rows of the motor are: time from 26 to 125 °C, unless said otherwise."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class MotorRow:
     """One published figure of the motor of Zhu et al."""

@@ -5,15 +5,9 @@ from functools import partial
 from pathlib import Path
 
 from scenarios.doc_tables import table
+from scenarios.studies.heat.cooling import MOTOR_FIGURES
 from scenarios.studies.page_tables.cells import difference, read_json
 
-FIGURES = {
-    "no_interface_s": "without thermal interface material (TIM) between winding and housing, s",
-    "forced_air_s": "with it and forced air (40 mm fan), s",
-    "forced_water_s": "with it and forced water, s",
-    "immersed_c": "immersed in deionised water: never; settles at, °C",
-    "immersed_ratio": "conductance of immersion relative to forced water",
-}
 CHANGES = {
     "still_air": "–",
     "heat_sink": "fins: 1.8 × conductance to air, 1.35 × capacity of the housing",
@@ -39,7 +33,8 @@ def cooling_tables(results: Path) -> dict[str, Callable[[], str]]:
 
 def _motor(path: Path) -> str:
     rows = [
-        (FIGURES[row["figure"]], f"{row['published']:g}", f"{row['modelled']:.2f}") for row in read_json(path)["motor"]
+        (MOTOR_FIGURES[row["figure"]], f"{row['published']:g}", f"{row['modelled']:.2f}")
+        for row in read_json(path)["motor"]
     ]
     return table(("time to 125 °C, or temperature", "published", "here"), rows)
 

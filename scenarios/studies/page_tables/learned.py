@@ -8,9 +8,10 @@ import numpy as np
 from agents.learned.training_log import read_log
 from scenarios.doc_tables import table
 from scenarios.leaderboard.board import BASELINE, SOURCE, read_all
-from scenarios.leaderboard.submission import split_references
+from scenarios.leaderboard.submission import Submission, split_references
 from scenarios.policy_loader import trainings_of
-from scenarios.statistics.scores import Scores, ranked, scores_of
+from scenarios.statistics.means import Interval
+from scenarios.statistics.scores import Normalised, Scores, ranked, scores_of
 from scenarios.suite.cells import CELLS
 from scenarios.suite.splits import instance
 from scenarios.trials.scores import normalised
@@ -21,6 +22,10 @@ TRAINED = {cell.arms for cell in CELLS if cell.split == "train"}
 """Numbers of arms of the fleets of the training split."""
 
 
+UNTRAINED = "wsept_untrained"
+LEARNED = ("train-pairs-*", "wsept_learned", "wsept_learned_local")
+
+
 def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
     """Text of the table by the name in its mark.
 
@@ -29,6 +34,7 @@ def learned_tables(results: Path) -> dict[str, Callable[[], str]]:
     """
     return {
         "trainings": lambda: _trainings(results / "learned"),
+        "learned_gain": lambda: _gain(results / "leaderboard"),
         "learned_test": lambda: _by_size(
             results / "leaderboard", "test", {
                 "trained sizes": lambda arms: np.isin(arms, list(TRAINED)),
@@ -59,13 +65,38 @@ def _trainings(folder: Path) -> str:
     return table(("training", "iterations", "first parameters", "best", "`wsept`"), rows)
 
 
-def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Array]]) -> str:
-    """Differences of normalised scores to the best rule on a split: on all instances, and by numbers of arms."""
+def _scored(folder: Path, split: str) -> tuple[dict[str, Submission], Normalised]:
+    """The results on a split by policy, and their scores."""
     found = {each.card.policy: each for each in read_all(folder, split) if each.card.difficulty == SOURCE}
     values = normalised(
         {name: each.study_rows() for name, each in found.items()}, split_references(split), failed_as_random=True
     )
     assert values is not None
+    return found, values
+
+
+def _gain(folder: Path) -> str:
+    """Scores of learned policies less those of the best rule, and of the parameters that training began with."""
+    bases = (BASELINE, UNTRAINED)
+    rows: list[tuple[str, ...]] = []
+    for split in ("test", "sizes"):
+        found, values = _scored(folder, split)
+        for name in LEARNED:
+            if name in found:
+                cells = [bold_if(values.difference(name, base)) for base in bases]
+                rows.append((f"{split}: {found[name].title}", f"{found[name].mean('faults'):.3f}", *cells))
+    return table(("split and policy", "faults per shift", *(f"score less that of `{base}`" for base in bases)), rows)
+
+
+def bold_if(difference: Interval) -> str:
+    """A difference with its interval, bold if that excludes 0."""
+    text = difference.text()
+    return f"**{text}**" if difference.excludes_zero else text
+
+
+def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Array]]) -> str:
+    """Differences of normalised scores to the best rule on a split: on all instances, and by numbers of arms."""
+    found, values = _scored(folder, split)
     arms = np.array([len(instance(name).scenario.arms) for name in values.instances])
     parts: dict[str, Scores] = {}
     for name, chosen in {"all instances": np.ones_like, **groups}.items():
@@ -75,8 +106,6 @@ def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Ar
     for name in ranked(next(iter(parts.values()))):
         cells = [found[name].title]
         for scores in parts.values():
-            own = scores.policies[name]
-            text = own.difference.text()
-            cells.append("" if name == BASELINE else f"**{text}**" if own.difference.excludes_zero else text)
+            cells.append("" if name == BASELINE else bold_if(scores.policies[name].difference))
         rows.append((*cells, f"{found[name].mean('faults'):.2f}"))
     return table(("policy", *parts, "faults"), rows)
