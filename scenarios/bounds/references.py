@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import delayed
 
 from agents.registry import RULES
 from fleet.errors import ScenarioError
@@ -24,6 +24,7 @@ from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
+from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
 from scenarios.scenario_hash import scenario_hash
@@ -200,7 +201,7 @@ def references(
     )
     done = len(tasks) - len(left)
     progress("bounding", Count(done, max(1, len(tasks))))
-    with Parallel(n_jobs=max(1, min(jobs, len(left))), return_as="generator_unordered") as pool:
+    with worker_processes(max(1, min(jobs, len(left)))) as pool:
         for new in pool(work):
             assert isinstance(new, Reference)
             rows.append(_key(new.instance, new.scenario_hash, new.seed, difficulty), asdict(new))

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from joblib import Parallel, cpu_count, delayed
+from joblib import cpu_count, delayed
 
 from fleet.errors import CheckpointError
+from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 
 log = logging.getLogger(__name__)
@@ -42,7 +43,7 @@ def load_or_make(models: Sequence[CachedModel[Model]], stage: str, progress: Pro
         reasons = [models[missing[0]].make(models[missing[0]].folder, report)]
         report(1)
     elif missing:
-        with Parallel(n_jobs=min(len(missing), cpu_count()), return_as="generator_unordered") as pool:
+        with worker_processes(min(len(missing), cpu_count())) as pool:
             tasks = (delayed(models[i].make)(models[i].folder, _ignore) for i in missing)
             for made, reason in enumerate(pool(tasks), start=1):
                 reasons.append(reason)

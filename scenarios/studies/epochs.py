@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from joblib import Parallel, cpu_count, delayed
+from joblib import cpu_count, delayed
 
+from scenarios.processes import worker_processes
 from scenarios.progress import Progress, quiet
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
@@ -70,7 +71,7 @@ def epoch_study(
     tasks = sorted(product(range(len(seeds)), range(len(epochs))), key=lambda task: -epochs[task[1]])
     cells = (delayed(_cell)(jobs, replace(base, epochs=epochs[e]), seeds[s], records) for s, e in tasks)
     total, done, results = len(seeds) * sum(epochs), 0, []
-    with Parallel(n_jobs=min(len(tasks), cpu_count()) if workers < 0 else workers, return_as="generator") as pool:
+    with worker_processes(min(len(tasks), cpu_count()) if workers < 0 else workers, in_order=True) as pool:
         for (_, e), result in zip(tasks, pool(cells), strict=True):
             results.append(result)
             done += epochs[e]

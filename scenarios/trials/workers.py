@@ -1,7 +1,6 @@
 """Run units on several processes, here or on a Ray cluster; those of a process that dies are run again."""
 
 import os
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -13,6 +12,7 @@ from joblib.externals.loky.backend import get_context
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from fleet.errors import FleetError
+from scenarios.processes import end_with
 from scenarios.trials.plan import Row, Unit
 from scenarios.trials.run_unit import Settings, died, run_unit
 
@@ -22,8 +22,6 @@ MOST_DEATHS = 3
 
 IDLE_S = 120.0
 """A process without work ends after this time."""
-PARENT_CHECK_S = 1.0
-"""Time between two checks of a process that the command that started it still runs."""
 
 
 class Worker(Protocol):
@@ -55,7 +53,7 @@ class LocalWorker:
 
     def _new(self) -> ProcessPoolExecutor:
         how = {"context": get_context("loky"), "env": {"OMP_NUM_THREADS": "1"}, "timeout": IDLE_S}
-        return ProcessPoolExecutor(1, initializer=_end_with, initargs=(os.getpid(),), **how)
+        return ProcessPoolExecutor(1, initializer=end_with, initargs=(os.getpid(),), **how)
 
     def submit(self, unit: Unit) -> "Future[list[Row]]":
         """Begin a unit."""
@@ -74,19 +72,6 @@ class LocalWorker:
     def close(self) -> None:
         """End the process."""
         self._pool.shutdown(wait=True, kill_workers=True)
-
-
-def _end_with(parent: int) -> None:
-    """End this process soon after its parent, also in the middle of a unit."""
-
-    pause = threading.Event()  # never set
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            pause.wait(PARENT_CHECK_S)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 class Queue:

@@ -6,10 +6,11 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from joblib import Parallel, cpu_count, delayed
+from joblib import cpu_count, delayed
 
 from fleet.errors import FleetError
 from fleet.robot import Robot
+from scenarios.processes import worker_processes
 from scenarios.progress import Progress, quiet
 from scenarios.studies.benchmark import VAE, chosen_variants, jobs_of
 from scenarios.studies.epochs import EPOCHS
@@ -99,7 +100,7 @@ class Lab:
         tasks = [(seed, name, 0) for name in networks for seed in self.seeds]
         tasks += [(seed, VAE, self.size.explored) for seed in self.seeds if explored]
         self.progress("training", 0.0)
-        with Parallel(n_jobs=max(1, min(cpu_count(), len(tasks))), return_as="generator_unordered") as pool:
+        with worker_processes(max(1, min(cpu_count(), len(tasks)))) as pool:
             for done, _ in enumerate(pool(delayed(_train)(self, *task) for task in tasks), start=1):
                 self.progress("training", done / len(tasks))
 

@@ -13,13 +13,14 @@ from typing import Any, Generic, TypeVar  # Any: JSON values
 
 import msgspec
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import delayed
 
 import fleet
 import scenarios
 import twin
 from fleet.errors import FleetError
 from fleet.files import atomic_path
+from scenarios.processes import worker_processes
 from scenarios.progress import COUNTED, Progress, quiet
 from scenarios.report.page import Section
 
@@ -114,7 +115,7 @@ def compute_sections(
     loads = {each.key: each.load for group in ordered for each in group}
     finished = 0.0
     progress("sections", 0.0)
-    with Parallel(n_jobs=max(1, min(processes, len(ordered))), return_as="generator_unordered") as pool:
+    with worker_processes(max(1, min(processes, len(ordered)))) as pool:
         results = pool(delayed(_compute)(group, subject, cache) for group in ordered)
         for section in (section for sections in results for section in sections or ()):
             done[section.key] = section
