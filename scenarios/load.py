@@ -37,6 +37,15 @@ def library() -> dict[str, Path]:
     return {Path(str(f)).stem: Path(str(f)) for f in sorted(folder.iterdir(), key=str) if f.name.endswith(".toml")}
 
 
+def own_seed(name_or_path: str | Path) -> int:
+    """The seed of an instance of the suite; 0 for every other scenario."""
+    if not INSTANCE.fullmatch(str(name_or_path)):
+        return 0
+    from scenarios.suite.splits import instance  # it imports this file
+
+    return instance(str(name_or_path)).seed
+
+
 def load(name_or_path: str | Path) -> Scenario:
     """The scenario of a library name, of a .toml file, or of an instance of the suite, as `test/0017`.
 

@@ -122,7 +122,7 @@ def tasks_of(names: str, seeds: int, first_seed: int) -> "list[Task]":
     return tasks
 
 
-HEADS = ("instance", "random", "best rule", "reward", "hindsight", "upper bound", "score of the rule", "gap", "CPU s")
+HEADS = ("instance", "random", "best start", "reward", "hindsight", "upper bound", "its score", "gap", "CPU s")
 
 
 def heads_of(references: "Sequence[Reference]") -> tuple[str, ...]:

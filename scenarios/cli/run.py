@@ -16,7 +16,7 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, plain_table, print_json, progress_bar, say
-from scenarios.load import load
+from scenarios.load import load, own_seed
 from scenarios.policy_loader import label, policy_of
 from scenarios.progress import Progress
 from scenarios.result_folder import check_free, disk_errors, new_folder
@@ -38,7 +38,14 @@ PAIR = "index.html"
 def run_command(
     scenario: options.ScenarioArg,
     policy: Annotated[str, typer.Option(help=NAMES_HELP)] = "least_difficulty",
-    seed: options.SeedOption = 0,
+    seed: Annotated[
+        int | None,
+        options.number(
+            "Random seed of jobs, sensor noise and policy; default: 0, or of an instance of the suite its own.",
+            0,
+            options.MAX_SEED,
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the recording; default: runs/SCENARIO-POLICY-SEED.")
     ] = None,
@@ -73,7 +80,7 @@ def run_command(
     from scenarios.run.run_folder import RUN
     from scenarios.run.shift import summary
 
-    chosen = load(scenario)
+    chosen, seed = load(scenario), own_seed(scenario) if seed is None else seed
     channel = options.channel_of(
         chosen, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
         jitter_s=jitter_s, loss=loss,

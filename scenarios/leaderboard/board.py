@@ -20,7 +20,7 @@ from scenarios.trials.scores import Shift, normalised
 BASELINE = "wsept"
 """Policy that differences refer to, with the scores of `SOURCE`; without it the last of the board."""
 SOURCE = "oracle"
-HEADS = ("", "policy", "scores from", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound")
+HEADS = ("", "policy", "predictions", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound")
 MORE = ("faults", "failed", "by", "code")
 
 
@@ -155,7 +155,14 @@ def references_text() -> str:
                 f"{median(each.normalised(each.best_rule) for each in found):.2f}",
             )
         )
-    heads = ("split", "instances", "shifts of a search", "nodes", "gap, median", "score of the best policy, median")
+    heads = (
+        "split",
+        "instances",
+        "shifts of a search",
+        "nodes",
+        "gap, median",
+        "score of the best starting policy, median",
+    )
     return table(heads, rows)
 
 

@@ -1,9 +1,11 @@
 """A scenario file is read, or refused with one sentence that says where and why."""
 
 import datetime
+import json
 import math
 import tomllib
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.errors import ScenarioError
-from scenarios.load import library, load, override, parse_scenario
+from scenarios.load import library, load, override, own_seed, parse_scenario
 
 FILE = Path("heat.toml")
 
@@ -325,3 +327,9 @@ def test_a_wrong_override_is_told(changes, sentence):
 def test_the_library_is_what_lies_in_its_folder():
     folder = Path(library()["quickstart"]).parent
     assert set(library()) == {path.stem for path in folder.glob("*.toml")} >= {"quickstart", "heat_wave"}
+
+
+def test_an_instance_of_the_suite_has_a_seed_of_its_own():
+    line = json.loads(resources.files("scenarios.suite").joinpath("test.jsonl").read_text().splitlines()[3])
+    assert line["name"] == "test/0003" and own_seed("test/0003") == line["seed"]
+    assert own_seed("heat_wave") == own_seed("some/cell.toml") == 0
