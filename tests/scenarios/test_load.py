@@ -331,5 +331,6 @@ def test_the_library_is_what_lies_in_its_folder():
 
 def test_an_instance_of_the_suite_has_a_seed_of_its_own():
     line = json.loads(resources.files("scenarios.suite").joinpath("test.jsonl").read_text().splitlines()[3])
-    assert line["name"] == "test/0003" and own_seed("test/0003") == line["seed"]
+    assert line["name"] == "test/0003"
+    assert own_seed("test/0003") == line["seed"]
     assert own_seed("heat_wave") == own_seed("some/cell.toml") == 0
