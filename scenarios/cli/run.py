@@ -120,7 +120,7 @@ def demo_command(
     out: Annotated[Path, typer.Option(help="Folder of the two recordings and of the page that compares them.")] = Path(
         "out/demo"
     ),
-    seed: options.SeedOption = 19,
+    seed: options.SeedOption = 20,
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
     from scenarios.report.pair_page import Side, pair_page
