@@ -69,7 +69,7 @@ def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, t
     def never(*_args, **_more):
         raise AssertionError("trained again")
 
-    monkeypatch.setattr(model_cache, "Parallel", never)
+    monkeypatch.setattr(model_cache, "worker_processes", never)
     again = rehearse.train_twins(scenario, arms(2, plans), tmp_path, silent)
     assert [t.version for t in again] == [t.version for t in first]
     other = replace(scenario, twin=replace(scenario.twin, cool_c=200.0))  # hot motion is in the records as well
