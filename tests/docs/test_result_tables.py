@@ -35,10 +35,10 @@ BY_HAND = {
     ("docs/security.md", ""): "times of one machine; `benchmarks/bench_tls.py` prints them",
     ("docs/several_machines.md", "fault"): "`make mesh` prints it: 256 arms",
     ("docs/suite.md", "split"): "the definition of the suite",
+    ("docs/suite.md", "axis of a cell"): "the definition of the suite",
     ("docs/trainers.md", "trainer"): "versions",
     ("docs/twin.md", "scenario"): "`thermofleet twin reliability` prints it: an hour; labelled with its revision",
     ("docs/twin.md", "question"): "hours; labelled with its revision, the code is beside it",
-    ("README.md", "you"): "links",
 }
 """Tables that are kept by hand, by page and first heading, and why."""
 
