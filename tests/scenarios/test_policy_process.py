@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -118,17 +118,27 @@ def test_a_process_that_ends_or_hangs_in_a_shift_fails_the_shift(fleet, served):
 
 
 def test_few_requests_wait_for_a_process_and_the_oldest_are_dropped():
-    busy = "import threading, own_policy_process as p; p.act = lambda _: threading.Event().wait(); p.main({}, 'mine')"
+    act = "lambda _: (print('busy', flush=True), threading.Event().wait())"
+    busy = f"import threading, own_policy_process as p; p.act = {act}; p.main({{}}, 'mine')"
     ended: queue.Queue[int] = queue.Queue()
+    told: queue.Queue[str] = queue.Queue()
     with Router() as router, open_client(router.endpoint, timeout_s=PATIENCE_S) as session:
         command = [sys.executable, "-c", busy.format(router.endpoint.rsplit(":", 1)[1])]
         with started(command, cwd=ROOT / "examples") as process:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready mine\n"
-            for number in range(1 + MOST_WAITING + 3):
-                handler = zenoh.handlers.Callback(lambda _: None, partial(ended.put, number))
+            threading.Thread(target=lambda: told.put(process.stdout.readline()), daemon=True).start()
+
+            def ask(when_over: Callable[[], None]) -> None:
+                handler = zenoh.handlers.Callback(lambda _: None, when_over)
                 session.get(KEY, handler, payload="{}", encoding=encoding(ActRequest), timeout=2 * PATIENCE_S)
-            assert [ended.get(timeout=PATIENCE_S) for _ in range(3)] == [1, 2, 3]
+
+            ask(partial(told.put, "nobody there yet"))
+            while told.get(timeout=PATIENCE_S) != "busy\n":  # it is at work on the first one, so the others wait
+                ask(partial(told.put, "nobody there yet"))
+            for number in range(1, 1 + MOST_WAITING + 3):
+                ask(partial(ended.put, number))
+            assert {ended.get(timeout=PATIENCE_S) for _ in range(3)} == {1, 2, 3}
             assert ended.empty()
 
 
