@@ -12,7 +12,12 @@ def difference(mean: float, low: float | None, high: float | None, digits: int =
     if low is None or high is None or math.isnan(low + high):
         return text
     text += f" ({signed(low, digits)} … {signed(high, digits)})"
-    return f"**{text}**" if low > 0 or high < 0 else text
+    return bold_if(low > 0 or high < 0, text)
+
+
+def bold_if(shown: bool, text: str) -> str:
+    """The text, bold where a difference is shown."""
+    return f"**{text}**" if shown else text
 
 
 def signed(value: float, digits: int = 1) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from scenarios.doc_tables import table
 from scenarios.statistics.counts import paired_counts
 from scenarios.statistics.means import paired
+from scenarios.studies.page_tables.cells import bold_if
 
 COLUMNS = {
     "value": ("value", 1),
@@ -56,4 +57,4 @@ def _cell(name: str, x: np.ndarray, base: np.ndarray) -> str:
         return mean
     d = (paired_counts if name == "faults" else paired)(x, base)
     text = d.text(digits, "+")
-    return f"{mean} ({f'**{text}**' if d.excludes_zero else text})"
+    return f"{mean} ({bold_if(d.excludes_zero, text)})"

@@ -12,6 +12,7 @@ from scenarios.leaderboard.submission import Submission, split_references
 from scenarios.policy_loader import trainings_of
 from scenarios.statistics.means import Interval
 from scenarios.statistics.scores import Normalised, Scores, ranked, scores_of
+from scenarios.studies.page_tables.cells import bold_if
 from scenarios.suite.cells import CELLS
 from scenarios.suite.splits import instance
 from scenarios.trials.scores import normalised
@@ -83,15 +84,14 @@ def _gain(folder: Path) -> str:
         found, values = _scored(folder, split)
         for name in LEARNED:
             if name in found:
-                cells = [bold_if(values.difference(name, base)) for base in bases]
+                cells = [_shown(values.difference(name, base)) for base in bases]
                 rows.append((f"{split}: {found[name].title}", f"{found[name].mean('faults'):.3f}", *cells))
     return table(("split and policy", "faults per shift", *(f"score less that of `{base}`" for base in bases)), rows)
 
 
-def bold_if(difference: Interval) -> str:
+def _shown(difference: Interval) -> str:
     """A difference with its interval, bold if that excludes 0."""
-    text = difference.text()
-    return f"**{text}**" if difference.excludes_zero else text
+    return bold_if(difference.excludes_zero, difference.text())
 
 
 def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Array]]) -> str:
@@ -106,6 +106,6 @@ def _by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Ar
     for name in ranked(next(iter(parts.values()))):
         cells = [found[name].title]
         for scores in parts.values():
-            cells.append("" if name == BASELINE else bold_if(scores.policies[name].difference))
+            cells.append("" if name == BASELINE else _shown(scores.policies[name].difference))
         rows.append((*cells, f"{found[name].mean('faults'):.2f}"))
     return table(("policy", *parts, "faults"), rows)

@@ -7,7 +7,7 @@ from typing import Any
 from agents.registry import RULES, WRAPPERS
 from scenarios.doc_tables import table
 from scenarios.run.compare import HEADINGS
-from scenarios.studies.page_tables.cells import difference, read_json, signed
+from scenarios.studies.page_tables.cells import bold_if, difference, read_json, signed
 
 NAMED = ("faults", "value", "on_time", "reward", "hot_surface_min")
 """Figures of the table of named scenarios; those that are 0 everywhere are left out."""
@@ -87,7 +87,7 @@ def _mean_cell(figure: dict[str, Any], *, is_base: bool) -> str:
     low, high = figure["difference_low"], figure["difference_high"]
     differs = low is not None and (low > 0 or high < 0)
     text += f" ({signed(figure['difference'])})"
-    return f"**{text}**" if differs else text
+    return bold_if(differs, text)
 
 
 def _decisions(measured: dict[str, Any]) -> str:
