@@ -21,7 +21,7 @@ class Rule:
 
     kind: type[Policy] | type[ArmPolicy]
     cost: str
-    """The quantity that it minimises, for a table."""
+    """What it allocates by, smallest first, for a table."""
     source: str = ""
 
     @property

@@ -197,12 +197,12 @@ def ablate_command(
             help="Policy that runs with each source: a name, FILE.py:CLASS, or a folder of `thermofleet train`."
         ),
     ] = "least_difficulty",
-    scores: Annotated[
+    sources: Annotated[
         str | None,
         typer.Option(
-            help="Sources, separated by commas: trained, untrained, torque, rc-nominal, rc, random, inverted, "
-            "constant, blind, oracle; or POLICY@SOURCE for another policy. Differences refer to the first one. "
-            "Default: all sources.",
+            help="Sources, separated by commas: trained, unweighted, untrained, torque, weighted-torque, rc-nominal, "
+            "rc, random, inverted, constant, blind, oracle; or POLICY@SOURCE for another policy. Differences refer to "
+            "the first one. Default: all sources.",
             show_default=False,
         ),
     ] = None,
@@ -218,9 +218,9 @@ def ablate_command(
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Compare the results of one policy with scores from different sources.
+    """Compare the results of one policy with predictions from different sources.
 
-    Scores are difficulty, P(saturation) and predicted peak. Every shift is written
+    Predictions are difficulty, P(saturation) and predicted peak. Every shift is written
     to ablation.csv, the intervals to ablation.json. The same command resumes an
     interrupted comparison. A training takes up to a minute per arm.
     """
@@ -231,7 +231,7 @@ def ablate_command(
     from scenarios.studies.ablation import AblationPlan, ablate, ablation_table
 
     chosen = load(scenario)
-    given = {} if scores is None else {"scores": tuple(options.split_names(scores))}
+    given = {} if sources is None else {"scores": tuple(options.split_names(sources))}
     plan = AblationPlan(policy=policy, fleets=fleets, trainings=trainings, seeds=seeds, first_seed=first_seed, **given)
     folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy).replace(':', '-')}")
     with progress_bar(kept="Finished shifts are", file=folder) as progress:

@@ -51,7 +51,7 @@ COMMANDS = {
     "view": LazyCommand(_LOOK, "view:view_command", "Play a shift in MuJoCo's viewer."),
     "trace": LazyCommand(_LOOK, "scenarios.trace.command:trace_command", "Follow an event to its causes."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
-    "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of scores under one policy."),
+    "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of predictions under one policy."),
     "bounds": LazyCommand(_POLICIES, "scenarios.bounds.command:bounds_command", "Bound the reward of shifts."),
     "leaderboard": LazyCommand(
         _POLICIES, "scenarios.leaderboard.command:leaderboard_command", "Print the leaderboard of a split."

@@ -239,7 +239,7 @@ def metrics_table(results: dict[str, Metrics]) -> Table:
         ("availability", lambda m: f"{m.availability:.1%}"),
         ("energy, Wh", lambda m: f"{m.energy_wh:.0f}"),
         ("insulation life used, ppb", lambda m: f"{max(m.insulation_ppb.values()):.1f}"),
-        ("min hot surface", lambda m: f"{m.hot_surface_min:.1f}"),
+        ("hot surface, min", lambda m: f"{m.hot_surface_min:.1f}"),
         ("tool drift, mm", lambda m: f"{max(m.tool_drift_mm.values()):.2f}"),
     ]
     if any(m.contacts for m in results.values()):

@@ -33,7 +33,7 @@ HEADINGS = {
     "availability": "availability, 0–1",
     "insulation_ppb": "insulation, ppb",
     "tool_drift_mm": "tool drift, mm",
-    "hot_surface_min": "min hot surface",
+    "hot_surface_min": "hot surface, min",
 }
 """Headings of the figures in the table, with units."""
 LEAST_DIGITS = {"availability": 3, "tool_drift_mm": 2}

@@ -1,4 +1,4 @@
-"""Compare sources of scores: one policy with difficulty, P(saturation) and predicted peak from each source.
+"""Compare sources of predictions: one policy with difficulty, P(saturation) and predicted peak from each source.
 
 Every source runs on the same fleets, trainings and seeds; intervals count all three (`scenarios.statistics.means`).
 """
@@ -54,7 +54,7 @@ class AblationPlan:
         for i, name in enumerate(self.scores):
             policy, source = self.parts(name)
             if source not in ALL_SOURCES:
-                raise FleetError(f"No source of scores '{source}'{nearest(source, ALL_SOURCES)}")
+                raise FleetError(f"No source of predictions '{source}'{nearest(source, ALL_SOURCES)}")
             if name in self.scores[:i]:
                 raise FleetError(f"The source '{name}' is given twice; names must be unique.")
             policy_of(policy)

@@ -236,7 +236,7 @@ SOURCES: dict[str, Source] = {
     "blind": Source("blind", lambda drawn, _: drawn.blind, trained=False),
     "oracle": Source("oracle", lambda drawn, _: drawn.oracle, trained=False),
 }
-"""By name, as `--scores` takes them."""
+"""By name, as `--sources` takes them."""
 
 
 def _variant(label: str, **changes: int) -> Source:

@@ -40,7 +40,7 @@ def test_the_inverse_has_the_opposite_order_and_probability() -> None:
 def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp_path, monkeypatch) -> None:
     out = tmp_path / "ablation"
     scores = "blind,random,constant,oracle,round_robin@blind"
-    call = ("ablate", small_toml, "--fleets", 2, "--scores", scores, "--out", out, "--policy", "wspt")
+    call = ("ablate", small_toml, "--fleets", 2, "--sources", scores, "--out", out, "--policy", "wspt")
     done = thermofleet(*call, "--seeds", 2)
     assert done.code == 0, done.err
     for name in scores.split(","):
@@ -53,7 +53,7 @@ def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp
     mean = np.mean([float(row["reward"]) for row in rows if row["scores"] == "random"])
     assert card["effects"]["random"]["reward"]["mean"] == pytest.approx(mean)
     alone = tmp_path / "alone"
-    call_alone = (*call[:4], "--scores", "blind", "--policy", "round_robin", "--out", alone)
+    call_alone = (*call[:4], "--sources", "blind", "--policy", "round_robin", "--out", alone)
     assert thermofleet(*call_alone, "--seeds", 2).code == 0
     same = json.loads((alone / "ablation.json").read_text())["effects"]["blind"]["value"]["mean"]
     assert card["effects"]["round_robin@blind"]["value"]["mean"] == same
@@ -75,13 +75,13 @@ def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp
 
 
 def test_bad_sources_are_named(thermofleet, small_toml, tmp_path) -> None:
-    said = thermofleet("ablate", small_toml, "--scores", "trained,oracel", "--out", tmp_path / "x")
+    said = thermofleet("ablate", small_toml, "--sources", "trained,oracel", "--out", tmp_path / "x")
     assert said.code == 2
-    assert "No source of scores 'oracel'; did you mean 'oracle'?" in said.err
+    assert "No source of predictions 'oracel'; did you mean 'oracle'?" in said.err
     assert not (tmp_path / "x").exists()
     full = tmp_path / "full"
     full.mkdir()
     (full / "mine.txt").write_text("x")
-    said = thermofleet("ablate", small_toml, "--scores", "blind,constant", "--out", full)
+    said = thermofleet("ablate", small_toml, "--sources", "blind,constant", "--out", full)
     assert said.code == 2
     assert "holds other files" in said.err

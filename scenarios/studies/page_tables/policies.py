@@ -35,7 +35,7 @@ def policy_tables(results: Path) -> dict[str, Callable[[], str]]:
 
 def _policies() -> str:
     rows = [(f"`{name}`", rule.scope, rule.cost, rule.source) for name, rule in RULES.items()]
-    return table(("policy", "scope", "minimises", "source"), rows)
+    return table(("policy", "scope", "allocates by", "source"), rows)
 
 
 def _wrappers() -> str:
