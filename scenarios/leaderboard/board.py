@@ -95,14 +95,14 @@ def board_text(board: Board | None, split: str) -> str:
 
 
 def best_text(board: Board) -> str:
-    """The best policy of each scope, in a sentence."""
+    """The policy with the highest mean score of each scope, in a sentence."""
     best = [
         f"{scope} `{each.card.policy}` ({board.scores.policies[each.name].mean.text()})"
         for scope in ("central", "arm")
         for each in [board.best(scope)]
         if each
     ]
-    return f"Best policy of scope {', of scope '.join(best)}."
+    return f"Highest mean score of scope {', of scope '.join(best)}."
 
 
 def remark_text(board: Board) -> str:
@@ -158,7 +158,7 @@ def references_text() -> str:
     heads = (
         "split",
         "instances",
-        "shifts of a search",
+        "shifts of the last search",
         "nodes",
         "gap, median",
         "score of the best starting policy, median",

@@ -31,7 +31,6 @@ BY_HAND = {
     ("docs/scaling.md", ""): "to be made from files",
     ("docs/scaling.md", "arms, sites"): "to be made from files",
     ("docs/scaling.md", "asked"): "to be made from files",
-    ("docs/scaling.md", "arms"): "to be made from files",
     ("docs/security.md", ""): "times of one machine; `benchmarks/bench_tls.py` prints them",
     ("docs/several_machines.md", "fault"): "`make mesh` prints it: 256 arms",
     ("docs/suite.md", "split"): "the definition of the suite",

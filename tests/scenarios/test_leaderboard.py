@@ -96,7 +96,7 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     assert "has a result of Ann" in capsys.readouterr().err
     assert run("leaderboard", sent, "--markdown") == 0
     text = capsys.readouterr().out
-    assert "Best policy of scope central `wsept` (0.75 [" in text or "of scope arm `wsept` (0.75 [" in text
+    assert "Highest mean score of scope central `wsept` (0.75 [" in text or "of scope arm `wsept` (0.75 [" in text
     (first,) = re.findall(r"\| 1 \|.*", text)
     assert [cell.strip() for cell in first.split("|")][2:5] == ["`wsept`", "oracle", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text

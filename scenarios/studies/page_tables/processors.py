@@ -20,8 +20,8 @@ def processor_sentence(measured: dict[str, Any]) -> str:
     """How many shifts have another reward, and how far apart the others are."""
     policies = " and ".join(f"`{name}`" for name in measured["policies"])
     share = measured["largest_share"]
-    apart = "all are equal to the last bit" if not share else f"the largest difference is {share:.0e} of the reward"
+    apart = "all are equal to the last bit" if not share else f"the others differ by at most {share:.0e} of the reward"
     return (
         f"{measured['instances']} instances of the test split, {policies}: {len(measured['other_reward'])} of "
-        f"{measured['shifts']} shifts have another reward; {apart}."
+        f"{measured['shifts']} shifts have a reward that differs by more than 1e-9 of it; {apart}."
     )
