@@ -203,7 +203,7 @@ def main() -> None:
         line(f"batch of 1024, {difficulty}", measured(here, "batch", difficulty, "1024"), 1_000_000)
     print(f"two threads against one, 1024 envs, wall clock: {measured(here, 'threads', '1024')} times (target 1.8)")
     if find_spec("torchrl") is None:
-        print("TorchRL is not installed; install it with: pip install 'thermofleet[learn]' -c constraints.txt")
+        print("TorchRL is not installed; install it with: pip install -e '.[learn]' -c constraints.txt")
     else:
         line("TorchRL rollout of 1024, blind", measured(here, "torchrl", "1024"), 300_000)
         line("the same after keep_pages()", measured(here, "torchrl", "1024", "kept"), 300_000)

@@ -163,3 +163,8 @@ def visible(text: str, keep: str = "") -> str:
     if text.isprintable():
         return text
     return "".join(char if char.isprintable() or char in keep else json.dumps(char)[1:-1] for char in text)
+
+
+def install(extra: str) -> str:
+    """How an extra is installed, for an error; no package index has thermofleet."""
+    return f"pip install -e '.[{extra}]' -c constraints.txt, in a copy of the repository"

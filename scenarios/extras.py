@@ -2,7 +2,7 @@
 
 from importlib.util import find_spec
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, install
 
 EXTRAS = {
     "cli": ("rich", "typer"),
@@ -49,4 +49,4 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
 
 
 def _sentence(library: str, extra: str) -> str:
-    return f"This needs the library '{library}', which is not installed: pip install 'thermofleet[{extra}]'."
+    return f"This needs the library '{library}', which is not installed: {install(extra)}."

@@ -54,6 +54,34 @@ class Unusable(FleetError):
     """The class of a policy that cannot be made without arguments."""
 
 
+class PolicyFailed(FleetError):
+    """A policy of one's own that raised an exception or returned no action."""
+
+
+def failure(name: str, error: BaseException, where: str) -> BaseException:
+    """What to raise for an error of a policy: a sentence, or the error itself of a built-in policy or a `FleetError`.
+
+    Args:
+        where: In which shift, as `quickstart/3`.
+    """
+    if isinstance(error, FleetError) or is_built_in(name):
+        return error
+    source = source_of(name)
+    frames = extract_tb(error.__traceback__)
+    own = [frame for frame in frames if source and Path(frame.filename).absolute() == source.absolute()]
+    line = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+    text = f"{type(error).__name__}: {error_text(error)}".rstrip(".: ")
+    return PolicyFailed(f"The policy '{name}' failed in {where}: {text}{line}.")
+
+
+def error_text(error: BaseException) -> str:
+    """What an error of a policy says, whatever it is made of."""
+    try:
+        return str(error).encode("utf-8", "backslashreplace").decode()
+    except Exception as failed:  # whatever its own code raises
+        return f"(its text raises {type(failed).__name__})"
+
+
 def policy_of(name: str, bus: OnBus = ON_BUS) -> Policy:
     """A fresh policy for all arms.
 

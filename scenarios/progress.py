@@ -13,7 +13,6 @@ COUNTED = "computing "
 
 STAGES = {
     "planning": "Planning motions",
-    "space": "Finding motions that exclude each other",
     "identifying": "Identifying the arms",
     "training": "Training the twins",
     "calibrating": "Calibrating the twins",

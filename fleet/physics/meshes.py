@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mujoco
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, install
 
 MESH_OF_GEOM = {
     "base": "base_link",
@@ -56,7 +56,7 @@ def mesh_folder() -> Path:
     try:
         menagerie = import_module("mujoco_menagerie")
     except ModuleNotFoundError as error:
-        raise FleetError("Meshes need the optional package: pip install 'thermofleet[meshes]'.") from error
+        raise FleetError(f"Meshes need the optional package: {install('meshes')}.") from error
     try:
         folder = Path(menagerie.get("kinova_gen3").path(progress=None)) / "assets"
     except (menagerie.MenagerieError, OSError) as error:

@@ -76,6 +76,8 @@ def bounds_command(
     from scenarios.prepare.fleet import DifficultyName
 
     if show_only:
+        if not out.is_file():
+            raise FleetError(f"--show prints a file of this command, and there is no file '{out}'.")
         found = load_references(out)
     else:
         if bool(scenarios) == bool(suite):

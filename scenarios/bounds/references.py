@@ -22,10 +22,11 @@ from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, Simulated, 
 from scenarios.bounds.upper import upper_bound
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
-from scenarios.policy_loader import policy_at, policy_of
+from scenarios.policy_loader import failure, policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
+from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit, TooSlow
 from scenarios.run.provenance import code_hash
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
@@ -121,7 +122,7 @@ def reference(
     world = episode.world
     rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key)
     # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
-    each = [rules.follow([policy_at(name, task.seed)]) for name in policies]
+    each = [_followed(rules, name, task) for name in policies]
     starts = reduce(Simulated.and_, each)
     best = int(starts.reward.argmax())
     rule, best_rule = policies[best], float(starts.reward[best])
@@ -157,6 +158,22 @@ def reference(
         code=code_hash(),
         claims=tuple(found.claims),
     )
+
+
+def _followed(simulator: ShiftSimulator, name: str, task: Task) -> Simulated:
+    """The shift of a task under a policy.
+
+    Raises:
+        PolicyFailed: the policy is one of one's own, and raised something, was too slow or returned no action.
+    """
+    limit = DecisionLimit(DECISION_LIMIT_S)
+    try:
+        with limit.watching():
+            with limit.decision():
+                policy = policy_at(name, task.seed)
+            return simulator.follow([policy], limit)
+    except (Exception, TooSlow) as error:  # whatever the policy raises
+        raise failure(name, error, task.instance) from error
 
 
 def references(

@@ -15,6 +15,7 @@ from fleet.env.validation import actions_of
 from fleet.job import MOST_FAULTS
 from fleet.observation import Layout, Observation
 from scenarios.bounds.play import play_rows
+from scenarios.run.decision_limit import UNLIMITED, DecisionLimit
 
 Array = np.ndarray
 
@@ -121,8 +122,12 @@ class ShiftSimulator:
         lists = [[(tick, a, action) for tick, a, action in claims[e, : count[e]].tolist()] for e in range(given)]
         return Simulated(reward, start_s, schedules.arm, schedules.option, lists)
 
-    def follow(self, policies: Sequence[Policy]) -> Simulated:
-        """The results of at most `rows` policies, each at the beginning of its shift."""
+    def follow(self, policies: Sequence[Policy], limit: DecisionLimit = UNLIMITED) -> Simulated:
+        """The results of at most `rows` policies, each at the beginning of its shift.
+
+        Args:
+            limit: Of the time of a decision.
+        """
         engine, world, given = self._engine, self.world, len(policies)
         skips = all(only_choices(policy) for policy in policies)
         engine.reset(np.arange(self.rows), self._shifts)
@@ -136,7 +141,7 @@ class ShiftSimulator:
         give_back, options = self._layout.actions - 1, self._layout.plans
         while running.any():
             asked = running & engine.mask[..., 1:-1].any(axis=(1, 2)) if skips else running
-            actions = self._actions(policies, asked)
+            actions = self._actions(policies, asked, limit)
             tick, slot_job = engine.state.tick.copy(), engine.offers.slot_job.copy()
             legal = np.take_along_axis(engine.mask, np.clip(actions, 0, give_back)[..., None], axis=2)[..., 0] > 0
             _, earned, finished = engine.step(actions, self._vectors, until)
@@ -154,13 +159,14 @@ class ShiftSimulator:
         self.evaluations += given
         return Simulated(reward[:given], start_s[:given], arm_of[:given], option_of[:given], claims[:given])
 
-    def _actions(self, policies: Sequence[Policy], asked: Array) -> Array:
+    def _actions(self, policies: Sequence[Policy], asked: Array, limit: DecisionLimit) -> Array:
         """The actions of the policies that are asked, int64 [row, arm]; the others wait."""
         names, mask = self.world.arms, self._engine.mask
         actions = np.full((self.rows, len(names)), WAIT, np.int64)
         for e in np.flatnonzero(asked).tolist():
             known = {arm: self._layout.read(self._vectors[e, a], mask[e, a]) for a, arm in enumerate(names)}
-            actions[e] = actions_of(names, policies[e].act(known))
+            with limit.decision():
+                actions[e] = actions_of(names, policies[e].act(known))
         return actions
 
 

@@ -39,7 +39,7 @@ def leaderboard_command(
 
     split = choose("split", split, SplitName)
     if not folder.is_dir():
-        raise FleetError(f"There is no folder '{folder}'; give the folder of the results.")
+        raise FleetError(f"'{folder}' is no folder; give the folder of the results.")
     found = read_all(folder, split)
     if verify:
         from scenarios.leaderboard.repeat import check_repeated

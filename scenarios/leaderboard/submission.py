@@ -19,12 +19,13 @@ from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.fleet import RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
-from scenarios.run.evaluate import FIGURES, Outcome
+from scenarios.run.decision_limit import DECISION_LIMIT_S
+from scenarios.run.evaluate import COUNTS, FIGURES, Outcome
 from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import Row as Line
-from scenarios.suite.splits import line_of, manifest
+from scenarios.suite.splits import cell_of_instance, line_of, manifest
 from scenarios.trials.cases import suite_of
-from scenarios.trials.plan import DECISION_LIMIT_S, Key, Row
+from scenarios.trials.plan import Key, Row
 from scenarios.trials.scores import Shift, references_of
 
 FORMAT = 1
@@ -37,6 +38,10 @@ SLACK = 1e-6
 NEEDED = ("python", "thermofleet", "numpy", "numba", "scipy")
 """Versions that a result must state."""
 MOST_FIGURE = 1e9
+COLDEST_C, HOTTEST_C = -60.0, 300.0
+"""Range of the temperature of a motor."""
+MOST_LOSS = 100.0
+"""Least possible reward: this many times the way from random to the upper bound, below random."""
 SHOWN = 3
 """Problems that an error names."""
 Text = Annotated[str, msgspec.Meta(max_length=200)]
@@ -56,7 +61,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     scope: Literal["arm", "central"]
     trainings: Annotated[int, msgspec.Meta(ge=1, le=MOST_TRAININGS)]
     """Trainings of the policy, or else of the twins; each has a row for every instance."""
-    author: Name
+    author: Annotated[str, msgspec.Meta(min_length=1, max_length=200, pattern=PLAIN)]
     about: Name
     """What the policy is, and where it can be had."""
     manifest: Hash
@@ -200,7 +205,17 @@ def _of_shift(row: Played, line: Line, references: Mapping[Shift, Reference]) ->
         yield f"has {own['finished']:g} finished jobs, {own['on_time']:g} on time, of {line.count}"
     if min(value for name, value in own.items() if name not in ("reward", "peak_c")) < 0 or own["availability"] > 1:
         yield "has a figure below 0, or an availability above 1"
+    if any(own[name] % 1 for name in COUNTS):
+        yield f"has counts that are no whole numbers ({', '.join(COUNTS)})"
+    cell = cell_of_instance(line)
+    longest_min = 60.0 * cell.hours * cell.arms
+    if max(own["above_warning_min"], own["hot_surface_min"]) > longest_min + SLACK:
+        yield f"has more minutes above a limit than its arms work ({longest_min:g})"
+    if not COLDEST_C <= own["peak_c"] <= HOTTEST_C:
+        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {COLDEST_C:g} to {HOTTEST_C:g}"
     known = references.get((row.instance, line.seed))
+    if known and own["reward"] < (least := known.random - MOST_LOSS * (known.upper - known.random)):
+        yield f"has a reward of {own['reward']:.4g}, below what the worst policy could lose ({least:.4g})"
     if known and own["reward"] > known.upper + SLACK * (1 + abs(known.upper)):
         yield f"has a reward of {own['reward']:.4g}, above the upper bound {known.upper:.4g}, which no policy exceeds"
 
@@ -311,4 +326,5 @@ def read_card(out: Path) -> dict[str, Any]:
     try:
         return json.loads((out / CARD).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise FleetError(f"'{out}' holds no study of `thermofleet compare --out`.") from error
+        what = "holds no study of `thermofleet compare --out`" if out.is_dir() else "is no folder"
+        raise FleetError(f"'{out}' {what}; give the folder of such a command.") from error

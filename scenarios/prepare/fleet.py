@@ -135,7 +135,7 @@ def space_of(
     """Space of the plans of a scenario's arms; cached in `folder`."""
 
     def report(done: int, total: int) -> None:
-        progress("space", Count(done, total))
+        progress("finding motions that exclude each other", Count(done, total))
 
     return space_table(robots, plans, scenario.clearance_m, folder / "plans", report)
 

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from zipfile import ZipFile
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, install
 
 _LIBRARY = re.compile(r"<script>(/\*\*\n \* @license\n \* Copyright [\d-]+ Three\.js Authors\n(?: \*[^\n]*\n)+[^\n]+)")
 """The licence, then the whole library on one line; trimesh's own viewer follows."""
@@ -26,8 +26,8 @@ def three_js() -> str:
         with ZipFile(Path(package.origin).parent / "resources/templates/viewer.zip") as packed:
             page = packed.read("viewer.html.template").decode()
     except (ModuleNotFoundError, FileNotFoundError, KeyError) as error:
-        raise FleetError(f"Pages in 3-D need trimesh: pip install 'thermofleet[report]' ({error}).") from error
+        raise FleetError(f"Pages in 3-D need trimesh: {install('report')} ({error}).") from error
     found = _LIBRARY.search(page)
     if found is None:
-        raise FleetError("This version of trimesh carries no three.js: pip install 'thermofleet[report]'.")
+        raise FleetError(f"This version of trimesh carries no three.js: {install('report')}.")
     return found[1]

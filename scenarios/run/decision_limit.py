@@ -8,6 +8,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+DECISION_LIMIT_S = 60.0
+"""Longest time of a decision by default."""
 AGAIN_S = 1.0
 """An alarm is repeated, in case the policy catches the first one."""
 MOST_CAUGHT = 5
@@ -71,3 +73,6 @@ class DecisionLimit:
             os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"{text}its process ends.\n".encode())
             os._exit(1)
         raise TooSlow(f"a decision took longer than {self.limit_s:g} s (--decision-limit)")
+
+
+UNLIMITED = DecisionLimit(None)

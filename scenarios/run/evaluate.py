@@ -14,10 +14,10 @@ from fleet.bus.exchange.memory import MemoryExchange
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
 from scenarios.fault_price import weights_of
-from scenarios.policy_loader import OnBus, policy_at
+from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.fleet import Fleet
 from scenarios.run.batch import library_of
-from scenarios.run.decision_limit import DecisionLimit
+from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit
 from scenarios.run.heat_use import HeatUse
 from scenarios.run.outcome import common_figures
 
@@ -70,15 +70,18 @@ class Played:
 
 
 def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel = PERFECT) -> list[Outcome]:
-    """The figures of a policy on each seed, independent of the other seeds.
+    """The figures of a policy on each seed, independent of the other seeds. A decision takes at most
+    `DECISION_LIMIT_S`.
 
     Raises:
-        Exception: whatever the policy raises.
+        PolicyFailed: the policy is one of one's own, and raised something, was too slow or returned no action.
+        Exception: whatever a built-in policy raises.
     """
     results: list[Outcome] = []
-    for played in play(fleet, policy, seeds, channel):
+    for seed, played in zip(seeds, play(fleet, policy, seeds, channel, DECISION_LIMIT_S), strict=True):
         if played.error is not None:
-            raise played.error
+            where = f"{fleet.scenario.name}/{seed}, at {played.time_s:g} s of the shift"
+            raise failure(policy, played.error, where) from played.error
         assert played.outcome is not None
         results.append(played.outcome)
     return results

@@ -12,10 +12,11 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
 from fleet.env.allocation_v1 import VERSION, AllocationEnv
+from fleet.env.validation import actions_of
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
-from scenarios.policy_loader import OnBus, policy_at
+from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
 from scenarios.progress import Progress, quiet
 from scenarios.run.heat_use import HeatUse
@@ -88,8 +89,15 @@ def run(
     Args:
         record: Keep telemetry.
         endpoint: Zenoh router on loopback, for other listeners; by default the fleet has its own.
+
+    Raises:
+        PolicyFailed: the policy is one of one's own, and raised something or returned no action.
     """
-    policy = policy_at(spec.policy, spec.seed, OnBus(fleet=fleet.scenario.name))
+    shift = f"{fleet.scenario.name}/{spec.seed}"
+    try:
+        policy = policy_at(spec.policy, spec.seed, OnBus(fleet=fleet.scenario.name))
+    except Exception as error:  # whatever the policy raises
+        raise failure(spec.policy, error, shift) from error
     recorder = _Recorder(fleet.scenario, record)
     env = env_of(
         fleet,
@@ -107,7 +115,12 @@ def run(
         env.reset(seed=spec.seed)
         while env.agents and not stopped():
             seen, count = env.knowledge(), len(env.events)
-            actions = policy.act(seen)
+            try:
+                actions = policy.act(seen)
+                actions_of(env.agents, actions)
+            except Exception as error:  # whatever the policy raises
+                where = f"{shift}, at {env.tick * env.world.dt_s:g} s of the shift"
+                raise failure(spec.policy, error, where) from error
             _, rewards, _, _, _ = env.step(actions)
             awards = [event for event in env.events[count:] if event.kind == "award"]
             for award in awards if record else ():

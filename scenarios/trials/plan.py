@@ -16,6 +16,7 @@ from fleet.seeding import child
 from scenarios.policy_loader import Unusable, label, policy_of, source_of, trainings_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
+from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit, TooSlow
 from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.run.provenance import code_hash
 from scenarios.scenario_hash import scenario_hash
@@ -24,7 +25,6 @@ from scenarios.trials.cells import plan_content
 
 TOGETHER = 16
 """Shifts of a policy that are stepped side by side."""
-DECISION_LIMIT_S = 60.0
 _LIBRARIES = ("thermofleet", "numpy", "numba", "scipy", "mujoco", "torch")
 
 
@@ -138,7 +138,7 @@ class Study:
         labels: dict[str, str] = {}
         for policy, own in self.own_trainings.items():
             for each in own:
-                check_policy(each)
+                check_policy(each, self.decision_limit_s)
             if len(own) > 1 and (self.trainings > 1 or self.fleets > 1):
                 raise FleetError(
                     f"'{policy}' has {len(own)} trainings of its own: then --trainings and --fleets must be 1."
@@ -227,14 +227,21 @@ def _versions() -> Iterator[tuple[str, str | None]]:
             yield name, None
 
 
-def check_policy(name: str) -> None:
+def check_policy(name: str, limit_s: float | None = None) -> None:
     """Check that there is such a policy. One that is there and cannot be made fails later, shift by shift.
 
+    Args:
+        limit_s: Most time until it is loaded and made, s.
+
     Raises:
-        FleetError: no such rule, file, module, class or folder, or one that is no policy.
+        FleetError: no such rule, file, module, class or folder, one that is no policy, or one that takes too long.
     """
+    limit = DecisionLimit(limit_s)
     try:
-        policy_of(name)
+        with limit.watching(), limit.decision():
+            policy_of(name)
+    except TooSlow as error:
+        raise FleetError(f"The policy '{name}' takes longer than {limit_s:g} s to load (--decision-limit).") from error
     except Unusable:
         return
     except FleetError:

@@ -12,6 +12,7 @@ from traceback import format_tb
 from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
 from fleet.files import cache_folder
+from scenarios.policy_loader import error_text
 from scenarios.prepare.fleet import RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.run import evaluate
@@ -72,7 +73,7 @@ def row_of(unit: Unit, index: int, played: Played) -> Row:
         figures = {name: float(value) for name, value in asdict(played.outcome).items()}  # as a file gives them
         return Row(key, Outcome(**figures), played.illegal)
     assert played.error is not None
-    error = f"{type(played.error).__name__}: {_text(played.error)}"[:MOST_TEXT]
+    error = f"{type(played.error).__name__}: {error_text(played.error)}"[:MOST_TEXT]
     frames = [text for text in format_tb(played.error.__traceback__) if f'"{evaluate.__file__}"' not in text]
     trace = "".join(frames[-MOST_TRACE:])
     return Row(key, None, 0, f"{error} (at {played.time_s:g} s of the shift)", trace[-MOST_TEXT:])
@@ -100,14 +101,6 @@ def _check(policy: str, settings: Settings) -> None:
             f"The {here} has other files of the policy '{policy}' than this command began with: copy the same to every "
             "machine, and change none while it runs."
         )
-
-
-def _text(error: BaseException) -> str:
-    """What an error of a policy says, whatever it is made of."""
-    try:
-        return str(error).encode("utf-8", "backslashreplace").decode()
-    except Exception as failed:  # whatever its own code raises
-        return f"(its text raises {type(failed).__name__})"
 
 
 @contextmanager

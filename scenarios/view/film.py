@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from fleet.env.render.heat import heat_colour, heat_marks
-from fleet.errors import FleetError, visible
+from fleet.errors import FleetError, install, visible
 from fleet.physics.cell_player import CellCamera, CellPlayer
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES
@@ -200,9 +200,7 @@ def write_film(path: Path, kind: str, pictures: Iterator[Array], shot: Shot) -> 
     try:
         import av
     except ModuleNotFoundError as error:
-        raise FleetError(
-            "Films as MP4 or WebM need PyAV: pip install 'thermofleet[film]'. A GIF needs nothing."
-        ) from error
+        raise FleetError(f"Films as MP4 or WebM need PyAV: {install('film')}. A GIF needs nothing.") from error
     codec = CODECS[kind]
     count = 0
     with av.open(str(path), "w", format=kind) as container:

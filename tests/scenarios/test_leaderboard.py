@@ -146,6 +146,10 @@ FORGED = {
     "files of another process": (changed(None, policy="bus:mine"), r"\(bus:NAME has none\)"),
     "no number": (changed(7, value=float("nan")), "needs 11 figures of at most 1e\\+09"),
     "below 0": (changed(7, faults=-1.0), "a figure below 0"),
+    "half a fault": (changed(7, faults=0.5), "counts that are no whole numbers"),
+    "more minutes than the shift": (changed(7, above_warning_min=1e6), "more minutes above a limit"),
+    "a motor below absolute zero": (changed(7, peak_c=-500.0), "a hottest motor of -500 °C"),
+    "an endless loss": (changed(7, reward=-1e9), "a reward of -1e\\+09, below what the worst policy could lose"),
     "neither figures nor error": (changed(7, figures=None), "needs either figures or an error"),
 }
 

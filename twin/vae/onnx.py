@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, install
 from fleet.files import atomic_path
 from fleet.motion import CHANNELS
 from twin.logs.recording import CONTINUOUS
@@ -45,7 +45,7 @@ def export_onnx(twin: Twin, path: Path) -> Path:
     try:
         import onnx
     except ImportError:
-        raise ExportError("Export to ONNX needs the extra 'onnx': pip install 'thermofleet[onnx]'.") from None
+        raise ExportError(f"Export to ONNX needs the extra 'onnx': {install('onnx')}.") from None
     file = path if path.suffix == ".onnx" else path / MODEL
     file.parent.mkdir(parents=True, exist_ok=True)
     example = torch.zeros(2, twin.config.window, twin.joints, len(CHANNELS), dtype=torch.float64)

@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet.engine.state import State, World
 from fleet.env.render.scene import Cell, scene_of
-from fleet.errors import FleetError
+from fleet.errors import FleetError, install
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,7 +50,7 @@ class Renderer:
             try:
                 from fleet.env.render.picture import Picture
             except ImportError as error:
-                raise FleetError("Rendering needs matplotlib: pip install 'thermofleet[report]'.") from error
+                raise FleetError(f"Rendering needs matplotlib: {install('report')}.") from error
             self._picture = Picture()
         return self._picture.frame(scene_of(world, state, self._cell))
 

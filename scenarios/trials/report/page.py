@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import isnan
 from typing import Any  # values of a card
 
 import numpy as np
@@ -14,7 +15,7 @@ from scenarios.run.evaluate import FIGURES
 from scenarios.statistics.means import LEVEL, Interval
 from scenarios.statistics.scores import HEADS, Normalised, Scores, ranked, score_cells, scores_of
 from scenarios.statistics.suites import profile
-from scenarios.statistics.tables import LEGEND, Figure
+from scenarios.statistics.tables import EQUAL, LEGEND, Figure, remarks
 from scenarios.trials.report.charts import Range, lines, points, spans
 
 Array = np.ndarray
@@ -123,7 +124,15 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
         best = max(result.figures, key=lambda name: result.figures[name]["reward"].mean)
         figure = result.figures[best]["reward"]
         if best == result.baseline:
-            yield f"{where}no policy has more reward than the baseline {label(best)} ({figure.mean:.1f})."
+            others = [name for name in result.figures if name != best]
+            told = f"{where}no policy has more reward than the baseline {label(best)} ({figure.mean:.1f})"
+            if others:
+                other = max(others, key=lambda name: result.figures[name]["reward"].mean)
+                less = result.figures[other]["reward"]
+                surely = less.to_base.excludes_zero and _significant(less.p, len(others))
+                told += f"; the difference of {label(other)} to it is {less.to_base.text(1)}"
+                told += "" if surely else ", which is not significant"
+            yield f"{told}."
             continue
         span = figure.to_base.text(1)
         significant = figure.to_base.excludes_zero and _significant(figure.p, len(result.figures) - 1)
@@ -204,18 +213,24 @@ def _figures(result: Comparison, *, alone: bool) -> Iterator[str]:
     about = f"{result.scenario}, {result.unit}. Mean [interval] and paired difference to {label(result.baseline)}"
     settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
     yield paragraph(f"{about}; {LEGEND}. {settings}", "faint")
+    yield from (paragraph(sentence, "faint") for sentence in remarks(result.figures, result.draws))
     order = sorted(result.figures, key=lambda name: -result.figures[name]["reward"].mean)
     for name in FIGURES:
         digits = LEAST_DIGITS.get(name, 1)
         rows = []
         for policy in order:
             f = result.figures[policy][name]
-            own = Interval(f.mean, f.low, f.high).text(digits)
-            to_base = "" if policy == result.baseline else f"{f.to_base.text(digits)} {f.stars}".rstrip()
+            own = _with_equal(Interval(f.mean, f.low, f.high), digits)
+            to_base = "" if policy == result.baseline else f"{_with_equal(f.to_base, digits)} {f.stars}".rstrip()
             rows.append((label(policy), own, to_base))
         summary = f"{HEADINGS[name]}"
         inner = table(("policy", "mean", "difference"), rows, style="numbers scores")
         yield f"<details{' open' if name == 'reward' else ''}><summary>{escape(summary)}</summary>{inner}</details>"
+
+
+def _with_equal(figure: Interval, digits: int) -> str:
+    """The text of an interval; values without variation say so."""
+    return f"{figure.text(digits)} {EQUAL}" if isnan(figure.low + figure.high) else figure.text(digits)
 
 
 def _failures(judged: Judged) -> Iterator[str]:
