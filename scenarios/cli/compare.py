@@ -207,10 +207,10 @@ def ablate_command(
         ),
     ] = None,
     fleets: Annotated[
-        int, options.number("Number of fleets: draws of the arms' deviations (spread.seed).", 2, 100)
+        int, options.number("Number of fleets, 2 or more: draws of the arms' deviations (spread.seed).", 2, 100)
     ] = 3,
     trainings: Annotated[int, options.number("Number of trainings of the twins of each fleet.", 1, 20)] = 2,
-    seeds: Annotated[int, options.number("Number of seeds.", 2, 10_000)] = 20,
+    seeds: Annotated[int, options.number("Number of seeds, 2 or more.", 2, 10_000)] = 20,
     first_seed: Annotated[int, options.number("First seed.", 0, options.MAX_SEED)] = 10_000,
     out: Annotated[
         Path | None,

@@ -36,6 +36,7 @@ def leaderboard_command(
     from scenarios.leaderboard.board import best_text, board_of, board_text, read_all, remark_text
     from scenarios.load import SplitName
     from scenarios.statistics.scores import score_tables
+    from scenarios.statistics.tables import LEGEND
 
     split = choose("split", split, SplitName)
     if not folder.is_dir():
@@ -53,8 +54,15 @@ def leaderboard_command(
     elif board is None or markdown:
         echo(board_text(board, split))
     else:
-        labels = {name: f"{each.card.policy}@{each.card.difficulty}" for name, each in board.entries.items()}
-        out_console.print(best_text(board), *score_tables(board.scores, labels), remark_text(board), sep="\n")
+        sources = sorted({each.card.difficulty for each in board.entries.values()})
+        labels = {
+            name: each.card.policy
+            + (f"@{each.card.difficulty}" if len(sources) > 1 else "")
+            + (" (arm)" if each.card.scope == "arm" else "")
+            for name, each in board.entries.items()
+        }
+        about = f"Predictions: {', '.join(sources)}. (arm): scope arm, others central. {LEGEND}."
+        out_console.print(best_text(board), about, *score_tables(board.scores, labels), remark_text(board), sep="\n")
 
 
 def submit_command(
