@@ -65,5 +65,5 @@ def test_matplotlib_is_loaded_for_frames_alone() -> None:
 def test_without_matplotlib_the_error_names_the_extra(monkeypatch, small) -> None:
     world, _ = small.shop([[small.job("a", small.work("bench"))]])
     monkeypatch.setitem(sys.modules, "fleet.env.render.picture", None)
-    with pytest.raises(FleetError, match=r"pip install 'thermofleet\[report\]'"):
+    with pytest.raises(FleetError, match=r"pip install -e '\.\[report\]'"):
         Renderer().frame(world, initial(world))
