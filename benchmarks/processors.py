@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pyarrow.parquet as parquet
 
+from scenarios.studies.page_tables.processors import SAME
 from scenarios.suite.splits import instance, manifest
 
 COMPARE = [sys.executable, "-m", "scenarios", "compare", "--difficulty", "oracle", "--jobs", "1"]
@@ -28,8 +29,6 @@ OLDER = {
     "NPY_DISABLE_CPU_FEATURES": "X86_V3",
     "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX",
 }
-SAME = 1e-9
-"""Share of a reward within which it counts as the same: decisions were, and sums were rounded in another order."""
 
 
 def rewards(instances: list[str], policies: str, folder: Path, setting: dict[str, str]) -> dict[tuple[str, str], float]:

@@ -67,19 +67,26 @@ def failure(name: str, error: BaseException, where: str) -> BaseException:
     if isinstance(error, FleetError) or is_built_in(name):
         return error
     source = source_of(name)
-    frames = extract_tb(error.__traceback__)
-    own = [frame for frame in frames if source and Path(frame.filename).absolute() == source.absolute()]
-    line = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
-    text = f"{type(error).__name__}: {error_text(error)}".rstrip(".: ")
-    return PolicyFailed(f"The policy '{name}' failed in {where}: {text}{line}.")
+    line = last_line(error, source) if source else None
+    place = f" ({source.absolute()}, line {line})" if source and line else ""
+    return PolicyFailed(f"The policy '{name}' failed in {where}: {error_text(error).rstrip('.: ')}{place}.")
+
+
+def last_line(error: BaseException, file: Path) -> int | None:
+    """The line of a file in which an error was raised, or from which the code that raised it was called."""
+    lines = [
+        frame.lineno for frame in extract_tb(error.__traceback__) if Path(frame.filename).absolute() == file.absolute()
+    ]
+    return lines[-1] if lines else None
 
 
 def error_text(error: BaseException) -> str:
-    """What an error of a policy says, whatever it is made of."""
+    """Kind and text of an error of a policy, whatever it is made of."""
     try:
-        return str(error).encode("utf-8", "backslashreplace").decode()
+        text = str(error).encode("utf-8", "backslashreplace").decode()
     except Exception as failed:  # whatever its own code raises
-        return f"(its text raises {type(failed).__name__})"
+        text = f"(its text raises {type(failed).__name__})"
+    return f"{type(error).__name__}: {text}"
 
 
 def policy_of(name: str, bus: OnBus = ON_BUS) -> Policy:
@@ -291,8 +298,7 @@ def _module(where: str, name: str) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:  # whatever the file raises
         syntax = isinstance(error, SyntaxError)
-        frames = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == where]
-        line = error.lineno if syntax else frames[-1] if frames else None
+        line = error.lineno if syntax else last_line(error, path)
         raise FleetError(
             f"Policy '{name}': '{where}' cannot be loaded: {type(error).__name__}{f' in line {line}' if line else ''}: "
             f"{error.msg if syntax else error}."

@@ -238,5 +238,6 @@ def test_a_missing_extra_is_one_sentence(call, extra):
     program = f"{WITHOUT_EXTRAS}\n{call}"
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
     assert said.returncode
-    sentence = r"This needs the library '\w+', which is not installed: pip install -e '\.\[(\w+)\]' -c constraints"
+    command = r"pip install -e '\.\[(\w+)\]' -c constraints\.txt, in a copy of the repository"
+    sentence = rf"This needs the library '\w+', which is not installed: {command}\."
     assert re.findall(sentence, said.stderr.splitlines()[-1]) == [extra]

@@ -132,21 +132,11 @@ def run(sizes: list[int], most_in_hall: int, out: Path) -> None:
         print(json.loads(done.stdout), flush=True)
 
 
-def table(rows: list[dict]) -> str:
-    """The costs of every size, ms of CPU time."""
-    head = "| arms | " + " | ".join(COSTS.values()) + " | MB |\n|" + "---|" * (len(COSTS) + 2)
-    lines = [
-        f"| {row['arms']} | "
-        + " | ".join(f"{1e3 * row['cpu_s'][name] / row['arms'] / row['hours']:.3g}" for name in COSTS)
-        + f" | {row['most_mb']} |"
-        for row in rows
-    ]
-    return "\n".join([head, *lines])
-
-
 def plot(out: Path) -> None:
     """Print the table, and draw the costs per arm-hour; plans and conflicts per arm."""
     from matplotlib.figure import Figure
+
+    from scenarios.studies.page_tables.speed import halls_table
 
     rows = [json.loads(line) for line in out.read_text("utf-8").splitlines()]
     figure = Figure(figsize=(7, 4.2), layout="constrained")
@@ -162,7 +152,7 @@ def plot(out: Path) -> None:
     axes.grid(alpha=0.3)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     figure.savefig(PICTURE, dpi=130)
-    print(table(rows))
+    print(halls_table(out))
 
 
 def main() -> None:

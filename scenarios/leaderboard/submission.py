@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from fleet.bus.exchange.channel import PERFECT
+from fleet.engine.observe import PEAK_HIGH_C, PEAK_LOW_C
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
 from scenarios.bounds.references import Reference
@@ -38,8 +39,6 @@ SLACK = 1e-6
 NEEDED = ("python", "thermofleet", "numpy", "numba", "scipy")
 """Versions that a result must state."""
 MOST_FIGURE = 1e9
-COLDEST_C, HOTTEST_C = -60.0, 300.0
-"""Range of the temperature of a motor."""
 MOST_LOSS = 100.0
 """Least possible reward: this many times the way from random to the upper bound, below random."""
 SHOWN = 3
@@ -211,8 +210,8 @@ def _of_shift(row: Played, line: Line, references: Mapping[Shift, Reference]) ->
     longest_min = 60.0 * cell.hours * cell.arms
     if max(own["above_warning_min"], own["hot_surface_min"]) > longest_min + SLACK:
         yield f"has more minutes above a limit than its arms work ({longest_min:g})"
-    if not COLDEST_C <= own["peak_c"] <= HOTTEST_C:
-        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {COLDEST_C:g} to {HOTTEST_C:g}"
+    if not PEAK_LOW_C <= own["peak_c"] <= PEAK_HIGH_C:
+        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {PEAK_LOW_C:g} to {PEAK_HIGH_C:g}"
     known = references.get((row.instance, line.seed))
     if known and own["reward"] < (least := known.random - MOST_LOSS * (known.upper - known.random)):
         yield f"has a reward of {own['reward']:.4g}, below what the worst policy could lose ({least:.4g})"

@@ -73,7 +73,7 @@ def row_of(unit: Unit, index: int, played: Played) -> Row:
         figures = {name: float(value) for name, value in asdict(played.outcome).items()}  # as a file gives them
         return Row(key, Outcome(**figures), played.illegal)
     assert played.error is not None
-    error = f"{type(played.error).__name__}: {error_text(played.error)}"[:MOST_TEXT]
+    error = error_text(played.error)[:MOST_TEXT]
     frames = [text for text in format_tb(played.error.__traceback__) if f'"{evaluate.__file__}"' not in text]
     trace = "".join(frames[-MOST_TRACE:])
     return Row(key, None, 0, f"{error} (at {played.time_s:g} s of the shift)", trace[-MOST_TEXT:])

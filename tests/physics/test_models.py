@@ -247,7 +247,7 @@ def test_missing_mesh_files_are_named(monkeypatch, tmp_path):
 
 @pytest.mark.skipif(importlib.util.find_spec("mujoco_menagerie") is not None, reason="mujoco-menagerie is installed")
 def test_meshes_without_the_package_say_how_to_get_it():
-    with pytest.raises(FleetError, match=r"\.\[meshes\]"):
+    with pytest.raises(FleetError, match=r"pip install -e '\.\[meshes\]'"):
         build_cell([Robot(name="a")], meshes=True)
 
 

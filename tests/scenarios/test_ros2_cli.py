@@ -94,4 +94,4 @@ def test_a_missing_extra_is_named(capsys, monkeypatch):
     with pytest.raises(SystemExit) as end:
         main(["ros2", "bridge", "--fleet", "f", "--domain", "0"])
     assert end.value.code == 2
-    assert ".[ros2]" in capsys.readouterr().err
+    assert "pip install -e '.[ros2]'" in capsys.readouterr().err

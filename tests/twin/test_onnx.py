@@ -59,5 +59,5 @@ def test_every_kind_of_twin_can_be_exported(records, small, rng, motion, tmp_pat
 
 def test_without_onnx_the_error_names_the_extra(twin, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ExportError, match=r"\.\[onnx\]"):
+    with pytest.raises(ExportError, match=r"pip install -e '\.\[onnx\]'"):
         export_onnx(twin, tmp_path)

@@ -6,6 +6,9 @@ from typing import Any
 
 from scenarios.studies.page_tables.cells import read_json
 
+SAME = 1e-9
+"""Share of a reward within which it counts as the same: decisions were, and sums were rounded in another order."""
+
 
 def processor_tables(file: Path) -> dict[str, Callable[[], str]]:
     """Text by the name in its mark.
@@ -23,5 +26,5 @@ def processor_sentence(measured: dict[str, Any]) -> str:
     apart = "all are equal to the last bit" if not share else f"the others differ by at most {share:.0e} of the reward"
     return (
         f"{measured['instances']} instances of the test split, {policies}: {len(measured['other_reward'])} of "
-        f"{measured['shifts']} shifts have a reward that differs by more than 1e-9 of it; {apart}."
+        f"{measured['shifts']} shifts have a reward that differs by more than {SAME:g} of it; {apart}."
     )

@@ -16,7 +16,7 @@ def speed_tables(folder: Path) -> dict[str, Callable[[], str]]:
     """
     return {
         "workers": lambda: _workers(folder / "workers.jsonl"),
-        "growing_halls": lambda: _halls(folder / "arms.jsonl"),
+        "growing_halls": lambda: halls_table(folder / "arms.jsonl"),
         "large_fleet": lambda: _commands(folder),
     }
 
@@ -30,17 +30,18 @@ def _workers(path: Path) -> str:
     return table(("workers", "shifts", "one, s", "two, s", "speed-up", "two loops that share nothing"), rows)
 
 
-def _halls(path: Path) -> str:
+def halls_table(path: Path) -> str:
+    """The costs of halls of every size, from the rows of `benchmarks/scaling/arms.py`."""
     rows: list[tuple[str, ...]] = []
     for line in path.read_text(encoding="utf-8").splitlines():
         one = json.loads(line)
-        hours = {"plans": 1.0, "conflicts": 1.0}  # once, not in each hour
-        each = {name: 1000.0 * s / one["arms"] / hours.get(name, one["hours"]) for name, s in one["cpu_s"].items()}
-        costs = (f"{each[name]:.3g}" for name in ("plans", "conflicts", "engine", "matching", "scores"))
-        rows.append((str(one["arms"]), *costs, str(one["most_mb"])))
-    hourly = ("engine", "matching", "twins")
-    once = ("plans, ms per arm", "conflict table, ms per arm")
-    return table(("arms", *once, *(f"{name}, ms per arm and hour" for name in hourly), "peak memory, MB"), rows)
+        per_arm = {name: 1000.0 * seconds / one["arms"] for name, seconds in one["cpu_s"].items()}
+        once = (per_arm[name] for name in ("plans", "conflicts"))
+        hourly = (per_arm[name] / one["hours"] for name in ("engine", "matching", "scores"))
+        rows.append((str(one["arms"]), *(f"{cost:.3g}" for cost in (*once, *hourly)), str(one["most_mb"])))
+    heads = ("plans, ms per arm", "conflict table, ms per arm")
+    heads += tuple(f"{name}, ms per arm and hour" for name in ("engine", "matching", "twins"))
+    return table(("arms", *heads, "peak memory, MB"), rows)
 
 
 def _commands(folder: Path) -> str:

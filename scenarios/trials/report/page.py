@@ -121,23 +121,25 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
         if not result.figures:
             yield f"{where}no differences, as the baseline {label(result.baseline)} failed."
             continue
-        best = max(result.figures, key=lambda name: result.figures[name]["reward"].mean)
-        figure = result.figures[best]["reward"]
-        if best == result.baseline:
-            others = [name for name in result.figures if name != best]
-            told = f"{where}no policy has more reward than the baseline {label(best)} ({figure.mean:.1f})"
-            if others:
-                other = max(others, key=lambda name: result.figures[name]["reward"].mean)
-                less = result.figures[other]["reward"]
-                surely = less.to_base.excludes_zero and _significant(less.p, len(others))
-                told += f"; the difference of {label(other)} to it is {less.to_base.text(1)}"
-                told += "" if surely else ", which is not significant"
-            yield f"{told}."
+        base = result.baseline
+        best, *others = sorted(result.figures, key=lambda name: -result.figures[name]["reward"].mean)
+        reward = f"{result.figures[best]['reward'].mean:.1f}"
+        if not others:
+            yield f"{where}no policy has more reward than the baseline {label(base)} ({reward})."
             continue
+        compared = best if best != base else others[0]
+        figure = result.figures[compared]["reward"]
         span = figure.to_base.text(1)
-        significant = figure.to_base.excludes_zero and _significant(figure.p, len(result.figures) - 1)
+        significant = figure.to_base.excludes_zero and _significant(figure.p, len(others))
+        if best == base:
+            doubt = "" if significant else ", which is not significant"
+            yield (
+                f"{where}no policy has more reward than the baseline {label(base)} ({reward}); "
+                f"the difference of {label(compared)} to it is {span}{doubt}."
+            )
+            continue
         more = "more reward than" if significant else "more than, which is not significant,"
-        yield f"{where}{label(best)} has the most reward, {figure.mean:.1f}; {span} {more} {label(result.baseline)}."
+        yield f"{where}{label(best)} has the most reward, {reward}; {span} {more} {label(base)}."
 
 
 def _scores(judged: Judged) -> Iterator[str]:
