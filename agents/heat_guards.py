@@ -8,13 +8,16 @@ policy chooses among the claims that are left.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
-from agents.policy import WAIT, ArmPolicy, Policy, per_option, plans_of
+from agents.policy import WAIT, ArmPolicy, Planner, Policy, per_option, plans_of
 from fleet.observation import Observation
 from fleet.robot import RATING
+
+if TYPE_CHECKING:  # loads the engine
+    from fleet.engine.lookahead import Lookahead
 
 Array = np.ndarray
 
@@ -190,6 +193,11 @@ class GuardedFleet:
         """Begin a shift."""
         self._guards = {}
         self._policy.reset(rng)
+
+    def plan_in(self, cell: "Lookahead") -> None:
+        """Let the policy plan in the simulator of a shift, if it does so."""
+        if isinstance(self._policy, Planner):
+            self._policy.plan_in(cell)
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The actions of the policy among the claims that the guards allow."""

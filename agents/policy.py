@@ -6,11 +6,14 @@ in the process of each arm.
 """
 
 from collections.abc import Callable, Mapping
-from typing import ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from fleet.observation import Observation
+
+if TYPE_CHECKING:  # loads the engine
+    from fleet.engine.lookahead import Lookahead
 
 SCOPES = ("central", "arm")
 
@@ -35,6 +38,15 @@ class Policy(_Resettable, Protocol):
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """One action per arm: WAIT, k to claim option k - 1 (k = 1 is `observation.difficulty[0]`), or the last action
         to give the current job back after the present cycle."""
+        ...
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """What a policy has besides that plans in a simulator of its cell."""
+
+    def plan_in(self, cell: "Lookahead") -> None:
+        """Plan in the simulator of a shift; called once before it begins."""
         ...
 
 

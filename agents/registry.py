@@ -8,6 +8,7 @@ from agents.consensus import Consensus
 from agents.dispatching import Atc, Edd, Fifo, LeastLoaded, Spt
 from agents.heat_guards import FuzzySpeed, Guard, Shutdown, TorqueLimiter
 from agents.heat_rules import Thermometer, Wsept, WseptAhead, WseptLocal
+from agents.mpc import Mpc
 from agents.pair_scores import WseptLearned, WseptLearnedLocal, WseptUntrained
 from agents.policy import ArmPolicy, Policy, for_all_arms
 from agents.rolling_horizon import RollingHorizon
@@ -57,6 +58,7 @@ RULES: dict[str, Rule] = {
     ),
     "auction": Rule(Auction, "time per expected worth, within n · ε", "Bertsekas 1988"),
     "rolling_horizon": Rule(RollingHorizon, "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"),
+    "mpc": Rule(Mpc, "reward of the next minutes in a simulator of the cell", "Mayne et al. 2000"),
     "ssi": Rule(Ssi, _THERMAL, _SSI),
     "matching": Rule(Matching, _THERMAL, _KUHN),
     "matching_ahead": Rule(MatchingAhead, "thermal, with arms that are home soon", _KUHN),

@@ -11,9 +11,10 @@ from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.protocol import Exchange
 from fleet.engine.batch import Engine, shifts_of
 from fleet.engine.event_log import events_of
+from fleet.engine.lookahead import CellSimulator, Lookahead
 from fleet.engine.peers import deliver
 from fleet.engine.reward import RewardWeights
-from fleet.engine.state import State, World
+from fleet.engine.state import PER_JOB, State, World
 from fleet.engine.tables import tables_of
 from fleet.events import Event
 from fleet.motion import Drive
@@ -189,6 +190,10 @@ class ShiftRunner:
         """Decision intervals that are over."""
         return int(self._engine.state.tick[0])
 
+    def lookahead(self, simulator: CellSimulator) -> Lookahead:
+        """For a policy that plans: a simulator of the cell, tied to this shift."""
+        return Lookahead(simulator, self._engine)
+
     def step(self, actions: Array | None) -> tuple[Array, float, bool]:
         """One decision interval: weighted reward terms [term], their sum, and whether all jobs are done.
 
@@ -229,8 +234,7 @@ def _stepped(
 def _without_room(state: State, world: World) -> State:
     """Views of the state with as many jobs as the world has; an engine may have room for more."""
     jobs = world.jobs.exists.shape[1]
-    per_job = ("status", "queued_s", "cycles", "returns", "failed_arm", "finished_s")
-    return state._replace(**{name: getattr(state, name)[:, :jobs] for name in per_job})
+    return state._replace(**{name: getattr(state, name)[:, :jobs] for name in PER_JOB})
 
 
 def record_of(engine: Engine, env: int = 0) -> StepRecord:

@@ -192,6 +192,10 @@ class State(NamedTuple):
         return type(self)(*(values[envs].copy() for values in self))
 
 
+PER_JOB = ("status", "queued_s", "cycles", "returns", "failed_arm", "finished_s")
+"""Arrays of a state with the axes [env, job, ...]; the others have [env, arm, ...] or [env]."""
+
+
 def initial(world: World) -> State:
     """Every arm at home, at its start temperature; every job waiting."""
     envs, arms, jobs = world.envs, len(world.arms), world.jobs.exists.shape[1]

@@ -17,6 +17,7 @@ from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.protocol import Exchange
+from fleet.engine.lookahead import CellSimulator, Lookahead
 from fleet.engine.reward import TERMS, RewardWeights
 from fleet.engine.shift import Episode as Episode
 from fleet.engine.shift import EpisodeFactory as EpisodeFactory
@@ -217,6 +218,10 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         shift = self._begun("knowledge()")
         vectors, masks = shift.vectors.copy(), shift.mask.copy()
         return {arm: self.layout.read(vectors[a], masks[a]) for a, arm in enumerate(self.possible_agents)}
+
+    def lookahead(self, simulator: CellSimulator) -> Lookahead:
+        """For a policy that plans: a simulator of the cell, tied to the current episode."""
+        return self._begun("looking ahead").lookahead(simulator)
 
     def render(self) -> Array | str | None:
         """The fleet as a picture, uint8 [height, width, 3], in mode "rgb_array", as a table of text in mode "ansi", or

@@ -13,6 +13,7 @@ import numpy as np
 
 from fleet.bus.exchange.protocol import Exchange
 from fleet.engine.batch import Engine, Shift
+from fleet.engine.lookahead import CellSimulator, Lookahead
 from fleet.engine.peers import deliver
 from fleet.engine.reward import TERMS, RewardWeights
 from fleet.engine.state import State
@@ -200,6 +201,10 @@ class BatchEnv:
         vectors = self._no_vectors()  # the caller may have written into the last ones
         self._observe(np.arange(self.num_envs), vectors)
         return self.layout.read(vectors, self._engine.mask.copy())
+
+    def lookahead(self, simulator: CellSimulator, env: int) -> Lookahead:
+        """For a policy that plans: a simulator of the cell, tied to the shifts of an env."""
+        return Lookahead(simulator, self._engine, env)
 
     def close(self) -> None:
         """Release nothing: a batch holds no resources."""

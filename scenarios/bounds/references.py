@@ -24,6 +24,7 @@ from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import failure, policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
+from scenarios.prepare.known_cell import simulator_of_shift
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit, TooSlow
@@ -120,7 +121,8 @@ def reference(
     entropy = np.random.SeedSequence(task.seed)
     episode, weights = ShiftFactory(fleet)(entropy), weights_of(fleet.scenario)
     world = episode.world
-    rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key)
+    simulator = simulator_of_shift(fleet, task.seed)
+    rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key, simulator=simulator)
     # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
     each = [_followed(rules, name, task) for name in policies]
     starts = reduce(Simulated.and_, each)

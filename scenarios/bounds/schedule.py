@@ -1,4 +1,4 @@
-"""Schedules of one shift: who does which job, by which plan, in which order; many are simulated side by side."""
+"""Schedules and policies in one shift, simulated many times side by side."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -6,52 +6,22 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.policy import WAIT, Policy, only_choices
+from agents.policy import WAIT, Planner, Policy, only_choices
+from agents.schedule_changes import Changes
 from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
+from fleet.engine.lookahead import CellSimulator, Lookahead
+from fleet.engine.reward import RewardWeights
+from fleet.engine.schedules import Schedules
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
 from fleet.env.validation import actions_of
-from fleet.job import MOST_FAULTS
 from fleet.observation import Layout, Observation
-from scenarios.bounds.play import play_rows
 from scenarios.run.decision_limit import UNLIMITED, DecisionLimit
 
 Array = np.ndarray
 
 Claim = tuple[int, int, int]
 """Decision interval, arm (its index) and action."""
-
-
-@dataclass(frozen=True, eq=False)
-class Schedules:
-    """Schedules of the jobs of one shift; arrays [schedule, job].
-
-    A free arm claims, of its jobs that it may claim, the one that comes first.
-    """
-
-    arm: Array
-    """int."""
-    option: Array
-    """Index of the plan among those on offer, int."""
-    order: Array
-    """Jobs with smaller numbers come first; inf for a job that is left out."""
-    not_before_s: Array
-    """No arm claims the job earlier."""
-
-    def __len__(self) -> int:
-        return len(self.arm)
-
-    def at(self, rows: Sequence[int] | Array) -> "Schedules":
-        """Copies of some schedules."""
-        chosen = np.asarray(rows, dtype=int)
-        return Schedules(*(getattr(self, name)[chosen].copy() for name in self.__dataclass_fields__))
-
-
-def stack(schedules: Sequence[Schedules]) -> Schedules:
-    """Schedules one after the other."""
-    names = Schedules.__dataclass_fields__
-    return Schedules(*(np.concatenate([getattr(each, name) for each in schedules]) for name in names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +53,7 @@ class ShiftSimulator:
         world: Its env 0.
         rows: Number of simulations at a time.
         noise_key: Of the sensors, which only policies notice.
+        simulator: For policies that plan, of the same shift.
         compiled: As in `Engine`.
     """
 
@@ -93,34 +64,39 @@ class ShiftSimulator:
         rows: int,
         *,
         noise_key: int = 0,
+        simulator: CellSimulator | None = None,
         compiled: bool | None = None,
     ) -> None:
         tables, drawn = tables_of(world)
-        self.world, self.rows = world, rows
+        self.world, self.rows, self._simulator = world, rows, simulator
         self.jobs = int(world.jobs.exists[0].sum())
         self.evaluations = 0
         """Shifts simulated so far."""
         self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
         self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
         self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled)
-        self._weights, self._compiled = weights_per_unit(weights), compiled
         self._vectors = np.zeros((rows, self._layout.arms, self._layout.size), np.float32)
+
+    def changes(self, rng: np.random.Generator) -> Changes:
+        """Changes of its schedules."""
+        tables, jobs = self._engine.tables, self.jobs
+        can = tables.work["plan"][0, :, :jobs] >= 0
+        return Changes(
+            can, tables.stations[0, :jobs], self.world.jobs.release_s[0, :jobs], self.world.horizon_s,
+            self.world.dt_s, rng,
+        )  # fmt: skip
 
     def run(self, schedules: Schedules) -> Simulated:
         """The results of at most `rows` schedules."""
-        given, engine = len(schedules), self._engine
-        rows, terms = np.arange(given), np.empty((self.rows, len(TERMS) + 1))
-        reward, count = np.zeros(given), np.zeros(given, np.int64)
-        start_s = np.full((given, self.jobs), np.inf)
-        claims = np.zeros((given, MOST_FAULTS * self.jobs, 3), np.int64)
-        engine.reset(rows, self._shifts[:given])
-        bundle = engine._bundle  # pyright: ignore[reportPrivateUsage]  # the arrays that all kernels share
-        chosen = (schedules.arm, schedules.option, schedules.order, schedules.not_before_s)
-        play = play_rows.chosen(self._compiled)
-        play(bundle, self._weights, terms, *chosen, rows, reward, start_s, claims, count)
+        given = len(schedules)
+        self._engine.reset(np.arange(given), self._shifts[:given])
+        played = self._engine.play(schedules, np.ones(self.world.ticks))
         self.evaluations += given
-        lists = [[(tick, a, action) for tick, a, action in claims[e, : count[e]].tolist()] for e in range(given)]
-        return Simulated(reward, start_s, schedules.arm, schedules.option, lists)
+        lists = [
+            [(tick, a, action) for tick, a, action in played.claims[e, : played.count[e]].tolist()]
+            for e in range(given)
+        ]
+        return Simulated(played.reward, played.start_s, schedules.arm, schedules.option, lists)
 
     def follow(self, policies: Sequence[Policy], limit: DecisionLimit = UNLIMITED) -> Simulated:
         """The results of at most `rows` policies, each at the beginning of its shift.
@@ -132,6 +108,9 @@ class ShiftSimulator:
         skips = all(only_choices(policy) for policy in policies)
         engine.reset(np.arange(self.rows), self._shifts)
         engine.observe(np.arange(self.rows), self._vectors)
+        for e, policy in enumerate(policies):
+            if isinstance(policy, Planner) and self._simulator:
+                policy.plan_in(Lookahead(self._simulator, engine, e))
         reward, running = np.zeros(self.rows), np.ones(self.rows, bool)
         running[given:] = False
         start_s = np.full((self.rows, self.jobs), np.inf)

@@ -8,14 +8,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from agents.policy import WAIT, Policy, only_choices
+from agents.policy import WAIT, Planner, Policy, only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import MemoryExchange
+from fleet.engine.lookahead import CellSimulator
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.fleet import Fleet
+from scenarios.prepare.known_cell import as_known, simulator_of
 from scenarios.run.batch import library_of
 from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit
 from scenarios.run.heat_use import HeatUse
@@ -133,6 +135,11 @@ def play(
         for e, seed in enumerate(seeds):
             with guarded(e, 0.0):
                 policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
+        for e, each in policies.items():
+            if isinstance(each, Planner):
+                cell = env.lookahead(_simulator(fleet), e)  # may compile, which is no time of the policy
+                with guarded(e, 0.0):
+                    each.plan_in(cell)
         only_when_asked = bool(policies) and only_choices(next(iter(policies.values())))
         tick = 0
         while running.any():
@@ -173,3 +180,8 @@ def play(
 @lru_cache(maxsize=1)
 def _library(fleet: Fleet) -> Library:
     return library_of(fleet)
+
+
+@lru_cache(maxsize=1)
+def _simulator(fleet: Fleet) -> CellSimulator:
+    return simulator_of(fleet, library_of(as_known(fleet)).tables)

@@ -24,18 +24,20 @@ def play_rows(
     start_s: Array,
     claims: Array,
     count: Array,
+    discount: Array,
 ) -> None:
-    """Execute the schedule of each of some envs from the beginning of its shift to the end.
+    """Execute the schedule of each of some envs from its present state to the end of its shift.
 
     Args:
         weights: Reward per unit of each term, [term].
         terms: Room for the reward terms and their sum, [env, term + 1].
-        arm: Schedules (`scenarios.bounds.schedule.Schedules`), int [env, job]; likewise option, order, not_before_s.
+        arm: Schedules (`fleet.engine.schedules.Schedules`), int [env, job]; likewise option, order, not_before_s.
         rows: int [row].
-        reward: Receives the reward of each shift, [env].
+        reward: Receives the discounted reward of each from now on, [env].
         start_s: Receives when each job was last awarded, [env, job].
         claims: Receives the claims that were won: interval, arm, action, int [env, claim, 3]; others are dropped.
         count: Receives their number, int [env].
+        discount: Factor on the reward of each step, [tick].
     """
     t, s, o = sim.tables, sim.state, sim.offers
     arms, slots, options = s.mode.shape[1], o.slot_job.shape[1], t.work.shape[3]
@@ -67,4 +69,4 @@ def play_rows(
                             count[e] += 1
             step_arms(sim, weights, terms, one)
             update_offers(sim.tables, sim.jobs, sim.state, sim.offers, sim.events, one)
-            reward[e] += terms[e, terms.shape[1] - 1]
+            reward[e] += discount[tick] * terms[e, terms.shape[1] - 1]

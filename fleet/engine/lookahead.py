@@ -1,0 +1,139 @@
+"""Looking ahead: what would come of schedules from now on, simulated with what the dispatcher of a cell knows.
+
+It knows the plans of the arms and the space they take, which arm works on what, the jobs on offer, and of each arm the
+measured motor temperatures, its estimate of the housings and its thermal network as identified. It does not know which
+jobs arrive later, how the air of the cell will change, which sensors err, or the true temperatures.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.engine.batch import Engine, Shift
+from fleet.engine.reward import RewardWeights
+from fleet.engine.schedules import Executed, Schedules
+from fleet.engine.state import DONE, GIVEN_UP, PER_JOB, RUNNING, State
+from fleet.engine.tables import Tables
+from fleet.observation import Layout, Observation
+from fleet.thermal import HOUSING, WINDING
+
+Array = np.ndarray
+
+SIDE_BY_SIDE = 32
+"""Schedules that are simulated at a time."""
+_DERIVED = ("queue", "head", "unfinished", "given_up", "current_kind", "pending")
+"""What the simulation changes in the offers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Present:
+    """The jobs and arms of a shift at a moment; arrays [job] have all jobs of the shift, but only those on offer are
+    known."""
+
+    now_s: float
+    open: Array
+    """Jobs on offer, int [n]."""
+    can: Array
+    """Whether an arm has a plan for a job, bool [arm, job, option]."""
+    stations: Array
+    """Stations of each job as bits, uint64 [job, word]."""
+
+
+class CellSimulator:
+    """Simulates schedules of a cell, for any number of its shifts one after the other.
+
+    Args:
+        tables: The fleet as the arms know themselves.
+        arms, slots: Their numbers.
+        weights: Of the reward terms.
+        compiled: As in `Engine`.
+    """
+
+    def __init__(
+        self, tables: Tables, arms: int, slots: int, weights: RewardWeights, *, compiled: bool | None = None
+    ) -> None:
+        self._ambient_c = tables.ambient_c
+        layout = Layout(arms, slots, plans=tables.work.shape[3])
+        self._engine = Engine(
+            tables._replace(ambient_c=tables.ambient_c.copy()), SIDE_BY_SIDE, layout, weights, compiled=compiled
+        )
+        self._state: State | None = None
+        self._derived: list[Array] = []
+        none = np.zeros((0, 0))
+        self._engine.play(Schedules(none.astype(int), none.astype(int), none, none), np.zeros(0))  # compiles
+
+    @property
+    def dt_s(self) -> float:
+        """Decision interval."""
+        return self._engine.tables.dt_s
+
+    @property
+    def horizon_s(self) -> float:
+        """Length of a shift."""
+        return self._engine.tables.ticks * self.dt_s
+
+    def look(self, engine: Engine, env: int, seen: Mapping[str, Observation]) -> Present:
+        """Begin at the present of a row of another engine with the same kinds of jobs.
+
+        Args:
+            seen: What its arms observe.
+        """
+        jobs, state, slot_job = engine.jobs, engine.state, engine.offers.slot_job[env]
+        row, count, open_ = slice(env, env + 1), int(jobs.number[env]), slot_job[slot_job >= 0]
+        hidden = (state.status[env] != DONE) & (state.status[env] != RUNNING)
+        hidden[open_] = False
+        known = state.copy(row)
+        known.status[0, hidden] = GIVEN_UP
+        known.temp_c[0, :, WINDING] = [each.temp_c for each in seen.values()]
+        known.temp_c[0, :, HOUSING] = [each.housing_c for each in seen.values()]
+        mine, tick = self._engine, int(state.tick[env])
+        mine.tables.work["difficulty"] = engine.tables.work["difficulty"]  # it decides between claims
+        mine.tables.ambient_c[:] = self._ambient_c[:, [min(tick, mine.tables.ticks - 1)]]
+        named = ("kind", "release_s", "due_s", "repetitions", "expires", "after")
+        drawn = {name: getattr(jobs, name)[env, :count] for name in named}
+        fleet, offset_k = int(jobs.fleet[env]), float(jobs.ambient_offset_k[env])
+        shift = Shift(fleet=fleet, ambient_offset_k=offset_k, noise_key=0, **drawn)
+        mine.reset(np.arange(SIDE_BY_SIDE), [shift] * SIDE_BY_SIDE)
+        mine.load(known._replace(**{name: getattr(known, name)[:, :count] for name in PER_JOB}))
+        self._state = mine.state.copy(slice(0, 1))
+        self._derived = [getattr(mine.offers, name)[0].copy() for name in _DERIVED]
+        kind = jobs.kind[env, :count]
+        can = mine.tables.work["plan"][fleet][:, kind] >= 0
+        return Present(tick * self.dt_s, open_, can, mine.tables.stations[fleet, kind])
+
+    def run(self, schedules: Schedules, discount: Array) -> Executed:
+        """What comes of at most `SIDE_BY_SIDE` schedules from the moment of the last look.
+
+        Args:
+            discount: Factor on the reward of each step of a shift, [tick].
+        """
+        if self._state is None:
+            raise RuntimeError("There is no present to begin at: call look() before run().")
+        mine = self._engine
+        for own, saved in zip(mine.state, self._state, strict=True):
+            own[:] = saved
+        for name, saved in zip(_DERIVED, self._derived, strict=True):
+            getattr(mine.offers, name)[:] = saved
+        return mine.play(schedules, discount)
+
+
+class Lookahead:
+    """The simulator of a cell, tied to one of its shifts."""
+
+    def __init__(self, simulator: CellSimulator, engine: Engine, env: int = 0) -> None:
+        self.simulator, self._engine, self._env = simulator, engine, env
+
+    @property
+    def slot_job(self) -> Array:
+        """Jobs in the slots of the observation by their numbers, int [slot], −1 for an empty one."""
+        return self._engine.offers.slot_job[self._env]
+
+    @property
+    def now_s(self) -> float:
+        """Time since the shift began."""
+        return float(self._engine.state.tick[self._env]) * self.simulator.dt_s
+
+    def look(self, seen: Mapping[str, Observation]) -> Present:
+        """Begin at the present; see `CellSimulator.look`."""
+        return self.simulator.look(self._engine, self._env, seen)
