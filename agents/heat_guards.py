@@ -194,11 +194,6 @@ class GuardedFleet:
         self._guards = {}
         self._policy.reset(rng)
 
-    def plan_in(self, cell: "Lookahead") -> None:
-        """Let the policy plan in the simulator of a shift, if it does so."""
-        if isinstance(self._policy, Planner):
-            self._policy.plan_in(cell)
-
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The actions of the policy among the claims that the guards allow."""
         for arm in observations:
@@ -211,8 +206,18 @@ class GuardedFleet:
         return self.act({"": observation})[""]
 
 
+class GuardedPlanner(GuardedFleet):
+    """A policy that plans in a simulator, which knows of no guards, with a guard for each arm."""
+
+    def plan_in(self, cell: "Lookahead") -> None:
+        """Let the policy plan in the simulator of a shift."""
+        if isinstance(self._policy, Planner):
+            self._policy.plan_in(cell)
+
+
 def guarded(guard: Callable[[], Guard], policy: Policy | ArmPolicy) -> Policy | ArmPolicy:
     """A policy, for one arm or for all, whose claims pass a guard."""
     if hasattr(policy, "act"):
-        return GuardedFleet(guard, policy)  # pyright: ignore  # hasattr does not narrow the type
+        kind = GuardedPlanner if isinstance(policy, Planner) else GuardedFleet
+        return kind(guard, policy)  # pyright: ignore  # hasattr does not narrow the type
     return GuardedArm(guard, policy)  # pyright: ignore

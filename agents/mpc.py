@@ -17,11 +17,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.policy import WAIT, plans_of
+from agents.policy import WAIT, no_simulator, plans_of
 from agents.schedule_changes import Changes
 from fleet.engine.lookahead import SIDE_BY_SIDE, Lookahead
 from fleet.engine.schedules import Schedules, stack
-from fleet.errors import FleetError
 from fleet.observation import Observation
 
 Array = np.ndarray
@@ -61,7 +60,8 @@ class Mpc:
         self._schedule: Schedules | None = None
         self._planned: set[int] = set()
         """Jobs that have been on offer in a search."""
-        self._searched_s = -np.inf
+        self.searched_s = -np.inf
+        """Time of the last search."""
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """Of each free arm, the claim that comes first in the schedule among those that are legal now.
@@ -73,15 +73,12 @@ class Mpc:
         if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
             return actions
         if self._cell is None:
-            raise FleetError(
-                "The policy 'mpc' plans in a simulator of its cell, and there is none here: it works in `run`, "
-                "`compare` and `bounds`. Choose another, for example wsept_learned."
-            )
+            raise no_simulator("mpc")
         cell, now_s = self._cell, self._cell.now_s
         slot_job = cell.slot_job
         new = [job for job in slot_job[slot_job >= 0].tolist() if job not in self._planned]
-        if new or now_s - self._searched_s >= self.every_s:
-            self._schedule, self._searched_s = self._search(cell, observations, new), now_s
+        if new or now_s - self.searched_s >= self.every_s:
+            self._schedule, self.searched_s = self._search(cell, observations, new), now_s
             self._planned.update(new)
         assert self._schedule is not None
         return actions | _claims(self._schedule, slot_job, observations, now_s)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
+from fleet.errors import FleetError
 from fleet.observation import Observation
 
 if TYPE_CHECKING:  # loads the engine
@@ -48,6 +49,14 @@ class Planner(Protocol):
     def plan_in(self, cell: "Lookahead") -> None:
         """Plan in the simulator of a shift; called once before it begins."""
         ...
+
+
+def no_simulator(name: str) -> FleetError:
+    """The error of a policy that plans, where there is no simulator of its cell."""
+    return FleetError(
+        f"The policy '{name}' plans in a simulator of its cell, and there is none here: it works in `run`, `compare` "
+        "and `bounds`. Choose another, for example wsept_learned."
+    )
 
 
 class ArmPolicy(_Resettable, Protocol):

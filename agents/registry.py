@@ -10,7 +10,7 @@ from agents.heat_guards import FuzzySpeed, Guard, Shutdown, TorqueLimiter
 from agents.heat_rules import Thermometer, Wsept, WseptAhead, WseptLocal
 from agents.mpc import Mpc
 from agents.pair_scores import WseptLearned, WseptLearnedLocal, WseptUntrained
-from agents.policy import ArmPolicy, Policy, for_all_arms
+from agents.policy import ArmPolicy, Planner, Policy, for_all_arms
 from agents.rolling_horizon import RollingHorizon
 from agents.rules import CoolestFirst, LeastDifficulty, RandomLegal, RoundRobin, Wspt, WsptCool
 from fleet.errors import nearest
@@ -29,6 +29,11 @@ class Rule:
     def scope(self) -> str:
         """See `agents.policy`."""
         return self.kind.scope
+
+    @property
+    def plans(self) -> bool:
+        """Whether it plans in a simulator of its cell, which a live fleet does not have."""
+        return issubclass(self.kind, Planner)
 
 
 _RELATIVE, _THERMAL, _TIME = "difficulty relative to the fleet", "thermal", "time until the finish"
@@ -86,8 +91,8 @@ WRAPPERS: dict[str, Wrapper] = {
 
 
 def names_of(scope: str) -> str:
-    """The policies of a scope, separated by commas."""
-    return ", ".join(name for name, rule in RULES.items() if rule.scope == scope)
+    """The policies of a scope that a live fleet can have, separated by commas."""
+    return ", ".join(name for name, rule in RULES.items() if rule.scope == scope and not rule.plans)
 
 
 WRAPPERS_HELP = " or ".join(f"{name}:POLICY" for name in WRAPPERS).replace(" or ", ", ", len(WRAPPERS) - 2)

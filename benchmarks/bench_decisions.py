@@ -5,37 +5,49 @@
 Prints Markdown for docs/policies.md and writes JSON to FILE. The observations are drawn: jobs of 2 to 30 min, values of
 1 to 4 and predicted peaks of 35 to 75 °C. Each arm can do 60 % of them, and half of the arms are free. The time is CPU
 time, which other programs on the machine hardly change; with --wall real time, for a policy `bus:NAME`. That of a
-policy of scope `arm` is for one free arm. For `rolling_horizon` the largest gap that the solver left is added. Exits
-with an error if a median exceeds its limit.
+policy of scope `arm` is for one free arm; that of `mpc` for the decisions with a search in a shift of 16 arms and 48
+slots. For `rolling_horizon` the largest gap that the solver left is added. Exits with an error if a median exceeds its
+limit.
 """
 
 import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
 from agents.assignment import Ssi
 from agents.consensus import Consensus
+from agents.mpc import Mpc
+from agents.policy import Planner
 from agents.registry import RULES
 from agents.rolling_horizon import RollingHorizon
+from fleet.engine.lookahead import Lookahead
 from fleet.observation import Layout, Observation
+from scenarios.bounds.schedule import ShiftSimulator
+from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, scope_of
+from scenarios.prepare.fleet import ShiftFactory, prepare
+from scenarios.prepare.known_cell import simulator_of_shift
+from scenarios.suite.splits import instance
 
 PLANS = 2
 WARNING_C = 60.0
 RULE_MS, MATCHING_MS, HORIZON_MS = 1.0, 5.0, 1000.0
-"""Largest median of a rule, of a matching, an auction or a policy that calls one, and of the rolling horizon."""
+"""Largest median of a rule, of a matching, an auction or a policy that calls one, and of a plan of the next minutes."""
+SHIFT = "validation/0005"
+"""Shift of 16 arms and 48 slots in which a policy plans that needs a simulator of its cell."""
 
 
 def limit_ms(name: str) -> float:
     """The largest median of a policy."""
     kind = RULES[name].kind if name in RULES else None
-    if kind is None or issubclass(kind, RollingHorizon):
+    if kind is None or issubclass(kind, RollingHorizon | Planner):
         return HORIZON_MS
     return MATCHING_MS if issubclass(kind, Ssi | Consensus) else RULE_MS
 
@@ -90,6 +102,44 @@ def measure(name: str, moments: list[dict[str, Observation]], clock: Callable[[]
     return row | {"largest_ms": max(times_ms) / arms} | ({"largest_gap": max(gaps)} if gaps else {})
 
 
+class _Timed:
+    """A policy that plans, with the times of its decisions."""
+
+    scope: ClassVar = "central"
+    only_choices = True
+
+    def __init__(self, policy: Mpc, clock: Callable[[], float]) -> None:
+        self._policy, self._clock, self.times_ms = policy, clock, list[float]()
+
+    def plan_in(self, cell: Lookahead) -> None:
+        """Let the policy plan."""
+        self._policy.plan_in(cell)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """Its decision; the time of one without a search does not count."""
+        began_s, searched_s = self._clock(), self._policy.searched_s
+        actions = self._policy.act(observations)
+        if self._policy.searched_s > searched_s:
+            self.times_ms.append((self._clock() - began_s) * 1e3)
+        return actions
+
+
+def measure_planner(name: str, clock: Callable[[], float]) -> dict[str, float | str]:
+    """Median and largest time of a decision with a search, in ms, in `SHIFT`."""
+    shift, policy = instance(SHIFT), policy_at(name, 0)
+    assert isinstance(policy, Mpc)
+    fleet = prepare(shift.scenario, difficulty="oracle")
+    world = ShiftFactory(fleet)(np.random.SeedSequence(shift.seed)).world
+    timed = _Timed(policy, clock)
+    simulator = simulator_of_shift(fleet, shift.seed)
+    ShiftSimulator(world, weights_of(shift.scenario), 1, simulator=simulator).follow([timed])
+    median_ms = statistics.median(timed.times_ms)
+    return {"policy": name, "scope": "central", "median_ms": median_ms, "largest_ms": max(timed.times_ms)}
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
@@ -103,7 +153,10 @@ def main() -> None:
     rng = np.random.default_rng(0)
     moments = [draw(rng, options.arms, options.jobs) for _ in range(options.decisions)]
     clock = time.perf_counter if options.wall else time.process_time
-    rows = [measure(name, moments, clock) for name in options.policies.split(",")]
+    rows = [
+        measure_planner(name, clock) if name in RULES and RULES[name].plans else measure(name, moments, clock)
+        for name in options.policies.split(",")
+    ]
     print("| policy | scope | median ms | largest ms |\n|---|---|---|---|")
     for row in rows:
         print(f"| `{row['policy']}` | {row['scope']} | {row['median_ms']:.2f} | {row['largest_ms']:.2f} |")

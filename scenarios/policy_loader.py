@@ -16,7 +16,7 @@ import numpy as np
 
 from agents.heat_guards import guarded
 from agents.pair_scores import PAIRS, load_pairs
-from agents.policy import SCOPES, ArmPolicy, Local, Policy, for_all_arms
+from agents.policy import SCOPES, ArmPolicy, Local, Planner, Policy, for_all_arms, no_simulator
 from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
 from fleet.bus.protocol.keys import ENDPOINT
 from fleet.errors import NAME_RULE, FleetError, is_name, nearest, printable
@@ -135,6 +135,18 @@ def policy_at(name: str, seed: int, bus: OnBus = ON_BUS) -> Policy:
     """
     policy = policy_of(name, bus)
     policy.reset(np.random.default_rng(child(np.random.SeedSequence([seed, 1]), 0)))
+    return policy
+
+
+def policy_without_simulator(name: str) -> Policy:
+    """A fresh policy for all arms, where there is no simulator of their cell.
+
+    Raises:
+        FleetError: as `policy_of`, or the policy plans in a simulator.
+    """
+    policy = policy_of(name)
+    if isinstance(policy, Planner):
+        raise no_simulator(name)
     return policy
 
 

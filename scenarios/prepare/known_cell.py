@@ -1,14 +1,19 @@
 """A cell as its arms know it, for policies that plan in a simulator."""
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from agents.policy import Planner, Policy
 from fleet.difficulty import Blind
 from fleet.engine.lookahead import CellSimulator
 from fleet.engine.tables import Tables, tables_of
 from scenarios.fault_price import weights_of
 from scenarios.prepare.fleet import Fleet, ShiftFactory
+
+if TYPE_CHECKING:
+    from fleet.env.allocation_v1 import AllocationEnv
 
 
 def as_known(fleet: Fleet) -> Fleet:
@@ -28,6 +33,12 @@ def simulator_of(fleet: Fleet, tables: Tables) -> CellSimulator:
         tables: Of `as_known(fleet)`.
     """
     return CellSimulator(tables, len(fleet.arms), fleet.scenario.slots, weights_of(fleet.scenario))
+
+
+def let_plan(policy: Policy, fleet: Fleet, env: "AllocationEnv", seed: int) -> None:
+    """Give a policy that plans a simulator of the shift that an env has just begun, of a prepared fleet and a seed."""
+    if isinstance(policy, Planner):
+        policy.plan_in(env.lookahead(simulator_of_shift(fleet, seed)))
 
 
 def simulator_of_shift(fleet: Fleet, seed: int) -> CellSimulator:

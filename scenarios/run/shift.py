@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from agents.policy import Planner
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
@@ -19,7 +18,7 @@ from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
 from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
-from scenarios.prepare.known_cell import simulator_of_shift
+from scenarios.prepare.known_cell import let_plan
 from scenarios.progress import Progress, quiet
 from scenarios.run.heat_use import HeatUse
 from scenarios.run.metrics import Metrics
@@ -115,8 +114,7 @@ def run(
     try:
         recorder.env = env
         env.reset(seed=spec.seed)
-        if isinstance(policy, Planner):
-            policy.plan_in(env.lookahead(simulator_of_shift(fleet, spec.seed)))
+        let_plan(policy, fleet, env, spec.seed)
         while env.agents and not stopped():
             seen, count = env.knowledge(), len(env.events)
             try:

@@ -14,6 +14,7 @@ from fleet.events import Event
 from fleet.thermal import WINDING
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import RISK, Fleet, RiskName, env_of, prepare
+from scenarios.prepare.known_cell import let_plan
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
 from scenarios.trials.cells import drawn
@@ -146,6 +147,7 @@ def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
     warm_c = fleet.scenario.limits.warning_c - WARM_K
     try:
         env.reset(seed=seed)
+        let_plan(chooser, fleet, env, seed)
         while env.agents:
             known, tick = env.knowledge(), env.tick
             actions = chooser.act(known)

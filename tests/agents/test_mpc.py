@@ -1,0 +1,141 @@
+"""Model predictive control: it sees no future, finds proven optima, and its simulator agrees with the true one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.mpc import Mpc
+from agents.policy import Planner
+from agents.registry import RULES, make_policy
+from fleet.engine.batch import Engine, shifts_of
+from fleet.engine.lookahead import CellSimulator, Lookahead
+from fleet.engine.reward import RewardWeights
+from fleet.engine.schedules import Schedules
+from fleet.engine.tables import tables_of
+from fleet.errors import FleetError
+from fleet.observation import Layout
+from fleet.robot import ThermalLimits
+from scenarios.bounds.exhaustive import optimum
+from scenarios.bounds.schedule import ShiftSimulator
+from scenarios.live.allocation import central_allocation
+from scenarios.load import load
+from scenarios.policy_loader import policy_of, policy_without_simulator
+
+HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
+WEIGHTS = RewardWeights(tardiness=-0.5, faults=-10.0)
+
+
+def simulator_of(world, weights=WEIGHTS):
+    tables, _ = tables_of(world)
+    tables.work["difficulty"] = np.nan  # the arms share it
+    return CellSimulator(tables, len(world.arms), world.slots, weights)
+
+
+def played(world, policy, *, seed=0, weights=WEIGHTS):
+    policy.reset(np.random.default_rng(seed))
+    return ShiftSimulator(world, weights, 1, simulator=simulator_of(world, weights)).follow([policy])
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000), hot=st.booleans(), moment=st.sampled_from([50.0, 100.0]))
+def test_no_job_before_its_release_changes_a_claim(small, seed, hot, moment):
+    shifts = small.Shifts(arms=3, jobs=10, ticks=40, limits=HOT if hot else ThermalLimits(), crowding=0.3)
+    jobs = sorted(shifts.drawn(np.random.SeedSequence(seed))[0], key=lambda job: job.release_s)
+    jobs = [replace(job, after=()) for job in jobs]
+    other = [
+        job
+        if job.release_s <= moment
+        else replace(job, value=9.0, repetitions=7, work=small.work("bench", small.HOT), due_s=job.release_s + 5.0)
+        for job in jobs
+    ]
+    both = [played(shifts.shop(some)[0], Mpc()).claims[0] for some in (jobs, other, other[:-1])]
+    early = [[claim for claim in claims if claim[0] * 10.0 < moment] for claims in both]
+    assert early[0] == early[1] == early[2]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_it_finds_the_proven_optimum_where_all_jobs_are_known(small, seed):
+    """Without a price of time: the whole reward of the shift is before its eyes."""
+
+    class Patient(Mpc):
+        tau_s = 1e9
+        evaluations = 640
+
+    shifts = small.Shifts(arms=2, jobs=3, ticks=10)
+    drawn = shifts.drawn(np.random.SeedSequence(seed))[0]
+    jobs = [replace(job, repetitions=min(job.repetitions, 2), release_s=0.0, due_s=25.0, after=()) for job in drawn]
+    world, _ = shifts.shop(jobs)
+    assert played(world, Patient()).reward[0] == pytest.approx(optimum(world, WEIGHTS), abs=1e-9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000), ticks=st.integers(0, 20))
+def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
+    """From any moment of a shift, with all jobs on offer, a schedule gives the reward and the awards of the shift."""
+    shifts = small.Shifts(arms=3, jobs=6, ticks=40, slots=6, crowding=0.3)
+    jobs = [replace(j, release_s=0.0, after=()) for j in shifts.drawn(np.random.SeedSequence(seed))[0]]
+    rng, (world, _) = np.random.default_rng(seed), shifts.shop(jobs)
+    difficulty = rng.uniform(0.0, 3.0, world.offers.difficulty.shape)
+    world = replace(world, offers=replace(world.offers, difficulty=difficulty))
+    tables, drawn = tables_of(world)
+    layout = Layout(3, world.slots, plans=world.plans_per_job)
+    schedule = Schedules(
+        rng.integers(0, 3, (1, 6)), np.zeros((1, 6), int), rng.uniform(0, 1, (1, 6)), rng.uniform(0, 300, (1, 6))
+    )
+    engine, vectors = Engine(tables, 1, layout, WEIGHTS, jobs=6), np.zeros((1, 3, layout.size), np.float32)
+    engine.reset(np.arange(1), shifts_of(drawn, [0]))
+    engine.observe(np.arange(1), vectors)
+    for _ in range(ticks):
+        engine.step(np.array([[rng.choice(np.flatnonzero(m[:-1])) for m in engine.mask[0]]]), vectors)
+    seen = {name: layout.read(vectors[0, a], engine.mask[0, a]) for a, name in enumerate(world.arms)}
+    cell = Lookahead(simulator_of(world), engine)
+    present = cell.look(seen)
+    assert present.now_s == cell.now_s == ticks * 10.0
+    ahead = cell.simulator.run(schedule, np.ones(world.ticks))
+    truth = engine.play(schedule, np.ones(world.ticks))
+    np.testing.assert_array_equal(ahead.start_s, truth.start_s)
+    assert ahead.reward[0] == pytest.approx(truth.reward[0], abs=1e-3)
+
+
+def test_a_later_reward_is_worth_less(small):
+    world, _ = small.Shifts(arms=1, jobs=1).shop([small.job("a")])
+    simulator = simulator_of(world, RewardWeights(tardiness=0.0, energy=0.0))
+    tables, drawn = tables_of(world)
+    layout = Layout(1, world.slots, plans=world.plans_per_job)
+    engine, vectors = Engine(tables, 1, layout, WEIGHTS), np.zeros((1, 1, layout.size), np.float32)
+    engine.reset(np.arange(1), shifts_of(drawn, [0])[:1])
+    engine.observe(np.arange(1), vectors)
+    simulator.look(engine, 0, {"arm_0": layout.read(vectors[0, 0], engine.mask[0, 0])})
+    discount = 0.5 ** np.arange(world.ticks)
+    whole = Schedules(np.zeros((1, 1), int), np.zeros((1, 1), int), np.zeros((1, 1)), np.zeros((1, 1)))
+    value, later = (float(simulator.run(whole, each).reward[0]) for each in (np.ones(world.ticks), discount))
+    finished = int(np.log2(value / later))
+    assert value == world.jobs.value[0, 0]
+    assert later == value * 0.5**finished
+    delayed = replace(whole, not_before_s=np.full((1, 1), 30.0))
+    assert simulator.run(delayed, discount).reward[0] == later / 8
+
+
+def test_where_there_is_no_simulator_an_error_says_so(small):
+    assert [name for name, rule in RULES.items() if rule.plans] == ["mpc"]
+    for name in ("mpc", "limited:mpc"):
+        assert isinstance(policy_of(name), Planner)
+        for refused in (policy_without_simulator, lambda name: central_allocation(name, load("quickstart"), 0)):
+            with pytest.raises(FleetError, match=f"'{name}' plans in a simulator of its cell, and there is none here"):
+                refused(name)
+    assert not isinstance(policy_of("limited:wsept"), Planner)
+    world, _ = small.Shifts().shop(small.Shifts().drawn(np.random.SeedSequence(1))[0])
+    with pytest.raises(FleetError, match="Choose another"):
+        ShiftSimulator(world, WEIGHTS, 1).follow([make_policy("mpc")])
+    with pytest.raises(RuntimeError, match=r"call look\(\)"):
+        simulator_of(world).run(Schedules(*(np.zeros((1, 8)) for _ in range(4))), np.ones(world.ticks))
+
+
+def test_a_guard_stops_claims_of_a_planner(small):
+    world, _ = small.Shifts(jobs=12, ambient_c=38.0).shop(small.Shifts(jobs=12).drawn(np.random.SeedSequence(3))[0])
+    free, guarded = (played(world, policy_of(name)) for name in ("mpc", "shutdown:mpc"))
+    assert np.isfinite(free.start_s).any()
+    assert np.isfinite(guarded.start_s).sum() <= np.isfinite(free.start_s).sum()
