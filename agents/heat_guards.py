@@ -8,16 +8,13 @@ policy chooses among the claims that are left.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
-from agents.policy import WAIT, ArmPolicy, Planner, Policy, per_option, plans_of
+from agents.policy import WAIT, ArmPolicy, Lookahead, Planner, Policy, per_option, plans_of
 from fleet.observation import Observation
 from fleet.robot import RATING
-
-if TYPE_CHECKING:  # loads the engine
-    from fleet.engine.lookahead import Lookahead
 
 Array = np.ndarray
 
@@ -209,7 +206,7 @@ class GuardedFleet:
 class GuardedPlanner(GuardedFleet):
     """A policy that plans in a simulator, which knows of no guards, with a guard for each arm."""
 
-    def plan_in(self, cell: "Lookahead") -> None:
+    def plan_in(self, cell: Lookahead) -> None:
         """Let the policy plan in the simulator of a shift."""
         if isinstance(self._policy, Planner):
             self._policy.plan_in(cell)

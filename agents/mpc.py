@@ -6,7 +6,7 @@ discounted by exp(−time / `tau_s`): jobs that arrive later will need the arms 
 begins at the schedule of the last time, puts every new job where it is worth most, and goes on with random changes
 (large neighbourhood search). In between the arms follow the schedule.
 
-The simulator knows what a dispatcher of the cell knows, see `fleet.engine.lookahead`: no job before it is on offer, no
+The simulator knows what a dispatcher of the cell knows, see `fleet.env.lookahead`: no job before it is on offer, no
 true temperature, no thermal network but that which the arms know.
 
 Sources: Mayne et al., Automatica 36, 2000 (model predictive control); Shaw, CP 1998 (large neighbourhood search).
@@ -17,10 +17,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.policy import WAIT, no_simulator, plans_of
-from agents.schedule_changes import Changes
-from fleet.engine.lookahead import SIDE_BY_SIDE, Lookahead
-from fleet.engine.schedules import Schedules, stack
+from agents.policy import WAIT, Lookahead, no_simulator, plans_of
+from agents.schedules import Changes, Schedules, stack
 from fleet.observation import Observation
 
 Array = np.ndarray
@@ -96,15 +94,15 @@ class Mpc:
 
         for job in new:
             if job in changes.choices:
-                tried = _inserted(best, job, changes.choices[job], present.open, now_s, rng)
+                tried = _inserted(best, job, changes.choices[job], present.open, now_s, simulator.rows, rng)
                 rewards = simulator.run(tried, discount).reward
                 at = int(rewards.argmax())
                 if rewards[at] > reward + LEAST_GAIN:
                     best, reward = tried.at([at]), float(rewards[at])
 
         joint: list[Schedules] = []
-        for _ in range(0 if changes.none else self.evaluations // SIDE_BY_SIDE):
-            tried = stack([*joint, *(changes.changed(best) for _ in range(SIDE_BY_SIDE - len(joint)))])
+        for _ in range(0 if changes.none else self.evaluations // simulator.rows):
+            tried = stack([*joint, *(changes.changed(best) for _ in range(simulator.rows - len(joint)))])
             result = simulator.run(tried, discount)
             at, better = int(result.reward.argmax()), np.flatnonzero(result.reward > reward + LEAST_GAIN)
             joint = changes.joined(best, tried, better[np.argsort(-result.reward[better])])
@@ -120,16 +118,16 @@ def _no_job(jobs: int) -> Schedules:
 
 
 def _inserted(
-    schedule: Schedules, job: int, choices: Array, open_: Array, now_s: float, rng: np.random.Generator
+    schedule: Schedules, job: int, choices: Array, open_: Array, now_s: float, most: int, rng: np.random.Generator
 ) -> Schedules:
-    """Schedules with one more job: by every plan for it, before, amid or behind the other open jobs; at most as many
-    as are simulated at a time."""
+    """Schedules with one more job: by every plan for it, before, amid or behind the other open jobs; at most
+    `most`, which are drawn."""
     order = np.sort(schedule.order[0, open_])
     order = order[np.isfinite(order)]
     places = [order[0] - BEHIND_S, order[len(order) // 2], order[-1] + BEHIND_S] if len(order) else [now_s]
     ways = [(arm, option, place) for arm, option in choices.tolist() for place in places]
-    if len(ways) > SIDE_BY_SIDE:
-        ways = [ways[i] for i in rng.choice(len(ways), SIDE_BY_SIDE, replace=False)]
+    if len(ways) > most:
+        ways = [ways[i] for i in rng.choice(len(ways), most, replace=False)]
     tried = schedule.at([0] * len(ways))
     tried.arm[:, job], tried.option[:, job], tried.order[:, job] = zip(*ways, strict=True)
     tried.not_before_s[:, job] = 0.0

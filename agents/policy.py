@@ -6,15 +6,12 @@ in the process of each arm.
 """
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from fleet.errors import FleetError
 from fleet.observation import Observation
-
-if TYPE_CHECKING:  # loads the engine
-    from fleet.engine.lookahead import Lookahead
 
 SCOPES = ("central", "arm")
 
@@ -42,11 +39,32 @@ class Policy(_Resettable, Protocol):
         ...
 
 
+class Lookahead(Protocol):
+    """A simulator of a cell, tied to one of its shifts: `fleet.env.lookahead.Lookahead`."""
+
+    simulator: Any
+    """`fleet.env.lookahead.CellSimulator`; Any, as policies do not know the engine."""
+
+    @property
+    def slot_job(self) -> np.ndarray:
+        """Jobs in the slots of the observation by their numbers, int [slot], −1 for an empty one."""
+        ...
+
+    @property
+    def now_s(self) -> float:
+        """Time since the shift began."""
+        ...
+
+    def look(self, seen: Mapping[str, Observation]) -> Any:  # a `fleet.env.lookahead.Present`
+        """Begin at the present."""
+        ...
+
+
 @runtime_checkable
 class Planner(Protocol):
     """What a policy has besides that plans in a simulator of its cell."""
 
-    def plan_in(self, cell: "Lookahead") -> None:
+    def plan_in(self, cell: Lookahead) -> None:
         """Plan in the simulator of a shift; called once before it begins."""
         ...
 

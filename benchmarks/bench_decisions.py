@@ -27,7 +27,7 @@ from agents.mpc import Mpc
 from agents.policy import Planner
 from agents.registry import RULES
 from agents.rolling_horizon import RollingHorizon
-from fleet.engine.lookahead import Lookahead
+from fleet.env.lookahead import Lookahead
 from fleet.observation import Layout, Observation
 from scenarios.bounds.schedule import ShiftSimulator
 from scenarios.fault_price import weights_of

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from fleet.engine.event_log import PER_ARM, event_buffer
-from fleet.engine.play import play_rows
+from fleet.engine.play import Executed, Plans, execute
 from fleet.engine.reset import reset_rows
 from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
-from fleet.engine.schedules import Executed, Schedules
 from fleet.engine.state import DONE, RUNNING, WAITING, State
 from fleet.engine.step import BLOCK, CLAIM, MOVE, OBSERVE, ROUNDING_S, step_rows
 from fleet.engine.tables import LANES, Jobs, MeasuredDrive, OpenJobs, Simulation, Tables, Trace, form_of
@@ -236,20 +235,13 @@ class Engine:
         measured.current_sq[..., :JOINTS], measured.friction_w[..., :JOINTS] = drive.current_sq, drive.friction_w
         return self._stepped(MOVE + OBSERVE, _NO_ACTIONS, out)
 
-    def play(self, schedules: Schedules, discount: Array) -> Executed:
+    def play(self, schedules: Plans, discount: Array) -> Executed:
         """Execute one schedule in each of the first rows, from the present state to the end of the shift.
 
         Args:
             discount: Factor on the reward of each step of a shift, [tick].
         """
-        given, jobs = schedules.arm.shape
-        terms = np.empty((self.envs, len(TERMS) + 1))
-        reward, start_s = np.zeros(given), np.full((given, jobs), np.inf)
-        claims, count = np.zeros((given, MOST_FAULTS * jobs, 3), np.int64), np.zeros(given, np.int64)
-        chosen = (schedules.arm, schedules.option, schedules.order, schedules.not_before_s)
-        play = play_rows.chosen(self._options[2])
-        play(self._bundle, self._weights, terms, *chosen, self._all[:given], reward, start_s, claims, count, discount)
-        return Executed(reward, start_s, claims, count)
+        return execute(self._bundle, self._weights, self.envs, schedules, discount, compiled=self._options[2])
 
     def _stepped(
         self, parts: int, actions: Array, out: Array, until: Array | None = None

@@ -1,13 +1,50 @@
 """The loop that executes schedules in the simulator; compiled, without observations."""
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from fleet.engine.claims import resolve_claims, update_offers
 from fleet.engine.step import step_arms
 from fleet.engine.tables import Simulation
 from fleet.jit import kernel, nonnegative
+from fleet.job import MOST_FAULTS
 
 Array = np.ndarray
+
+Plans = tuple[Array, Array, Array, Array]
+"""Schedules (`agents.schedules.Schedules`): arm, option, order and earliest time of each job, [schedule, job]."""
+
+
+class Executed(NamedTuple):
+    """What came of schedules."""
+
+    reward: Array
+    """Discounted, [schedule]."""
+    start_s: Array
+    """When each job was last awarded, inf if never, [schedule, job]."""
+    claims: Array
+    """The claims that were won, in the order of time: decision interval, arm and action, int [schedule, claim, 3]."""
+    won: Array
+    """Their number, int [schedule]."""
+
+
+def execute(
+    bundle: Any,  # numba's where the loop is compiled
+    weights: Array,
+    envs: int,
+    schedules: Plans,
+    discount: Array,
+    *,
+    compiled: bool | None,
+) -> Executed:
+    """Execute one schedule in each of the first of `envs` rows; see `play_rows`."""
+    given, jobs = schedules[0].shape
+    claims, count = np.zeros((given, MOST_FAULTS * jobs, 3), np.int64), np.zeros(given, np.int64)
+    done = Executed(np.zeros(given), np.full((given, jobs), np.inf), claims, count)
+    terms = np.empty((envs, len(weights) + 1))
+    play_rows.chosen(compiled)(bundle, weights, terms, *schedules, np.arange(given), *done, discount)
+    return done
 
 
 @kernel
@@ -31,7 +68,7 @@ def play_rows(
     Args:
         weights: Reward per unit of each term, [term].
         terms: Room for the reward terms and their sum, [env, term + 1].
-        arm: Schedules (`fleet.engine.schedules.Schedules`), int [env, job]; likewise option, order, not_before_s.
+        arm: Schedules (`agents.schedules.Schedules`), int [env, job]; likewise option, order, not_before_s.
         rows: int [row].
         reward: Receives the discounted reward of each from now on, [env].
         start_s: Receives when each job was last awarded, [env, job].

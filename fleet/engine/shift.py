@@ -11,7 +11,6 @@ from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.protocol import Exchange
 from fleet.engine.batch import Engine, shifts_of
 from fleet.engine.event_log import events_of
-from fleet.engine.lookahead import CellSimulator, Lookahead
 from fleet.engine.peers import deliver
 from fleet.engine.reward import RewardWeights
 from fleet.engine.state import PER_JOB, State, World
@@ -190,9 +189,10 @@ class ShiftRunner:
         """Decision intervals that are over."""
         return int(self._engine.state.tick[0])
 
-    def lookahead(self, simulator: CellSimulator) -> Lookahead:
-        """For a policy that plans: a simulator of the cell, tied to this shift."""
-        return Lookahead(simulator, self._engine)
+    @property
+    def engine(self) -> Engine:
+        """The engine, with one row."""
+        return self._engine
 
     def step(self, actions: Array | None) -> tuple[Array, float, bool]:
         """One decision interval: weighted reward terms [term], their sum, and whether all jobs are done.

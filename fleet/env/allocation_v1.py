@@ -17,12 +17,12 @@ from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.protocol import Exchange
-from fleet.engine.lookahead import CellSimulator, Lookahead
 from fleet.engine.reward import TERMS, RewardWeights
 from fleet.engine.shift import Episode as Episode
 from fleet.engine.shift import EpisodeFactory as EpisodeFactory
 from fleet.engine.shift import ShiftRunner, Watch
 from fleet.engine.state import State, World
+from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import Cell
 from fleet.env.spaces import arm_spaces, spaces_like
@@ -221,7 +221,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     def lookahead(self, simulator: CellSimulator) -> Lookahead:
         """For a policy that plans: a simulator of the cell, tied to the current episode."""
-        return self._begun("looking ahead").lookahead(simulator)
+        return Lookahead(simulator, self._begun("looking ahead").engine)
 
     def render(self) -> Array | str | None:
         """The fleet as a picture, uint8 [height, width, 3], in mode "rgb_array", as a table of text in mode "ansi", or

@@ -13,12 +13,12 @@ import numpy as np
 
 from fleet.bus.exchange.protocol import Exchange
 from fleet.engine.batch import Engine, Shift
-from fleet.engine.lookahead import CellSimulator, Lookahead
 from fleet.engine.peers import deliver
 from fleet.engine.reward import TERMS, RewardWeights
 from fleet.engine.state import State
 from fleet.engine.tables import Tables
 from fleet.env.buffers import Shelf
+from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.random_actions import random_legal as random_legal
 from fleet.env.spaces import arm_spaces
 from fleet.env.validation import Decisions, at_least_one, decisions_of, seeds_of, switch

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.engine.schedules import Schedules, stack
+from agents.schedules import Schedules, stack
 from scenarios.bounds.schedule import Claim, ShiftSimulator, Simulated
 
 Array = np.ndarray

@@ -7,13 +7,12 @@ from typing import ClassVar
 import numpy as np
 
 from agents.policy import WAIT, Planner, Policy, only_choices
-from agents.schedule_changes import Changes
+from agents.schedules import Changes, Schedules
 from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.lookahead import CellSimulator, Lookahead
 from fleet.engine.reward import RewardWeights
-from fleet.engine.schedules import Schedules
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
+from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.validation import actions_of
 from fleet.observation import Layout, Observation
 from scenarios.run.decision_limit import UNLIMITED, DecisionLimit
@@ -88,13 +87,12 @@ class ShiftSimulator:
 
     def run(self, schedules: Schedules) -> Simulated:
         """The results of at most `rows` schedules."""
-        given = len(schedules)
+        given = len(schedules.arm)
         self._engine.reset(np.arange(given), self._shifts[:given])
         played = self._engine.play(schedules, np.ones(self.world.ticks))
         self.evaluations += given
         lists = [
-            [(tick, a, action) for tick, a, action in played.claims[e, : played.count[e]].tolist()]
-            for e in range(given)
+            [(tick, a, action) for tick, a, action in played.claims[e, : played.won[e]].tolist()] for e in range(given)
         ]
         return Simulated(played.reward, played.start_s, schedules.arm, schedules.option, lists)
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from agents.policy import Planner, Policy
 from fleet.difficulty import Blind
-from fleet.engine.lookahead import CellSimulator
 from fleet.engine.tables import Tables, tables_of
+from fleet.env.lookahead import CellSimulator
 from scenarios.fault_price import weights_of
 from scenarios.prepare.fleet import Fleet, ShiftFactory
 

@@ -11,7 +11,7 @@ import numpy as np
 from agents.policy import WAIT, Planner, Policy, only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import MemoryExchange
-from fleet.engine.lookahead import CellSimulator
+from fleet.env.lookahead import CellSimulator
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
 from scenarios.fault_price import weights_of

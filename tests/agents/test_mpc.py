@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from agents.mpc import Mpc
 from agents.policy import Planner
 from agents.registry import RULES, make_policy
+from agents.schedules import Schedules
 from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.lookahead import CellSimulator, Lookahead
 from fleet.engine.reward import RewardWeights
-from fleet.engine.schedules import Schedules
 from fleet.engine.tables import tables_of
+from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.errors import FleetError
 from fleet.observation import Layout
 from fleet.robot import ThermalLimits
@@ -115,7 +115,7 @@ def test_a_later_reward_is_worth_less(small):
     finished = int(np.log2(value / later))
     assert value == world.jobs.value[0, 0]
     assert later == value * 0.5**finished
-    delayed = replace(whole, not_before_s=np.full((1, 1), 30.0))
+    delayed = whole._replace(not_before_s=np.full((1, 1), 30.0))
     assert simulator.run(delayed, discount).reward[0] == later / 8
 
 

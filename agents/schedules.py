@@ -1,10 +1,37 @@
-"""Random changes of schedules: the neighbourhood of a local search."""
+"""Schedules of the jobs of a shift, and random changes of them: the neighbourhood of a local search."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from fleet.engine.schedules import Schedules
-
 Array = np.ndarray
+
+
+class Schedules(NamedTuple):
+    """Who does which job, by which plan, in which order; arrays [schedule, job].
+
+    A free arm claims, of its jobs that it may claim, the one that comes first.
+    """
+
+    arm: Array
+    """int."""
+    option: Array
+    """Index of the plan among those on offer, int."""
+    order: Array
+    """Jobs with smaller numbers come first; inf for a job that is left out."""
+    not_before_s: Array
+    """No arm claims the job earlier."""
+
+    def at(self, rows: Sequence[int] | Array) -> "Schedules":
+        """Copies of some schedules."""
+        chosen = np.asarray(rows, dtype=int)
+        return Schedules(*(values[chosen].copy() for values in self))
+
+
+def stack(schedules: Sequence[Schedules]) -> Schedules:
+    """Schedules one after the other."""
+    return Schedules(*(np.concatenate(parts) for parts in zip(*schedules, strict=True)))
 
 
 class Changes:
@@ -57,7 +84,7 @@ class Changes:
 
     def freed(self, schedules: Schedules) -> Schedules:
         """The same, but no arm waits with a job that it may claim."""
-        copy = schedules.at(range(len(schedules)))
+        copy = schedules.at(range(len(schedules.arm)))
         copy.not_before_s[:] = 0.0
         return copy
 
@@ -78,7 +105,7 @@ class Changes:
         while len(better) >= count and len(found) < 3:
             together = before.at([0])
             for row in better[:count][::-1].tolist():
-                for name in Schedules.__dataclass_fields__:
+                for name in Schedules._fields:
                     old, new, all_ = (getattr(each, name) for each in (before, tried, together))
                     changed = new[row] != old[0]
                     all_[0, changed] = new[row, changed]

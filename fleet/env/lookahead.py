@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.engine.batch import Engine, Shift
+from fleet.engine.play import Executed, Plans
 from fleet.engine.reward import RewardWeights
-from fleet.engine.schedules import Executed, Schedules
 from fleet.engine.state import DONE, GIVEN_UP, PER_JOB, RUNNING, State
 from fleet.engine.tables import Tables
 from fleet.observation import Layout, Observation
@@ -61,7 +61,12 @@ class CellSimulator:
         self._state: State | None = None
         self._derived: list[Array] = []
         none = np.zeros((0, 0))
-        self._engine.play(Schedules(none.astype(int), none.astype(int), none, none), np.zeros(0))  # compiles
+        self._engine.play((none.astype(int), none.astype(int), none, none), np.zeros(0))  # compiles
+
+    @property
+    def rows(self) -> int:
+        """Most schedules at a time."""
+        return self._engine.envs
 
     @property
     def dt_s(self) -> float:
@@ -102,8 +107,8 @@ class CellSimulator:
         can = mine.tables.work["plan"][fleet][:, kind] >= 0
         return Present(tick * self.dt_s, open_, can, mine.tables.stations[fleet, kind])
 
-    def run(self, schedules: Schedules, discount: Array) -> Executed:
-        """What comes of at most `SIDE_BY_SIDE` schedules from the moment of the last look.
+    def run(self, schedules: Plans, discount: Array) -> Executed:
+        """What comes of at most `rows` schedules from the moment of the last look.
 
         Args:
             discount: Factor on the reward of each step of a shift, [tick].
