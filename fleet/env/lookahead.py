@@ -28,8 +28,7 @@ _DERIVED = ("queue", "head", "unfinished", "given_up", "current_kind", "pending"
 
 @dataclass(frozen=True, eq=False)
 class Present:
-    """The jobs and arms of a shift at a moment; arrays [job] have all jobs of the shift, but only those on offer are
-    known."""
+    """The jobs of a shift at a moment; of those that are not on offer arrays [job] tell nothing."""
 
     now_s: float
     open: Array
@@ -104,8 +103,10 @@ class CellSimulator:
         self._state = mine.state.copy(slice(0, 1))
         self._derived = [getattr(mine.offers, name)[0].copy() for name in _DERIVED]
         kind = jobs.kind[env, :count]
-        can = mine.tables.work["plan"][fleet][:, kind] >= 0
-        return Present(tick * self.dt_s, open_, can, mine.tables.stations[fleet, kind])
+        can, stations = mine.tables.work["plan"][fleet][:, kind] >= 0, mine.tables.stations[fleet, kind]
+        unknown = ~np.isin(np.arange(count), open_)
+        can[:, unknown], stations[unknown] = False, 0
+        return Present(tick * self.dt_s, open_, can, stations)
 
     def run(self, schedules: Plans, discount: Array) -> Executed:
         """What comes of at most `rows` schedules from the moment of the last look.

@@ -94,6 +94,9 @@ def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
     cell = Lookahead(simulator_of(world), engine)
     present = cell.look(seen)
     assert present.now_s == cell.now_s == ticks * 10.0
+    others = ~np.isin(np.arange(6), present.open)
+    assert not present.can[:, others].any()
+    assert not present.stations[others].any()
     ahead = cell.simulator.run(schedule, np.ones(world.ticks))
     truth = engine.play(schedule, np.ones(world.ticks))
     np.testing.assert_array_equal(ahead.start_s, truth.start_s)
