@@ -7,6 +7,9 @@ import numpy as np
 
 Array = np.ndarray
 
+LEAST_GAIN = 1e-9
+"""A smaller difference of rewards is no gain."""
+
 
 class Schedules(NamedTuple):
     """Who does which job, by which plan, in which order; arrays [schedule, job].
@@ -99,9 +102,15 @@ class Changes:
         copy.order[0, begun] = start_s[row, begun]
         return copy
 
-    def joined(self, before: Schedules, tried: Schedules, better: Array) -> list[Schedules]:
-        """Schedules with several improvements of one schedule at once: the two best, four best, and so on."""
-        found, count = [], 2
+    def joined(self, before: Schedules, score: float, tried: Schedules, reward: Array) -> list[Schedules]:
+        """Schedules with several improvements of one schedule at once: the two best, four best, and so on.
+
+        Args:
+            score: Reward of the schedule before.
+            reward: Of its neighbours that were tried, [schedule].
+        """
+        better = np.flatnonzero(reward > score + LEAST_GAIN)
+        better, found, count = better[np.argsort(-reward[better])], list[Schedules](), 2
         while len(better) >= count and len(found) < 3:
             together = before.at([0])
             for row in better[:count][::-1].tolist():
@@ -112,6 +121,10 @@ class Changes:
             found.append(together)
             count *= 2
         return found
+
+    def neighbours(self, schedule: Schedules, first: Sequence[Schedules], count: int) -> Schedules:
+        """Some schedules, and random neighbours of a schedule up to a number."""
+        return stack([*first, *(self.changed(schedule) for _ in range(count - len(first)))])
 
     def changed(self, schedule: Schedules) -> Schedules:
         """A random neighbour of a schedule."""

@@ -16,6 +16,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -134,7 +135,7 @@ def measure_planner(name: str, clock: Callable[[], float]) -> dict[str, float | 
     fleet = prepare(shift.scenario, difficulty="oracle")
     world = ShiftFactory(fleet)(np.random.SeedSequence(shift.seed)).world
     timed = _Timed(policy, clock)
-    simulator = simulator_of_shift(fleet, shift.seed)
+    simulator = partial(simulator_of_shift, fleet, shift.seed)
     ShiftSimulator(world, weights_of(shift.scenario), 1, simulator=simulator).follow([timed])
     median_ms = statistics.median(timed.times_ms)
     return {"policy": name, "scope": "central", "median_ms": median_ms, "largest_ms": max(timed.times_ms)}

@@ -138,13 +138,12 @@ def policy_at(name: str, seed: int, bus: OnBus = ON_BUS) -> Policy:
     return policy
 
 
-def policy_without_simulator(name: str) -> Policy:
-    """A fresh policy for all arms, where there is no simulator of their cell.
+def without_simulator(name: str, policy: Policy) -> Policy:
+    """The policy of a name, where there is no simulator of the cell.
 
     Raises:
-        FleetError: as `policy_of`, or the policy plans in a simulator.
+        FleetError: it plans in a simulator.
     """
-    policy = policy_of(name)
     if isinstance(policy, Planner):
         raise no_simulator(name)
     return policy

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.schedules import Schedules, stack
+from agents.schedules import LEAST_GAIN, Schedules, stack
 from scenarios.bounds.schedule import Claim, ShiftSimulator, Simulated
 
 Array = np.ndarray
@@ -17,7 +17,6 @@ TOLERANCE = 0.004
 """At the beginning the search goes on from a schedule that is worse by at most this share of the value on offer."""
 RESTART = 30
 """Rounds without a better schedule after which the search goes on near the best one."""
-LEAST_GAIN = 1e-9
 KICKS = 6
 """It is changed fewer times than this before."""
 
@@ -91,11 +90,10 @@ def hindsight(
         used = max(spent_s / budget.seconds, spent / budget.evaluations)
         if used >= 1.0:
             break
-        tried = stack([*joint, *(changes.changed(current) for _ in range(simulator.rows - len(joint)))])
+        tried = changes.neighbours(current, joint, simulator.rows)
         result = simulator.run(tried)
         at, since = int(result.reward.argmax()), since + 1
-        top, better = float(result.reward[at]), np.flatnonzero(result.reward > score + LEAST_GAIN)
-        joint = changes.joined(current, tried, better[np.argsort(-result.reward[better])])
+        top, joint = float(result.reward[at]), changes.joined(current, score, tried, result.reward)
         if top > best + LEAST_GAIN:
             best, best_claims, since = top, result.claims[at], 0
             record = changes.in_order(tried, result.start_s, at)

@@ -4,7 +4,7 @@ import re
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from math import isfinite
 from pathlib import Path
 
@@ -121,7 +121,7 @@ def reference(
     entropy = np.random.SeedSequence(task.seed)
     episode, weights = ShiftFactory(fleet)(entropy), weights_of(fleet.scenario)
     world = episode.world
-    simulator = simulator_of_shift(fleet, task.seed)
+    simulator = partial(simulator_of_shift, fleet, task.seed)
     rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key, simulator=simulator)
     # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
     each = [_followed(rules, name, task) for name in policies]

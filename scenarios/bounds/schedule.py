@@ -1,6 +1,6 @@
 """Schedules and policies in one shift, simulated many times side by side."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -52,7 +52,7 @@ class ShiftSimulator:
         world: Its env 0.
         rows: Number of simulations at a time.
         noise_key: Of the sensors, which only policies notice.
-        simulator: For policies that plan, of the same shift.
+        simulator: Makes that of the same shift for a policy that plans.
         compiled: As in `Engine`.
     """
 
@@ -63,7 +63,7 @@ class ShiftSimulator:
         rows: int,
         *,
         noise_key: int = 0,
-        simulator: CellSimulator | None = None,
+        simulator: Callable[[], CellSimulator] | None = None,
         compiled: bool | None = None,
     ) -> None:
         tables, drawn = tables_of(world)
@@ -108,7 +108,7 @@ class ShiftSimulator:
         engine.observe(np.arange(self.rows), self._vectors)
         for e, policy in enumerate(policies):
             if isinstance(policy, Planner) and self._simulator:
-                policy.plan_in(Lookahead(self._simulator, engine, e))
+                policy.plan_in(Lookahead(self._simulator(), engine, e))
         reward, running = np.zeros(self.rows), np.ones(self.rows, bool)
         running[given:] = False
         start_s = np.full((self.rows, self.jobs), np.inf)

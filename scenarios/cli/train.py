@@ -10,7 +10,7 @@ from scenarios.cli.options import MAX_SEED, DifficultyOption, RandomiseOption, R
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.load import INSTANCE, load
-from scenarios.policy_loader import policy_without_simulator
+from scenarios.policy_loader import policy_of, without_simulator
 from scenarios.schema_errors import choose
 
 
@@ -129,7 +129,7 @@ def train_command(
         raise FleetError("--algo pairs trains over a split: give --suite, not a scenario.")
     chosen = load(scenario) if scenario is not None else None
     if warm_start:
-        policy_without_simulator(warm_start)
+        without_simulator(warm_start, policy_of(warm_start))
     places = [
         out or Path("runs") / f"{suite if chosen is None else chosen.name}-{algorithm}-{seed + k}" for k in range(seeds)
     ]

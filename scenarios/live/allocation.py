@@ -7,7 +7,7 @@ from fleet.env.validation import actions_of
 from fleet.errors import BusError, FleetError
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Allocate, Assignment, Bidding, resolve_claims
-from scenarios.policy_loader import ON_BUS, OnBus, policy_at, policy_without_simulator, scope_of
+from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
 from scenarios.schema import Scenario
 
 _LOG = logging.getLogger(__name__)
@@ -79,5 +79,5 @@ def central_allocation(
             f"Policy '{policy}' of scope arm runs without an auctioneer. "
             f"Start each arm with: thermofleet arm SCENARIO NAME --policy {policy}"
         )
-    policy_without_simulator(policy)
-    return CentralAllocation(policy_at(policy, seed, bus), live_fleet(scenario, ends=ends))
+    made = without_simulator(policy, policy_at(policy, seed, bus))
+    return CentralAllocation(made, live_fleet(scenario, ends=ends))

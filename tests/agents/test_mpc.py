@@ -22,7 +22,7 @@ from scenarios.bounds.exhaustive import optimum
 from scenarios.bounds.schedule import ShiftSimulator
 from scenarios.live.allocation import central_allocation
 from scenarios.load import load
-from scenarios.policy_loader import policy_of, policy_without_simulator
+from scenarios.policy_loader import policy_of, without_simulator
 
 HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
 WEIGHTS = RewardWeights(tardiness=-0.5, faults=-10.0)
@@ -34,9 +34,13 @@ def simulator_of(world, weights=WEIGHTS):
     return CellSimulator(tables, len(world.arms), world.slots, weights)
 
 
+def alone(name):
+    return without_simulator(name, policy_of(name))
+
+
 def played(world, policy, *, seed=0, weights=WEIGHTS):
     policy.reset(np.random.default_rng(seed))
-    return ShiftSimulator(world, weights, 1, simulator=simulator_of(world, weights)).follow([policy])
+    return ShiftSimulator(world, weights, 1, simulator=lambda: simulator_of(world, weights)).follow([policy])
 
 
 @settings(max_examples=15, deadline=None)
@@ -126,7 +130,7 @@ def test_where_there_is_no_simulator_an_error_says_so(small):
     assert [name for name, rule in RULES.items() if rule.plans] == ["mpc"]
     for name in ("mpc", "limited:mpc"):
         assert isinstance(policy_of(name), Planner)
-        for refused in (policy_without_simulator, lambda name: central_allocation(name, load("quickstart"), 0)):
+        for refused in (alone, lambda name: central_allocation(name, load("quickstart"), 0)):
             with pytest.raises(FleetError, match=f"'{name}' plans in a simulator of its cell, and there is none here"):
                 refused(name)
     assert not isinstance(policy_of("limited:wsept"), Planner)
