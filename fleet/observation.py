@@ -5,7 +5,7 @@ observation contains no true state of the simulation.
 """
 
 from collections import namedtuple
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Annotated, Any, Literal, get_type_hints
@@ -108,6 +108,7 @@ def _fields() -> Iterator[Field]:
 
 FIELDS: tuple[Field, ...] = tuple(_fields())
 """The layout: the order of this tuple is the order in the vector."""
+_BY_NAME = {field.name: field for field in FIELDS}
 Offsets = namedtuple("Offsets", [field.name for field in FIELDS])  # pyright: ignore[reportUntypedNamedTuple]
 """First column of each field in the vector, by name."""
 
@@ -183,11 +184,11 @@ class Layout:
 
     def write(self, vectors: Array, fields: Mapping[str, Array]) -> None:
         """Write fields, [..., *shape], into vectors [..., size], clipped to `bounds`."""
-        low, high = self.bounds
         for name, values in fields.items():
-            span, shape = self._spans[name]
+            (span, shape), field = self._spans[name], _BY_NAME[name]
             lead = values.shape[: values.ndim - len(shape)]
-            vectors[..., span] = np.clip(np.reshape(values, (*lead, -1)), low[span], high[span])
+            inside = values if values.dtype == bool else np.clip(values, field.low, field.high)
+            vectors[..., span] = np.reshape(inside, (*lead, -1))
 
     def read(self, vector: Array, action_mask: Array) -> Observation:
         """The observation of vectors [..., size]; its arrays are views of them."""
@@ -201,6 +202,14 @@ class Layout:
             name: vector[..., span].reshape((*lead, *shape)) for name, (span, shape) in self._spans.items()
         }
         return Observation(**named, action_mask=action_mask)
+
+    def read_each(self, arms: Sequence[str], vectors: Array, action_masks: Array) -> dict[str, Observation]:
+        """The observation of each arm by name, from vectors [arm, size] and masks [arm, option + 2], as policies get it.
+
+        Its arrays are views; values without an axis are NumPy scalars. Cheaper than `read` for one arm after another.
+        """
+        fields = vars(self.read(vectors, action_masks)).values()
+        return {arm: Observation(*each) for arm, *each in zip(arms, *fields, strict=True)}
 
 
 @cache

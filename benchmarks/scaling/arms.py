@@ -102,8 +102,7 @@ def _shift(env: Any, policy: Any, seed: int) -> tuple[float, float]:  # modules 
         began = process_time()
         actions = np.zeros((1, len(env.agents)), int)
         if mask[:, 1:-1].any() or not lazy:
-            seen = {name: env.layout.read(vectors[a], mask[a]) for a, name in enumerate(env.agents)}
-            actions[0] = actions_of(env.agents, policy.act(seen))
+            actions[0] = actions_of(env.agents, policy.act(env.layout.read_each(env.agents, vectors, mask)))
         decided = process_time()
         obs, _, finished, cut, _ = env.step(actions)
         engine_s, matching_s = engine_s + process_time() - decided, matching_s + decided - began

@@ -31,8 +31,9 @@ def broadcast(engine: Engine, vectors: Array, names: Sequence[str], twins: tuple
     known, slots = engine.layout.read(vectors, engine.mask[env]), engine.offers.slot_job[env]
     tables, fleet = engine.tables, engine.jobs.fleet[env]
     kinds = np.where(slots >= 0, engine.jobs.kind[env, slots], 0)
-    work, filled = tables.work[fleet][:, kinds], slots[:, None] >= 0  # [arm, slot, plan]
-    unknown = (work["risk"] < 0) & (work["peak"] < 0) & np.isnan(work["p_saturation"])
+    filled = slots[:, None] >= 0
+    work = {name: tables.work[name][fleet][:, kinds] for name in ("difficulty", "p_saturation", "risk", "peak")}
+    unknown = (work["risk"] < 0) & (work["peak"] < 0) & np.isnan(work["p_saturation"])  # [arm, slot, plan]
     p_saturation = known.p_saturation.reshape(unknown.shape)
     return Broadcast(
         time_s=float(engine.state.tick[env] * tables.dt_s),

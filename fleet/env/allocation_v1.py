@@ -213,11 +213,15 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         """What all arms know together: their vectors one after the other, float32."""
         return self._begun("state()").vectors.reshape(-1).copy()
 
+    @property
+    def may_claim(self) -> bool:
+        """Whether an arm may claim a job now."""
+        return bool(self._begun("may_claim").mask[:, 1:-1].any())
+
     def knowledge(self) -> dict[str, Observation]:
         """The present observation of every arm by name, as policies read it."""
         shift = self._begun("knowledge()")
-        vectors, masks = shift.vectors.copy(), shift.mask.copy()
-        return {arm: self.layout.read(vectors[a], masks[a]) for a, arm in enumerate(self.possible_agents)}
+        return self.layout.read_each(self.possible_agents, shift.vectors.copy(), shift.mask.copy())
 
     def lookahead(self, simulator: CellSimulator) -> Lookahead:
         """For a policy that plans: a simulator of the cell, tied to the current episode."""

@@ -141,7 +141,7 @@ class ShiftSimulator:
         names, mask = self.world.arms, self._engine.mask
         actions = np.full((self.rows, len(names)), WAIT, np.int64)
         for e in np.flatnonzero(asked).tolist():
-            known = {arm: self._layout.read(self._vectors[e, a], mask[e, a]) for a, arm in enumerate(names)}
+            known = self._layout.read_each(names, self._vectors[e], mask[e])
             with limit.decision():
                 actions[e] = actions_of(names, policies[e].act(known))
         return actions

@@ -147,7 +147,7 @@ def play(
             asked = running & mask[..., 1:-1].any(axis=(1, 2)) if only_when_asked else running
             actions = np.full(mask.shape[:2], WAIT)
             for e in np.flatnonzero(asked).tolist():
-                known = {arm: env.layout.read(vectors[e, a], mask[e, a]) for a, arm in enumerate(env.agents)}
+                known = env.layout.read_each(env.agents, vectors[e], mask[e])
                 with guarded(e, tick * dt_s):
                     actions[e] = actions_of(env.agents, policies[e].act(known))
             obs, earned, finished, cut, _ = env.step(actions)

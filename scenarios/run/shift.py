@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from agents.policy import only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
@@ -115,10 +116,12 @@ def run(
         recorder.env = env
         env.reset(seed=spec.seed)
         let_plan(policy, fleet, env, spec.seed)
+        only_when_asked = only_choices(policy)
         while env.agents and not stopped():
-            seen, count = env.knowledge(), len(env.events)
+            count, asked = len(env.events), env.may_claim or not only_when_asked
+            seen = env.knowledge() if asked else {}
             try:
-                actions = policy.act(seen)
+                actions = policy.act(seen) if asked else {}
                 actions_of(env.agents, actions)
             except Exception as error:  # whatever the policy raises
                 where = f"{shift}, at {env.tick * env.world.dt_s:g} s of the shift"

@@ -5,6 +5,8 @@ import time
 from collections.abc import Sequence
 from typing import Generic, TypeVar
 
+import numpy as np
+
 from fleet.bus.client.client import BusClient
 from fleet.bus.exchange.protocol import Array, Broadcast
 from fleet.bus.protocol import keys
@@ -193,4 +195,6 @@ class _Publishers:
 
 def _nullable(values: Array) -> list[tuple[float | None, ...]]:
     """Rows of an array [arm, job], with None for NaN."""
-    return [tuple(None if math.isnan(value) else float(value) for value in row) for row in values.tolist()]
+    nullable = values.astype(object)
+    nullable[np.isnan(values)] = None
+    return [tuple(row) for row in nullable.tolist()]

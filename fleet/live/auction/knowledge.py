@@ -146,8 +146,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     # Waiting is always legal; a live fleet has no action to give a job back.
     legal = feasible & free & per_option(per_job(stations) > 0) & room[:, None]
     mask = np.pad(legal.astype(np.int8), ((0, 0), (1, 1)), constant_values=((0, 0), (1, 0)))
-    vectors = layout.pack(fields)
-    return {arm: layout.read(vectors[a], mask[a]) for a, arm in enumerate(arms)}
+    return layout.read_each(arms, layout.pack(fields), mask)
 
 
 def claimed_jobs(
