@@ -187,8 +187,11 @@ class Layout:
         for name, values in fields.items():
             (span, shape), field = self._spans[name], _BY_NAME[name]
             lead = values.shape[: values.ndim - len(shape)]
-            inside = values if values.dtype == bool else np.clip(values, field.low, field.high)
-            vectors[..., span] = np.reshape(inside, (*lead, -1))
+            flat, out = np.reshape(values, (*lead, -1)), vectors[..., span]
+            if values.dtype == bool:
+                out[...] = flat
+            else:
+                np.clip(flat, field.low, field.high, out=out, casting="same_kind")
 
     def read(self, vector: Array, action_mask: Array) -> Observation:
         """The observation of vectors [..., size]; its arrays are views of them."""

@@ -57,7 +57,8 @@ def write_peers(layout: Layout, view: PeerView, vectors: Array) -> None:
 
     age_s, mode = received(view.age_s), received(view.mode)
     headroom_k, busy_s, difficulty = received(view.headroom_k), received(view.busy_s), received(view.difficulty)
-    never, known = np.isinf(age_s), ~np.isnan(difficulty)
+    never, unknown = np.isinf(age_s), np.isnan(difficulty)
+    difficulty[unknown] = 0.0
     fields = {
         "peer_heard": ~never,
         "peer_age_s": np.where(never, LONG_S, age_s),
@@ -65,7 +66,7 @@ def write_peers(layout: Layout, view: PeerView, vectors: Array) -> None:
         "peer_faulted": ~never & (mode == FAULTED),
         "peer_busy_s": np.where(np.isnan(busy_s), 0.0, busy_s),
         "peer_headroom_k": np.where(np.isnan(headroom_k), 0.0, headroom_k),
-        "peer_known": known,
-        "peer_difficulty": np.where(known, difficulty, 0.0),
+        "peer_known": ~unknown,
+        "peer_difficulty": difficulty,
     }
     layout.write(vectors, fields)
