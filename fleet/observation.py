@@ -207,7 +207,7 @@ class Layout:
         return Observation(**named, action_mask=action_mask)
 
     def read_each(self, arms: Sequence[str], vectors: Array, action_masks: Array) -> dict[str, Observation]:
-        """The observation of each arm by name, from vectors [arm, size] and masks [arm, option + 2], as policies get it.
+        """The observation of each arm by name, from vectors [arm, size] and masks [arm, option + 2], for policies.
 
         Its arrays are views; values without an axis are NumPy scalars. Cheaper than `read` for one arm after another.
         """

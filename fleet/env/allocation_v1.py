@@ -187,20 +187,11 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             RuntimeError: before reset, or after the end.
             ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
         """
-        shift = self._begun("step()")
-        if not self.agents:
-            raise RuntimeError("The episode is over: call reset() before step().")
-        arms, chosen = self.possible_agents, actions_of(self.possible_agents, actions)
-        last_tick, before = min(self.world.ticks, self._max_cycles or self.world.ticks), shift.tick
-        parts, reward, finished = shift.step(chosen)
-        while self._until_choice and not finished and shift.tick < last_tick and not shift.choice:
-            more, earned, finished = shift.step(None)
-            parts, reward = parts + more, reward + earned
-        over = not finished and shift.tick >= last_tick
+        before = self._begun("step()").tick
+        parts, reward, finished, over = self.advance(actions)
         observations, masks = self._observations()
-        infos = self._infos(parts, masks, (shift.tick - before) * self.world.dt_s)
-        if finished or over:
-            self.agents = []
+        infos = self._infos(parts, masks, (self.tick - before) * self.world.dt_s)
+        arms = self.possible_agents
         return (
             observations,
             dict.fromkeys(arms, reward),
@@ -208,6 +199,26 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             dict.fromkeys(arms, over),
             infos,
         )
+
+    def advance(self, actions: dict[str, Any]) -> tuple[Array, float, bool, bool]:
+        """As `step`, without making observations, for callers that read `knowledge` when they need it.
+
+        Returns the weighted terms of the reward, float [term], their sum, and whether all jobs are done and whether
+        the time is over.
+        """
+        shift = self._begun("step()")
+        if not self.agents:
+            raise RuntimeError("The episode is over: call reset() before step().")
+        chosen = actions_of(self.possible_agents, actions)
+        last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
+        parts, reward, finished = shift.step(chosen)
+        while self._until_choice and not finished and shift.tick < last_tick and not shift.choice:
+            more, earned, finished = shift.step(None)
+            parts, reward = parts + more, reward + earned
+        over = not finished and shift.tick >= last_tick
+        if finished or over:
+            self.agents = []
+        return parts, reward, finished, over
 
     def state(self) -> Array:
         """What all arms know together: their vectors one after the other, float32."""

@@ -126,12 +126,12 @@ def run(
             except Exception as error:  # whatever the policy raises
                 where = f"{shift}, at {env.tick * env.world.dt_s:g} s of the shift"
                 raise failure(spec.policy, error, where) from error
-            _, rewards, _, _, _ = env.step(actions)
+            _, earned, _, _ = env.advance(actions)
             awards = [event for event in env.events[count:] if event.kind == "award"]
             for award in awards if record else ():
                 offers += offers_of(award, seen, actions, env.world.plans_per_job)
             env.events[count:] = [_with_prediction(event, seen, actions) for event in env.events[count:]]
-            reward += next(iter(rewards.values()))
+            reward += earned
             progress("working", env.tick / env.world.ticks)
         finished = not env.agents
     finally:
