@@ -52,7 +52,7 @@ class CellSimulator:
     def __init__(
         self, tables: Tables, arms: int, slots: int, weights: RewardWeights, *, compiled: bool | None = None
     ) -> None:
-        self._ambient_c = tables.ambient_c
+        self._ambient_c, self._weights = tables.ambient_c, weights
         layout = Layout(arms, slots, plans=tables.work.shape[3])
         self._engine = Engine(
             tables._replace(ambient_c=tables.ambient_c.copy()), SIDE_BY_SIDE, layout, weights, compiled=compiled
@@ -61,6 +61,12 @@ class CellSimulator:
         self._derived: list[Array] = []
         none = np.zeros((0, 0))
         self._engine.play((none.astype(int), none.astype(int), none, none), np.zeros(0))  # compiles
+
+    def with_limits(self, warning_c: float, error_c: float) -> "CellSimulator":
+        """A simulator of the same cell in which motors have other limits, °C, as to plan with a margin."""
+        engine = self._engine
+        tables = engine.tables._replace(warning_c=warning_c, error_c=error_c, ambient_c=self._ambient_c)
+        return CellSimulator(tables, engine.layout.arms, engine.layout.slots, self._weights)
 
     @property
     def rows(self) -> int:

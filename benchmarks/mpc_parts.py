@@ -1,0 +1,36 @@
+"""`mpc` without one of its parts, to see what each is worth: policies for `thermofleet ablate`.
+
+    thermofleet ablate heat_wave --policy mpc --fleets 4 --trainings 1 --seeds 4 \
+        --sources mpc@rc,benchmarks/mpc_parts.py:WithoutHeat@rc --out runs/mpc_parts
+"""
+
+from typing import Any
+
+from agents.mpc import Mpc
+
+OUT_OF_REACH_C = 1e6
+
+
+class WithoutDiscount(Mpc):
+    """A later reward counts as much as an early one."""
+
+    tau_s = 1e12
+    only_choices = True
+
+
+class WithoutSearch(Mpc):
+    """New jobs are put where they are worth most, and nothing is changed afterwards."""
+
+    evaluations = 0
+    only_choices = True
+
+
+class WithoutHeat(Mpc):
+    """In the simulator no motor comes near a limit."""
+
+    only_choices = True
+
+    def plan_in(self, cell: Any) -> None:
+        """Plan in the simulator of a shift, with limits out of reach."""
+        cell.simulator = cell.simulator.with_limits(OUT_OF_REACH_C, OUT_OF_REACH_C)
+        super().plan_in(cell)
