@@ -38,7 +38,7 @@ REPEATED = 2
 
 SCENARIO = """
 description = "Arms hold and sort."
-horizon_s = 180
+horizon_s = 1800
 arms = [{ name = "left", position_m = [-0.45, 0.0, 0.0] }, { name = "right", position_m = [0.45, 0.0, 0.0] }, \
 { name = "spare", position_m = [0.0, 0.9, 0.0] }]
 places = [{ name = "bench", position_m = [0.0, 0.2, 0.25] }, { name = "shelf", position_m = [0.0, -0.2, 0.25] }]
@@ -224,7 +224,12 @@ def outside(port: int, fleet: str) -> Iterator[Outsider]:
     """An outsider on the router of a fleet, which may not be there yet."""
     config = {
         "mode": "client",
-        "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 60_000, "exit_on_failure": True},
+        "connect": {
+            "endpoints": [f"tcp/127.0.0.1:{port}"],
+            "timeout_ms": 60_000,
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 20, "period_max_ms": 20, "period_increase_factor": 1.0},
+        },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {"shared_memory": {"enabled": False}},
     }
