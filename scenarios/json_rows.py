@@ -41,7 +41,7 @@ class Rows:
 
     def _refusal(self, line: int) -> FleetError:
         return FleetError(
-            f"{self.path}, line {line}: not a row of this study; remove the line, or write to another file."
+            f"{self.path}, line {line}: not a row of this study; name another file, or remove a damaged line."
         )
 
     def __contains__(self, key: str) -> bool:

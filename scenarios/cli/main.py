@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from itertools import zip_longest
 from typing import Annotated, Any, NamedTuple
 
 import typer
@@ -156,6 +157,16 @@ def _options(
     pass
 
 
+def _given(error: typer.TyperException, words: Sequence[str]) -> str | None:
+    """The value of the option that an error is about, which typer's own messages leave out; None if there is none."""
+    options = getattr(getattr(error, "param", None), "opts", ())
+    for word, following in zip_longest(words, words[1:]):
+        name, is_whole, value = word.partition("=")
+        if name in options:
+            return value if is_whole else following
+    return None
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line: an error that the user can correct is one sentence and exit code 2; Ctrl-C is 130."""
     _log_warnings()
@@ -175,7 +186,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     except typer.TyperException as error:
         message = error.format_message().replace("Value error, ", "")  # typer's own word before "'x' is not one of"
         if message:  # empty if the help was shown instead
-            say(f"Error: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See thermofleet --help.")
+            given = _given(error, sys.argv[1:] if argv is None else argv)
+            more = "" if given is None or given in message else f" (got '{given}')"
+            say(f"Error: {message.rstrip('.')}{more}{'' if message.endswith('?') else '.'} See thermofleet --help.")
         sys.exit(USAGE)
     except OSError as error:
         if error.errno not in _DISK:

@@ -257,17 +257,21 @@ def read(path: Path) -> Submission:
     Raises:
         FleetError: it is too large, or has a line that is none of ours.
     """
+    number = 1
     try:
         if path.stat().st_size > MOST_BYTES:
             raise FleetError(f"'{path}': a result has at most {MOST_BYTES} bytes.")
         first, *rest = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
-        card = msgspec.json.decode(first, type=Card)
-        rows = tuple(msgspec.json.decode(line, type=Played) for line in rest)
+        card, rows = msgspec.json.decode(first, type=Card), list[Played]()
+        for line in rest:
+            number += 1
+            rows.append(msgspec.json.decode(line, type=Played))
     except OSError as error:
         raise FleetError(f"Cannot read '{path}': {error.strerror}.") from error
     except (ValueError, msgspec.DecodeError) as error:
-        raise FleetError(f"'{path}' is no result of `thermofleet submit-result`: {printable(str(error))}.") from error
-    return Submission(card=card, rows=rows)
+        why = f"line {number}: {printable(str(error))}"
+        raise FleetError(f"'{path}' is no result of `thermofleet submit-result`: {why}.") from error
+    return Submission(card=card, rows=tuple(rows))
 
 
 def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, about: str) -> list[Submission]:

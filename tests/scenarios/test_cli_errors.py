@@ -55,7 +55,7 @@ BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
         ["--difficulty", "blnd"],
         "No difficulty 'blnd'; did you mean 'blind'? Allowed: blind, oracle",
     ),
-    ("seed text", None, ["--seed", "one"], "Invalid value for '--seed'"),
+    ("seed text", None, ["--seed", "one"], "parse string as an integer (got 'one'). See"),
     ("option", None, ["--sed", "1"], "No such option: --sed"),
     ("out is a file", None, ["--out", "HERE/heat.toml"], "it is a file; --out needs a folder."),
     ("out below a file", None, ["--out", "HERE/heat.toml/run"], "heat.toml' is a file, not a folder."),

@@ -201,6 +201,9 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
         path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
         with pytest.raises(FleetError, match="is no result of `thermofleet submit-result`"):
             read(path)
+    path.write_text("\n".join([*lines[:2], lines[2][:20], *lines[3:]]), encoding="utf-8")
+    with pytest.raises(FleetError, match="line 3: "):
+        read(path)
     path.write_text(lines[0] + "\n" + " " * MOST_BYTES, encoding="utf-8")
     with pytest.raises(FleetError, match=f"at most {MOST_BYTES} bytes"):
         read(path)
