@@ -17,11 +17,13 @@ from hypothesis import settings
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.engine.batch import Shift
 from fleet.engine.profile_plant import ProfilePlant
+from fleet.engine.reward import RewardWeights
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
 from fleet.engine.world import Arm, Space, build_world
 from fleet.env.allocation_v1 import Episode
-from fleet.env.vector import Library
+from fleet.env.lookahead import CellSimulator
+from fleet.env.vector import BatchEnv, Library
 from fleet.job import Job, Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.motor import Motors, gen3_motors
@@ -37,6 +39,16 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.enviro
 
 # A shell starts background jobs with Ctrl-C ignored, and their child processes inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the engine before xdist starts workers: each would compile it, at the same time."""
+    if session.config.getoption("numprocesses", None):
+        library = Shifts().library()
+        env = BatchEnv(library, 1)
+        env.reset()
+        env.step(np.zeros((1, len(library.arms)), int))
+        CellSimulator(library.tables, len(library.arms), library.slots, RewardWeights())
 
 
 @pytest.fixture(autouse=True)

@@ -13,18 +13,19 @@ WRAPPED = {"wspt": "wspt@blind", "wsept": "wsept@rc", "least_difficulty": "least
 """Policies of the table of wrappers, with their sources."""
 DIGITS = {"faults": 2}
 """Decimals of a figure; 1 for others."""
+MPC_PARTS = "benchmarks/mpc_parts.py"
 
 
 def ablation_tables(results: Path) -> dict[str, Callable[[], str]]:
     """Text of each table by the name in its mark.
 
     Args:
-        results: With the folders `ablations/sources_SCENARIO` and `twin_windows/SCENARIO` of `thermofleet ablate
-            --out`, for one or more of `SCENARIOS`.
+        results: With the folders `ablations/sources_SCENARIO`, `ablations/mpc_SCENARIO` and `twin_windows/SCENARIO` of
+            `thermofleet ablate --out`, for one or more of `SCENARIOS`.
     """
-    sources, windows = (
+    sources, parts, windows = (
         {name: path for name in SCENARIOS if (path := results / each.format(name)).is_dir()}
-        for each in ("ablations/sources_{}", "twin_windows/{}")
+        for each in ("ablations/sources_{}", "ablations/mpc_{}", "twin_windows/{}")
     )
     return {
         "wrappers_measured": lambda: _wrappers(sources),
@@ -37,6 +38,18 @@ def ablation_tables(results: Path) -> dict[str, Callable[[], str]]:
                 "thermometer@blind": "`thermometer`, blind",
                 "limited:wspt@blind": "`limited:wspt`, blind",
                 "fuzzy:wspt@blind": "`fuzzy:wspt`, blind",
+            },
+        ),
+        "mpc_parts": lambda: _table(
+            parts,
+            {
+                "mpc@rc": "`mpc`, identified network",
+                "mpc@oracle": "true network",
+                "mpc@rc-nominal": "nominal network",
+                f"{MPC_PARTS}:WithoutHeat@rc": "without heat",
+                f"{MPC_PARTS}:WithoutDiscount@rc": "without discount",
+                f"{MPC_PARTS}:WithoutSearch@rc": "without search",
+                "wsept@rc": "`wsept`",
             },
         ),
         "twin_windows": lambda: _table(
