@@ -1,12 +1,13 @@
-"""Model predictive control: search for the best schedule of the open jobs in a simulator of the cell, again and again.
+"""Model predictive control: search repeatedly for the best schedule of the open jobs, in a simulator of the cell.
 
-Whenever jobs are new on offer, and at the latest after `every_s`, the policy looks for a schedule of all jobs on offer:
-which arm does which job, by which plan, when. A schedule is worth the reward that the simulator gives it from now on,
-discounted by exp(−time / `tau_s`): jobs that arrive later will need the arms too, so time has a price. The search
-begins at the schedule of the last time, puts every new job where it is worth most, and goes on with random changes
-(large neighbourhood search). In between the arms follow the schedule.
+When an arm may claim a job, and a job is new in the slots or the last search is `every_s` old, the policy searches for
+a schedule of all jobs in the slots: which arm does which job, by which plan, when. The worth of a schedule is its
+simulated reward until the end of the shift; what comes a time t later counts exp(−t / `tau_s`), because jobs that
+arrive later will need the arms too. The search begins at the last schedule and tries each new job at the beginning, in
+the middle and at the end of the order, by every plan; then it tries random changes (large neighbourhood search). In
+between the arms follow the schedule.
 
-The simulator knows what a dispatcher of the cell knows, see `fleet.env.lookahead`: no job before it is on offer, no
+The simulator knows what a dispatcher of the cell knows, see `fleet.env.lookahead`: no job that has no slot yet, no
 true temperature, no thermal network but that which the arms know.
 
 Sources: Mayne et al., Automatica 36, 2000 (model predictive control); Shaw, CP 1998 (large neighbourhood search).
@@ -24,14 +25,14 @@ from fleet.observation import Observation
 Array = np.ndarray
 
 BEHIND_S = 1.0
-"""A job that comes right before or after another in a schedule has an order that is smaller or larger by this."""
+"""Difference of the order of a job that comes right before or after another in a schedule."""
 
 
 class Mpc:
     """Model predictive control with a simulator of the cell; see the module. Scope central: it plans for all arms.
 
-    It plans only where there is a simulator of its cell, which `plan_in` gives it: in `run`, `compare` and `bounds`,
-    not in a live fleet.
+    It plans only where there is a simulator of its cell, which `plan_in` gives it: in `run`, `compare`, `ablate` and
+    `bounds`, not in a live fleet.
     """
 
     scope: ClassVar = "central"
@@ -40,6 +41,7 @@ class Mpc:
     """Time in which the worth of a later reward falls to 1/e: chosen on 24 instances of the validation split of the
     suite among 300, 600, 900, 1200, 2400, 3600 and 7200."""
     every_s: ClassVar = 300.0
+    """Age of a search after which the next decision searches again, also without a new job."""
     evaluations: ClassVar = 128
     """Simulated changes of each search."""
 
@@ -56,7 +58,7 @@ class Mpc:
         self._rng = rng
         self._schedule: Schedules | None = None
         self._planned: set[int] = set()
-        """Jobs that have been on offer in a search."""
+        """Jobs that were in a slot in some search."""
         self.searched_s = -np.inf
         """Time of the last search."""
 
@@ -81,7 +83,7 @@ class Mpc:
         return actions | _claims(self._schedule, slot_job, observations, now_s)
 
     def _search(self, cell: Lookahead, observations: Mapping[str, Observation], new: list[int]) -> Schedules:
-        """The best schedule found for the jobs on offer."""
+        """The best schedule found for the jobs in the slots."""
         present, simulator, rng = cell.look(observations), cell.simulator, self._rng
         jobs, now_s, horizon_s, dt_s = present.can.shape[1], present.now_s, simulator.horizon_s, simulator.dt_s
         later_s = np.maximum(np.arange(round(horizon_s / dt_s)) * dt_s - now_s, 0.0)

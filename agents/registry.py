@@ -63,7 +63,7 @@ RULES: dict[str, Rule] = {
     ),
     "auction": Rule(Auction, "time per expected worth, within n · ε", "Bertsekas 1988"),
     "rolling_horizon": Rule(RollingHorizon, "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"),
-    "mpc": Rule(Mpc, "reward of the next minutes in a simulator of the cell", "Mayne et al. 2000"),
+    "mpc": Rule(Mpc, "discounted reward of the rest of the shift, in a simulator of the cell", "Mayne et al. 2000"),
     "ssi": Rule(Ssi, _THERMAL, _SSI),
     "matching": Rule(Matching, _THERMAL, _KUHN),
     "matching_ahead": Rule(MatchingAhead, "thermal, with arms that are home soon", _KUHN),

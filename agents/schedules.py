@@ -20,7 +20,7 @@ class Schedules(NamedTuple):
     arm: Array
     """int."""
     option: Array
-    """Index of the plan among those on offer, int."""
+    """Index of the plan among those of the job, int."""
     order: Array
     """Jobs with smaller numbers come first; inf for a job that is left out."""
     not_before_s: Array
@@ -103,7 +103,7 @@ class Changes:
         return copy
 
     def joined(self, before: Schedules, score: float, tried: Schedules, reward: Array) -> list[Schedules]:
-        """Schedules with several improvements of one schedule at once: the two best, four best, and so on.
+        """Schedules with several improvements of one schedule at once: the two, four and eight best.
 
         Args:
             score: Reward of the schedule before.
@@ -168,7 +168,7 @@ class Changes:
         new.order[0, job], new.not_before_s[0, job] = self._time(job, new.order[0, job]), 0.0
 
     def _swap(self, new: Schedules) -> None:
-        """Two jobs that are near in time exchange their arms or their places."""
+        """Two jobs that are near in time exchange their places, half of the time their arms, too."""
         job = self._one()
         begun = self._jobs[np.isfinite(new.order[0, self._jobs])]
         if not np.isfinite(new.order[0, job]):
@@ -198,7 +198,7 @@ class Changes:
             new.not_before_s[0, job] = new.order[0, job] + self._rng.exponential(self._rng.choice(self._waits_s))
 
     def _leave_out(self, new: Schedules) -> None:
-        """A job is left out, or taken up if it was."""
+        """Mostly a job that is left out is taken up; otherwise one is left out."""
         missing = self._jobs[~np.isfinite(new.order[0, self._jobs])]
         if len(missing) and self._rng.random() < 0.8:
             job = int(self._rng.choice(missing))
@@ -208,7 +208,7 @@ class Changes:
             new.order[0, self._one()] = np.inf
 
     def _window(self, new: Schedules) -> None:
-        """Some jobs that are near in time, or share a station, get new arms and places; the others do not wait."""
+        """Some jobs that are near in time, or share a station, get new arms and places; no job within an hour waits."""
         job = self._one()
         centre_s = new.order[0, job] if np.isfinite(new.order[0, job]) else self._release_s[job]
         near = np.abs(np.where(np.isfinite(new.order[0]), new.order[0], self._release_s) - centre_s)

@@ -1,14 +1,11 @@
-"""`mpc` without one of its parts, to see what each is worth: policies for `thermofleet ablate`.
-
-    thermofleet ablate heat_wave --policy mpc --fleets 4 --trainings 1 --seeds 4 \
-        --sources mpc@rc,benchmarks/mpc_parts.py:WithoutHeat@rc --out runs/mpc_parts
-"""
+"""Variants of `mpc` without discount, search or heat, for `thermofleet ablate`; docs/policies.md has the command."""
 
 from typing import Any
 
 from agents.mpc import Mpc
 
 OUT_OF_REACH_C = 1e6
+"""Limits of motor temperatures where heat shall not count."""
 
 
 class WithoutDiscount(Mpc):

@@ -1,8 +1,9 @@
-"""Looking ahead: what would come of schedules from now on, simulated with what the dispatcher of a cell knows.
+"""Simulate schedules from the present to the end of a shift, with what the dispatcher of a cell knows.
 
-It knows the plans of the arms and the space they take, which arm works on what, the jobs on offer, and of each arm the
-measured motor temperatures, its estimate of the housings and its thermal network as identified. It does not know which
-jobs arrive later, how the air of the cell will change, which sensors err, or the true temperatures.
+It knows the plans of the arms and the space they take, which arm works on what, the jobs in the slots, and of each arm
+the measured motor temperatures, its estimate of the housings and its thermal network as identified. It does not know
+the jobs without a slot and those that arrive later, how the air of the cell will change, which sensors err, or the true
+temperatures.
 """
 
 from collections.abc import Mapping
@@ -23,16 +24,16 @@ Array = np.ndarray
 SIDE_BY_SIDE = 32
 """Schedules that are simulated at a time."""
 _DERIVED = ("queue", "head", "unfinished", "given_up", "current_kind", "pending")
-"""What the simulation changes in the offers."""
+"""Fields of the offers that a simulation changes, and `run` restores."""
 
 
 @dataclass(frozen=True, eq=False)
 class Present:
-    """The jobs of a shift at a moment; of those that are not on offer arrays [job] tell nothing."""
+    """The jobs of a shift at a moment; entries of jobs without a slot are meaningless."""
 
     now_s: float
     open: Array
-    """Jobs on offer, int [n]."""
+    """Jobs in the slots, int [n]."""
     can: Array
     """Whether an arm has a plan for a job, bool [arm, job, option]."""
     stations: Array
@@ -44,7 +45,7 @@ class CellSimulator:
 
     Args:
         tables: The fleet as the arms know themselves.
-        arms, slots: Their numbers.
+        arms, slots: Number of arms and of slots.
         weights: Of the reward terms.
         compiled: As in `Engine`.
     """
