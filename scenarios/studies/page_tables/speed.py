@@ -38,10 +38,11 @@ def halls_table(path: Path) -> str:
         per_arm = {name: 1000.0 * seconds / one["arms"] for name, seconds in one["cpu_s"].items()}
         once = (per_arm[name] for name in ("plans", "conflicts"))
         hourly = (per_arm[name] / one["hours"] for name in ("engine", "matching", "scores"))
-        rows.append((str(one["arms"]), *(f"{cost:.3g}" for cost in (*once, *hourly)), str(one["most_mb"])))
+        sizes = (str(one[name]) for name in ("arms", "halls"))
+        rows.append((*sizes, *(f"{cost:.3g}" for cost in (*once, *hourly)), str(one["most_mb"])))
     heads = ("plans, ms per arm", "conflict table, ms per arm")
     heads += tuple(f"{name}, ms per arm and hour" for name in ("engine", "matching", "twins"))
-    return table(("arms", *heads, "peak memory, MB"), rows)
+    return table(("arms", "halls", *heads, "peak memory, MB"), rows)
 
 
 def _commands(folder: Path) -> str:
