@@ -99,6 +99,19 @@ class Local:
     central: ClassVar[type[Policy]]
     """The central policy."""
 
+    def __init_subclass__(cls) -> None:
+        """Refuse a policy that plans: an arm alone has no simulator of the cell.
+
+        Raises:
+            TypeError: names the policy.
+        """
+        super().__init_subclass__()
+        if hasattr(getattr(cls, "central", None), "plan_in"):
+            raise TypeError(
+                f"{cls.__name__}: {cls.central.__name__} plans in a simulator of its cell, which an arm alone "
+                "does not have; take a central policy without plan_in()"
+            )
+
     def __init__(self) -> None:
         self._policy = self.central()
 
@@ -118,7 +131,10 @@ class EveryArm:
 
     def __init__(self, make: Callable[[], ArmPolicy]) -> None:
         """`make` is the class of the policy."""
-        self._make, self.kind = make, type(make())
+        first = make()
+        self._make, self.kind = make, type(first)
+        if hasattr(first, "plan_in"):
+            raise FleetError(f"{self.kind.__name__} has plan_in(), but only scope central gets a simulator.")
         self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:

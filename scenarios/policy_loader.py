@@ -149,6 +149,16 @@ def without_simulator(name: str, policy: Policy) -> Policy:
     return policy
 
 
+def check_needs_no_simulator(name: str) -> None:
+    """Refuse a policy of a live fleet that plans in a simulator, before anything is started.
+
+    Raises:
+        FleetError: it does, or as `policy_of`.
+    """
+    if not (is_on_bus(name) or _is_folder(name)):  # those never do, and a folder takes seconds to load
+        without_simulator(name, policy_of(name))
+
+
 def is_built_in(name: str) -> bool:
     """Whether a name is that of a rule, perhaps in wrappers; no code is loaded for it."""
     wrapped = _wrapped(name)

@@ -119,16 +119,45 @@ class CellSimulator:
         """What comes of at most `rows` schedules from the moment of the last look.
 
         Args:
+            schedules: An `agents.schedules.Schedules`.
             discount: Factor on the reward of each step of a shift, [tick].
+
+        Raises:
+            RuntimeError: before the first look.
+            ValueError: too many schedules, arrays of other shapes, an arm or option that does not exist, or a discount
+                that is not finite.
         """
         if self._state is None:
             raise RuntimeError("There is no present to begin at: call look() before run().")
         mine = self._engine
+        _check(schedules, discount, self.rows, mine.tables.work.shape, int(mine.jobs.number[0]), mine.tables.ticks)
         for own, saved in zip(mine.state, self._state, strict=True):
             own[:] = saved
         for name, saved in zip(_DERIVED, self._derived, strict=True):
             getattr(mine.offers, name)[:] = saved
         return mine.play(schedules, discount)
+
+
+def _check(schedules: Plans, discount: Array, rows: int, work: tuple[int, ...], jobs: int, ticks: int) -> None:
+    """Refuse what the compiled loop would read beyond its arrays; `work` has the shape [fleet, arm, kind, option]."""
+    arm, option = schedules[:2]
+    shapes = [np.shape(each) for each in schedules]
+    if len(shapes[0]) != 2 or shapes[0][1] != jobs or shapes[0][0] > rows or len(set(shapes)) != 1:
+        raise ValueError(
+            f"Schedules must be arrays [schedule, job] of at most {rows} schedules and {jobs} jobs, all of "
+            f"the same shape (got {', '.join(map(str, shapes))})."
+        )
+    for name, values, most in (("arm", arm, work[1]), ("option", option, work[3])):
+        if not np.issubdtype(values.dtype, np.integer) or (values < 0).any() or (values >= most).any():
+            raise ValueError(
+                f"The {name} of a schedule must be an integer from 0 to {most - 1}, also of a job that is "
+                f"left out (got {values.dtype} from {values.min()} to {values.max()})."
+            )
+    if np.shape(discount) != (ticks,) or not np.isfinite(discount).all():
+        raise ValueError(
+            f"The discount must be {ticks} finite factors, one for each step of a shift "
+            f"(got shape {np.shape(discount)})."
+        )
 
 
 class Lookahead:

@@ -174,7 +174,7 @@ def _followed(simulator: ShiftSimulator, name: str, task: Task) -> Simulated:
             with limit.decision():
                 policy = policy_at(name, task.seed)
             return simulator.follow([policy], limit)
-    except (Exception, TooSlow) as error:  # whatever the policy raises
+    except (Exception, TooSlow, SystemExit) as error:  # whatever the policy raises
         raise failure(name, error, task.instance) from error
 
 

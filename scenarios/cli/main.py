@@ -158,13 +158,13 @@ def _options(
 
 
 def _given(error: typer.TyperException, words: Sequence[str]) -> str | None:
-    """The value of the option that an error is about, which typer's own messages leave out; None if there is none."""
-    options = getattr(getattr(error, "param", None), "opts", ())
+    """The last value of the option that an error is about, which typer's own messages leave out; None without one."""
+    options, given = getattr(getattr(error, "param", None), "opts", ()), None
     for word, following in zip_longest(words, words[1:]):
         name, is_whole, value = word.partition("=")
         if name in options:
-            return value if is_whole else following
-    return None
+            given = value if is_whole else following
+    return given
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -16,6 +16,7 @@ from scenarios.statistics.scores import Scores, ranked, score_cells, scores_of
 from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import manifest
 from scenarios.trials.scores import Shift, normalised
+from scenarios.trials.store import CARD
 
 BASELINE = "wsept"
 """Policy that differences refer to, with the scores of `SOURCE`; without it the last of the board."""
@@ -49,8 +50,18 @@ def read_all(folder: Path, split: str) -> list[Submission]:
     """The checked results of a split in a folder, by the names of their files.
 
     Raises:
-        FleetError: a file is no result, or one that is refused, or has the name of another.
+        FleetError: a file is no result, or one that is refused, or has the name of another, or of no split.
     """
+    if (folder / CARD).exists():
+        raise FleetError(
+            f"'{folder}' is a folder of `thermofleet compare`; run `thermofleet submit-result` with it first."
+        )
+    for path in folder.glob("*.jsonl"):
+        if path.stem.partition("-")[0] not in JUDGED:
+            raise FleetError(
+                f"'{path}' must have the name that `thermofleet submit-result` gives, SPLIT-POLICY-PREDICTIONS.jsonl "
+                f"with SPLIT {', '.join(JUDGED)}."
+            )
     references, found = split_references(split), list[Submission]()
     for path in sorted(folder.glob(f"{split}-*.jsonl")):
         submission = read(path)

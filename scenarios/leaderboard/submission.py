@@ -212,6 +212,8 @@ def _of_shift(row: Played, line: Line, references: Mapping[Shift, Reference]) ->
         yield f"has more minutes above a limit than its arms work ({longest_min:g})"
     if not PEAK_LOW_C <= own["peak_c"] <= PEAK_HIGH_C:
         yield f"has a hottest motor of {own['peak_c']:g} °C, not within {PEAK_LOW_C:g} to {PEAK_HIGH_C:g}"
+    if own["reward"] > own["value"] + SLACK * (1 + own["value"]):
+        yield f"has a reward of {own['reward']:.4g}, above the finished value {own['value']:.4g}: all else is a cost"
     known = references.get((row.instance, line.seed))
     if known and own["reward"] < (least := known.random - MOST_LOSS * (known.upper - known.random)):
         yield f"has a reward of {own['reward']:.4g}, below what the worst policy could lose ({least:.4g})"

@@ -98,7 +98,7 @@ def run(
     shift = f"{fleet.scenario.name}/{spec.seed}"
     try:
         policy = policy_at(spec.policy, spec.seed, OnBus(fleet=fleet.scenario.name))
-    except Exception as error:  # whatever the policy raises
+    except (Exception, SystemExit) as error:  # whatever the policy raises
         raise failure(spec.policy, error, shift) from error
     recorder = _Recorder(fleet.scenario, record)
     env = env_of(
@@ -115,7 +115,10 @@ def run(
     try:
         recorder.env = env
         env.reset(seed=spec.seed)
-        let_plan(policy, fleet, env, spec.seed)
+        try:
+            let_plan(policy, fleet, env, spec.seed)
+        except (Exception, SystemExit) as error:  # whatever the policy raises
+            raise failure(spec.policy, error, shift) from error
         only_when_asked = only_choices(policy)
         while env.agents and not stopped():
             count, asked = len(env.events), env.may_claim or not only_when_asked
@@ -123,7 +126,7 @@ def run(
             try:
                 actions = policy.act(seen) if asked else {}
                 actions_of(env.agents, actions)
-            except Exception as error:  # whatever the policy raises
+            except (Exception, SystemExit) as error:  # whatever the policy raises
                 where = f"{shift}, at {env.tick * env.world.dt_s:g} s of the shift"
                 raise failure(spec.policy, error, where) from error
             _, earned, _, _ = env.advance(actions)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # slow to import
     from scenarios.bounds.references import Reference
 
 NO_SCORES = (
-    f"No normalised scores: fewer than {FEWEST} of these shifts have references. Make them with thermofleet "
+    f"No normalised scores: they need {FEWEST} or more shifts with references. Make references with thermofleet "
     "bounds, then compare with --references FILE."
 )
 NO_SCORES_RANDOMISED = "No normalised scores: references are of shifts without randomisation."

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.mpc import Mpc
-from agents.policy import Planner
+from agents.policy import EveryArm, Local, Planner
 from agents.registry import RULES, make_policy
 from agents.schedules import Schedules
 from fleet.engine.batch import Engine, shifts_of
@@ -32,6 +32,17 @@ def simulator_of(world, weights=WEIGHTS):
     tables, _ = tables_of(world)
     tables.work["difficulty"] = np.nan  # the arms share it
     return CellSimulator(tables, len(world.arms), world.slots, weights)
+
+
+def begun(world):
+    """An engine at the beginning of the shift of a world, and what its arms observe."""
+    tables, drawn = tables_of(world)
+    layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+    engine = Engine(tables, 1, layout, WEIGHTS, jobs=len(world.jobs.names[0]))
+    vectors = np.zeros((1, len(world.arms), layout.size), np.float32)
+    engine.reset(np.arange(1), shifts_of(drawn, [0]))
+    engine.observe(np.arange(1), vectors)
+    return engine, layout.read_each(world.arms, vectors[0], engine.mask[0])
 
 
 def alone(name):
@@ -110,12 +121,8 @@ def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
 def test_a_later_reward_is_worth_less(small):
     world, _ = small.Shifts(arms=1, jobs=1).shop([small.job("a")])
     simulator = simulator_of(world, RewardWeights(tardiness=0.0, energy=0.0))
-    tables, drawn = tables_of(world)
-    layout = Layout(1, world.slots, plans=world.plans_per_job)
-    engine, vectors = Engine(tables, 1, layout, WEIGHTS), np.zeros((1, 1, layout.size), np.float32)
-    engine.reset(np.arange(1), shifts_of(drawn, [0])[:1])
-    engine.observe(np.arange(1), vectors)
-    simulator.look(engine, 0, {"arm_0": layout.read(vectors[0, 0], engine.mask[0, 0])})
+    engine, seen = begun(world)
+    simulator.look(engine, 0, seen)
     discount = 0.5 ** np.arange(world.ticks)
     whole = Schedules(np.zeros((1, 1), int), np.zeros((1, 1), int), np.zeros((1, 1)), np.zeros((1, 1)))
     value, later = (float(simulator.run(whole, each).reward[0]) for each in (np.ones(world.ticks), discount))
@@ -146,3 +153,57 @@ def test_a_guard_stops_claims_of_a_planner(small):
     free, guarded = (played(world, policy_of(name)) for name in ("mpc", "shutdown:mpc"))
     assert np.isfinite(free.start_s).any()
     assert np.isfinite(guarded.start_s).sum() <= np.isfinite(free.start_s).sum()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s, d: (s.at([0] * 33), d), "at most 32 schedules and 8 jobs"),
+        (lambda s, d: (Schedules(*(each[:, :7] for each in s)), d), "8 jobs"),
+        (lambda s, d: (s._replace(order=s.order[:, :7]), d), "the same shape"),
+        (lambda s, d: (s._replace(arm=s.arm - 1), d), "The arm of a schedule must be an integer from 0 to 2"),
+        (lambda s, d: (s._replace(arm=s.arm + 3), d), "from 0 to 2"),
+        (
+            lambda s, d: (s._replace(option=s.option + 0.5), d),
+            "option of a schedule must be an integer from 0 to 0",
+        ),
+        (lambda s, d: (s, d[1:]), "one for each step"),
+        (lambda s, d: (s, d * np.nan), "finite factors"),
+    ],
+)
+def test_schedules_that_the_simulator_cannot_hold_are_refused(small, change, said):
+    """Compiled code does not check indices."""
+    world, _ = small.Shifts().shop(small.Shifts().drawn(np.random.SeedSequence(1))[0])
+    simulator, (engine, seen) = simulator_of(world), begun(world)
+    simulator.look(engine, 0, seen)
+    none = np.zeros((1, 8), int)
+    whole, discount = Schedules(none, none, np.zeros((1, 8)), np.zeros((1, 8))), np.ones(world.ticks)
+    assert np.isfinite(simulator.run(whole, discount).reward).all()
+    with pytest.raises(ValueError, match=said):
+        simulator.run(*change(whole, discount))
+
+
+def test_limits_out_of_reach_let_no_arm_fault(small):
+    jobs = [small.job(f"job_{i}", small.work(payload_kg=small.HOT), repetitions=5, due_s=1e4) for i in range(4)]
+    world, _ = small.Shifts(arms=1, jobs=4, ticks=120, ambient_c=40.0).shop(jobs)
+    engine, seen = begun(world)
+    none = np.zeros((1, 4), int)
+    all_, rewards = Schedules(none, none, np.arange(4.0)[None], np.zeros((1, 4))), []
+    for simulator in (cell := simulator_of(world)), cell.with_limits(1e6, 1e6):
+        simulator.look(engine, 0, seen)
+        rewards.append(float(simulator.run(all_, np.ones(world.ticks)).reward[0]))
+    assert rewards[0] < rewards[1]
+
+
+def test_only_a_central_policy_plans():
+    with pytest.raises(
+        TypeError, match="Alone: Mpc plans in a simulator of its cell, which an arm alone"
+    ):
+        type("Alone", (Local,), {"central": Mpc})
+
+    class Planning:
+        def plan_in(self, cell):
+            pass
+
+    with pytest.raises(FleetError, match=r"Planning has plan_in\(\), but only scope central"):
+        EveryArm(Planning)

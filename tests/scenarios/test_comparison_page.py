@@ -105,7 +105,10 @@ def test_a_baseline_that_failed_has_no_differences(study: Study):
 def test_the_best_of_several_must_be_significant_among_them(study: Study):
     about = judged(study, rows_of(study), {})
     (result,) = about.results
-    for p, said in ((0.016, "more reward than wspt"), (0.02, "more than, which is not significant, wspt")):  # of three
+    for p, said in (
+        (0.016, "more reward than wspt."),
+        (0.02, "more reward than wspt, which is not significant."),
+    ):  # of three
         reward = replace(result.figures["wsept"]["reward"], p=p)
         figures = result.figures | {"wsept": result.figures["wsept"] | {"reward": reward}}
         (only,) = verdict(replace(about, results=[replace(result, figures=figures)]))

@@ -30,6 +30,16 @@ class Speaks(Bad):
         return {arm: "left" for arm in observations}
 
 
+class Exits(Bad):
+    def act(self, observations):
+        raise SystemExit(0)
+
+
+class Misplans(Bad):
+    def plan_in(self, cell):
+        raise ValueError("no plan")
+
+
 class Endless(Bad):
     def __init__(self):
         while True:
@@ -45,7 +55,13 @@ def file(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("policy", "expected"), [("Raises", "ValueError: boom (FILE, line 14)"), ("Speaks", "(got 'left')")]
+    ("policy", "expected"),
+    [
+        ("Raises", "ValueError: boom (FILE, line 14)"),
+        ("Speaks", "(got 'left')"),
+        ("Exits", "SystemExit: 0 (FILE, line 24)"),
+        ("Misplans", "ValueError: no plan (FILE, line 29)"),
+    ],
 )
 @pytest.mark.parametrize("command", ["run", "ablate", "bounds"])
 def test_it_is_one_sentence(thermofleet, small_toml, tmp_path, file, command, policy, expected) -> None:

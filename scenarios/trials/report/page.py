@@ -138,8 +138,8 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
                 f"the difference of {label(compared)} to it is {span}{doubt}."
             )
             continue
-        more = "more reward than" if significant else "more than, which is not significant,"
-        yield f"{where}{label(best)} has the most reward, {reward}; {span} {more} {label(base)}."
+        doubt = "" if significant else ", which is not significant"
+        yield f"{where}{label(best)} has the most reward, {reward}; {span} more reward than {label(base)}{doubt}."
 
 
 def _scores(judged: Judged) -> Iterator[str]:
