@@ -196,9 +196,7 @@ def test_limits_out_of_reach_let_no_arm_fault(small):
 
 
 def test_only_a_central_policy_plans():
-    with pytest.raises(
-        TypeError, match="Alone: Mpc plans in a simulator of its cell, which an arm alone"
-    ):
+    with pytest.raises(TypeError, match="Alone: Mpc plans in a simulator of its cell, which an arm alone"):
         type("Alone", (Local,), {"central": Mpc})
 
     class Planning:

@@ -188,6 +188,12 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
     path.rename(tmp_path / "test-other-oracle.jsonl")
     with pytest.raises(FleetError, match="must have the name of its policy and split, test-mine-oracle"):
         read_all(tmp_path, "test")
+    (tmp_path / "banana.jsonl").touch()
+    with pytest.raises(FleetError, match=r"banana.jsonl' must have the name .* with SPLIT validation, test, sizes"):
+        read_all(tmp_path, "test")
+    (tmp_path / "study.json").touch()
+    with pytest.raises(FleetError, match="is a folder of `thermofleet compare`; run `thermofleet submit-result`"):
+        read_all(tmp_path, "test")
     lines = (tmp_path / "test-other-oracle.jsonl").read_text(encoding="utf-8").splitlines()
     for bad in (
         "",
