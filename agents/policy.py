@@ -6,12 +6,15 @@ in the process of each arm.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 
+from agents.schedules import Schedules
 from fleet.errors import FleetError
 from fleet.observation import Observation
+
+Array = np.ndarray
 
 SCOPES = ("central", "arm")
 
@@ -39,14 +42,49 @@ class Policy(_Resettable, Protocol):
         ...
 
 
+class Present(Protocol):
+    """The jobs of a shift at a moment: `fleet.env.lookahead.Present`, which explains the fields."""
+
+    @property
+    def now_s(self) -> float: ...
+    @property
+    def open(self) -> Array: ...
+    @property
+    def can(self) -> Array: ...
+    @property
+    def stations(self) -> Array: ...
+
+
+class Executed(Protocol):
+    """What came of schedules: `fleet.engine.play.Executed`, which explains the fields."""
+
+    @property
+    def reward(self) -> Array: ...
+    @property
+    def start_s(self) -> Array: ...
+
+
+class Simulator(Protocol):
+    """Simulates schedules of a cell: `fleet.env.lookahead.CellSimulator`, which explains the members."""
+
+    @property
+    def rows(self) -> int: ...
+    @property
+    def dt_s(self) -> float: ...
+    @property
+    def horizon_s(self) -> float: ...
+    def with_limits(self, warning_c: float, error_c: float) -> Self: ...
+    def run(self, schedules: Schedules, discount: Array) -> Executed: ...
+
+
 class Lookahead(Protocol):
     """A simulator of a cell, tied to one of its shifts: `fleet.env.lookahead.Lookahead`."""
 
-    simulator: Any
-    """`fleet.env.lookahead.CellSimulator`; Any, as policies do not know the engine."""
+    @property
+    def simulator(self) -> Simulator: ...
 
     @property
-    def slot_job(self) -> np.ndarray:
+    def slot_job(self) -> Array:
         """Jobs in the slots of the observation by their numbers, int [slot], −1 for an empty one."""
         ...
 
@@ -55,7 +93,7 @@ class Lookahead(Protocol):
         """Time since the shift began."""
         ...
 
-    def look(self, seen: Mapping[str, Observation]) -> Any:  # a `fleet.env.lookahead.Present`
+    def look(self, seen: Mapping[str, Observation]) -> Present:
         """Begin at the present."""
         ...
 

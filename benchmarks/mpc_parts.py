@@ -27,7 +27,7 @@ class WithoutHeat(Mpc):
 
     only_choices = True
 
-    def plan_in(self, cell: Any) -> None:
+    def plan_in(self, cell: Any) -> None:  # it gets another simulator
         """Plan in the simulator of a shift, with limits out of reach."""
         cell.simulator = cell.simulator.with_limits(OUT_OF_REACH_C, OUT_OF_REACH_C)
         super().plan_in(cell)
