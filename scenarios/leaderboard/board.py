@@ -15,8 +15,8 @@ from scenarios.load import SPLITS
 from scenarios.statistics.scores import Scores, ranked, score_cells, scores_of
 from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import manifest
+from scenarios.trials.plan import CARD
 from scenarios.trials.scores import Shift, normalised
-from scenarios.trials.store import CARD
 
 BASELINE = "wsept"
 """Policy that differences refer to, with the scores of `SOURCE`; without it the last of the board."""

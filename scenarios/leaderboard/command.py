@@ -89,7 +89,8 @@ def submit_command(
     try:
         made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
     except (KeyError, TypeError, AttributeError) as error:
-        raise FleetError(f"'{results}' is damaged: study.json lacks {error}. Run the comparison again.") from error
+        what = f"lacks {error}" if isinstance(error, KeyError) else f"has a value of another type ({error})"
+        raise FleetError(f"'{results}' is damaged: its study.json {what}. Run the comparison again.") from error
     if policies is not None:
         wanted = [label(name) for name in options.split_names(policies)]
         unknown = [name for name in wanted if name not in {each.card.policy for each in made}]

@@ -26,7 +26,7 @@ from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import Row as Line
 from scenarios.suite.splits import cell_of_instance, line_of, manifest
 from scenarios.trials.cases import suite_of
-from scenarios.trials.plan import Key, Row
+from scenarios.trials.plan import CARD, Key, Row
 from scenarios.trials.scores import Shift, references_of
 
 FORMAT = 1
@@ -326,10 +326,13 @@ def read_card(out: Path) -> dict[str, Any]:
     Raises:
         FleetError: it holds no study.
     """
-    from scenarios.trials.store import CARD  # needs the extra for Parquet
-
     try:
-        return json.loads((out / CARD).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        card = json.loads((out / CARD).read_text(encoding="utf-8"))
+        if isinstance(card, dict):
+            return card
+        what = f"has a damaged {CARD}, which holds no object"
+    except ValueError as error:
+        what = f"has a damaged {CARD} ({error})"
+    except OSError:
         what = "holds no study of `thermofleet compare --out`" if out.is_dir() else "is no folder"
-        raise FleetError(f"'{out}' {what}; give the folder of such a command.") from error
+    raise FleetError(f"'{out}' {what}; give the folder of such a command.")

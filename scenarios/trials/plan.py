@@ -23,6 +23,8 @@ from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 from scenarios.trials.cells import plan_content
 
+CARD = "study.json"
+"""File of a study with its plan, in the folder of its results."""
 TOGETHER = 16
 """Shifts of a policy that are stepped side by side."""
 _LIBRARIES = ("thermofleet", "numpy", "numba", "scipy", "mujoco", "torch")

@@ -16,9 +16,9 @@ from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import FIGURES, Outcome
-from scenarios.trials.plan import Key, Row, columns
+from scenarios.trials.plan import CARD, Key, Row, columns
 
-RESULTS, CARD, PARTS = "results.parquet", "study.json", "parts"
+RESULTS, PARTS = "results.parquet", "parts"
 MOST_PARTS = 500
 """More are made one file at once."""
 SCHEMA = pa.schema(

@@ -24,7 +24,7 @@ from scenarios.trials.plan import Row, Study
 from scenarios.trials.store import opened
 
 REWARD = FIGURES.index("reward")
-BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0))
+BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0) | {"value": 50.0})
 
 
 def reference(line) -> Reference:
@@ -144,6 +144,7 @@ FORGED = {
     "code of its author": (changed(None, policy="this:x", policy_hash=""), "must be built-in and have no hash"),
     "another process": (changed(None, policy="bus:mine", policy_hash=""), None),
     "files of another process": (changed(None, policy="bus:mine"), r"\(bus:NAME has none\)"),
+    "more than the value": (changed(7, value=11.9), r"test/0007 has a reward of 12, above the finished value 11\.9"),
     "no number": (changed(7, value=float("nan")), "needs 11 figures of at most 1e\\+09"),
     "below 0": (changed(7, faults=-1.0), "a figure below 0"),
     "half a fault": (changed(7, faults=0.5), "counts that are no whole numbers"),
@@ -164,7 +165,7 @@ def good(study: Study) -> Submission:
         manifest=submission.manifest_hash("test"), code_hash="a" * 16, policy_hash="c" * 16, risk="rc",
         versions=versions,
     )  # fmt: skip
-    figures = [12.0, *[0.0] * (len(FIGURES) - 1)]
+    figures = [12.0 if name == "reward" else 50.0 if name == "value" else 0.0 for name in FIGURES]
     rows = [
         Played(instance=case.name, scenario=scenarios[case.name], seed=case.seeds[0], training=0, figures=figures,
                illegal=0)
