@@ -17,6 +17,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from fleet.env.allocation_v1 import parallel_env
 from fleet.env.validation import Decisions
 from fleet.env.vector import BatchEnv
+from fleet.files import user_cache_folder
 
 PAGE = Path(__file__).parents[2] / "docs" / "trainers.md"
 
@@ -169,10 +170,12 @@ def by_hand() -> SimpleNamespace:
     return SimpleNamespace(turns=turns, claim_by_chance=claim_by_chance)
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="package", autouse=True)
 def home(tmp_path_factory) -> Iterator[None]:
-    """A home of its own: some trainers leave logs and tokens there."""
+    """A home of its own for these tests, as some trainers leave logs and tokens there; the compiled engine stays."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(user_cache_folder().parent))
+        patch.setenv("THERMOFLEET_CACHE", str(tmp_path_factory.mktemp("plans")))
         patch.setenv("HOME", str(tmp_path_factory.mktemp("home")))
         yield
 

@@ -9,7 +9,6 @@ from threading import Thread
 import pytest
 
 from fleet.errors import FleetError
-from fleet.files import user_cache_folder
 from scenarios.load import load
 from scenarios.trials.contest import run_study
 from scenarios.trials.plan import Case, Row, Study
@@ -22,8 +21,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
-COMPILED = user_cache_folder()
-"""Before the tests get a home of their own: the nodes need not compile the engine again."""
 OWN = f"""{IDLE}
 class Where(Idle):
     def act(self, seen):
@@ -43,14 +40,12 @@ class Waits(Idle):
 
 
 @pytest.fixture(scope="module")
-def cluster(home, tmp_path_factory) -> Iterator:
+def cluster(home) -> Iterator:
     """Two nodes of one CPU each, with a cache that both share."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_MODE", "disabled")
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("THERMOFLEET_CACHE", str(tmp_path_factory.mktemp("plans")))
         patch.setenv("PYTHONPATH", f"{Path(__file__).parents[2]}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-        patch.setenv("XDG_CACHE_HOME", str(COMPILED.parent))
         import ray
         from ray.cluster_utils import Cluster
 
