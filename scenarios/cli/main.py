@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from fleet.errors import FleetError, JournalFull, NoRouter, visible
+from fleet.errors import FleetError, JournalFull, NoRouter, printable, visible
 from fleet.live.supervisor import SUPERVISED, WAITS
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, echo, err_console, say
 from scenarios.extras import missing_extra
@@ -187,7 +187,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         message = error.format_message().replace("Value error, ", "")  # typer's own word before "'x' is not one of"
         if message:  # empty if the help was shown instead
             given = _given(error, sys.argv[1:] if argv is None else argv)
-            more = "" if given is None or given in message else f" (got '{given}')"
+            more = "" if given is None or given in message else f" (got '{printable(given)}')"
             say(f"Error: {message.rstrip('.')}{more}{'' if message.endswith('?') else '.'} See thermofleet --help.")
         sys.exit(USAGE)
     except OSError as error:
