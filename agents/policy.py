@@ -6,7 +6,7 @@ in the process of each arm.
 """
 
 from collections.abc import Callable, Mapping
-from typing import ClassVar, Protocol, Self, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -73,7 +73,6 @@ class Simulator(Protocol):
     def dt_s(self) -> float: ...
     @property
     def horizon_s(self) -> float: ...
-    def with_limits(self, warning_c: float, error_c: float) -> Self: ...
     def run(self, schedules: Schedules, discount: Array) -> Executed: ...
 
 
@@ -91,6 +90,10 @@ class Lookahead(Protocol):
     @property
     def now_s(self) -> float:
         """Time since the shift began."""
+        ...
+
+    def with_limits(self, warning_c: float, error_c: float) -> "Lookahead":
+        """The same with other limits of the motors, °C, as to plan with a margin."""
         ...
 
     def look(self, seen: Mapping[str, Observation]) -> Present:

@@ -1,8 +1,7 @@
 """Variants of `mpc` without discount, search or heat, for `thermofleet ablate`; docs/policies.md has the command."""
 
-from typing import Any
-
 from agents.mpc import Mpc
+from agents.policy import Lookahead
 
 OUT_OF_REACH_C = 1e6
 """Limits of motor temperatures where heat shall not count."""
@@ -27,7 +26,6 @@ class WithoutHeat(Mpc):
 
     only_choices = True
 
-    def plan_in(self, cell: Any) -> None:  # it gets another simulator
+    def plan_in(self, cell: Lookahead) -> None:
         """Plan in the simulator of a shift, with limits out of reach."""
-        cell.simulator = cell.simulator.with_limits(OUT_OF_REACH_C, OUT_OF_REACH_C)
-        super().plan_in(cell)
+        super().plan_in(cell.with_limits(OUT_OF_REACH_C, OUT_OF_REACH_C))

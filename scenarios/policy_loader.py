@@ -5,7 +5,8 @@ object is a class or a function that returns a new policy."""
 import importlib
 import importlib.util
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from inspect import signature
 from pathlib import Path
@@ -70,6 +71,17 @@ def failure(name: str, error: BaseException, where: str) -> BaseException:
     line = last_line(error, source) if source else None
     place = f" ({source.absolute()}, line {line})" if source and line else ""
     return PolicyFailed(f"The policy '{name}' failed in {where}: {error_text(error).rstrip('.: ')}{place}.")
+
+
+@contextmanager
+def blaming(name: str, where: str) -> Iterator[None]:
+    """Raise the `failure` of a policy for whatever its code in the block raises, SystemExit too."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise failure(name, error, where) from error
 
 
 def last_line(error: BaseException, file: Path) -> int | None:
@@ -149,14 +161,15 @@ def without_simulator(name: str, policy: Policy) -> Policy:
     return policy
 
 
-def check_needs_no_simulator(name: str) -> None:
-    """Refuse a policy of a live fleet that plans in a simulator, before anything is started.
+def plans(name: str) -> bool:
+    """Whether a policy plans in a simulator of its cell, as its class says; none is made for it.
 
     Raises:
-        FleetError: it does, or as `policy_of`.
+        FleetError: as `policy_of`.
     """
-    if not (is_on_bus(name) or _is_folder(name)):  # those never do, and a folder takes seconds to load
-        without_simulator(name, policy_of(name))
+    if wrapped := _wrapped(name):
+        return plans(wrapped[1])
+    return not (is_on_bus(name) or has_trainings(name) or _is_folder(name)) and hasattr(_made_by(name)[0], "plan_in")
 
 
 def is_built_in(name: str) -> bool:

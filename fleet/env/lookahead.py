@@ -176,6 +176,10 @@ class Lookahead:
         """Time since the shift began."""
         return float(self._engine.state.tick[self._env]) * self.simulator.dt_s
 
+    def with_limits(self, warning_c: float, error_c: float) -> "Lookahead":
+        """The same shift, ahead with other limits of the motors; see `CellSimulator.with_limits`."""
+        return Lookahead(self.simulator.with_limits(warning_c, error_c), self._engine, self._env)
+
     def look(self, seen: Mapping[str, Observation]) -> Present:
         """Begin at the present; see `CellSimulator.look`."""
         return self.simulator.look(self._engine, self._env, seen)

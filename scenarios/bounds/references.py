@@ -22,12 +22,12 @@ from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, Simulated, 
 from scenarios.bounds.upper import upper_bound
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
-from scenarios.policy_loader import failure, policy_at, policy_of
+from scenarios.policy_loader import blaming, policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
 from scenarios.prepare.known_cell import simulator_of_shift
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
-from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit, TooSlow
+from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit
 from scenarios.run.provenance import code_hash
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
@@ -169,13 +169,10 @@ def _followed(simulator: ShiftSimulator, name: str, task: Task) -> Simulated:
         PolicyFailed: the policy is one of one's own, and raised something, was too slow or returned no action.
     """
     limit = DecisionLimit(DECISION_LIMIT_S)
-    try:
-        with limit.watching():
-            with limit.decision():
-                policy = policy_at(name, task.seed)
-            return simulator.follow([policy], limit)
-    except (Exception, TooSlow, SystemExit) as error:  # whatever the policy raises
-        raise failure(name, error, task.instance) from error
+    with blaming(name, task.instance), limit.watching():
+        with limit.decision():
+            policy = policy_at(name, task.seed)
+        return simulator.follow([policy], limit)
 
 
 def references(

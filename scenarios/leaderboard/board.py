@@ -56,14 +56,15 @@ def read_all(folder: Path, split: str) -> list[Submission]:
         raise FleetError(
             f"'{folder}' is a folder of `thermofleet compare`; run `thermofleet submit-result` with it first."
         )
-    for path in folder.glob("*.jsonl"):
-        if path.stem.partition("-")[0] not in JUDGED:
+    references, found = split_references(split), list[Submission]()
+    for path in sorted(folder.glob("*.jsonl")):
+        if (named := path.stem.partition("-")[0]) not in JUDGED:
             raise FleetError(
                 f"'{path}' must have the name that `thermofleet submit-result` gives, SPLIT-POLICY-PREDICTIONS.jsonl "
                 f"with SPLIT {', '.join(JUDGED)}."
             )
-    references, found = split_references(split), list[Submission]()
-    for path in sorted(folder.glob(f"{split}-*.jsonl")):
+        if named != split:
+            continue
         submission = read(path)
         if path.stem != submission.name:
             raise FleetError(f"'{path}' must have the name of its policy and split, {submission.name}.jsonl.")

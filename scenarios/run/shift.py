@@ -17,7 +17,7 @@ from fleet.env.validation import actions_of
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
-from scenarios.policy_loader import OnBus, failure, policy_at
+from scenarios.policy_loader import OnBus, blaming, policy_at
 from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
 from scenarios.prepare.known_cell import let_plan
 from scenarios.progress import Progress, quiet
@@ -96,10 +96,8 @@ def run(
         PolicyFailed: the policy is one of one's own, and raised something or returned no action.
     """
     shift = f"{fleet.scenario.name}/{spec.seed}"
-    try:
+    with blaming(spec.policy, shift):
         policy = policy_at(spec.policy, spec.seed, OnBus(fleet=fleet.scenario.name))
-    except (Exception, SystemExit) as error:  # whatever the policy raises
-        raise failure(spec.policy, error, shift) from error
     recorder = _Recorder(fleet.scenario, record)
     env = env_of(
         fleet,
@@ -115,20 +113,15 @@ def run(
     try:
         recorder.env = env
         env.reset(seed=spec.seed)
-        try:
+        with blaming(spec.policy, shift):
             let_plan(policy, fleet, env, spec.seed)
-        except (Exception, SystemExit) as error:  # whatever the policy raises
-            raise failure(spec.policy, error, shift) from error
         only_when_asked = only_choices(policy)
         while env.agents and not stopped():
             count, asked = len(env.events), env.may_claim or not only_when_asked
             seen = env.knowledge() if asked else {}
-            try:
+            with blaming(spec.policy, f"{shift}, at {env.tick * env.world.dt_s:g} s of the shift"):
                 actions = policy.act(seen) if asked else {}
                 actions_of(env.agents, actions)
-            except (Exception, SystemExit) as error:  # whatever the policy raises
-                where = f"{shift}, at {env.tick * env.world.dt_s:g} s of the shift"
-                raise failure(spec.policy, error, where) from error
             _, earned, _, _ = env.advance(actions)
             awards = [event for event in env.events[count:] if event.kind == "award"]
             for award in awards if record else ():

@@ -35,14 +35,18 @@ def simulator_of(world, weights=WEIGHTS):
 
 
 def begun(world):
-    """An engine at the beginning of the shift of a world, and what its arms observe."""
+    """An engine at the beginning of the shift of a world, and the vectors of its arms."""
     tables, drawn = tables_of(world)
     layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
     engine = Engine(tables, 1, layout, WEIGHTS, jobs=len(world.jobs.names[0]))
     vectors = np.zeros((1, len(world.arms), layout.size), np.float32)
     engine.reset(np.arange(1), shifts_of(drawn, [0]))
     engine.observe(np.arange(1), vectors)
-    return engine, layout.read_each(world.arms, vectors[0], engine.mask[0])
+    return engine, vectors
+
+
+def seen_by(world, engine, vectors):
+    return engine.layout.read_each(world.arms, vectors[0], engine.mask[0])
 
 
 def alone(name):
@@ -95,19 +99,14 @@ def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
     rng, (world, _) = np.random.default_rng(seed), shifts.shop(jobs)
     difficulty = rng.uniform(0.0, 3.0, world.offers.difficulty.shape)
     world = replace(world, offers=replace(world.offers, difficulty=difficulty))
-    tables, drawn = tables_of(world)
-    layout = Layout(3, world.slots, plans=world.plans_per_job)
     schedule = Schedules(
         rng.integers(0, 3, (1, 6)), np.zeros((1, 6), int), rng.uniform(0, 1, (1, 6)), rng.uniform(0, 300, (1, 6))
     )
-    engine, vectors = Engine(tables, 1, layout, WEIGHTS, jobs=6), np.zeros((1, 3, layout.size), np.float32)
-    engine.reset(np.arange(1), shifts_of(drawn, [0]))
-    engine.observe(np.arange(1), vectors)
+    engine, vectors = begun(world)
     for _ in range(ticks):
         engine.step(np.array([[rng.choice(np.flatnonzero(m[:-1])) for m in engine.mask[0]]]), vectors)
-    seen = {name: layout.read(vectors[0, a], engine.mask[0, a]) for a, name in enumerate(world.arms)}
     cell = Lookahead(simulator_of(world), engine)
-    present = cell.look(seen)
+    present = cell.look(seen_by(world, engine, vectors))
     assert present.now_s == cell.now_s == ticks * 10.0
     others = ~np.isin(np.arange(6), present.open)
     assert not present.can[:, others].any()
@@ -121,8 +120,8 @@ def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
 def test_a_later_reward_is_worth_less(small):
     world, _ = small.Shifts(arms=1, jobs=1).shop([small.job("a")])
     simulator = simulator_of(world, RewardWeights(tardiness=0.0, energy=0.0))
-    engine, seen = begun(world)
-    simulator.look(engine, 0, seen)
+    engine, vectors = begun(world)
+    simulator.look(engine, 0, seen_by(world, engine, vectors))
     discount = 0.5 ** np.arange(world.ticks)
     whole = Schedules(np.zeros((1, 1), int), np.zeros((1, 1), int), np.zeros((1, 1)), np.zeros((1, 1)))
     value, later = (float(simulator.run(whole, each).reward[0]) for each in (np.ones(world.ticks), discount))
@@ -174,8 +173,8 @@ def test_a_guard_stops_claims_of_a_planner(small):
 def test_schedules_that_the_simulator_cannot_hold_are_refused(small, change, said):
     """Compiled code does not check indices."""
     world, _ = small.Shifts().shop(small.Shifts().drawn(np.random.SeedSequence(1))[0])
-    simulator, (engine, seen) = simulator_of(world), begun(world)
-    simulator.look(engine, 0, seen)
+    simulator, (engine, vectors) = simulator_of(world), begun(world)
+    simulator.look(engine, 0, seen_by(world, engine, vectors))
     none = np.zeros((1, 8), int)
     whole, discount = Schedules(none, none, np.zeros((1, 8)), np.zeros((1, 8))), np.ones(world.ticks)
     assert np.isfinite(simulator.run(whole, discount).reward).all()
@@ -183,15 +182,15 @@ def test_schedules_that_the_simulator_cannot_hold_are_refused(small, change, sai
         simulator.run(*change(whole, discount))
 
 
-def test_limits_out_of_reach_let_no_arm_fault(small):
+def test_heat_costs_nothing_where_limits_are_out_of_reach(small):
     jobs = [small.job(f"job_{i}", small.work(payload_kg=small.HOT), repetitions=5, due_s=1e4) for i in range(4)]
     world, _ = small.Shifts(arms=1, jobs=4, ticks=120, ambient_c=40.0).shop(jobs)
-    engine, seen = begun(world)
+    engine, vectors = begun(world)
     none = np.zeros((1, 4), int)
     all_, rewards = Schedules(none, none, np.arange(4.0)[None], np.zeros((1, 4))), []
-    for simulator in (cell := simulator_of(world)), cell.with_limits(1e6, 1e6):
-        simulator.look(engine, 0, seen)
-        rewards.append(float(simulator.run(all_, np.ones(world.ticks)).reward[0]))
+    for cell in (near := Lookahead(simulator_of(world), engine)), near.with_limits(1e6, 1e6):
+        cell.look(seen_by(world, engine, vectors))
+        rewards.append(float(cell.simulator.run(all_, np.ones(world.ticks)).reward[0]))
     assert rewards[0] < rewards[1]
 
 

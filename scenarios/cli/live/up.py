@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from agents.policy import no_simulator
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError, nearest
 from fleet.live.supervisor import Part, Supervisor
@@ -26,7 +27,7 @@ from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.load import load
-from scenarios.policy_loader import check_needs_no_simulator, scope_of
+from scenarios.policy_loader import plans, scope_of
 from scenarios.schema_errors import choose
 
 START_S = 60.0
@@ -154,7 +155,8 @@ def up_command(
         _check_page(tls)
     if tls is not None:
         check_roster(tls, scenario)
-    check_needs_no_simulator(policy)
+    if plans(policy):  # before anything is started
+        raise no_simulator(policy)
     refuse_other_way(folder / "journals", names, alone=scope_of(policy) == "arm", new_epoch=new_epoch)
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
         prepare(chosen, difficulty=difficulty, risk=choose("risk", risk, RiskName), progress=progress)
