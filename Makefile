@@ -98,7 +98,6 @@ EXTRA := [cli]
 .venv-adapters/bench/.installed: EXTRA := [cli,learn]
 .venv-adapters/ray/.installed: EXTRA := [cli,ray]
 .venv-adapters/ros2/.installed: EXTRA := [bus,ros2]
-.venv-adapters/vda5050/.installed: EXTRA := [bus,vda5050]
 bench-env: .venv-adapters/bench/.installed
 	@.venv-adapters/bench/bin/python benchmarks/env.py
 

@@ -19,7 +19,6 @@ EXTRAS = {
     "ray": ("ray",),
     "rerun": ("rerun",),
     "ros2": ("rosbags",),
-    "vda5050": ("paho",),
 }
 """Top-level modules of the libraries of each extra."""
 

@@ -19,7 +19,7 @@ NOUNS_OF_LAWS = ("robot", "job", "errors", "jit")
 
 SIM_LIBRARIES = ("mujoco", "mink", "ruckig")
 TRAINERS = ("agilerl", "benchmarl", "ray", "sb3_contrib", "stable_baselines3", "tianshou")
-NEIGHBOURS = {"rosbags": "fleet.ros2.cdr", "rclpy": "fleet.ros2.job_action", "paho": "fleet.vda5050.mqtt"}
+NEIGHBOURS = {"rosbags": "fleet.ros2.cdr", "rclpy": "fleet.ros2.job_action"}
 """Libraries of other systems, each in one module."""
 TENSORS = ("torch", "torchrl", "tensordict")
 HEAVY = ("torch", "mujoco", "zenoh")
@@ -80,7 +80,6 @@ BELOW = {
     "fleet.env": ("fleet.engine", *IN_MEMORY),
     "fleet.live": ("fleet.bus", "fleet.engine", "fleet.planning", "fleet.physics"),
     "fleet.ros2": ("fleet.bus", "fleet.live"),
-    "fleet.vda5050": ("fleet.bus", "fleet.live"),
 }
 """Which folders of fleet a folder of fleet may import, besides itself and the nouns."""
 
@@ -170,7 +169,6 @@ def test_the_wrong_way_is_seen(importer, imported):
         ("agents.rules", "torch"),
         ("fleet.env.x", "mink"),
         ("fleet.ros2.node", "rosbags"),
-        ("fleet.vda5050.station", "paho"),
         ("fleet.env.allocation_v1", "ray"),
         ("agents.learned.train", "stable_baselines3"),
         ("fleet.env.vector", "torch"),

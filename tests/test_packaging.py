@@ -42,7 +42,7 @@ def pinned_in(file: str) -> dict[str, str]:
 APART = sorted(path.stem for path in (ROOT / "constraints").glob("*.txt"))
 """What has an environment and pins of its own: trainers of reinforcement learning, peers to measure beside, and
 neighbours to talk to."""
-NEIGHBOURS = ("ray", "ros2", "vda5050")
+NEIGHBOURS = ("ray", "ros2")
 """Their extras have the shared pins; what the test talks to (a cluster, ROS 2, a broker) is apart."""
 ALONE = [name for name in APART if name not in NEIGHBOURS]
 EXTRAS = {

@@ -85,7 +85,6 @@ COMMANDS = {
     "replay": LazyCommand(_LIVE, "live.record:replay_command", "Replay a run or a recording on the bus."),
     "report": LazyCommand(_LIVE, "live.record:report_command", "Write the report of a recording."),
     "ros2": LazyCommand(_LIVE, "ros2:ros2_app", "Connect a fleet and ROS 2."),
-    "vda5050": LazyCommand(_LIVE, "live.vda5050:vda5050_command", "Take orders by VDA 5050 over MQTT."),
     "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
     "twin": LazyCommand(_TWIN, "twin.group:twin_app", "Train, score and use the digital twin of an arm."),
     "study": LazyCommand(
