@@ -110,7 +110,6 @@ def library_allowed(importer: str, library: str) -> bool:
             "fleet.bus.exchange.zenoh",
             "fleet.bus.client.router",
             "fleet.bus.client.client",
-            "fleet.bus.client.query",
             "fleet.ros2.node",
         )
     if library in NEIGHBOURS:

@@ -236,8 +236,6 @@ class SimulatedClient:
         handle: Handle,
         *,
         history: bool = False,
-        own: bool = True,
-        wake: bool = True,
     ) -> None:
         channel_for(expression, "publish", kind)
         subscription = Subscription(self, expression, handle, history)
@@ -308,6 +306,9 @@ class SimulatedClient:
 
         self.world.wait(self.process, self.process.real_s + timeout_s + 1.0, is_complete)
         return complete[0] if complete else Replies(took_s=timeout_s)
+
+    def ask(self, key: str, request: msgspec.Struct, kind: type[msgspec.Struct], *, timeout_s: float) -> Any:
+        return self.query_and_wait(key, request, kind, timeout_s=timeout_s).first(key)
 
 
 class _Query:

@@ -1,17 +1,19 @@
-"""Submit jobs to a fleet and follow them: what adapters of other job interfaces have in common."""
+"""Submit jobs to a fleet, follow them and cancel them: what every job interface of the fleet uses."""
 
 import logging
 import math
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from graphlib import CycleError, TopologicalSorter
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     SETTLED,
+    Admission,
     JobSpec,
     JobStatus,
     Result,
@@ -20,106 +22,168 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.operator import Action, Cancel, Controlled, ControlRequest, Pause, Resume
+from fleet.bus.protocol.operator import Cancel, Controlled, ControlRequest
 
 _LOG = logging.getLogger(__name__)
 
-POLL_S, REPLY_S = 0.5, 2.0
-"""Real seconds between two status requests, and for a reply."""
-MOST_FOLLOWED = 128
-"""Jobs in one request."""
+REPLY_S, ATTEMPTS = 5.0, 3
+"""Real seconds to wait for a reply, and number of attempts of `submit_and_wait`: a job submitted twice is one job."""
+RETRY_S = 0.5
+"""Real seconds between two attempts to submit or cancel."""
+STATUS_S = (0.5, 2.0)
+"""Real seconds between two status requests: without an auctioneer, so without results; and with one, where they only
+report done cycles and lost results."""
+JOBS_PER_MESSAGE = 64
+"""A router may drop messages of more than 64 KiB."""
 
 
 class JobClient:
-    """Submits jobs until there is a reply, and reports every change of their states; for the thread of its link.
+    """Submits jobs, and reports every change of their states as soon as a result is published.
+
+    For the thread of its link: call `step` after each `serve` of the link.
 
     Args:
         by: Who submits, for the records.
         on_change: Called with the new state of a job; a job that is not accepted is `given_up`, with the reason.
 
     Attributes:
-        statuses: Last known state of each followed job.
+        statuses: Last known state of each followed job; None until it is known.
+        heard_s: Real second of the last message about jobs.
     """
 
     def __init__(self, link: BusClient, by: str, on_change: Callable[[JobStatus], None]) -> None:
-        self.statuses: dict[str, JobStatus] = {}
+        self.statuses: dict[str, JobStatus | None] = {}
+        self.heard_s = time.monotonic()
         self._link, self._by, self._on_change = link, by, on_change
         self._unsubmitted: dict[str, JobSpec] = {}
-        self._requests: dict[str, ControlRequest] = {}
-        """Requests without a reply, by name."""
-        self._due_s = -math.inf
+        self._cancels: dict[str, ControlRequest] = {}
+        """Requests without a reply, by job."""
+        self._auctioneers: set[str] = set()
+        self._retry_s = self._status_s = -math.inf
+        """Real seconds at which the next attempts and the next status requests are due."""
         link.subscribe(keys.of_every_auction(link.fleet, "result"), Result, lambda _, result: self._set(result.status))
+        link.watch_tokens(keys.of_every_auction(link.fleet, "alive"), self._watch)
 
-    def submit(self, spec: JobSpec) -> None:
-        """Submit a job, again until there is a reply, and follow it. The same job twice is one job."""
-        self._unsubmitted[spec.name] = spec
-        self.statuses.setdefault(spec.name, JobStatus(spec.name, "waiting"))
-        self._due_s = -math.inf
+    def submit(self, *jobs: JobSpec) -> None:
+        """Submit jobs, again until there is a reply, and follow them. The same job twice is one job."""
+        for job in jobs:
+            self._unsubmitted[job.name] = job
+            self.statuses.setdefault(job.name, JobStatus(job.name, "waiting"))
+        self._retry_s = -math.inf
 
-    def cancel(self, job: str) -> str:
-        """Ask the fleet to cancel a job; return why that is impossible, or "". The job then ends as any other."""
-        if job not in self.statuses:
-            return f"There is no job '{job}'."
-        self._request(Cancel(job))
-        return ""
+    def submit_and_wait(self, jobs: Sequence[JobSpec]) -> list[Admission]:
+        """Submit jobs and return the decision on each; those that are accepted are on disk and followed.
 
-    def pause(self, paused: bool) -> str:
-        """Ask the fleet to begin no further cycle, or to go on; return why that is impossible, or ""."""
-        later = {name: r for name, r in self._requests.items() if not isinstance(r.action, Pause | Resume)}
-        self._requests = later
-        self._request(Pause() if paused else Resume())
-        return ""
+        Raises:
+            Refused: the fleet refuses the submission, with its reason.
+            NoReply: nobody replied.
+        """
+        key, admissions = keys.of_jobs(self._link.fleet, "submit"), list[Admission]()
+        for batch in batches(jobs):
+            request = Submission(batch, self._by)
+            reply = self._link.ask(key, request, SubmissionReply, timeout_s=REPLY_S, attempts=ATTEMPTS)
+            admissions += reply.jobs
+        self.follow(admission.job for admission in admissions if admission.accepted)
+        return admissions
+
+    def follow(self, names: Iterable[str]) -> None:
+        """Follow jobs that are submitted already."""
+        for name in names:
+            self.statuses.setdefault(name, None)
+        self.heard_s, self._status_s = time.monotonic(), -math.inf
 
     def forget(self, job: str) -> None:
         """Follow a job no longer."""
         self.statuses.pop(job, None)
         self._unsubmitted.pop(job, None)
 
-    def _request(self, action: Action) -> None:
-        request = ControlRequest(secrets.token_hex(8), action, self._by)
-        self._requests[request.request] = request
-        self._due_s = -math.inf
+    @property
+    def open(self) -> list[str]:
+        """Names of the followed jobs that have not ended."""
+        return [name for name, status in self.statuses.items() if status is None or status.state not in SETTLED]
+
+    def cancel(self, job: str) -> str:
+        """Cancel a job; return why that is impossible, or "". The job then ends as any other."""
+        if job not in self.statuses:
+            return f"There is no job '{job}'."
+        self._cancels.setdefault(job, ControlRequest(secrets.token_hex(8), Cancel(job), self._by))
+        self._retry_s = -math.inf
+        return ""
 
     def step(self) -> None:
         """Send requests that are due."""
-        if (real_s := time.monotonic()) < self._due_s:
-            return
-        self._due_s = real_s + POLL_S
-        for spec in self._unsubmitted.values():
-            request = Submission((spec,), self._by)
-            key = keys.of_jobs(self._link.fleet, "submit")
-            self._link.query(key, request, SubmissionReply, self._apply_admission, timeout_s=REPLY_S)
-        known = self._unsubmitted
-        for request in self._requests.values():
-            if not (isinstance(request.action, Cancel) and request.action.job in known):
-                key, done = keys.of_jobs(self._link.fleet, "control"), partial(self._apply_control, request)
-                self._link.query(key, request, Controlled, done, timeout_s=REPLY_S)
-        open_jobs = [job for job, status in self.statuses.items() if job not in known and status.state not in SETTLED]
-        if open_jobs:
-            request = StatusRequest(tuple(open_jobs[:MOST_FOLLOWED]))
-            key = keys.of_jobs(self._link.fleet, "status")
-            self._link.query(key, request, Status, self._apply_statuses, timeout_s=REPLY_S)
+        fleet, real_s = self._link.fleet, time.monotonic()
+        if real_s >= self._retry_s:
+            self._retry_s = real_s + REPLY_S
+            for batch in batches(tuple(self._unsubmitted.values())):
+                request = Submission(batch, self._by)
+                self._link.query(
+                    keys.of_jobs(fleet, "submit"), request, SubmissionReply, self._apply_admissions, timeout_s=REPLY_S
+                )
+            for job, control in self._cancels.items():
+                if job not in self._unsubmitted:
+                    done = partial(self._apply_control, job)
+                    self._link.query(keys.of_jobs(fleet, "control"), control, Controlled, done, timeout_s=REPLY_S)
+        if real_s >= self._status_s:
+            self._status_s = real_s + STATUS_S[bool(self._auctioneers)]
+            names = [name for name in self.open if name not in self._unsubmitted]
+            for start in range(0, len(names), JOBS_PER_MESSAGE):
+                asked = StatusRequest(tuple(names[start : start + JOBS_PER_MESSAGE]))
+                self._link.query(keys.of_jobs(fleet, "status"), asked, Status, self._apply_statuses, timeout_s=REPLY_S)
 
-    def _apply_admission(self, replies: Replies[SubmissionReply]) -> None:
+    def _watch(self, auctioneer: str, present: bool) -> None:
+        (self._auctioneers.add if present else self._auctioneers.discard)(auctioneer)
+        self._status_s = -math.inf  # a result may have been published while it or we were away
+
+    def _apply_admissions(self, replies: Replies[SubmissionReply]) -> None:
         for admission in (each for reply in replies.messages.values() for each in reply.jobs):
             if self._unsubmitted.pop(admission.job, None) and not admission.accepted:
                 self._set(JobStatus(admission.job, "given_up", reason=f"not accepted: {admission.reason}"))
-        for reason in filter(None, replies.refused.values()):
+        if replies.messages:
+            self._status_s = -math.inf
+        self._retry_s = min(self._retry_s, time.monotonic() + RETRY_S)
+        for reason in replies.refusals:
             _LOG.warning("Not submitted yet: %s", reason)
 
-    def _apply_control(self, request: ControlRequest, replies: Replies[Controlled]) -> None:
-        refusals = list(filter(None, replies.refused.values()))
-        if replies.messages or refusals:
-            self._requests.pop(request.request, None)
-        for reason in refusals:
+    def _apply_control(self, job: str, replies: Replies[Controlled]) -> None:
+        if replies.messages or replies.refusals:
+            self._cancels.pop(job, None)
+        self._retry_s = min(self._retry_s, time.monotonic() + RETRY_S)
+        for reason in replies.refusals:
             _LOG.warning("Refused: %s", reason)
 
     def _apply_statuses(self, replies: Replies[Status]) -> None:
-        for status in (each for reply in replies.messages.values() for each in reply.jobs):
-            self._set(status)
+        for reply in replies.messages.values():
+            self.heard_s = time.monotonic()
+            for status in reply.jobs:
+                self._set(status)
 
     def _set(self, status: JobStatus) -> None:
-        known = self.statuses.get(status.job)
-        if known is not None and known != status and known.state != "finished":
+        if status.job not in self.statuses:
+            return
+        known, self.heard_s = self.statuses[status.job], time.monotonic()
+        if known is None or (known.state != "finished" and _progress(known) != _progress(status)):
             self.statuses[status.job] = status
             self._on_change(status)
+
+
+def _progress(status: JobStatus) -> tuple[object, ...]:
+    """What results and statuses state alike."""
+    return status.state, status.arm, status.award, status.cycles, status.finished_s, status.reason
+
+
+def batches(jobs: Sequence[JobSpec]) -> Iterator[tuple[JobSpec, ...]]:
+    """Split jobs into messages, each job after those that it waits for."""
+    ordered = in_order(jobs)
+    for start in range(0, len(ordered), JOBS_PER_MESSAGE):
+        yield tuple(ordered[start : start + JOBS_PER_MESSAGE])
+
+
+def in_order(jobs: Sequence[JobSpec]) -> Sequence[JobSpec]:
+    """Sort jobs so that each comes after those that it waits for; leave them as they are if that is impossible."""
+    try:
+        order = list(TopologicalSorter({job.name: job.after for job in jobs}).static_order())
+    except CycleError:
+        return jobs  # the auctioneer names the cycle
+    place = {name: i for i, name in enumerate(order)}
+    return sorted(jobs, key=lambda job: place[job.name])

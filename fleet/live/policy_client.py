@@ -88,7 +88,7 @@ class PolicyClient:
 
     def _reply_in(self, replies: Replies[ActReply], request: ActRequest) -> ActReply:
         """The only reply."""
-        refusals = [reason for reason in replies.refused.values() if reason]
+        refusals = replies.refusals
         if len(replies.messages) + len(refusals) > 1:
             raise BusError(f"Several processes reply as {self._whose}: stop all but one.")
         if refusals:

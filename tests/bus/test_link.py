@@ -8,8 +8,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus.client.client import BusClient, Refused
-from fleet.bus.client.query import MOST_REPLIES
+from fleet.bus.client.client import MOST_REPLIES, BusClient, Refused
 from fleet.bus.client.replies import Replies
 from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys

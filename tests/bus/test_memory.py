@@ -34,6 +34,21 @@ def test_nothing_is_known_of_an_empty_slot(make_words):
     assert (heard.difficulty[:, :, [0, 2]] == 1.0).all()
 
 
+def test_scores_go_to_the_slot_of_their_job(make_words):
+    exchange = MemoryExchange(("s", "t"), Channel(delay_s=10.0))
+    words = replace(
+        make_words(np.random.default_rng(0), 2, 0.0, slots=3),
+        jobs=("a", "b", "c"),
+        difficulty=np.array([[1.0, 2.0, 3.0]] * 2),
+        p_saturation=np.array([[0.1, 0.2, 0.3]] * 2),
+    )
+    exchange.share(words)
+    later = make_words(np.random.default_rng(1), 2, 10.0, slots=4)
+    heard = exchange.share(replace(later, jobs=("c", "", "x", "a")))
+    np.testing.assert_array_equal(heard.difficulty[0, 1], [3.0, np.nan, np.nan, 1.0])
+    np.testing.assert_array_equal(heard.p_saturation[0, 1], [0.3, np.nan, np.nan, 0.1])
+
+
 def test_on_a_ring_only_neighbours_are_heard(make_words):
     exchange = MemoryExchange(ARMS, Channel(topology=nx.cycle_graph(ARMS)))
     rng = np.random.default_rng(1)

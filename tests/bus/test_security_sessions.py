@@ -1,16 +1,13 @@
-"""Certificates in sessions of other modes, of strangers, of new participants, and of a whole exchange."""
+"""Certificates in sessions of other modes, of strangers, and of new participants."""
 
 import queue
 import time
 from contextlib import suppress
 
-import numpy as np
 import pytest
 import zenoh
 
 from fleet.bus.client.router import Router, open_client
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.bus.protocol import keys
 from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.certificates import issue
@@ -20,22 +17,6 @@ from fleet.bus.security.tls import Tls
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
 PATIENT_S = 20.0
 HERE = "thermofleet/v4/f"
-
-
-def test_a_whole_exchange_is_the_same_with_every_rule_on(guarded, folder, make_words, assert_same):
-    rng = np.random.default_rng(0)
-    with (
-        ZenohExchange(ARMS, "f", guarded.endpoint, tls=folder, timeout_s=PATIENT_S) as bus,
-        ZenohExchange(ARMS, "f", tls=folder, timeout_s=PATIENT_S) as own,
-        MemoryExchange(ARMS) as memory,
-    ):
-        for tick in range(10):
-            words = make_words(rng, 3, 10.0 * tick, slots=3 + tick % 3)
-            known = memory.share(words)
-            assert_same(bus.share(words), known)
-            assert_same(own.share(words), known)
-        assert (bus.late, bus.malformed, own.late, own.malformed) == (0, 0, 0, 0)
-        assert (own.endpoint or "").startswith("tls/127.0.0.1:")
 
 
 @pytest.mark.parametrize("mode", ["client", "peer", "router"])

@@ -1,7 +1,6 @@
 """Over Zenoh and in memory the fleet knows the same, whatever the channel does to its words."""
 
 import networkx as nx
-import numpy as np
 import pytest
 
 from agents.registry import make_policy
@@ -24,20 +23,6 @@ CHANNELS = {
     "directed": Channel(topology=nx.DiGraph([("arm_0", "arm_1"), ("arm_1", "arm_2")]), loss=0.5),
     "silent": Channel(loss=1.0),
 }
-
-
-@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
-def test_the_bus_and_the_memory_know_the_same_under_a_channel(make_words, assert_same, channel):
-    rng = np.random.default_rng(0)
-    with ZenohExchange(ARMS, "same", channel=channel, timeout_s=PATIENT_S) as bus:
-        memory = MemoryExchange(ARMS, channel)
-        for episode in range(2):
-            for exchange in (bus, memory):
-                exchange.begin(np.random.default_rng(episode))
-            for tick in range(15):
-                words = make_words(rng, 4, 10.0 * tick, slots=3 + tick % 3)
-                assert_same(bus.share(words), memory.share(words))
-        assert (bus.delivered, bus.late, bus.malformed) == (memory.delivered, memory.late, 0)
 
 
 @pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)

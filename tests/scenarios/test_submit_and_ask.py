@@ -24,7 +24,8 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.errors import FleetError
-from scenarios.cli.live.submit import batches, read_jobs
+from fleet.live.job_client import batches
+from scenarios.cli.live.submit import read_jobs
 
 PATIENT_S = 20.0
 HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}

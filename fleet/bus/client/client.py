@@ -2,8 +2,8 @@
 
 What each key carries, and with which history, priority and congestion control, is in `fleet.bus.protocol.registry`.
 Zenoh's threads only queue what arrives; `serve` calls the handlers. So a participant needs no locks, and a handler may
-publish and query. `query` does not wait: its replies go to a handler, too. A malformed message is counted and logged,
-and never raises; a malformed request is refused with the reason.
+publish and query. `query` does not wait: its replies go to a handler, too; outside handlers, `ask` waits for a reply. A
+malformed message is counted and logged, and never raises; a malformed request is refused with the reason.
 """
 
 import logging
@@ -14,16 +14,14 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import partial
-from itertools import islice
 from queue import Empty
 from threading import Lock
-from typing import Any, Self, TypeVar, TypeVarTuple
+from typing import Any, Generic, Self, TypeVar, TypeVarTuple
 
 import msgspec
 import zenoh
 from zenoh import ext as advanced
 
-from fleet.bus.client.query import MOST_REPLIES, PendingQuery
 from fleet.bus.client.queue import Mailbox
 from fleet.bus.client.replies import AnotherReplies, Replies, read_message
 from fleet.bus.client.router import connect, plain_reason
@@ -42,6 +40,8 @@ Reply = TypeVar("Reply", bound=msgspec.Struct)
 Arguments = TypeVarTuple("Arguments")
 
 BACKLOG = 4096
+MOST_REPLIES = 1024
+"""Replies to one query that are read: one of each arm of the largest fleet."""
 
 
 class BusClient:
@@ -61,7 +61,6 @@ class BusClient:
         *,
         timeout_s: float = 5.0,
         backlog: int = BACKLOG,
-        read: Callable[[type[Any], str, str, bytes], tuple[str, Any]] = read_message,
         stopped: Callable[[], bool] | None = None,
     ) -> None:
         """Prepare a client of the router at `endpoint`.
@@ -69,7 +68,6 @@ class BusClient:
         Args:
             timeout_s: How long the router may take to accept the connection.
             backlog: Most messages in the queue; when it is full, the oldest is dropped.
-            read: Reads publications; clients of one process may share a cached `read_message`.
             stopped: Wait for a router until this is true, instead of `timeout_s`.
         """
         self.fleet = fleet
@@ -79,8 +77,6 @@ class BusClient:
         self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
         self._waiting: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox()
         self._backlog = backlog
-        self._read = read
-        self._polled: list[tuple[Callable[[], zenoh.Sample | None], Callable[[zenoh.Sample], None]]] = []
         self._overrunning = Lock()
         self._session: zenoh.Session | None = None
         self._participant: Participant | None = None
@@ -104,7 +100,7 @@ class BusClient:
         except zenoh.ZError as error:
             raise BusError(f"The session at {self._endpoint} did not close cleanly: {plain_reason(error)}.") from error
         finally:
-            self._waiting, self._polled = Mailbox(), []
+            self._waiting = Mailbox()
 
     def __enter__(self) -> Self:
         return self.open()
@@ -124,10 +120,6 @@ class BusClient:
         for handle, arguments in self._waiting.drain():
             handle(*arguments)
             handled += 1
-        for try_recv, take in self._polled:
-            for sample in islice(iter(try_recv, None), self._backlog):
-                take(sample)
-                handled += 1
         return handled
 
     def post(self, handle: Callable[[*Arguments], None], *arguments: *Arguments, urgent: bool = False) -> None:
@@ -194,7 +186,7 @@ class BusClient:
         if channel.reply is not kind:
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
         self._check_may_query(key)
-        pending = PendingQuery(kind, most=most, post=self.post, each=each, reject=self.reject, done=done)
+        pending = _PendingQuery(kind, most=most, post=self.post, each=each, reject=self.reject, done=done)
         try:
             self._open().get(
                 key,
@@ -220,6 +212,27 @@ class BusClient:
             self.serve(deadline_s)
         return complete[0] if complete else Replies(took_s=timeout_s)
 
+    def ask(
+        self, key: str, request: msgspec.Struct, kind: type[Reply], *, timeout_s: float, attempts: int = 1
+    ) -> Reply:
+        """Query a participant, and return its reply; of several, the first.
+
+        Args:
+            timeout_s: Real seconds of one attempt.
+            attempts: The request is sent again, at most this often in all, while nobody replies.
+
+        Raises:
+            Refused: the participant refuses, with its reason.
+            NoReply: nobody replied.
+            BusError: as `query`.
+        """
+        replies: Replies[Reply] = Replies()
+        for _ in range(attempts):
+            replies = self.query_and_wait(key, request, kind, timeout_s=timeout_s)
+            if replies.messages or replies.refusals:
+                break
+        return replies.first(key)
+
     # Replying and subscribing
 
     def reply_to(self, key: str, kind: type[Request], handle: Callable[[Request], msgspec.Struct]) -> None:
@@ -239,47 +252,38 @@ class BusClient:
         handle: Callable[[str, Message], None],
         *,
         history: bool = False,
-        own: bool = True,
-        wake: bool = True,
     ) -> None:
         """Receive all messages of one key expression; `handle` gets the name in the key and the message.
 
         Args:
             history: Also receive what publishers have cached, now and after a break, and messages lost in transit.
-            own: Also receive what this client publishes.
-            wake: Wake `serve` for a message. Otherwise it waits in Zenoh, without Python's global lock, for the next
-                call of `serve`.
         """
         channel = channel_for(expression, "publish", kind)
-        origin = zenoh.Locality.ANY if own else zenoh.Locality.REMOTE
 
         def take(sample: zenoh.Sample) -> None:
             if sample.kind != zenoh.SampleKind.PUT:
                 return
             try:
                 payload = sample.payload.to_bytes()
-                name, message = self._read(kind, str(sample.key_expr), str(sample.encoding), payload)
+                name, message = read_message(kind, str(sample.key_expr), str(sample.encoding), payload)
             except ValueError as error:
                 self.reject(f"under '{sample.key_expr}': {error}")
             else:
                 handle(name, message)
 
-        receive = _direct(partial(self.post, take)) if wake else zenoh.handlers.RingChannel(self._backlog)
-        subscriber = (
+        receive = _direct(partial(self.post, take))
+        if not history:
+            self._keep(self._open().declare_subscriber(expression, receive))
+            return
+        self._keep(
             advanced.declare_advanced_subscriber(
                 self._open(),
                 expression,
                 receive,
-                allowed_origin=origin,
                 history=advanced.HistoryConfig(detect_late_publishers=True, max_samples=channel.history),
                 recovery=advanced.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
-            if history
-            else self._open().declare_subscriber(expression, receive, allowed_origin=origin)
         )
-        self._keep(subscriber)
-        if not wake:
-            self._polled.append((subscriber.try_recv, take))
 
     def watch_tokens(self, expression: str, handle: Callable[[str, bool], None]) -> None:
         """Follow liveliness tokens: `handle` gets the name in the key, and whether the token is present.
@@ -376,6 +380,76 @@ class BusClient:
             except AnotherReplies:
                 return
             query.reply(own_key, encode(reply), encoding=encoding(type(reply)))
+
+
+class _PendingQuery(Generic[Reply]):
+    """A query that is not complete. Zenoh's thread calls `receive` and `finish`, which only queue calls.
+
+    Attributes:
+        token: Cancels the query when more replies arrive than are read.
+    """
+
+    def __init__(
+        self,
+        kind: type[Reply],
+        *,
+        most: int,
+        post: Callable[..., None],
+        each: Callable[[Reply], None],
+        reject: Callable[[str], None],
+        done: Callable[[Replies[Reply]], None],
+    ) -> None:
+        """Start the clock; arguments as of `BusClient.query`.
+
+        Args:
+            post: Queues a call for the thread of the client.
+            reject: Gets the reason why a reply is malformed.
+        """
+        self.token = zenoh.CancellationToken()
+        self._kind, self._most, self._post, self._each, self._reject, self._done = kind, most, post, each, reject, done
+        self._replies: Replies[Reply] = Replies()
+        self._start_s = time.monotonic()
+        self._arrived = 0
+
+    def receive(self, reply: zenoh.Reply) -> None:
+        """Queue a reply."""
+        self._arrived += 1
+        if self._arrived <= self._most:
+            self._post(self._take, reply)
+        elif self._arrived == self._most + 1:
+            self._post(self._stop)
+
+    def finish(self) -> None:
+        """Queue the end: no reply follows."""
+        self._post(self._complete)
+
+    def _take(self, reply: zenoh.Reply) -> None:
+        if reply.ok is None:
+            self._replies.miss(_error_in(reply))
+            return
+        replier = str(reply.ok.key_expr)
+        try:
+            payload = reply.ok.payload.to_bytes()
+            message = self._replies.take(replier, str(reply.ok.encoding), payload, self._kind)
+        except MalformedMessage as error:
+            self._reject(f"reply under '{replier}': {error}")
+        else:
+            if message is not None:
+                self._each(message)
+
+    def _stop(self) -> None:
+        self._replies.miss(f"More than {self._most} replies to one query; no more are read.")
+        self.token.cancel()  # and so calls `finish`
+
+    def _complete(self) -> None:
+        self._replies.took_s = time.monotonic() - self._start_s
+        self._done(self._replies)
+
+
+def _error_in(reply: zenoh.Reply) -> str:
+    # Any: Zenoh's stubs do not state that a reply has either `ok` or `err`.
+    error: Any = reply.err
+    return "" if error is None else error.payload.to_bytes().decode(errors="replace")
 
 
 # Any in both: Zenoh's stubs have no types for settings, and type handlers by their internals.

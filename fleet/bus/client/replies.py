@@ -9,6 +9,7 @@ import msgspec
 
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode_as, encoding
+from fleet.errors import BusError, Refused
 
 Message = TypeVar("Message", bound=msgspec.Struct)
 Entry = TypeVar("Entry")
@@ -22,6 +23,18 @@ class AnotherReplies(Exception):
 
 
 @dataclass(eq=False)
+class NoReply(BusError):
+    """Nobody replied to a query, and nobody refused it."""
+
+    key: str
+    late: bool
+    """Whether a participant received the query and did not reply in time."""
+
+    def __str__(self) -> str:
+        return f"Nobody replied to '{self.key}'" + (" in time." if self.late else ".")
+
+
+@dataclass(eq=False)
 class Replies(Generic[Message]):
     """Replies so far; complete when the handler gets them."""
 
@@ -31,6 +44,24 @@ class Replies(Generic[Message]):
     """Reasons by the key of the replier; "" for one that did not reply in time, whose key is not known."""
     took_s: float = math.nan
     """Real seconds until they were complete."""
+
+    @property
+    def refusals(self) -> list[str]:
+        """Reasons of the participants that refused, without those that did not reply in time."""
+        return [reason for reason in self.refused.values() if reason]
+
+    def first(self, key: str) -> Message:
+        """The first reply to a query of `key`.
+
+        Raises:
+            Refused: there is none, and a participant refuses, with its reason.
+            NoReply: there is neither.
+        """
+        for message in self.messages.values():
+            return message
+        for reason in self.refusals:
+            raise Refused(reason)
+        raise NoReply(key, late=bool(self.refused))
 
     def take(self, key: str, sent_encoding: str, payload: bytes, kind: type[Message]) -> Message | None:
         """Add a reply of this kind, or a refusal; return the reply.

@@ -1,24 +1,20 @@
-"""The exchange without a bus: for training, for sweeps, and for tests of a policy on a channel that is not perfect."""
+"""What arms of a simulated shift share with each other, through a channel that may delay and lose messages.
+
+Delay and loss depend on the channel, the time and the random generator of the episode, never on the content. So a seed
+delays and loses the same broadcasts under every policy.
+"""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.bus.exchange.delivery import Delivery
-from fleet.bus.exchange.protocol import (
-    Broadcast,
-    Condition,
-    PeerView,
-    Scores,
-    assemble,
-    check,
-    check_order,
-    checked_arms,
-)
+from fleet.bus.exchange.protocol import UNHEARD, Broadcast, PeerView, check, check_order, checked_arms
 from fleet.errors import BusError
-from fleet.telemetry import MODES
+
+Array = np.ndarray
 
 
 class MemoryExchange:
@@ -37,10 +33,11 @@ class MemoryExchange:
         """
         self.arms = checked_arms(arms)
         self.delivered = 0
-        self.malformed = 0
         self.late = 0
         self._delivery = None if channel.perfect else Delivery(self.arms, channel, rng)
-        self._now_s = -float("inf")
+        self._sent: dict[int, Broadcast] = {}
+        """Broadcasts that an arm still has, or that are in transit, by tick."""
+        self._tick, self._now_s = -1, -float("inf")
         self._closed = False
 
     @property
@@ -50,7 +47,8 @@ class MemoryExchange:
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
         """Begin an episode without messages received or in transit; `rng` is for channels with loss or jitter."""
-        self._now_s = -float("inf")
+        self._tick, self._now_s = -1, -float("inf")
+        self._sent.clear()
         if self._delivery is not None:
             self._delivery.begin(rng)
 
@@ -66,16 +64,17 @@ class MemoryExchange:
             raise BusError("This exchange is closed.")
         check(broadcast, self.arms)
         check_order(broadcast.time_s, self._now_s)
-        self._now_s = now_s = float(broadcast.time_s)
-        conditions, scores = _contents_of(broadcast)
-        arms = len(self.arms)
-        to_all, all_scores = [conditions] * arms, [scores] * arms
+        self._tick, self._now_s = self._tick + 1, float(broadcast.time_s)
+        broadcast = _copy(broadcast)  # the caller may reuse its arrays at the next step
         if self._delivery is None:
-            self.delivered += arms * (arms - 1)
-            return assemble(now_s, broadcast.jobs, to_all, all_scores)
-        self._delivery.carry(now_s, to_all, all_scores)
+            self.delivered += len(self.arms) * (len(self.arms) - 1)
+            return _view_at_once(broadcast)
+        self._sent[self._tick] = broadcast
+        received = self._delivery.carry(self._now_s)
         self.delivered, self.late = self._delivery.delivered, self._delivery.late
-        return assemble(now_s, broadcast.jobs, self._delivery.conditions, self._delivery.scores)
+        kept = self._delivery.in_transit | set(np.unique(received).tolist())
+        self._sent = {tick: sent for tick, sent in self._sent.items() if tick in kept}
+        return _view(broadcast, received, self._sent)
 
     def close(self) -> None:
         """Release all resources; may be called twice."""
@@ -89,17 +88,133 @@ class MemoryExchange:
         self.close()
 
 
-def _contents_of(broadcast: Broadcast) -> tuple[list[Condition], list[Scores]]:
-    """Contents of a broadcast, [arm]; copies, as the caller may reuse its arrays at the next step."""
-    difficulty, p_saturation = (
-        np.array(broadcast.difficulty, dtype=float),
-        np.array(broadcast.p_saturation, dtype=float),
+class Delivery:
+    """Which broadcasts every arm has received through a channel, in one episode after the other.
+
+    A lost broadcast is not sent again: its receiver keeps the last one. A broadcast that arrives after a later one is
+    ignored. The time is that of the broadcasts.
+    """
+
+    def __init__(self, arms: Sequence[str], channel: Channel, rng: np.random.Generator | None = None) -> None:
+        """Prepare a delivery without anything in transit.
+
+        Args:
+            rng: For loss and jitter, until `begin` brings another.
+
+        Raises:
+            ValueError: the channel names an arm that is not there.
+        """
+        self.delivered = 0
+        """Broadcasts delivered to a peer, over all episodes."""
+        self.late = 0
+        """Broadcasts that were lost, over all episodes."""
+        self._channel = channel
+        self._linked = channel.links(arms)
+        self._cuts = [(p.from_s, p.to_s, p.cuts(arms)) for p in channel.partitions]
+        self._rng = rng
+        self.begin(rng)
+
+    def begin(self, rng: np.random.Generator | None = None) -> None:
+        """Begin an episode without broadcasts received or in transit; `rng` is for loss and jitter."""
+        self._rng = rng or self._rng
+        self._tick = -1
+        self._newest = np.full(self._linked.shape, -1)
+        self._due_s: dict[int, Array] = {}
+        """When the broadcasts of each tick in transit arrive, [receiver, sender]; inf for one that is lost, or has
+        arrived."""
+
+    @property
+    def in_transit(self) -> set[int]:
+        """Ticks of broadcasts that have not arrived yet."""
+        return set(self._due_s)
+
+    def carry(self, now_s: float) -> Array:
+        """Send the broadcasts of the next tick, and deliver everything that is due by now.
+
+        Returns:
+            Tick of the last broadcast that each arm has of each arm, [receiver, sender]; −1 for none. An arm has its
+            own at once.
+
+        Raises:
+            ValueError: the channel has loss or jitter, and no `rng` was given.
+        """
+        self._tick += 1
+        self._due_s[self._tick] = self._send(now_s)
+        # Tolerance: 0.1 + 0.2 must not arrive a step after 0.3.
+        until_s = now_s + 1e-9 * max(1.0, abs(now_s))
+        for tick, due_s in self._due_s.items():
+            due = due_s <= until_s
+            due_s[due] = np.inf
+            self.delivered += int(due.sum())
+            self._newest[due] = np.maximum(self._newest[due], tick)
+        self._due_s = {tick: due_s for tick, due_s in self._due_s.items() if np.isfinite(due_s).any()}
+        received = self._newest.copy()
+        np.fill_diagonal(received, self._tick)
+        return received
+
+    def _send(self, now_s: float) -> Array:
+        """When each broadcast of this tick arrives, [receiver, sender]; inf for lost ones."""
+        channel, shape = self._channel, self._linked.shape
+        due_s = np.where(self._linked, now_s + channel.delay_s, np.inf)
+        if channel.by_chance:
+            if self._rng is None:
+                raise ValueError("A channel with loss or jitter needs an rng; pass one to begin().")
+            # Always draws both, so that a change of jitter does not change which broadcasts are lost.
+            lost, longer = self._rng.random((2, *shape))
+            due_s += channel.jitter_s * longer
+            due_s[lost < channel.loss] = np.inf
+        for from_s, to_s, cut in self._cuts:
+            if now_s < to_s:
+                due_s[cut & (due_s >= from_s)] = np.inf
+        self.late += int(self._linked.sum()) - int(np.isfinite(due_s).sum())
+        return due_s
+
+
+def _copy(broadcast: Broadcast) -> Broadcast:
+    """A copy, in which empty slots have no scores."""
+    empty = [slot for slot, job in enumerate(broadcast.jobs) if not job]
+    difficulty, p_saturation = (np.array(a, float) for a in (broadcast.difficulty, broadcast.p_saturation))
+    difficulty[:, empty] = p_saturation[:, empty] = np.nan
+    return replace(
+        broadcast,
+        mode=np.array(broadcast.mode, int),
+        headroom_k=np.array(broadcast.headroom_k, float),
+        busy_s=np.array(broadcast.busy_s, float),
+        difficulty=difficulty,
+        p_saturation=p_saturation,
     )
-    time_s = float(broadcast.time_s)
-    conditions = [
-        Condition(time_s, MODES[mode], headroom_k, busy_s)
-        for mode, headroom_k, busy_s in zip(
-            broadcast.mode.tolist(), broadcast.headroom_k.tolist(), broadcast.busy_s.tolist(), strict=True
-        )
-    ]
-    return conditions, [Scores(time_s, broadcast.jobs, d, p) for d, p in zip(difficulty, p_saturation, strict=True)]
+
+
+def _view_at_once(broadcast: Broadcast) -> PeerView:
+    """The view of every arm that has received this broadcast."""
+    arms = len(broadcast.mode)
+    fields = (broadcast.mode, broadcast.headroom_k, broadcast.busy_s, broadcast.difficulty, broadcast.p_saturation)
+    mode, headroom_k, busy_s, difficulty, p_saturation = (np.broadcast_to(f, (arms, *f.shape)) for f in fields)
+    return PeerView(mode, headroom_k, busy_s, difficulty, p_saturation, np.zeros((arms, arms)))
+
+
+def _view(now: Broadcast, received: Array, sent: dict[int, Broadcast]) -> PeerView:
+    """The view of every arm, from the tick of the last broadcast that it has of each arm, [receiver, sender]."""
+    shape, slots = received.shape, len(now.jobs)
+    view = PeerView(
+        mode=np.full(shape, UNHEARD),
+        headroom_k=np.full(shape, np.nan),
+        busy_s=np.full(shape, np.nan),
+        difficulty=np.full((*shape, slots), np.nan),
+        p_saturation=np.full((*shape, slots), np.nan),
+        age_s=np.full(shape, np.inf),
+    )
+    for tick in np.unique(received[received >= 0]).tolist():
+        then = sent[tick]
+        receivers, senders = np.nonzero(received == tick)
+        columns = {job: column for column, job in enumerate(then.jobs) if job}
+        present = [slot for slot, job in enumerate(now.jobs) if job in columns]
+        old = [columns[now.jobs[slot]] for slot in present]
+        view.mode[receivers, senders] = then.mode[senders]
+        view.headroom_k[receivers, senders] = then.headroom_k[senders]
+        view.busy_s[receivers, senders] = then.busy_s[senders]
+        view.age_s[receivers, senders] = now.time_s - then.time_s
+        at = receivers[:, None], senders[:, None], present
+        view.difficulty[at] = then.difficulty[senders[:, None], old]
+        view.p_saturation[at] = then.p_saturation[senders[:, None], old]
+    return view

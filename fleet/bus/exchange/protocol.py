@@ -1,19 +1,16 @@
 """The exchange: broadcasts of every arm at a step, and what every arm then knows of every other.
 
-`MemoryExchange` works without a bus, `ZenohExchange` over one. With the same channel and random generator they return
-the same arrays.
+`MemoryExchange` is the one implementation; `ZenohExchange` also publishes the messages of each step on the bus.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self, TypeVar
+from typing import Protocol, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from fleet.bus.protocol.messages import DifficultyScores, State
-from fleet.telemetry import MODES, Mode
+from fleet.telemetry import MODES
 
 Array = np.ndarray
 
@@ -70,11 +67,9 @@ class Exchange(Protocol):
 
     arms: tuple[str, ...]
     delivered: int
-    """Broadcasts delivered to a peer in time, over all steps; one per receiver and sender."""
-    malformed: int
-    """Malformed messages, which are logged and dropped."""
+    """Broadcasts delivered to a peer, over all steps; one per receiver and sender."""
     late: int
-    """Broadcasts that did not reach a peer in their step, over all steps."""
+    """Broadcasts that were lost on the channel, over all steps."""
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
         """Begin an episode without any received broadcasts; `rng` is for channels with loss or jitter."""
@@ -97,65 +92,6 @@ class Exchange(Protocol):
     def __enter__(self) -> Self: ...
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object, /) -> None: ...
-
-
-@dataclass(frozen=True, eq=False)
-class Condition:
-    """State of an arm in its last broadcast: the part of a `State` that peers use."""
-
-    time_s: float
-    mode: Mode
-    headroom_k: float
-    busy_s: float
-
-
-@dataclass(frozen=True, eq=False)
-class Scores:
-    """Difficulties of the open jobs in an arm's last broadcast: the part of `DifficultyScores` that peers use."""
-
-    time_s: float
-    jobs: tuple[str, ...]
-    difficulty: Sequence[float] | Array
-    """[job], NaN where unknown."""
-    p_saturation: Sequence[float] | Array
-    """[job], NaN where unknown."""
-
-
-Content = TypeVar("Content")
-AllConditions = Sequence[Sequence[Condition | State | None]]
-"""[receiver][sender]; None for a broadcast that was not received."""
-AllScores = Sequence[Sequence[Scores | DifficultyScores | None]]
-
-
-def assemble(now_s: float, jobs: tuple[str, ...], conditions: AllConditions, scores: AllScores) -> PeerView:
-    """The view of every arm, from the last contents that each receiver has of each sender, [receiver][sender].
-
-    The age is that of the older of both contents.
-    """
-    spread, states = _distinct(conditions)
-    mode = spread([*(MODES.index(state.mode) for state in states), UNHEARD])
-    headroom_k = spread([*(state.headroom_k for state in states), math.nan])
-    busy_s = spread([*(state.busy_s for state in states), math.nan])
-    state_s = spread([*(state.time_s for state in states), -math.inf])
-
-    spread, contents = _distinct(scores)
-    table = np.full((2, len(contents) + 1, len(jobs)), np.nan)
-    together: dict[tuple[str, ...], list[int]] = {}  # in most steps all contents have the same jobs
-    for index, content in enumerate(contents):
-        together.setdefault(content.jobs, []).append(index)
-    for known, indices in together.items():
-        values = np.array([(contents[i].difficulty, contents[i].p_saturation) for i in indices], dtype=float)
-        values = values.swapaxes(0, 1)  # None became NaN
-        if known == jobs:
-            table[:, indices] = values
-            continue
-        columns = {name: column for column, name in enumerate(known)}
-        slots = [slot for slot, name in enumerate(jobs) if name in columns]
-        table[:, np.array(indices)[:, None], slots] = values[:, :, [columns[jobs[slot]] for slot in slots]]
-    table[:, :, [slot for slot, name in enumerate(jobs) if not name]] = np.nan
-    scores_s = spread([*(content.time_s for content in contents), -math.inf])
-    difficulty, p_saturation = map(spread, table)
-    return PeerView(mode, headroom_k, busy_s, difficulty, p_saturation, now_s - np.minimum(state_s, scores_s))
 
 
 def checked_arms(arms: Sequence[str]) -> tuple[str, ...]:
@@ -216,25 +152,3 @@ def check_order(time_s: float, last_s: float) -> None:
     """Refuse a broadcast that is older than the last one."""
     if time_s < last_s:
         raise ValueError(f"Broadcast of {time_s:g} s after that of {last_s:g} s; begin() starts a new episode.")
-
-
-def _distinct(contents: Sequence[Sequence[Content | None]]) -> tuple[Callable[[ArrayLike], Array], list[Content]]:
-    """The distinct contents, and a function from their values, and one for None, to [receiver, sender, ...].
-
-    Receivers that share one list, as those that share a client, share memory in its result.
-    """
-    rows = {id(row): row for row in contents}
-    flat = [content for row in rows.values() for content in row]
-    ids = np.fromiter(map(id, flat), np.int64, len(flat))
-    _, first, which = np.unique(ids, return_index=True, return_inverse=True)
-    found = [flat[i] for i in first]
-    there = np.array([content is not None for content in found])
-    number = np.where(there, np.cumsum(there) - 1, -1)[which].reshape(len(rows), -1)
-    place = {key: i for i, key in enumerate(rows)}
-    row = [place[id(row)] for row in contents]
-
-    def spread(values: ArrayLike) -> Array:
-        of_rows = np.asarray(values)[number]
-        return of_rows[row] if len(rows) > 1 else np.broadcast_to(of_rows[0], (len(row), *of_rows.shape[1:]))
-
-    return spread, [content for content in found if content is not None]

@@ -16,11 +16,12 @@ import typer
 
 from agents.registry import WRAPPERS_HELP, names_of
 from fleet.bus.client.client import BusClient
+from fleet.bus.client.replies import NoReply
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.protocol.registry import STATE_HZ
 from fleet.difficulty import Blind, DifficultyModel
-from fleet.errors import BusError, FleetError, InfeasibleJob, LogError
+from fleet.errors import BusError, FleetError, InfeasibleJob, LogError, Refused
 from fleet.files import cache_folder
 from fleet.job import Work
 from fleet.live.arm.auctioneer_client import AuctioneerClient, WorkSource
@@ -310,10 +311,10 @@ def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHi
 def fleet_clock(link: BusClient, speed: float | None) -> FleetClock:
     """Fleet time, from the auctioneer if there is one."""
     asked_s = time.monotonic()
-    answers = link.query_and_wait(keys.of_clock(link.fleet), ClockRequest(), Clock, timeout_s=CLOCK_S)
-    answered_s = time.monotonic()
-    for reply in answers.messages.values():
-        if speed is not None and speed != reply.speed:
-            log.warning("The fleet's speed is %g, not %g.", reply.speed, speed)
-        return FleetClock(reply.speed, epoch=reply.epoch).set_to(asked_s, answered_s, reply.time_s)
-    return FleetClock(speed or 1.0, answered_s)
+    try:
+        reply = link.ask(keys.of_clock(link.fleet), ClockRequest(), Clock, timeout_s=CLOCK_S)
+    except (NoReply, Refused):
+        return FleetClock(speed or 1.0, time.monotonic())
+    if speed is not None and speed != reply.speed:
+        log.warning("The fleet's speed is %g, not %g.", reply.speed, speed)
+    return FleetClock(reply.speed, epoch=reply.epoch).set_to(asked_s, time.monotonic(), reply.time_s)

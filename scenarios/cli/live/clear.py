@@ -36,10 +36,9 @@ def clear_command(
         request = ClearRequest(arm, by or user_name())
         replies = link.query_and_wait(keys.of_jobs(link.fleet, "clear"), request, Cleared, timeout_s=REPLY_S)
         name = link.fleet
-    reasons = [reason for reason in replies.refused.values() if reason]
-    if reasons:
+    for reason in replies.refusals:
         where = " by all arms" if replies.messages else ""
-        raise BusError(f"The space of '{arm}' was not freed{where}: {reasons[0]}")
+        raise BusError(f"The space of '{arm}' was not freed{where}: {reason}")
     if not replies.messages:
         raise BusError(
             f"Neither an auctioneer nor an arm of fleet '{name}' replied within {REPLY_S:g} s. With TLS, use a "

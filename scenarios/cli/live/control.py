@@ -7,6 +7,7 @@ import typer
 from msgspec import UNSET
 
 from fleet.bus.client.client import BusClient
+from fleet.bus.client.replies import NoReply
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobStatus
 from fleet.bus.protocol.operator import (
@@ -112,20 +113,21 @@ def reset_command(
     check_person(by)
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         key, message = keys.of_arm(link.fleet, arm, "reset"), ResetRequest(by or user_name())
-        replies = link.query_and_wait(key, message, ResetReply, timeout_s=REPLY_S)
-    for reason in filter(None, replies.refused.values()):
-        raise BusError(reason)
-    for reply in replies.messages.values():
-        echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
-        return
-    raise BusError(f"The arm '{arm}' did not reply. With TLS, use a certificate of the role operator.")
+        try:
+            reply = link.ask(key, message, ResetReply, timeout_s=REPLY_S)
+        except NoReply as error:
+            raise BusError(
+                f"The arm '{arm}' did not reply. With TLS, use a certificate of the role operator."
+            ) from error
+    echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
 
 
 def request(actions: list[Action], by: str, endpoint: str, fleet: str) -> None:
     """Request actions, one after another, and print what became of them.
 
     Raises:
-        BusError: one is refused, or nobody replies.
+        Refused: one is refused.
+        BusError: nobody replies.
     """
     check_person(by)
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
@@ -134,16 +136,14 @@ def request(actions: list[Action], by: str, endpoint: str, fleet: str) -> None:
 
 
 def _request(link: BusClient, control: ControlRequest) -> Controlled:
-    for _ in range(ATTEMPTS):
-        replies = link.query_and_wait(keys.of_jobs(link.fleet, "control"), control, Controlled, timeout_s=REPLY_S)
-        for reply in replies.messages.values():
-            return reply
-        for reason in filter(None, replies.refused.values()):
-            raise BusError(reason)
-    raise BusError(
-        f"Neither an auctioneer nor an arm of fleet '{link.fleet}' replied within {ATTEMPTS * REPLY_S:g} s. With TLS, "
-        "use a certificate of the role operator."
-    )
+    key = keys.of_jobs(link.fleet, "control")
+    try:
+        return link.ask(key, control, Controlled, timeout_s=REPLY_S, attempts=ATTEMPTS)
+    except NoReply as error:
+        raise BusError(
+            f"Neither an auctioneer nor an arm of fleet '{link.fleet}' replied within {ATTEMPTS * REPLY_S:g} s. With "
+            "TLS, use a certificate of the role operator."
+        ) from error
 
 
 def describe(action: Action, reply: Controlled) -> str:

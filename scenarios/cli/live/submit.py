@@ -3,8 +3,7 @@
 import re
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from graphlib import CycleError, TopologicalSorter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -12,30 +11,18 @@ import msgspec
 import typer
 
 from fleet.bus.client.client import BusClient
-from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import (
-    SETTLED,
-    Admission,
-    JobSpec,
-    JobStatus,
-    Status,
-    StatusRequest,
-    Submission,
-    SubmissionReply,
-)
-from fleet.errors import BusError, FleetError, nearest
+from fleet.bus.client.replies import NoReply
+from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus
+from fleet.errors import BusError, FleetError, Refused, nearest
 from fleet.job import BOUNDS, KINDS
+from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo
 
-REPLY_S, ATTEMPTS = 5.0, 3
-"""Real seconds to wait for a reply, and number of attempts: a job that is submitted twice is one job."""
-JOBS_PER_MESSAGE = 64
-"""A router may drop messages of more than 64 KiB."""
-POLL_S = 0.5
-"""Real seconds between two status requests."""
+TURN_S = 0.2
+"""Real seconds between two checks for a stop request."""
 PATIENCE_S = 30.0
 """Real seconds without a reply after which following ends."""
 _UNKNOWN_KIND = re.compile(r"Invalid enum value '(.*)'", re.DOTALL)
@@ -56,12 +43,13 @@ def submit_command(
     """Submit jobs to the fleet's auctioneer; accepted jobs are on its disk."""
     jobs = read_jobs(file)
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        admissions = [admission for batch in batches(jobs) for admission in submit(link, batch, by)]
+        client = JobClient(link, by, print_changes())
+        admissions = submit(client, jobs, link.fleet)
         for admission in admissions:
             decision = "accepted" if admission.accepted else "refused"
             echo(f"{admission.job}: {decision}{f': {admission.reason}' if admission.reason else ''}")
         accepted = [admission.job for admission in admissions if admission.accepted]
-        unfinished = follow(link, accepted, stop) if wait and accepted else []
+        unfinished = follow(link, client, stop) if wait else []
         stop.leave("Stopped following; the auctioneer has the jobs.")
     if len(accepted) < len(admissions) or unfinished:
         raise typer.Exit(1)
@@ -108,73 +96,47 @@ def explain(error: Exception) -> str:
     return f"{problem}{f' (at {path})' if path else ''}."
 
 
-def batches(jobs: Sequence[JobSpec]) -> Iterator[tuple[JobSpec, ...]]:
-    """Split jobs into messages, each job after those that it waits for."""
-    ordered = in_order(jobs)
-    for start in range(0, len(ordered), JOBS_PER_MESSAGE):
-        yield tuple(ordered[start : start + JOBS_PER_MESSAGE])
-
-
-def in_order(jobs: Sequence[JobSpec]) -> Sequence[JobSpec]:
-    """Sort jobs so that each comes after those that it waits for; leave them as they are if that is impossible."""
-    try:
-        order = list(TopologicalSorter({job.name: job.after for job in jobs}).static_order())
-    except CycleError:
-        return jobs  # the auctioneer names the cycle
-    place = {name: i for i, name in enumerate(order)}
-    return sorted(jobs, key=lambda job: place[job.name])
-
-
-def submit(link: BusClient, jobs: tuple[JobSpec, ...], by: str) -> tuple[Admission, ...]:
+def submit(client: JobClient, jobs: Sequence[JobSpec], fleet: str) -> list[Admission]:
     """Submit jobs and return the auctioneer's decision on each.
 
     Raises:
         FleetError: it refused, or there is none.
     """
-    key = keys.of_jobs(link.fleet, "submit")
-    for _ in range(ATTEMPTS):
-        answers = link.query_and_wait(key, Submission(jobs, by), SubmissionReply, timeout_s=REPLY_S)
-        for reply in answers.messages.values():
-            return reply.jobs
-        for reason in filter(None, answers.refused.values()):
-            raise FleetError(f"The auctioneer refused the submission: {reason}")
-    raise BusError(
-        f"No auctioneer of fleet '{link.fleet}' replied. Is `thermofleet auction` running? Arms that allocate by "
-        "consensus reply once all are present, or a majority has been for 20 s."
-    )
+    try:
+        return client.submit_and_wait(jobs)
+    except Refused as error:
+        raise FleetError(f"The auctioneer refused the submission: {error}") from error
+    except NoReply as error:
+        raise BusError(
+            f"No auctioneer of fleet '{fleet}' replied. Is `thermofleet auction` running? Arms that allocate by "
+            "consensus reply once all are present, or a majority has been for 20 s."
+        ) from error
 
 
-def follow(link: BusClient, names: Sequence[str], stop: Stop) -> list[str]:
-    """Print every change until all jobs have ended, or until stopped; return the names of those not finished.
+def follow(link: BusClient, client: JobClient, stop: Stop) -> list[str]:
+    """Serve until all followed jobs have ended, or until stopped; return the names of those not finished.
 
     Raises:
         BusError: the auctioneer is gone, and does not come back.
     """
-    states: dict[str, str] = {}
-    heard_s = time.monotonic()
-    while not stop.is_set():
-        for status in request_status(link, names):
-            heard_s = time.monotonic()
-            if states.get(status.job) != status.state:
-                states[status.job] = status.state
-                echo(describe_status(status))
-        if all(states.get(name) in SETTLED for name in names):
-            break
-        if time.monotonic() > heard_s + PATIENCE_S:
+    while client.open and not stop.is_set():
+        client.step()
+        link.serve(time.monotonic() + TURN_S)
+        if time.monotonic() > client.heard_s + PATIENCE_S:
             raise BusError(
                 f"No reply from an auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; "
                 "accepted jobs are on its disk."
             )
-        stop.wait(POLL_S)
-    return [name for name in names if states.get(name) != "finished"]
+    return [name for name, status in client.statuses.items() if status is None or status.state != "finished"]
 
 
-def request_status(link: BusClient, names: Sequence[str]) -> list[JobStatus]:
-    """Request the status of jobs; empty without a reply."""
-    key = keys.of_jobs(link.fleet, "status")
-    statuses: list[JobStatus] = []
-    for start in range(0, len(names), JOBS_PER_MESSAGE):
-        request = StatusRequest(tuple(names[start : start + JOBS_PER_MESSAGE]))
-        replies = link.query_and_wait(key, request, Status, timeout_s=REPLY_S).messages.values()
-        statuses += [status for reply in replies for status in reply.jobs]
-    return statuses
+def print_changes() -> Callable[[JobStatus], None]:
+    """A function that prints a status of a job if its state is another one than before."""
+    states: dict[str, str] = {}
+
+    def show(status: JobStatus) -> None:
+        if states.get(status.job) != status.state:
+            states[status.job] = status.state
+            echo(describe_status(status))
+
+    return show
