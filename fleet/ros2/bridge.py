@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, State
-from fleet.live.monitor.recent import Recent
+from fleet.live.monitor.snapshot import Recent
 from fleet.robot import ThermalLimits
 from fleet.ros2.cdr import DIAGNOSTICS, JOINT_STATE, type_hash, write_diagnostics, write_joints
 from fleet.ros2.conversion import diagnostics_of, joints_of

@@ -1,15 +1,19 @@
-"""The bus over HTTP: the fleet as JSON, messages as server-sent events, job submissions and quotes.
+"""The bus over HTTP: the fleet as JSON, messages as server-sent events, job submissions and quotes; who may do what.
 
 The bus is served on a thread of its own (`fleet.live.monitor.async_bridge`); feed and reader buffers are used on the
 event loop only. Errors are problem details (RFC 9457).
 """
 
 import asyncio
+import hmac
+import math
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from typing import TypeVar
+from pathlib import Path
+from typing import Literal, TypeVar, get_args
 
 import msgspec
 from starlette.applications import Starlette
@@ -18,9 +22,10 @@ from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import JobSpec, QuoteRequest, Status, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import (
@@ -32,22 +37,174 @@ from fleet.bus.protocol.operator import (
     ResetReply,
     ResetRequest,
 )
-from fleet.errors import NAME_RULE, is_name
-from fleet.live.monitor.async_bridge import AsyncBridge, NoReply
-from fleet.live.monitor.event_feed import Entry, EventFeed, ReaderBuffer
+from fleet.errors import NAME_RULE, BusError, FleetError, Refused, is_name, nearest
+from fleet.live.monitor.async_bridge import AsyncBridge, Entry, EventFeed, ReaderBuffer
 from fleet.live.monitor.snapshot import MAX_JOBS
-from scenarios.live.http_access import AccessCheck, Bodies, Problem, Role, check_role, problem_response
 from scenarios.live.http_page import FILES, LivePage, is_public, wants_page
 
+Role = Literal["monitor", "submitter", "operator"]
+ROLES: tuple[Role, ...] = get_args(Role)
+"""Each role may do what the ones before it may."""
+MIN_TOKEN = 16
+MAX_BODIES = 32
+"""Unfinished bodies at a time; one more ends the oldest."""
+RATE_HZ, BURST = 50.0, 100.0
+"""Requests per real second of one token, or without tokens of one address; and how many at once after a pause."""
+MAX_SENDERS = 4096
+"""Tokens and addresses whose rate is kept."""
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
 MAX_BYTES = 60_000
 """Of a body: what the router passes, less the overhead of a message."""
 MAX_READERS, MAX_REQUESTS = 64, 16
 BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
 """Real seconds: for a body to arrive; for a reader to take what was sent; between two heartbeats."""
 Body = TypeVar("Body", bound=msgspec.Struct)
+Asked = TypeVar("Asked", bound=msgspec.Struct)
 Reply = TypeVar("Reply")
 Endpoint = Callable[[Request], Awaitable[Response]]
 NO_TOKENS: Mapping[str, Role] = {}
+
+
+class Problem(Exception):
+    """An HTTP error with a sentence that says what is wrong."""
+
+    def __init__(self, status: HTTPStatus, detail: str) -> None:
+        super().__init__(detail)
+        self.status, self.detail = status, detail
+
+
+def check_token(token: str) -> str:
+    """Return the token.
+
+    Raises:
+        FleetError: it is too short, or has other characters than printable ASCII.
+    """
+    if len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable():
+        raise FleetError(f"A token needs {MIN_TOKEN} or more printable ASCII characters (got {len(token)}).")
+    return token
+
+
+def read_tokens(path: Path) -> dict[str, Role]:
+    """Roles by token, of a file with `ROLE TOKEN` in each line.
+
+    Raises:
+        FleetError: it cannot be read, others may read it, or a line is wrong.
+    """
+    try:
+        if path.stat().st_mode & 0o077:
+            raise FleetError(f"Other users can read the tokens in '{path}'. Run: chmod 600 {path}")
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FleetError(f"Cannot read the tokens in '{path}': {error}.") from error
+    tokens: dict[str, Role] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        name, _, token = line.strip().partition(" ")
+        role: Role | None = next((role for role in ROLES if role == name), None)
+        if role is None:
+            raise FleetError(f"{path}, line {number}: no role '{name}'{nearest(name, ROLES)}")
+        tokens[check_token(token.strip())] = role
+    if not tokens:
+        raise FleetError(f"'{path}' holds no tokens; a line is ROLE TOKEN. Roles: {', '.join(ROLES)}.")
+    return tokens
+
+
+class AccessCheck:
+    """Passes requests that show a token, at a limited rate; without tokens, requests to this machine's local names.
+
+    The name is checked since a page of another site must not reach the gateway under a name of its own. A request that
+    is `public` needs no token.
+    """
+
+    def __init__(
+        self, app: ASGIApp, tokens: Mapping[str, Role], public: Callable[[Scope], bool] = lambda scope: False
+    ) -> None:
+        self.app, self.tokens, self.public = app, {token.encode(): role for token, role in tokens.items()}, public
+        self._senders: dict[bytes, tuple[float, float]] = {}
+        """Requests that each may still send, and the loop's time at which that was counted."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse the request or pass it on, with its role."""
+        refusal = None
+        if scope["type"] == "http":
+            headers = dict(scope["headers"])
+            refusal = None if self.tokens and self.public(scope) else self.refusal(headers)
+            if refusal is None:
+                shown = headers.get(b"authorization", b"")[7:]
+                scope["role"] = self.tokens.get(shown, "monitor" if self.tokens else "operator")
+                sender = shown if shown in self.tokens else str((scope.get("client") or ("",))[0]).encode()
+                refusal = self._too_fast(sender)
+        await (refusal or self.app)(scope, receive, send)
+
+    def refusal(self, headers: dict[bytes, bytes]) -> Response | None:
+        """Error response, None if the request may pass."""
+        if not self.tokens:
+            host = headers.get(b"host", b"").decode("latin-1")
+            name = host if host.endswith("]") else host.rpartition(":")[0] or host
+            if name in LOCAL:
+                return None
+            return problem_response(HTTPStatus.MISDIRECTED_REQUEST, f"This gateway is {LOCAL[0]}, not '{name}'.")
+        shown = headers.get(b"authorization", b"")
+        if shown[:7].lower() == b"bearer " and any([hmac.compare_digest(shown[7:], token) for token in self.tokens]):
+            return None
+        detail = "This gateway needs a token: Authorization: Bearer …."
+        return problem_response(HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
+
+    def _too_fast(self, sender: bytes) -> Response | None:
+        now_s = asyncio.get_running_loop().time()
+        left, counted_s = self._senders.pop(sender, (BURST, now_s))
+        left = min(BURST, left + RATE_HZ * (now_s - counted_s))
+        self._senders[sender] = max(0.0, left - 1.0), now_s
+        if len(self._senders) > MAX_SENDERS:
+            del self._senders[next(iter(self._senders))]
+        if left >= 1.0:
+            return None
+        detail = f"More than {RATE_HZ:g} requests a second."
+        return problem_response(HTTPStatus.TOO_MANY_REQUESTS, detail, {"Retry-After": str(math.ceil(1 / RATE_HZ))})
+
+
+def check_role(request: Request, needed: Role) -> None:
+    """Check the role of a request's token.
+
+    Raises:
+        Problem: it may not do this.
+    """
+    role: Role = request.scope["role"]
+    if ROLES.index(role) < ROLES.index(needed):
+        raise Problem(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")
+
+
+class Bodies:
+    """Limits the time and the number of unfinished bodies: who sends quickly is not held up by those who do not."""
+
+    def __init__(self, body_s: float) -> None:
+        self.body_s = body_s
+        self._unfinished: dict[asyncio.Timeout, None] = {}
+
+    @asynccontextmanager
+    async def reading(self) -> AsyncIterator[None]:
+        """Within it one body is read.
+
+        Raises:
+            TimeoutError: it took too long, or too many newer ones arrived meanwhile.
+        """
+        async with asyncio.timeout(self.body_s) as limit:
+            self._unfinished[limit] = None
+            if len(self._unfinished) > MAX_BODIES:
+                oldest = next(iter(self._unfinished))
+                del self._unfinished[oldest]
+                oldest.reschedule(asyncio.get_running_loop().time())
+            try:
+                yield
+            finally:
+                self._unfinished.pop(limit, None)
+
+
+def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
+    """Problem details, RFC 9457."""
+    fields = {"type": "about:blank", "title": status.phrase, "status": status.value, "detail": detail}
+    return Response(msgspec.json.encode(fields), status.value, headers, media_type="application/problem+json")
 
 
 class AskBody(msgspec.Struct, frozen=True):
@@ -120,32 +277,35 @@ def application(
         jobs = int(text) if text.isdecimal() and len(text) < 5 else MAX_JOBS
         return json_response(await bridge.snapshot(jobs))
 
-    async def post_jobs(request: Request) -> Response:
-        submission = await read_body(request, Submission, bodies)
-        return json_response(await limited(lambda: bridge.submit(submission)))
+    async def ask(key: str, message: msgspec.Struct, kind: type[Asked]) -> Asked:
+        return await limited(lambda: bridge.ask(key, message, kind))
+
+    def of_jobs(topic: keys.JobsTopic, kind: type[Body], reply: type[msgspec.Struct]) -> Endpoint:
+        """Passes the body of a request on to the auctioneer."""
+
+        async def post(request: Request) -> Response:
+            message = await read_body(request, kind, bodies)
+            return json_response(await ask(keys.of_jobs(bridge.fleet, topic), message, reply))
+
+        return post
+
+    submit = of_jobs("submit", Submission, SubmissionReply)
+    control = of_jobs("control", ControlRequest, Controlled)
+    clear = of_jobs("clear", ClearRequest, Cleared)
 
     async def get_jobs(request: Request) -> Response:
         names = tuple(request.query_params.getlist("job"))
-        return json_response(await limited(lambda: bridge.status(StatusRequest(names))))
-
-    async def post_control(request: Request) -> Response:
-        control = await read_body(request, ControlRequest, bodies)
-        return json_response(await limited(lambda: bridge.request("control", control, Controlled)))
-
-    async def post_clear(request: Request) -> Response:
-        clear = await read_body(request, ClearRequest, bodies)
-        return json_response(await limited(lambda: bridge.request("clear", clear, Cleared)))
+        return json_response(await ask(keys.of_jobs(bridge.fleet, "status"), StatusRequest(names), Status))
 
     async def post_reset(request: Request) -> Response:
         body = await read_body(request, ResetBody, bodies)
         if not is_name(body.arm):
             raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
-        return json_response(
-            await limited(lambda: bridge.request_of_arm(body.arm, "reset", ResetRequest(body.by), ResetReply))
-        )
+        key = keys.of_arm(bridge.fleet, body.arm, "reset")
+        return json_response(await ask(key, ResetRequest(body.by), ResetReply))
 
     async def ask_cell() -> Cell:
-        return await limited(lambda: bridge.request("cell", CellRequest(), Cell))
+        return await ask(keys.of_jobs(bridge.fleet, "cell"), CellRequest(), Cell)
 
     async def get_cell(request: Request) -> Response:
         return json_response(await ask_cell())
@@ -154,9 +314,9 @@ def application(
         return json_response(await shown.scene(ask_cell))
 
     async def post_ask(request: Request) -> Response:
-        ask = await read_body(request, AskBody, bodies)
+        body = await read_body(request, AskBody, bodies)
         try:
-            quote_request = decode(QuoteRequest, encode(QuoteRequest("http", ask.jobs, dry_run=True)))
+            quote_request = decode(QuoteRequest, encode(QuoteRequest("http", body.jobs, dry_run=True)))
         except MalformedMessage as error:
             raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
         return json_response(await limited(lambda: bridge.quotes(quote_request)))
@@ -179,18 +339,18 @@ def application(
         ("GET", "/v4/fleet", "monitor", fleet, "State of every arm, jobs and messages, as `thermofleet watch --json`."),
         ("GET", "/v4/events", "monitor", events, "Every message as server-sent events."),
         ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
-        ("POST", "/v4/jobs", "submitter", post_jobs, "Submit jobs: a Submission."),
+        ("POST", "/v4/jobs", "submitter", submit, "Submit jobs: a Submission."),
         ("GET", "/v4/cell", "monitor", get_cell, "Places, arms, kinds of jobs and limits: all that a job may name."),
         ("GET", "/v4/scene", "monitor", get_scene, "Arms, places and colours in three dimensions, as the page draws."),
-        ("POST", "/v4/control", "operator", post_control, "Cancel, settle, change, pause, resume: a ControlRequest."),
-        ("POST", "/v4/clear", "operator", post_clear, "Free the space of an absent arm: a ClearRequest."),
+        ("POST", "/v4/control", "operator", control, "Cancel, settle, change, pause, resume: a ControlRequest."),
+        ("POST", "/v4/clear", "operator", clear, "Free the space of an absent arm: a ClearRequest."),
         ("POST", "/v4/reset", "operator", post_reset, 'Clear the fault of an arm: {"arm": …, "by": …}.'),
         ("POST", "/v4/ask", "submitter", post_ask, 'Quotes without submitting: {"jobs": […]}.'),
     ]
     routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
     if page is not None:
         routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
-    handlers = dict.fromkeys((Problem, NoReply, HTTPException, Exception), error_response)
+    handlers = dict.fromkeys((Problem, BusError, Refused, HTTPException, Exception), error_response)
     access = Middleware(AccessCheck, tokens=tokens, **({"public": is_public} if page is not None else {}))
     return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
 
@@ -291,7 +451,7 @@ def error_response(_: Request, error: Exception) -> Response:
     match error:
         case Problem():
             return problem_response(error.status, error.detail)
-        case NoReply():
+        case BusError() | Refused():
             return problem_response(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
         case HTTPException():
             return problem_response(HTTPStatus(error.status_code), str(error.detail), error.headers)

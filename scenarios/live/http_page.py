@@ -17,7 +17,7 @@ from starlette.types import Scope
 
 from fleet.bus.protocol.cell import Cell
 from fleet.env.render.heat import heat_scale
-from fleet.live.monitor.async_bridge import NoReply
+from fleet.errors import BusError
 from scenarios.report.three import three_js
 
 PAGE = "dashboard.html"
@@ -44,7 +44,7 @@ class LivePage:
         self._cell: Cell | None = None
 
     async def scene(self, ask_cell: Callable[[], Awaitable[Cell]]) -> Mapping[str, Any]:
-        """The cell in three dimensions; raises NoReply if nobody describes it, or with wrong numbers."""
+        """The cell in three dimensions; raises BusError if nobody describes it, or with wrong numbers."""
         if self._given and self._model is not None:
             return self._model
         cell = await ask_cell()
@@ -52,7 +52,7 @@ class LivePage:
             try:
                 self._model = await asyncio.to_thread(_model_of, cell)
             except ValueError as error:
-                raise NoReply(f"The auctioneer describes a cell that cannot be: {error}") from error
+                raise BusError(f"The auctioneer describes a cell that cannot be: {error}") from error
             self._cell = cell
         return self._model
 

@@ -6,7 +6,7 @@ import pytest
 
 from fleet.errors import FleetError
 from scenarios.cli.live.gateway import check
-from scenarios.live.http_access import check_token, read_tokens
+from scenarios.live.http_app import check_token, read_tokens
 
 PLAIN, SECURE = "tcp/127.0.0.1:7447", "tls/127.0.0.1:7447"
 

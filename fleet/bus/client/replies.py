@@ -9,6 +9,7 @@ import msgspec
 
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode_as, encoding
+from fleet.bus.protocol.registry import channel_of
 from fleet.errors import BusError, Refused
 
 Message = TypeVar("Message", bound=msgspec.Struct)
@@ -31,7 +32,9 @@ class NoReply(BusError):
     """Whether a participant received the query and did not reply in time."""
 
     def __str__(self) -> str:
-        return f"Nobody replied to '{self.key}'" + (" in time." if self.late else ".")
+        if self.late:
+            return f"The {replier(self.key)} did not reply in time."
+        return f"There is no {replier(self.key)} in this fleet."
 
 
 @dataclass(eq=False)
@@ -83,6 +86,12 @@ class Replies(Generic[Message]):
     def miss(self, reason: str) -> None:
         """Add an error of Zenoh's own, which does not say whose it is."""
         _add(self.refused, "?", "" if reason == "Timeout" else reason)
+
+
+def replier(key: str) -> str:
+    """Who replies to the queries of a key, for example `auctioneer` or `arm 'arm_0'`."""
+    sender = channel_of(key).sender
+    return f"{sender} '{keys.parse(key).name}'" if sender == "arm" and "*" not in key else sender
 
 
 def read_message(kind: type[Message], key: str, sent_encoding: str, payload: bytes) -> tuple[str, Message]:

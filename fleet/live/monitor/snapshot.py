@@ -1,24 +1,42 @@
 """Snapshot of a fleet: who is present, the last message of each participant and its age, and the state of every job.
 
 `FleetView` takes messages and real time, and has no clock and no I/O. Its memory is bounded, however many names are
-published: the least recent are dropped.
+published: the least recent are dropped. `FleetListener` keeps one up to date from the bus, without taking part in the
+fleet.
 """
 
+import logging
 import math
-from collections import Counter
-from collections.abc import Container, Sequence
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import repeat
 from typing import Literal, TypeVar
 
 import msgspec
 
-from fleet.bus.protocol import auction
-from fleet.bus.protocol.auction import Announcement, ArmEvent, JobStatus, Result, Status
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.replies import Replies
+from fleet.bus.protocol import auction, keys
+from fleet.bus.protocol.auction import (
+    Announcement,
+    ArmEvent,
+    Clock,
+    ClockRequest,
+    JobStatus,
+    Result,
+    Status,
+    StatusRequest,
+)
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
 from fleet.bus.protocol.operator import ALL_ARMS, ControlRequest, Operation, Pause, Resume
-from fleet.live.monitor.recent import Recent
+from fleet.bus.protocol.registry import PUBLISHED
+from fleet.errors import BusError
 from fleet.telemetry import Mode
+
+_LOG = logging.getLogger(__name__)
 
 FRESH_S = 3.0
 """Real seconds: an arm is present when it shows its token and its last state is no older than this."""
@@ -26,8 +44,31 @@ MAX_NAMES, MAX_JOBS = 1024, 4096
 COMPLETE_BYTES = 32_000
 """A status reply that is smaller, and has fewer jobs than one message may have, names all jobs."""
 
+STATUS_EVERY_S = 5.0
+"""Real seconds between two requests of the clock and of all jobs, whose results may be older than the listener."""
+
 Role = Literal["arm", "auction"]
 Message = TypeVar("Message", bound=msgspec.Struct)
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+OnMessage = Callable[[str, str, msgspec.Struct], None]
+"""Called with the topic, the name in the key, and the message."""
+OnPresence = Callable[[Role, str, bool], None]
+"""Called with the role and name of a participant, and whether it is present."""
+
+
+class Recent(OrderedDict[Key, Value]):
+    """Keeps the keys that were set last, at most `most` of them, in the order of their last setting."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self._most = most
+
+    def __setitem__(self, key: Key, value: Value) -> None:
+        super().__setitem__(key, value)
+        self.move_to_end(key)
+        if len(self) > self._most:
+            self.popitem(last=False)
 
 
 class JobScore(msgspec.Struct, frozen=True):
@@ -229,6 +270,69 @@ class FleetView:
         if job is None or job.status != status:
             job = self._jobs[status.job] = _Job(status, now_s)
         job.heard_s, job.number = now_s, max(last, number or 0)
+
+
+class FleetListener:
+    """`FleetListener(link).serve(until_s)` in a loop keeps `view` up to date.
+
+    Attributes:
+        view: The fleet as its messages show it.
+    """
+
+    def __init__(
+        self,
+        link: BusClient,
+        *,
+        on_message: OnMessage = lambda topic, name, message: None,
+        on_presence: OnPresence = lambda role, name, present: None,
+    ) -> None:
+        """Subscribe to all that is published in the fleet; `link` is open.
+
+        Args:
+            on_message: Called after `view` was updated.
+        """
+        self.view = FleetView(link.fleet)
+        self._link, self._on_message, self._on_presence = link, on_message, on_presence
+        self._status_due_s = time.monotonic()
+        for channel, message in PUBLISHED.items():
+            one = str(keys.Key(link.fleet, channel.role, "x", channel.topic))
+            everyone = one.replace(f"/{channel.role}/x/", f"/{channel.role}/*/")
+            link.subscribe(everyone, message, partial(self._message, channel.topic), history=True)
+        link.watch_tokens(keys.of_every_arm(link.fleet, "alive"), partial(self._token, "arm"))
+        link.watch_tokens(keys.of_every_auction(link.fleet, "alive"), partial(self._token, "auction"))
+
+    def serve(self, until_s: float) -> None:
+        """Handle messages until the real second `until_s`; request the fleet's clock and all jobs when that is due."""
+        asked_s = time.monotonic()
+        if asked_s >= self._status_due_s:
+            self._status_due_s = asked_s + STATUS_EVERY_S
+            fleet, done = self._link.fleet, partial(self._statuses, asked_s)
+            try:
+                self._link.query(keys.of_clock(fleet), ClockRequest(), Clock, self._clocks, timeout_s=STATUS_EVERY_S)
+                self._link.query(keys.of_jobs(fleet, "status"), StatusRequest(), Status, done, timeout_s=STATUS_EVERY_S)
+            except BusError as error:
+                _LOG.warning("%s", error)
+        while time.monotonic() < until_s:
+            self._link.serve(until_s)
+
+    def _message(self, topic: str, name: str, message: msgspec.Struct) -> None:
+        self.view.update(name, message, time.monotonic())
+        self._on_message(topic, name, message)
+
+    def _token(self, role: Role, name: str, present: bool) -> None:
+        if self.view.set_token(role, name, present):
+            self._on_presence(role, name, present)
+
+    def _clocks(self, answers: Replies[Clock]) -> None:
+        for reply in answers.messages.values():
+            self.view.speed = reply.speed
+
+    def _statuses(self, asked_s: float, answers: Replies[Status]) -> None:
+        replies = list(answers.messages.values())
+        for reply in replies:
+            self.view.update_jobs(reply, time.monotonic())
+        if not answers.refused:
+            self.view.forget_other_jobs(replies, asked_s)
 
 
 def describe_event(event: ArmEvent) -> str:

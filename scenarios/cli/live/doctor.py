@@ -17,8 +17,7 @@ from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.security.tls import identified, why_not
 from fleet.errors import BusError
 from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
-from fleet.live.monitor.listener import FleetListener
-from fleet.live.monitor.snapshot import FleetSnapshot
+from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number
 from scenarios.cli.terminal import echo, out_console, say
 from scenarios.live.watch_screen import arm_table, format_time, jobs_line, space_line

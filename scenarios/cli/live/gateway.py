@@ -23,8 +23,7 @@ from fleet.live.monitor.async_bridge import AsyncBridge
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import Interrupted, echo
-from scenarios.live.http_access import MIN_TOKEN, ROLES, Role, check_token, read_tokens
-from scenarios.live.http_app import STUCK_S, Readers, application
+from scenarios.live.http_app import MIN_TOKEN, ROLES, STUCK_S, Readers, Role, application, check_token, read_tokens
 from scenarios.live.http_page import LivePage
 from scenarios.load import load
 from scenarios.report.three import three_js

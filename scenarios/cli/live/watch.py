@@ -18,8 +18,7 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.client.discover import fleets_at
 from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
 from fleet.errors import NoRouter
-from fleet.live.monitor.listener import FleetListener
-from fleet.live.monitor.snapshot import FleetSnapshot, describe_status
+from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot, describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, err_console, out_console, say

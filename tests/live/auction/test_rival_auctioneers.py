@@ -11,7 +11,7 @@ from fleet.bus.protocol.auction import Clock, ClockRequest, Status, StatusReques
 from fleet.errors import BusError, Refused
 from fleet.live.auction import node as auction_node
 from fleet.live.auction.node import AuctionNode
-from fleet.live.monitor.listener import FleetListener
+from fleet.live.monitor.snapshot import FleetListener
 
 PATIENCE_S = 15.0
 

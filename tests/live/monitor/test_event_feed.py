@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.live.monitor.event_feed import HISTORY, MAX_WAITING, NEWEST_ONLY, EventFeed, ReaderBuffer
+from fleet.live.monitor.async_bridge import HISTORY, MAX_WAITING, NEWEST_ONLY, EventFeed, ReaderBuffer
 
 
 @given(

@@ -6,8 +6,8 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, StatusRequest
-from fleet.live.monitor import listener as listener_module
-from fleet.live.monitor.listener import FleetListener
+from fleet.live.monitor import snapshot as listener_module
+from fleet.live.monitor.snapshot import FleetListener
 from tests.live.monitor.messages import stands
 from tests.waiting import serve_until, wait_until
 
