@@ -4,20 +4,20 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import msgspec
 
+from fleet.bus.client.client import BusClient
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Lease, LeaseRequest, Receipt, Report
 from fleet.bus.protocol.history import HistoryRequest
 from fleet.errors import BusError
+from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.clock_sync import REPLY_S, ClockSync
 from fleet.live.arm.journal_records import ArmHistory
-
-if TYPE_CHECKING:
-    from fleet.live.arm.node import ArmNode
+from fleet.live.clock import FleetClock
 
 _LOG = logging.getLogger(__name__)
 
@@ -61,13 +61,25 @@ class RateLimitedWarnings:
             _LOG.warning("Arm '%s' %s", self._arm, sentence)
 
 
+class WorkingArm(Protocol):
+    """What a work source needs of its arm."""
+
+    link: BusClient
+    executor: AwardExecutor
+    clock: FleetClock
+
+    def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
+        """Use another clock; with `jump` it reads another time now."""
+        ...
+
+
 class AuctioneerClient:
     """Work source: any auctioneer that awards a job. Fleet time is that of the auctioneer."""
 
     objection = ""
     wake_s = math.inf
 
-    def __init__(self, arm: "ArmNode", history: ArmHistory | None = None) -> None:
+    def __init__(self, arm: WorkingArm, history: ArmHistory | None = None) -> None:
         """Start.
 
         Args:
