@@ -9,10 +9,10 @@ from types import MappingProxyType
 from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol import messages
 from fleet.bus.protocol.auction import MOST_JOBS, ArmEvent
+from fleet.bus.protocol.contract import Schema, descriptions, schemas
 from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.protocol.registry import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, Channel, MessageType
-from fleet.bus.protocol.schemas import Schema, descriptions, schemas
 from fleet.engine.reward import RewardWeights
 from fleet.errors import FleetError
 from fleet.events import MEANINGS

@@ -31,8 +31,7 @@ def contract_command(
 
 def documents(out: Path) -> dict[Path, str]:
     """Text of every document by path, including the pages that are in the folder above."""
-    from fleet.bus.protocol.asyncapi import asyncapi
-    from fleet.bus.protocol.schemas import schema_document
+    from fleet.bus.protocol.contract import asyncapi, schema_document
     from scenarios.doc_tables import MARK, fill_tables
     from scenarios.leaderboard.board import benchmark_tables
     from scenarios.studies.page_tables.ablations import ablation_tables
