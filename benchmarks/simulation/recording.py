@@ -26,8 +26,7 @@ from fleet.bus.protocol.operator import Operation
 from fleet.events import EVENTS_PER_BOOT
 from fleet.live.journal import Journal
 from scenarios.live import recorder as recorder_module
-from scenarios.live.recorder import Recorder
-from scenarios.live.recorder_node import RecorderNode
+from scenarios.live.recorder import Recorder, RecorderNode
 from scenarios.live.recording import Kind, read_card, read_parts
 
 RECORDER = "recorder"

@@ -13,8 +13,7 @@ from fleet.live.auction.ledger_view import LedgerView
 from fleet.live.auction.records import Operated
 from fleet.live.journal import Journal
 from scenarios.live import recorder as recorder_module
-from scenarios.live.gap_fetcher import GapFetcher
-from scenarios.live.recorder import Recorder
+from scenarios.live.recorder import GapFetcher, Recorder
 from scenarios.live.recording import PartOpened
 
 

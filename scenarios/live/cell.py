@@ -1,16 +1,20 @@
-"""The cell of a scenario as a message: places, arms, kinds of jobs and limits."""
+"""The cell of a scenario on the bus: its description as a message and back as a model, and the space of its plans."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any  # plain values of JSON
 
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS
-from fleet.bus.protocol.cell import Cell, CellArm, CellFixture, CellKind, CellPlace, Limit, PlannedWork
+from fleet.bus.protocol.cell import Cell, CellArm, CellFixture, CellKind, CellPlace, Limit, PlannedWork, Point
 from fleet.bus.protocol.messages import encode
 from fleet.files import cache_folder
-from fleet.job import BOUNDS, Work
+from fleet.job import BOUNDS, Fixture, Place, Work
+from fleet.live.space import CellSpace
 from fleet.motion import Plan
-from fleet.robot import RATING, Robot
+from fleet.planning.space import arms_in_reach, space_name
+from fleet.robot import RATING, Mount, Robot
 from scenarios.job_stream import all_works
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
@@ -52,6 +56,52 @@ def cell_message(scenario: Scenario, auctioneer: str, *, cache: Path | None = No
     return cell
 
 
+def described_model(cell: Cell, arms: Sequence[str]) -> dict[str, Any]:
+    """The model of a described cell, with some of its arms in this order.
+
+    Raises:
+        ValueError: it describes a cell that cannot be, or not all of these arms.
+    """
+    from fleet.physics.cell_model import cell_model  # loads MuJoCo
+
+    mounts = {arm.name: Mount(position_m=_xyz(arm.position_m), tilt_deg=_xyz(arm.tilt_deg)) for arm in cell.arms}
+    if missing := [arm for arm in arms if arm not in mounts]:
+        raise ValueError(f"The cell has no arm '{missing[0]}'; it has {', '.join(mounts) or 'none'}.")
+    robots = [Robot(name=f"arm_{i}", mount=mounts[arm]) for i, arm in enumerate(arms)]
+    model = cell_model(
+        robots,
+        [Place(name=p.name, position_m=_xyz(p.position_m), tool_deg=_xyz(p.tool_deg)) for p in cell.places],
+        [
+            Fixture(name=f.name, position_m=_xyz(f.position_m), size_m=_xyz(f.size_m), tilt_deg=_xyz(f.tilt_deg))
+            for f in cell.fixtures
+        ],
+    )
+    for shown, arm in zip(model["arms"], arms, strict=True):
+        shown["name"] = arm  # any name of the bus, not only one of a scenario
+    return model
+
+
+def cell_space(scenario: Scenario, *, cache: Path | None = None, progress: Progress = quiet) -> CellSpace:
+    """Compute the space of all plans of a scenario; plans and space are cached.
+
+    A plan for other work, which outsiders submitted, is not in it: it excludes all plans of arms within reach.
+    """
+    from scenarios.prepare.fleet import space_of  # loads the planner
+    from scenarios.prepare.planned_arm import plan_arms
+
+    folder = cache or cache_folder()
+    robots = [arm.robot() for arm in scenario.arms]
+    planned = plan_arms(scenario, range(len(robots)), all_works(scenario), folder, progress)
+    plans = [plan for arm in planned for plan in arm.all_plans]
+    table = space_of(scenario, robots, plans, folder, progress)
+    return CellSpace(
+        volume={space_name(key): volume for key, volume in table.volume.items()},
+        conflicts=table.conflicts,
+        reach=arms_in_reach(robots, scenario.clearance_m),
+        arms=frozenset(robot.name for robot in robots),
+    )
+
+
 def _arm(robot: Robot, works: tuple[PlannedWork, ...]) -> CellArm:
     own_kg = float("inf") if robot.payload_limit_kg is None else robot.payload_limit_kg
     near_kg, far_kg = (max(0.0, min(own_kg, kg - robot.tool_kg)) for kg in (RATING.mid_range_kg, RATING.full_reach_kg))
@@ -63,3 +113,8 @@ def _work(work: Work, plans: tuple[Plan, ...]) -> PlannedWork:
     places = tuple(place.name for place in work.places)
     cycle_s = min((plan.cycle.duration_s for plan in plans), default=None)
     return PlannedWork(work.kind, places, work.payload_kg, len(plans), cycle_s, work.dwell_s, work.force_n)
+
+
+def _xyz(point: Point) -> tuple[float, float, float]:
+    x, y, z = point
+    return x, y, z

@@ -85,6 +85,6 @@ def is_public(scope: Scope) -> bool:
 
 
 def _model_of(cell: Cell) -> Mapping[str, Any]:
-    from scenarios.live.described_cell import described_model  # loads MuJoCo
+    from scenarios.live.cell import described_model  # loads MuJoCo
 
     return {**described_model(cell, [arm.name for arm in cell.arms]), "heat": heat_scale(cell.warning_c, cell.error_c)}

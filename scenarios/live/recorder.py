@@ -2,14 +2,17 @@
 
 A message goes to the append-only journal first (`save`), later to Parquet parts (`write`). The card names the last
 complete part, so a crash at any moment loses no row and doubles none. Every sender numbers its messages: repeated ones
-are dropped, missing ones are sought in the caches of the publishers (`scenarios.live.gap_fetcher`), and those that
-cannot be had become a row of `gaps`.
+are dropped, missing ones are sought in the caches of the publishers (`GapFetcher`), and those that cannot be had become
+a row of `gaps`.
 """
 
 import logging
+import math
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,12 +20,15 @@ import msgspec
 import pyarrow.parquet as pq
 from msgspec import structs
 
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.replies import Replies
+from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
-from fleet.bus.protocol.cell import Cell
+from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Operation
 from fleet.bus.protocol.registry import HISTORY
-from fleet.errors import FleetError, JournalError
+from fleet.errors import BusError, FleetError, JournalError
 from fleet.events import EVENTS_PER_BOOT
 from fleet.files import atomic_path
 from fleet.live.journal import Journal
@@ -31,6 +37,7 @@ from scenarios.live.recording import (
     JOURNAL,
     KINDS,
     RECORDING_FORMAT,
+    SOURCES,
     Card,
     Count,
     Gap,
@@ -53,6 +60,20 @@ MAX_ROWS = 50_000
 """Rows in memory at which a part is written before it is due."""
 MAX_WAITING = 4 * MAX_ROWS
 """Rows in memory while the disk takes none; further messages are not taken, and sought when it does."""
+FETCH_S, PAUSE_S = 2.0, 3.0
+"""Real seconds: how long the caches have to reply; between two attempts."""
+ATTEMPTS = 4
+"""Attempts before the messages count as lost."""
+MAX_KEYS = 64
+"""Senders asked in one attempt."""
+SWEEP_S, SWEEP_KEYS = 60.0, 8
+"""Real seconds between two sweeps, and senders asked in one, by turns: a cache may hold a thousand messages."""
+TURN_S, BATCH = 0.5, 1000
+"""Real seconds, and messages, after which received messages are written to the disk."""
+CELL_S, CELL_REPLY_S = 30.0, 5.0
+"""Real seconds between two questions about the cell, until one is answered; in which a reply counts."""
+RETRY_S = 5.0
+"""Real seconds until the next attempt to write a part to a disk that refused."""
 
 
 @dataclass(frozen=True)
@@ -288,3 +309,137 @@ class Recorder:
                 os.close(folder)
         except OSError as error:
             raise FleetError(f"Cannot write '{path}': {error.strerror or error}.") from error
+
+
+class GapFetcher:
+    """Fetches what a recorder misses from the caches of the publishers: call `step` often.
+
+    An advanced subscriber asks a cache once when it detects a gap. If the router or the publisher is away at that
+    moment, the messages stay missing. So a second session subscribes to the same keys with history, which sends the
+    whole cache. Where no gap is known it does the same from time to time: a sender's last message may be missing.
+
+    Args:
+        connect: Makes a client of the fleet, which is not open yet.
+    """
+
+    def __init__(self, recorder: Recorder, connect: Callable[[], BusClient]) -> None:
+        self._recorder, self._connect = recorder, connect
+        self._link: BusClient | None = None
+        self._asked: tuple[str, ...] = ()
+        self._tries: Counter[str] = Counter()
+        self._due_s = self._swept_s = 0.0
+        self._swept = 0
+
+    def step(self, real_s: float) -> None:
+        """Handle replies; begin or end an attempt if it is due."""
+        if self._link is not None:
+            self._link.serve()
+        if real_s < self._due_s:
+            return
+        if self._link is not None:
+            self.close()
+            self._count()
+            self._due_s = real_s + PAUSE_S
+        elif senders := tuple(dict.fromkeys(gap.sender for gap in self._recorder.sought))[:MAX_KEYS]:
+            self._due_s = real_s + FETCH_S
+            self._begin(senders)
+        elif real_s >= self._swept_s + SWEEP_S:
+            self._due_s, self._swept_s = real_s + FETCH_S, real_s
+            self._begin(self._next_senders())
+
+    def close(self) -> None:
+        """End the attempt."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    def _next_senders(self) -> tuple[str, ...]:
+        """Return the senders of the next sweep: those of results and operations, which are few, first."""
+        known = sorted({name.partition(", epoch")[0] for name in self._recorder.counts} - {""}, reverse=True)
+        central = [name for name in known if name.startswith(("results", "operations"))][:SWEEP_KEYS]
+        arms = [name for name in known if name.startswith("events")]
+        start, self._swept = self._swept % max(1, len(arms)), self._swept + SWEEP_KEYS
+        return (*central, *dict.fromkeys((arms[start:] + arms)[:SWEEP_KEYS]))
+
+    def _begin(self, senders: tuple[str, ...]) -> None:
+        link = self._connect()
+        try:
+            link.open()
+        except BusError:  # no router: the next attempt is due soon, and this one does not count
+            return
+        self._link, self._asked = link, senders
+        for sender in senders:
+            label, _, name = sender.partition(" of ")
+            role, topic, kind = SOURCES[label]
+            link.subscribe(str(keys.Key(link.fleet, role, name, topic)), kind, self._recorder.add, history=True)
+
+    def _count(self) -> None:
+        """Give up the gaps of senders that were asked often enough."""
+        missing = {gap.sender for gap in self._recorder.sought}
+        self._tries = Counter({sender: self._tries[sender] + (sender in self._asked) for sender in missing})
+        for gap in list(self._recorder.sought):
+            if self._tries[gap.sender] >= ATTEMPTS:
+                self._recorder.give_up(gap, f"not in the cache of its publisher, asked {ATTEMPTS} times")
+        self._tries = Counter({sender: count for sender, count in self._tries.items() if count < ATTEMPTS})
+
+
+class RecorderNode:
+    """Records what a fleet publishes: call `serve` until the end, then `end`."""
+
+    def __init__(
+        self, link: BusClient, recorder: Recorder, connect: Callable[[], BusClient], *, rotate_s: float
+    ) -> None:
+        """Subscribe.
+
+        Args:
+            link: Open client of the bus.
+            connect: Makes another client of the fleet, not open yet, which fetches missed messages.
+            rotate_s: Real seconds between two Parquet parts; rows are in the journal before.
+        """
+        self._link, self.recorder, self._rotate_s = link, recorder, rotate_s
+        self._fetcher = GapFetcher(recorder, connect)
+        self._due_s, self._failure = time.monotonic() + rotate_s, ""
+        self._ask_cell_s = -math.inf
+        for role, topic, kind in SOURCES.values():
+            link.subscribe(keys.of_every(link.fleet, role, topic), kind, recorder.add, history=True)
+
+    def serve(self, until_s: float = math.inf) -> None:
+        """Handle messages for a turn, and do what is due; a disk that refuses is tried again later."""
+        self._link.serve(min(until_s, time.monotonic() + TURN_S), at_least=BATCH)
+        self._fetcher.step(real_s := time.monotonic())
+        if self.recorder.cell is None and real_s >= self._ask_cell_s:
+            self._ask_cell_s = real_s + CELL_S
+            key = keys.of_jobs(self._link.fleet, "cell")
+            with suppress(BusError):  # also with a certificate that does not allow it, the rest is recorded
+                self._link.query(key, CellRequest(), Cell, self._keep_cell, timeout_s=CELL_REPLY_S)
+        try:
+            if real_s >= self._due_s or (self.recorder.waiting >= MAX_ROWS and not self._failure):
+                self._due_s = real_s + self._rotate_s
+                self.recorder.write()
+            self.recorder.save()
+            self._failure = ""
+        except FleetError as error:
+            if not self._failure:
+                _LOG.error("Not recorded yet: %s", error)
+            self._failure, self._due_s = str(error), min(self._due_s, real_s + RETRY_S)
+
+    def _keep_cell(self, replies: Replies[Cell]) -> None:
+        """Keep the description of the cell without the work of its arms; the next part puts it on the disk."""
+        for cell in replies.messages.values():
+            self.recorder.cell = structs.replace(cell, arms=tuple(structs.replace(arm, works=()) for arm in cell.arms))
+            self._due_s = -math.inf
+            return
+
+    def end(self) -> None:
+        """Write everything that has arrived, and end the recording.
+
+        Raises:
+            FleetError: the disk refuses.
+        """
+        self.close()
+        self._link.serve()
+        self.recorder.write(status="finished")
+
+    def close(self) -> None:
+        """Close the client that fetches."""
+        self._fetcher.close()

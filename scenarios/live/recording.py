@@ -8,7 +8,7 @@ a part yet is in `open.journal`. A row of `gaps` says which messages of a sender
 import math
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import inspect, structs
 
+from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.messages import State
@@ -30,6 +31,13 @@ Message = State | ArmEvent | Result | Operation
 Kind = Literal["telemetry", "events", "results", "operations", "gaps"]
 MESSAGES: tuple[Kind, ...] = ("telemetry", "events", "results", "operations")
 KINDS: tuple[Kind, ...] = (*MESSAGES, "gaps")
+SOURCES: Mapping[str, tuple[keys.Role, str, type[Message]]] = {
+    "state": ("arm", "state", State),
+    "events": ("arm", "event", ArmEvent),
+    "results": ("auction", "result", Result),
+    "operations": ("auction", "operation", Operation),
+}
+"""Keys that are recorded, and what is published there, by the name of the series in the card."""
 RECORDING_FORMAT = 6
 CARD, JOURNAL = "recording.json", "open.journal"
 SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c")

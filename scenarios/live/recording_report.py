@@ -28,7 +28,7 @@ from fleet.heat.tool_drift import most_drift_m, segment_temperatures
 from fleet.physics.cell_model import cell_model
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
-from scenarios.live.described_cell import described_model
+from scenarios.live.cell import described_model
 from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
 from scenarios.report.gantt import clock
 from scenarios.report.run_page import report_html

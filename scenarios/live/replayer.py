@@ -16,7 +16,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import FleetError
-from scenarios.live.recording import CARD, MESSAGES, Message, read_card, read_parts, states
+from scenarios.live.recording import CARD, MESSAGES, SOURCES, Message, read_card, read_parts, states
 from scenarios.run.run_folder import check_format
 
 TURN_S, TOKENS_S = 0.2, 2.0
@@ -106,10 +106,13 @@ class Replay:
         return count
 
 
+_ADDRESSES = {kind: (role, topic) for role, topic, kind in SOURCES.values()}
+
+
 def _key(fleet: str, message: Message) -> str:
-    if isinstance(message, Result | Operation):
-        return keys.of_auction(fleet, message.auctioneer, "result" if isinstance(message, Result) else "operation")
-    return keys.of_arm(fleet, message.arm, "event" if isinstance(message, ArmEvent) else "state")
+    role, topic = _ADDRESSES[type(message)]
+    name = message.auctioneer if isinstance(message, Result | Operation) else message.arm
+    return str(keys.Key(fleet, role, name, topic))
 
 
 def _events(table: pa.Table) -> Iterator[ArmEvent]:

@@ -86,9 +86,14 @@ def of_arm(fleet: str, arm: str, topic: ArmTopic) -> str:
     return str(Key(fleet, "arm", arm, topic))
 
 
+def of_every(fleet: str, role: Role, topic: str) -> str:
+    """Key expression that matches a topic of every participant of a role in one fleet; not for publications."""
+    return str(Key(fleet, role, "x", topic)).replace(f"/{role}/x/", f"/{role}/*/")
+
+
 def of_every_arm(fleet: str, topic: ArmTopic) -> str:
     """Key expression that matches the topic of every arm of one fleet; for subscribers and queries alone."""
-    return of_arm(fleet, "x", topic).replace("/arm/x/", "/arm/*/")
+    return of_every(fleet, "arm", topic)
 
 
 def of_auction(fleet: str, auctioneer: str, topic: AuctionTopic) -> str:
@@ -98,7 +103,7 @@ def of_auction(fleet: str, auctioneer: str, topic: AuctionTopic) -> str:
 
 def of_every_auction(fleet: str, topic: AuctionTopic) -> str:
     """Key expression that matches the topic of every auctioneer of one fleet; not for publications."""
-    return of_auction(fleet, "x", topic).replace("/auction/x/", "/auction/*/")
+    return of_every(fleet, "auction", topic)
 
 
 def asked_by(fleet: str, asked: str, topic: AskedTopic, arm: str) -> str:
@@ -150,7 +155,7 @@ def of_policy(fleet: str, policy: str) -> str:
 
 def of_every_policy(fleet: str) -> str:
     """Key expression that matches every policy of one fleet; for router rules."""
-    return of_policy(fleet, "x").replace("/policy/x/", "/policy/*/")
+    return of_every(fleet, "policy", "act")
 
 
 def all_of_fleet(fleet: str) -> str:

@@ -295,9 +295,8 @@ class FleetListener:
         self._link, self._on_message, self._on_presence = link, on_message, on_presence
         self._status_due_s = time.monotonic()
         for channel, message in PUBLISHED.items():
-            one = str(keys.Key(link.fleet, channel.role, "x", channel.topic))
-            everyone = one.replace(f"/{channel.role}/x/", f"/{channel.role}/*/")
-            link.subscribe(everyone, message, partial(self._message, channel.topic), history=True)
+            expression = keys.of_every(link.fleet, channel.role, channel.topic)
+            link.subscribe(expression, message, partial(self._message, channel.topic), history=True)
         link.watch_tokens(keys.of_every_arm(link.fleet, "alive"), partial(self._token, "arm"))
         link.watch_tokens(keys.of_every_auction(link.fleet, "alive"), partial(self._token, "auction"))
 

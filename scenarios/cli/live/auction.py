@@ -34,8 +34,7 @@ from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, progress_bar
 from scenarios.job_stream import draw_jobs
 from scenarios.live.allocation import ON_BUS_S, central_allocation
-from scenarios.live.cell import cell_message
-from scenarios.live.space import cell_space
+from scenarios.live.cell import cell_message, cell_space
 from scenarios.load import load
 from scenarios.policy_loader import OnBus
 from scenarios.schema import Scenario

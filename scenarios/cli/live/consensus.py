@@ -19,8 +19,7 @@ from scenarios.cli.live.auction import own_jobs, summary
 from scenarios.cli.signals import Stop
 from scenarios.cli.terminal import echo
 from scenarios.live.allocation import live_fleet
-from scenarios.live.cell import cell_message
-from scenarios.live.space import cell_space
+from scenarios.live.cell import cell_message, cell_space
 from scenarios.policy_loader import arm_policy_of
 from scenarios.schema import Scenario
 

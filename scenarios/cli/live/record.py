@@ -16,8 +16,7 @@ from scenarios.cli.live.options import MAX_SPEED
 from scenarios.cli.options import ENDPOINT, EndpointOption, check_name, number
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import echo, out_console, say
-from scenarios.live.recorder import Recorder
-from scenarios.live.recorder_node import RecorderNode
+from scenarios.live.recorder import Recorder, RecorderNode
 from scenarios.live.replayer import Replay
 from scenarios.result_folder import disk_errors
 
