@@ -1,27 +1,47 @@
-"""Publishes the arms of a fleet in ROS 2: joint states as they arrive, diagnostics once a second.
+"""The arms of a fleet in ROS 2, and a real arm with a ROS 2 driver in a fleet.
 
-It only listens to the fleet, and its memory is bounded, however many names are published.
+`Bridge` publishes joint states as they arrive, and diagnostics once a second; it only listens to the fleet, and its
+memory is bounded, however many names are published. `Follower` publishes the state of a real arm, which takes no jobs;
+`ArmReadings` holds the arm's last readings (messages and time in, states out).
 """
 
 import logging
+import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.bus.protocol.auction import Ack, Award, JobEstimate, Quote, QuoteRequest
+from fleet.bus.protocol.messages import DifficultyScores, Info, MalformedMessage, State
+from fleet.errors import BusError, Refused
+from fleet.live.arm.auctioneer_client import WARNING_S, RateLimitedWarnings
+from fleet.live.arm.clock_sync import ClockSync
+from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import Recent
 from fleet.robot import ThermalLimits
-from fleet.ros2.cdr import DIAGNOSTICS, JOINT_STATE, type_hash, write_diagnostics, write_joints
-from fleet.ros2.conversion import diagnostics_of, joints_of
-from fleet.ros2.node import Node, Publisher
-from fleet.ros2.topics import NO_HASH, Topic, plain_name
+from fleet.ros2.cdr import (
+    DIAGNOSTICS,
+    JOINT_STATE,
+    read_diagnostics,
+    read_joints,
+    type_hash,
+    write_diagnostics,
+    write_joints,
+)
+from fleet.ros2.conversion import Joints, diagnostics_of, in_order, joints_of, plain_name, temperatures
+from fleet.ros2.node import NO_HASH, Node, Publisher, Topic
 
 _LOG = logging.getLogger(__name__)
 
 EVERY_S, STALE_S, GONE_S = 1.0, 3.0, 10.0
 """Real seconds: between two diagnostics; without a state until an arm is stale; until it is dropped."""
 MAX_ARMS = 1024
+FRESH_S, WARM_S = 2.0, 10.0
+"""Real seconds for which joint states and temperatures are valid."""
+MOVING_RAD_S = 0.01
+"""The arm is working when a joint is faster than this."""
 
 
 @dataclass(eq=False)
@@ -125,3 +145,168 @@ class Bridge:
 
     def _topic(self, name: str, kind: str) -> Topic:
         return Topic(name, kind, NO_HASH if self._humble else type_hash(kind), self._node.domain)
+
+
+class ArmReadings:
+    """Last readings of one real arm.
+
+    Args:
+        names: Names of its joints in ROS 2, from joint 1 on.
+        hardware: Text before them in the `hardware_id` of its diagnostics.
+    """
+
+    def __init__(self, names: tuple[str, ...], hardware: str = "") -> None:
+        self.names, self.hardware = names, hardware
+        self._joints: Joints | None = None
+        self._joints_s = -math.inf
+        self._moving = False
+        self._temp: dict[str, tuple[float, float]] = {}
+        """°C and the real second of its reading, by joint."""
+
+    def update_joints(self, joints: Joints, real_s: float) -> None:
+        """Apply a JointState; one of other joints only is ignored.
+
+        Raises:
+            MalformedMessage: it is no reading of this arm.
+        """
+        now = in_order(joints, self.names)
+        if now is not None:
+            self._moving = _fastest(now, self._joints) > MOVING_RAD_S
+            self._joints, self._joints_s = now, real_s
+
+    def update_temperatures(self, temp_c: Mapping[str, float], real_s: float) -> None:
+        """Apply temperatures, °C by joint."""
+        self._temp.update({name: (value, real_s) for name, value in temp_c.items()})
+
+    def missing(self, real_s: float) -> str:
+        """Readings that are missing or too old for a state; "" for none."""
+        if real_s - self._joints_s > FRESH_S:
+            return "no joint state"
+        old = [name for name in self.names if real_s - self._temp.get(name, (0.0, -math.inf))[1] > WARM_S]
+        return f"no temperature of {', '.join(old)}" if old else ""
+
+    def state(self, arm: str, tick: int, time_s: float, real_s: float, warning_c: float) -> State | None:
+        """State of the arm now; None while a reading is missing."""
+        if self._joints is None or self.missing(real_s):
+            return None
+        temp_c = tuple(self._temp[name][0] for name in self.names)
+        q, qd, tau = self._joints.q, self._joints.qd, self._joints.tau
+        mode = "working" if self._moving else "idle"
+        return State(arm, tick, time_s, mode, temp_c, warning_c - max(temp_c), q=q, qd=qd, tau=tau)
+
+
+def _fastest(now: Joints, before: Joints | None) -> float:
+    """Speed of the fastest joint, rad/s; from two positions where no velocity is measured."""
+    if now.qd:
+        return max(map(abs, now.qd))
+    if before is None or not now.q or not before.q or now.time_s <= before.time_s:
+        return 0.0
+    return max(abs(a - b) for a, b in zip(now.q, before.q, strict=True)) / (now.time_s - before.time_s)
+
+
+class Follower:
+    """`Follower(...).serve(until_s)` in a loop; link and node are open.
+
+    Args:
+        arm: Its name in the fleet.
+        topics: Topics of its joint states, and of the diagnostics with its motor temperatures.
+        clock: Fleet time, at a speed of 1.
+    """
+
+    def __init__(
+        self,
+        link: BusClient,
+        node: Node,
+        arm: str,
+        readings: ArmReadings,
+        topics: tuple[str, str],
+        clock: FleetClock,
+        *,
+        limits: ThermalLimits | None = None,
+        rate_hz: float = 10.0,
+    ) -> None:
+        self._link, self._arm, self._readings, self._clock = link, arm, readings, clock
+        self._warning_c = (limits or ThermalLimits()).warning_c
+        self._period_s, self._tick, self._due_s = 1.0 / rate_hz, 0, time.monotonic()
+        self._warn, self._warn_from_s = RateLimitedWarnings(arm), time.monotonic() + WARNING_S
+        self._sync = ClockSync(link, lambda: self._clock, self._set_clock, self._warn)
+        self._twin = f"ros2 {topics[0]}"
+        self._refusal = f"this arm is a real one that publishes under {topics[0]}, and takes no work"
+        self.malformed = 0
+        self._publish_state = link.publisher(keys.of_arm(link.fleet, arm, "state"), State)
+        self._publish_info = link.publisher(keys.of_arm(link.fleet, arm, "info"), Info)  # holds the last one
+        self._publish_info(Info(arm, len(readings.names), self._twin))
+        link.reply_to(keys.of_arm(link.fleet, arm, "quote"), QuoteRequest, self._quote)
+        link.reply_to(keys.of_arm(link.fleet, arm, "award"), Award, self._refuse)
+        link.declare_token(keys.of_arm(link.fleet, arm, "alive"))
+        for name, kind in zip(topics, (JOINT_STATE, DIAGNOSTICS), strict=True):
+            self._listen(node, Topic(name, kind, type_hash(kind), node.domain))
+
+    def serve(self, until_s: float) -> None:
+        """Read the arm's messages and publish its state, until the real second `until_s`."""
+        while (now_s := time.monotonic()) < until_s:
+            if now_s >= self._due_s:
+                self._due_s = max(self._due_s + self._period_s, now_s)
+                self._send_state(now_s)
+                self._sync.step(now_s)
+            self._link.serve(min(until_s, self._due_s))
+
+    def _listen(self, node: Node, topic: Topic) -> None:
+        def receive(sent_hash: str, payload: bytes) -> None:
+            self._link.post(lambda: self._receive(topic, sent_hash, payload))
+
+        node.listen(topic, receive)
+
+    def _receive(self, topic: Topic, sent_hash: str, payload: bytes) -> None:
+        now_s = time.monotonic()
+        try:
+            if sent_hash not in (topic.hash, NO_HASH):
+                raise MalformedMessage(f"The hash of its {topic.kind} is {sent_hash}, not {topic.hash}.")
+            if topic.kind == JOINT_STATE:
+                self._readings.update_joints(read_joints(payload), now_s)
+            else:
+                temp_c = temperatures(read_diagnostics(payload), self._readings.names, self._readings.hardware)
+                self._readings.update_temperatures(temp_c, now_s)
+        except MalformedMessage as error:
+            self.malformed += 1
+            if self.malformed & (self.malformed - 1) == 0:  # 1, 2, 4, 8, …
+                _LOG.warning("Dropped invalid message of %s (%d so far): %s", topic.name, self.malformed, error)
+
+    def _send_state(self, now_s: float) -> None:
+        self._tick += 1
+        state = self._state(now_s)
+        if state is None and now_s >= self._warn_from_s:
+            self._warn("state", f"publishes no state: there is {self._readings.missing(now_s)}.")
+        if state is not None:
+            self._publish_state(state)
+
+    def _state(self, now_s: float) -> State | None:
+        return self._readings.state(self._arm, self._tick, self._clock.now_s(now_s), now_s, self._warning_c)
+
+    def _quote(self, request: QuoteRequest) -> Quote:
+        now_s = time.monotonic()
+        state = self._state(now_s)
+        if state is None:
+            raise Refused(f"There is {self._readings.missing(now_s)}.")
+        estimates = tuple(JobEstimate(job.name, reason=self._refusal) for job in request.jobs)
+        return Quote(
+            arm=self._arm,
+            auction=request.auction,
+            quote="",
+            valid_s=0.0,
+            twin=self._twin,
+            time_s=state.time_s,
+            mode=state.mode,
+            headroom_k=state.headroom_k,
+            capacity=0,
+            estimates=estimates,
+        )
+
+    def _refuse(self, award: Award) -> Ack:
+        return Ack(self._arm, award.award, False, self._refusal)
+
+    def _set_clock(self, clock: FleetClock, jump: bool) -> None:
+        if clock.speed != 1.0:
+            speed = f"runs {clock.speed:g} times as fast as a real arm"
+            raise BusError(f"The fleet '{self._link.fleet}' {speed}: its speed must be 1.")
+        self._clock = clock

@@ -4,6 +4,7 @@ A JointState has no temperatures. Those are diagnostics, written and read in one
 with the name of the joint, with the value `temperature_c`.
 """
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import isfinite, isnan
@@ -157,3 +158,9 @@ def temperatures(diagnostics: Iterable[Diagnostic], names: tuple[str, ...], hard
         if not isfinite(temp_c[name]):
             raise MalformedMessage(f"The {TEMPERATURE} of {status.hardware} is {text}.")
     return temp_c
+
+
+def plain_name(name: str) -> str:
+    """Make any name one part of a topic: other characters become `_`, so different names may give the same."""
+    allowed = re.sub(r"_+", "_", re.sub(r"[^A-Za-z0-9]", "_", name)).strip("_")
+    return allowed if allowed[:1].isalpha() else f"n{allowed}"

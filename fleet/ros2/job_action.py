@@ -22,7 +22,7 @@ from thermofleet_msgs.action import DoJob
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol.auction import SETTLED, JobSpec, JobStatus
 from fleet.live.job_client import JobClient
-from fleet.ros2.topics import plain_name
+from fleet.ros2.conversion import plain_name
 
 _LOG = logging.getLogger(__name__)
 

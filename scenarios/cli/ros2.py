@@ -88,7 +88,7 @@ def listen_command(
     names, where = names_of(joints), ros2_router(router, endpoint)
     from fleet.bus.client.client import BusClient
     from fleet.live.clock import FleetClock
-    from fleet.ros2.follower import ArmReadings, Follower
+    from fleet.ros2.bridge import ArmReadings, Follower
     from scenarios.cli.signals import until_stopped
 
     with (
@@ -147,8 +147,7 @@ def ros2_router(router: str, endpoint: str) -> str:
 def node_at(router: str, name: str, domain: int, stopped: Callable[[], bool]) -> "Node":
     """A ROS 2 node, not yet open, which waits for a router; after a check of the domain and of the installed extra."""
     require_extra("ros2")
-    from fleet.ros2.node import Node
-    from fleet.ros2.topics import DOMAINS
+    from fleet.ros2.node import DOMAINS, Node
 
     if domain not in DOMAINS:
         raise FleetError(f"--domain must be 0 to {DOMAINS[-1]} (got {domain}).")

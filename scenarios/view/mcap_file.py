@@ -26,8 +26,7 @@ from fleet.ros2.cdr import (
     write_diagnostics,
     write_joints,
 )
-from fleet.ros2.conversion import Joints, diagnostics_of, joint_names
-from fleet.ros2.topics import plain_name
+from fleet.ros2.conversion import Joints, diagnostics_of, joint_names, plain_name
 from fleet.telemetry import MODES
 from scenarios.progress import Progress, quiet
 from scenarios.view.moments import Moments, ahead, motor_spheres

@@ -16,14 +16,14 @@ from zenoh.ext import Int64, z_deserialize
 
 from fleet.bus.client.router import Router
 from fleet.errors import BusError
-from fleet.ros2.node import Node
-from fleet.ros2.topics import (
+from fleet.ros2.conversion import plain_name
+from fleet.ros2.node import (
     NO_HASH,
+    Node,
     Topic,
     attachment,
     gid,
     node_token,
-    plain_name,
     publisher_token,
 )
 

@@ -19,8 +19,8 @@ from fleet.bus.protocol.auction import Ack, Award, Clock, ClockRequest, JobSpec,
 from fleet.bus.protocol.messages import Info, MalformedMessage, State
 from fleet.errors import BusError
 from fleet.live.clock import FleetClock
+from fleet.ros2.bridge import FRESH_S, WARM_S, ArmReadings, Follower
 from fleet.ros2.conversion import Joints, joint_names
-from fleet.ros2.follower import FRESH_S, WARM_S, ArmReadings, Follower
 from fleet.ros2.node import Node
 
 PATIENCE_S = 15.0
