@@ -106,11 +106,8 @@ class Replay:
         return count
 
 
-_ADDRESSES = {kind: (role, topic) for role, topic, kind in SOURCES.values()}
-
-
 def _key(fleet: str, message: Message) -> str:
-    role, topic = _ADDRESSES[type(message)]
+    role, topic = next((role, topic) for role, topic, kind in SOURCES.values() if isinstance(message, kind))
     name = message.auctioneer if isinstance(message, Result | Operation) else message.arm
     return str(keys.Key(fleet, role, name, topic))
 
