@@ -107,7 +107,7 @@ class Replay:
 
 
 def _key(fleet: str, message: Message) -> str:
-    role, topic = next((role, topic) for role, topic, kind in SOURCES.values() if isinstance(message, kind))
+    role, topic, _ = next(source for source in SOURCES.values() if isinstance(message, source[2]))
     name = message.auctioneer if isinstance(message, Result | Operation) else message.arm
     return str(keys.Key(fleet, role, name, topic))
 
