@@ -21,7 +21,7 @@ function arm(name) {
   return arms.get(name);
 }
 
-// Apply one message of the stream: {name, message}, with a message of docs/bus.md.
+// Apply one message of the stream: {name, message}, with a message of docs/bus/messages.md.
 function apply(topic, { name, message }) {
   if (topic === "state") {
     const hottest = Math.max(...message.temp_c);

@@ -1,4 +1,4 @@
-"""Example of your own allocator, with `eclipse-zenoh` and `json` only, by the rules of docs/bus.md.
+"""Example of your own allocator, with `eclipse-zenoh` and `json` only, by the rules of docs/bus/auctioneer.md.
 
     python examples/own_allocator.py 7447 my_fleet
 

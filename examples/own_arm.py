@@ -1,4 +1,4 @@
-"""Example of your own arm on the bus, with `eclipse-zenoh` and `json` only, by the rules of docs/bus.md.
+"""Example of your own arm on the bus, with `eclipse-zenoh` and `json` only, by the rules of docs/bus/arm.md.
 
     python examples/own_arm.py 7447 my_fleet my_arm
 

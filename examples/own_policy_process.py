@@ -1,4 +1,4 @@
-"""Example of your own policy in another process, with `eclipse-zenoh` and `json` only, by the rules of docs/bus.md.
+"""Example of your own policy in another process, with `eclipse-zenoh` and `json` only, by the rules of docs/how_to/own_policy.md.
 
     thermofleet router                                                   # in one terminal
     python examples/own_policy_process.py 7447 mine                      # in another one

@@ -2,7 +2,7 @@
 
     python examples/submit_jobs.py 7447 quickstart jobs.json
 
-The file contains a list of jobs (JobSpec in docs/bus.md). Without a file, three small jobs for the scenario
+The file contains a list of jobs (JobSpec in docs/bus/messages.md). Without a file, three small jobs for the scenario
 `quickstart` are submitted. The same job submitted twice is one job.
 """
 
