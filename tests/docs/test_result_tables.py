@@ -12,10 +12,6 @@ SHARE = 1 / 6
 """Least share of figures among the cells of a table of figures, without the first column."""
 
 BY_HAND = {
-    (
-        "docs/concepts/cooling.md",
-        "parameter, per J/K of the winding",
-    ): "parameters in the code; the command prints them",
     ("docs/concepts/cooling.md", "°C"): "published limits",
     ("docs/concepts/cooling.md", "contact"): "published limits",
     ("docs/faults.md", "fault"): "`make chaos` prints it: half an hour of real processes",
