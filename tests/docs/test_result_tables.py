@@ -33,7 +33,7 @@ BY_HAND = {
     ("docs/suite.md", "split"): "the definition of the suite",
     ("docs/suite.md", "axis of a cell"): "the definition of the suite",
     ("docs/trainers.md", "trainer"): "versions",
-    ("docs/results/twin.md", "scenario"): "`python -m benchmarks.paper reliability` prints it: an hour; labelled with its revision",
+    ("docs/results/twin.md", "scenario"): "`python -m benchmarks.paper reliability` prints it: an hour",
     ("docs/results/twin.md", "question"): "hours; labelled with its revision, the code is beside it",
 }
 """Tables that are kept by hand, by page and first heading, and why."""
