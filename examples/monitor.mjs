@@ -1,4 +1,4 @@
-// Monitor a fleet through `thermofleet gateway`, with Node 18 or newer and no packages.
+// Monitor a fleet through `thermofleet bus gateway`, with Node 18 or newer and no packages.
 //
 //     node examples/monitor.mjs http://127.0.0.1:8080/v4 [seconds]
 //
