@@ -1,4 +1,4 @@
-"""Example of your own allocator, with `eclipse-zenoh` and `json` only, by the rules of docs/bus/auctioneer.md.
+"""A custom allocator, with `eclipse-zenoh` and `json` only, by the rules of docs/bus/auctioneer.md.
 
     python examples/own_allocator.py 7447 my_fleet
 
@@ -202,7 +202,7 @@ class Allocator:
         }
 
     def expire(self):
-        """Put jobs whose lease has ended back to waiting; with permission to commit they become unfinished."""
+        """Return jobs whose lease has ended to waiting; with permission to commit they become unfinished."""
         for name, award in list(self.awards.items()):
             if time.monotonic() > award["end_s"]:
                 if self.status[award["job"]]["state"] == "finishing":
