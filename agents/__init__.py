@@ -1,1 +1,1 @@
-"""Decisions: policies that see an observation and nothing else."""
+"""Policies: they decide from observations alone."""

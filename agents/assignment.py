@@ -107,7 +107,7 @@ class Ahead:
 
 
 class MatchingAhead(Ahead, Matching):
-    """As `matching`, and an arm that is home soon takes part. Scope central, as `matching`."""
+    """As `matching`, with arms that are home soon as well. Scope central, as `matching`."""
 
     only_choices = True
 

@@ -1,4 +1,4 @@
-"""The auction algorithm: arms bid for jobs by price, with a bound on what the outcome lacks to the best one.
+"""The auction algorithm: arms bid for jobs by price; the total is within a bound of the best assignment.
 
 In a round every arm without a job bids for the job with the largest profit, benefit less price. It raises the price by
 its profit over that of its second choice, plus ε, so that the job still is within ε of its best choice. An arm without

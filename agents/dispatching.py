@@ -76,7 +76,8 @@ class Atc(IndexRule):
 
 
 class LeastLoaded:
-    """The oldest job goes to the able arm with the least time of work in this shift, by the plans that it claimed.
+    """The oldest job goes to the able arm with the least working time in this shift, by the durations of its claimed
+    plans.
 
     Scope central: it compares the work of all arms. The observation does not contain the work so far, so the rule adds
     the durations of its claims; a claim that lost is subtracted.
@@ -84,7 +85,7 @@ class LeastLoaded:
 
     scope: ClassVar = "central"
     only_choices = False
-    """A claim is known to be lost only in the next interval."""
+    """A lost claim becomes known in the next interval."""
 
     def __init__(self) -> None:
         self.reset(np.random.default_rng(0))
@@ -95,7 +96,7 @@ class LeastLoaded:
         self._claimed_s: dict[str, float] = {}
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """One pass over the slots from the oldest job; each goes to the able arm with the least work."""
+        """One pass over the slots from the oldest job; each goes to the able arm with the least working time."""
         for arm, claimed_s in self._claimed_s.items():
             if arm in observations and observations[arm].last_award < 0:
                 self._load_s[arm] -= claimed_s

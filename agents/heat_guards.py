@@ -1,4 +1,4 @@
-"""Reactive control of heat as a wrapper round any policy: a torque limiter, a thermal switch and a fuzzy speed control.
+"""Reactive thermal control as a wrapper of any policy: a torque limiter, a thermal switch and a fuzzy speed control.
 
 Both react to measured temperatures, and need neither a twin nor a thermal model. On a real arm they act on torque and
 speed within a motion. An allocation policy has no such command, so they act by what the environment allows: they close
@@ -20,14 +20,14 @@ Array = np.ndarray
 
 
 class Guard(Protocol):
-    """What the temperatures of an arm allow."""
+    """Claims and returns that the temperatures of an arm allow."""
 
     def claims(self, seen: Observation) -> Array:
         """Claims that it allows, of those that are legal, bool [option]."""
         ...
 
     def gives_back(self, seen: Observation, payload_kg: float) -> bool:
-        """Whether the arm must give back the job with this payload."""
+        """Whether the arm must return the job with this payload."""
         ...
 
 

@@ -117,7 +117,7 @@ class Wsept(Thermometer):
 
 
 class WseptAhead(Ahead, Wsept):
-    """As `wsept`, and an arm that is home soon takes part: a job waits for it where that is worth more per time.
+    """As `wsept`, with arms that are home soon as well: a job waits for such an arm if that is worth more per time.
 
     Scope central, as `wsept`.
     """

@@ -58,7 +58,7 @@ class Mpc:
         self._rng = rng
         self._schedule: Schedules | None = None
         self._planned: set[int] = set()
-        """Jobs that were in a slot in some search."""
+        """Jobs of earlier searches."""
         self.searched_s = -np.inf
         """Time of the last search."""
 
@@ -112,7 +112,7 @@ class Mpc:
 
 
 def _no_job(jobs: int) -> Schedules:
-    """A schedule that leaves every job out."""
+    """A schedule without jobs."""
     nobody = np.zeros((1, jobs), int)
     return Schedules(nobody, nobody.copy(), np.full((1, jobs), np.inf), np.zeros((1, jobs)))
 
@@ -120,8 +120,8 @@ def _no_job(jobs: int) -> Schedules:
 def _inserted(
     schedule: Schedules, job: int, choices: Array, open_: Array, now_s: float, most: int, rng: np.random.Generator
 ) -> Schedules:
-    """Schedules with one more job: by every plan for it, before, amid or behind the other open jobs; at most
-    `most`, which are drawn."""
+    """Schedules with one more job: by every plan for it, before, amid or behind the other open jobs; a random sample of
+    at most `most`."""
     order = np.sort(schedule.order[0, open_])
     order = order[np.isfinite(order)]
     places = [order[0] - BEHIND_S, order[len(order) // 2], order[-1] + BEHIND_S] if len(order) else [now_s]

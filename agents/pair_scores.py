@@ -31,7 +31,7 @@ PARAMETERS = len(Worth._fields) + PAIR_FEATURES * OUTPUTS
 
 
 def first_parameters() -> Array:
-    """Parameters from which a training begins, float [PARAMETERS]: `wsept`, except for the end of the shift and faults.
+    """Initial parameters of a training, float [PARAMETERS]: `wsept`, except for the end of the shift and faults.
 
     A job that cannot end before the shift does has no value, and one that just can has twice the score. A predicted
     peak may be 4 K above the error limit, and deviates twice as much.
@@ -105,7 +105,7 @@ def load_pairs(folder: Path) -> PairPolicy:
 
 
 def _parameters(folder: Traversable) -> Array:
-    """Those of a folder; errors as of `load_pairs`."""
+    """Parameters in a folder; errors as of `load_pairs`."""
     try:
         found = json.loads((folder / PAIRS_CARD).read_text(encoding="utf-8"))["format"]
         with (folder / PAIRS).open("rb") as opened:
@@ -151,7 +151,7 @@ class WseptLearnedLocal(Local):
 
 
 def _without_empty(seen: Observation) -> Observation:
-    """The observation without the last slots that hold a job in no env: usually most of them."""
+    """The observation without trailing slots that are empty in all envs."""
     plans = plans_of(seen)
     legal = seen.action_mask[..., 1:-1].any(axis=(0, 1)).reshape(-1, plans).any(axis=-1)
     used = np.flatnonzero(legal | seen.offered.any(axis=(0, 1)))

@@ -1,4 +1,4 @@
-"""Pairs of arm and option in numbers: what a learned score of pairs is given, for many envs at once.
+"""Features of pairs of arm and option, the inputs of a learned score, for many envs at once.
 
 Numbers of one option come from one arm's observation; numbers of the set (alternatives of the job, other jobs of the
 arm, arms that are home soon) come from the observations of all arms. They do not depend on the order or number of arms
@@ -24,7 +24,7 @@ MOST = 4.0
 
 
 class Worth(NamedTuple):
-    """What a learned worth per time has beyond `wsept`, [env] each; zeros give `wsept`."""
+    """Learned parameters of the worth per time, [env] each; zeros give `wsept`."""
 
     margin: Array
     """Predicted peaks may be this much higher, in units of 10 K."""

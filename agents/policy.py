@@ -56,7 +56,7 @@ class Present(Protocol):
 
 
 class Executed(Protocol):
-    """What came of schedules: `fleet.engine.play.Executed`, which explains the fields."""
+    """Simulated results of schedules: `fleet.engine.play.Executed`, which explains the fields."""
 
     @property
     def reward(self) -> Array: ...
@@ -93,7 +93,7 @@ class Lookahead(Protocol):
         ...
 
     def with_limits(self, warning_c: float, error_c: float) -> "Lookahead":
-        """The same with other limits of the motors, °C, as to plan with a margin."""
+        """The same simulator with other motor limits, °C, for example with a margin."""
         ...
 
     def look(self, seen: Mapping[str, Observation]) -> Present:
@@ -103,7 +103,7 @@ class Lookahead(Protocol):
 
 @runtime_checkable
 class Planner(Protocol):
-    """What a policy has besides that plans in a simulator of its cell."""
+    """A policy that plans in a simulator of its cell."""
 
     def plan_in(self, cell: Lookahead) -> None:
         """Plan in the simulator of a shift; called once before it begins."""

@@ -22,7 +22,7 @@ class Rule:
 
     kind: type[Policy] | type[ArmPolicy]
     cost: str
-    """What it allocates by, smallest first, for a table."""
+    """Cost that it minimises, for a table."""
     source: str = ""
 
     @property
@@ -79,7 +79,7 @@ class Wrapper:
 
     kind: type[Guard]
     effect: str
-    """What it does, for a table."""
+    """Description, for a table."""
     source: str
 
 

@@ -39,7 +39,7 @@ NONE = -1
 
 
 class Solution(NamedTuple):
-    """What the solver returned for one decision."""
+    """Result of the solver for one decision."""
 
     chosen: list[int]
     """Indices of the chosen sequences."""
@@ -153,7 +153,7 @@ class RollingHorizon(Wsept):
         hottest_c: float,
         options: Array | slice = slice(None),
     ) -> tuple[Array, Array]:
-        """What plans earn that begin at some time with some temperature, and the peak temperatures, °C.
+        """Worth of plans by start time and start temperature, and their peak temperatures, °C.
 
         Args:
             peak_c: Predicted for a start now, [option].

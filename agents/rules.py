@@ -78,7 +78,7 @@ class CoolestFirst(Stateless):
 class LeastDifficulty(Stateless):
     """The pair of free arm and job with the least difficulty relative to the fleet's average for that job first.
 
-    With absolute difficulties no arm would claim work that is new to every twin. Scope arm: each arm computes it from
+    With absolute difficulties no arm would claim a task that is new to every twin. Scope arm: each arm computes it from
     its own scores, those its peers shared, and its place in the fleet, which breaks ties. Without any score, free arms
     claim the oldest jobs in the fleet's order. `agents.staleness` discounts old messages.
     """

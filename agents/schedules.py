@@ -12,7 +12,7 @@ LEAST_GAIN = 1e-9
 
 
 class Schedules(NamedTuple):
-    """Who does which job, by which plan, in which order; arrays [schedule, job].
+    """Arm, plan and order of each job; arrays [schedule, job].
 
     A free arm claims, of its jobs that it may claim, the one that comes first.
     """

@@ -1,4 +1,4 @@
-// Monitor a fleet through `thermofleet gateway`, with Node 18 or newer and no packages.
+// Monitor a fleet through `thermofleet bus gateway`, with Node 18 or newer and no packages.
 //
 //     node examples/monitor.mjs http://127.0.0.1:8080/v4 [seconds]
 //
@@ -21,7 +21,7 @@ function arm(name) {
   return arms.get(name);
 }
 
-// Apply one message of the stream: {name, message}, with a message of docs/bus.md.
+// Apply one message of the stream: {name, message}, with a message of docs/bus/messages.md.
 function apply(topic, { name, message }) {
   if (topic === "state") {
     const hottest = Math.max(...message.temp_c);

@@ -1,10 +1,10 @@
-"""Example of your own allocator, with `eclipse-zenoh` and `json` only, by the rules of docs/bus.md.
+"""A custom allocator, with `eclipse-zenoh` and `json` only, by the rules of docs/bus/auctioneer.md.
 
     python examples/own_allocator.py 7447 my_fleet
 
-It replaces `thermofleet auction`: jobs are submitted at jobs/submit, every arm quotes the waiting jobs, and each job
-goes to the arm with the lowest difficulty. It follows the rules by which no job is done twice, as long as it runs. It
-has no disk, so a restart loses all jobs; a real allocator writes every reply to disk before it sends it.
+It replaces `thermofleet bus auctioneer`: jobs are submitted at jobs/submit, every arm quotes the waiting jobs, and each
+job goes to the arm with the lowest difficulty. It follows the rules by which no job is done twice, as long as it runs.
+It has no disk, so a restart loses all jobs; a real allocator writes every reply to disk before it sends it.
 """
 
 import json
@@ -202,7 +202,7 @@ class Allocator:
         }
 
     def expire(self):
-        """Put jobs whose lease has ended back to waiting; with permission to commit they become unfinished."""
+        """Return jobs whose lease has ended to waiting; with permission to commit they become unfinished."""
         for name, award in list(self.awards.items()):
             if time.monotonic() > award["end_s"]:
                 if self.status[award["job"]]["state"] == "finishing":

@@ -1,4 +1,4 @@
-"""Example of your own arm on the bus, with `eclipse-zenoh` and `json` only, by the rules of docs/bus.md.
+"""A custom arm on the bus, with `eclipse-zenoh` and `json` only, by the rules of docs/bus/arm.md.
 
     python examples/own_arm.py 7447 my_fleet my_arm
 
@@ -102,7 +102,7 @@ class Arm:
             query.reply(f"{self.own_key}/{topic}", json.dumps(reply), encoding=encoding(reply_name))
 
     def make_quote(self, request):
-        """Estimate the cost of each job. The quote of a dry run is not stored."""
+        """Predict the cost of each job. The quote of a dry run is not stored."""
         name = "" if request.get("dry_run") else f"{self.name}-{uuid.uuid4().hex}"  # unique, also after a restart
         done = request.get("cycles", {})
         estimates = [self.estimate(job, done.get(job["name"], 0)) for job in request["jobs"]]
@@ -214,7 +214,7 @@ class Arm:
             self.report("returned")
 
     def apply_receipt(self, receipt):
-        """Stop repeating a report: it is on the auctioneer's disk."""
+        """Stop repeating a report: it is durable at the auctioneer."""
         if self.reports.pop(receipt["award"], None):
             print(f"reported {receipt['award']}", flush=True)
 

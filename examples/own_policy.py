@@ -1,4 +1,4 @@
-"""Example of your own policy: least difficulty, but an arm with little headroom waits.
+"""A custom policy: least difficulty, but an arm with little headroom waits.
 
 Compare it with built-in policies:
     thermofleet compare active_waiting --policies round_robin,least_difficulty,examples/own_policy.py:Careful
@@ -24,7 +24,7 @@ class Careful:
         self._rule = LeastDifficulty()
 
     def reset(self, rng):
-        """Begin a shift; draw all random numbers from `rng`."""
+        """Begin a shift; sample all random numbers from `rng`."""
         self._rule.reset(rng)
 
     def choose(self, observation, place):

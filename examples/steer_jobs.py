@@ -20,11 +20,11 @@ from urllib.parse import quote
 from submit_jobs import connect, query, submit, wait_for_results
 
 ATTEMPTS = 3
-"""The same request again is carried out once: it has a name of its own."""
+"""Attempts for each request; a repeated request is carried out once, because its name is unique."""
 
 
 def control(session, root, action):
-    """Request an action; return the reply, None if it is refused or nobody replies."""
+    """Request an action; return the reply, None if it is refused or without a reply."""
     request = {"request": uuid.uuid4().hex, "action": action, "by": "steer_jobs.py"}
     for _ in range(ATTEMPTS):
         for reply in query(session, f"{root}/jobs/control", "ControlRequest", request):
@@ -45,7 +45,7 @@ def action_of(verb, words):
 
 
 def main(port, fleet, verb, *words):
-    """Do what the command line says; return whether it was possible."""
+    """Carry out the command line; return whether it was possible."""
     root = f"thermofleet/v4/{quote(fleet, safe='')}"
     with connect(port) as session:
         if verb == "cell":

@@ -2,7 +2,7 @@
 
     python examples/submit_jobs.py 7447 quickstart jobs.json
 
-The file contains a list of jobs (JobSpec in docs/bus.md). Without a file, three small jobs for the scenario
+The file contains a list of jobs (JobSpec in docs/bus/messages.md). Without a file, three small jobs for the scenario
 `quickstart` are submitted. The same job submitted twice is one job.
 """
 
@@ -20,7 +20,7 @@ MAX_JOBS = 100
 WAIT_S = 10.0
 """Longest wait for an auctioneer, or for arms that allocate jobs without one."""
 ENDED = ("finished", "unfinished", "given_up", "cancelled")
-"""States of jobs that no arm will work on any more."""
+"""Final states of jobs."""
 JOBS = [
     {"name": "outside 1", "kind": "hold", "places": ["fixture"], "payload_kg": 1.0, "dwell_s": 5.0},
     {"name": "outside 2", "kind": "hold", "places": ["fixture"], "payload_kg": 0.5, "dwell_s": 5.0, "repetitions": 2},
@@ -29,7 +29,7 @@ JOBS = [
 
 
 def submit(session, root, jobs):
-    """Submit jobs and print the replies; return the names of accepted jobs, which are on the auctioneer's disk."""
+    """Submit jobs and print the replies; return the names of accepted jobs, which are durable."""
     accepted = []
     for first in range(0, len(jobs), MAX_JOBS):
         request = {"jobs": jobs[first : first + MAX_JOBS], "by": "submit_jobs.py"}

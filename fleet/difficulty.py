@@ -245,7 +245,7 @@ class Difficulty:
 
 
 class DifficultyModel(Protocol):
-    """Scores plans of one arm without moving it."""
+    """Predicts difficulty, peak and P(saturation) of plans of one arm."""
 
     @property
     def version(self) -> str:
@@ -259,7 +259,7 @@ class DifficultyModel(Protocol):
 
 @dataclass(frozen=True)
 class Blind:
-    """A model without scores: every difficulty is None."""
+    """A model without predictions: every difficulty is None."""
 
     version: str = "blind"
 

@@ -1,4 +1,4 @@
-"""Exceptions that callers may want to catch, checks of numbers and names, and hints for unknown names."""
+"""Exceptions of the public interface, checks of numbers and names, and suggestions for unknown names."""
 
 import json
 from collections.abc import Iterable
@@ -8,7 +8,7 @@ from math import inf
 
 
 class FleetError(Exception):
-    """Base of every error that thermofleet raises on purpose."""
+    """Base of all errors of thermofleet."""
 
 
 class ScenarioError(FleetError):
@@ -17,7 +17,7 @@ class ScenarioError(FleetError):
 
 @dataclass(eq=False)
 class InfeasibleJob(FleetError):
-    """An arm cannot do a work."""
+    """An arm cannot execute a task."""
 
     arm: str
     place: str
@@ -38,11 +38,11 @@ class BusError(FleetError):
 
 
 class NoRouter(BusError):
-    """No router answers; one may start later."""
+    """No router replies; one may start later."""
 
 
 class IdentificationError(FleetError):
-    """Recordings do not determine an arm's thermal parameters; says what to record."""
+    """Recordings do not determine an arm's thermal parameters; the message states what to record."""
 
 
 class CheckpointError(FleetError):
@@ -98,7 +98,7 @@ def check_between(value: object, low: float, high: float, *fields: str) -> None:
 
 
 MOST_M = 10.0
-"""Largest coordinate of anything in a cell."""
+"""Largest coordinate in a cell."""
 
 
 def check_coordinates(value: object, *fields: str) -> None:
@@ -128,7 +128,7 @@ MAX_NAME = 128
 """Characters; a file name with it and an ending has at most 255 bytes."""
 NAME_RULE = f"1 to {MAX_NAME} printable characters without / \\ [ ], and no dot or space at the start"
 _FORBIDDEN = frozenset("/\\[]")
-"""The one rule for names of fleets, arms, auctioneers, jobs and places."""
+"""Rule for names of fleets, arms, auctioneers, jobs and places."""
 
 
 def is_name(text: str) -> bool:
@@ -155,7 +155,7 @@ def printable(text: str, longest: int = 4 * MAX_NAME) -> str:
 
 
 def visible(text: str, keep: str = "") -> str:
-    """Text as a terminal or a page may show it: control characters and direction marks as JSON escapes them.
+    """Text for a terminal or a page, with control characters and direction marks as JSON escapes.
 
     Args:
         keep: Characters that stay as they are, for example line breaks.
@@ -166,5 +166,5 @@ def visible(text: str, keep: str = "") -> str:
 
 
 def install(extra: str) -> str:
-    """How an extra is installed, for an error; no package index has thermofleet."""
+    """Command that installs an extra, for an error message; no package index has thermofleet."""
     return f"pip install -e '.[{extra}]' -c constraints.txt, in a copy of the repository"

@@ -25,13 +25,13 @@ EVENT_KINDS: tuple[str, ...] = get_args(EventKind)
 
 
 class Meaning(NamedTuple):
-    """Meaning of a kind of event."""
+    """Description of an event kind, for documentation and the bus."""
 
     text: str
     value: str = ""
-    """What `value` is; "" for nothing."""
+    """Content of `value`; "" if it is unused."""
     live: bool = False
-    """A live arm reports it; the others are events of simulated shifts alone."""
+    """Whether live arms report it; the other kinds occur in simulated shifts only."""
 
 
 MEANINGS: dict[EventKind, Meaning] = {
@@ -45,9 +45,9 @@ MEANINGS: dict[EventKind, Meaning] = {
     "warning": Meaning("The motor of `joint` passed its warning limit.", "temperature, °C", live=True),
     "fault": Meaning("The motor of `joint` passed its fault limit: the arm stopped.", "temperature, °C", live=True),
     "return": Meaning("After a fault the job is open again.", "cycles that are kept", live=True),
-    "give_up": Meaning("Arms faulted in the job too often: it is given up."),
+    "give_up": Meaning("Arms faulted in the job too often: it is abandoned."),
     "give_back": Meaning("The arm returned its job after a cycle.", "cycles that are kept"),
-    "expire": Meaning("The due date passed before an arm began the job: it is given up."),
+    "expire": Meaning("The due date passed before an arm began the job: it is abandoned."),
     "recover": Meaning("The fault is cleared.", live=True),
     "moved": Meaning("A person moved the faulted arm home.", live=True),
     "contact": Meaning(
@@ -69,7 +69,7 @@ class Event:
     arm: str = ""
     job: str = ""
     joint: int = 0
-    """Motor 1..7; 0 if the event has none."""
+    """Joint 1..7; 0 if the event has none."""
     value: float = float("nan")
     """Quantity of the kind, as in `MEANINGS`; NaN for none."""
     reason: str = ""

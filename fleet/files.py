@@ -30,7 +30,8 @@ def user_cache_folder() -> Path:
 
 
 def private_folder(path: Path) -> Path:
-    """Make a folder that only its owner can use (mode 700), and return it: who writes to a cache runs code.
+    """Make a folder with mode 700 and return it. Compiled code in a cache is executed, so only its owner may write to
+    it.
 
     Raises:
         FleetError: it belongs to another user, or cannot be made.

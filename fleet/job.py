@@ -1,4 +1,4 @@
-"""Places and fixtures of the cell, works that arms do at the places, and jobs that request works."""
+"""Places and fixtures of the cell, task types that arms execute at places, and jobs that request them."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,24 +16,24 @@ KINDS: tuple[str, ...] = get_args(Kind)
 DWELL_S = 0.5
 """Default of `dwell_s` in scenarios and on the bus: time to close or open the hand."""
 PAYLOAD_KG_PER_M3 = 2700.0
-"""A payload counts as a ball of this density, aluminium's, that hangs from the flange."""
+"""Density of the ball at the flange that stands for a payload: aluminium."""
 MOST_PAYLOAD_M = 0.1
-"""Largest radius of such a ball."""
+"""Largest radius of that ball."""
 LEAST_FIXTURE_M, MOST_FIXTURE_M = 0.001, 10.0
 """Smallest and largest length of a fixture."""
 LONGEST_GRASP_S = 180.0
-"""Largest `dwell_s` of a pick_place or sort, whose standstills are planned sample by sample."""
+"""Largest `dwell_s` of a pick_place or sort; their standstills are planned sample by sample."""
 LONGEST_JOB_S = 7 * 24 * 3600.0
 """Longest planned duration of a job."""
 
 
 MOST_FAULTS_OF_ONE_ARM = 2
 MOST_FAULTS = 3
-"""A job in which one arm, or all arms together, have faulted this often is given up."""
+"""Faults of one arm, and of all arms together, after which a job is abandoned."""
 
 
 def reason_to_give_up(arms: Iterable[str]) -> str:
-    """Why a job is given up; "" if it is not.
+    """Reason for abandoning a job; "" if it is not abandoned.
 
     Args:
         arms: The arm of each fault in this job.
@@ -46,7 +46,7 @@ def reason_to_give_up(arms: Iterable[str]) -> str:
 
 
 class Bounds(NamedTuple):
-    """Smallest and largest value of a number, both allowed."""
+    """Smallest and largest allowed value of a number."""
 
     low: float
     high: float
@@ -67,7 +67,7 @@ BOUNDS: Mapping[str, Bounds] = {
     "retreat_m": Bounds(0.0, 1.0, "m"),
     "tool_deg": Bounds(-360.0, 360.0, "deg"),
 }
-"""Of every number of a job and a place, in scenarios, on the bus and in Python."""
+"""Bounds of every number of a job and a place, in scenarios, on the bus and in Python."""
 
 
 def check_bounds(owner: object, *fields: str) -> None:
@@ -84,7 +84,7 @@ def check_bounds(owner: object, *fields: str) -> None:
 
 
 def check_places(owner: object, kind: str, names: Sequence[str]) -> None:
-    """Check that a kind of work gets as many places as it needs, all different.
+    """Check that a task type has the number of places that it needs, all different.
 
     Raises:
         ValueError: names the places.
@@ -96,7 +96,7 @@ def check_places(owner: object, kind: str, names: Sequence[str]) -> None:
 
 
 def check_dwell(owner: object, kind: str, dwell_s: float) -> None:
-    """Check that a work does not open or close the hand for too long.
+    """Check the time in which a task opens or closes the hand.
 
     Raises:
         ValueError: names the number and what is allowed.
@@ -123,7 +123,7 @@ def check_duration(owner: object, dwell_s: float, repetitions: int) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """A pose in the cell at which a hand works; also a station, which one arm at a time may use."""
+    """A pose of the hand in the cell; also a station, which one arm at a time may use."""
 
     name: str
     position_m: tuple[float, float, float]
@@ -171,13 +171,13 @@ class Fixture:
 
 
 def payload_radius_m(payload_kg: float) -> float:
-    """Radius of the ball that a payload counts as, m."""
+    """Radius of the ball that stands for a payload, m."""
     return min(MOST_PAYLOAD_M, (3.0 * max(payload_kg, 0.0) / (4.0 * pi * PAYLOAD_KG_PER_M3)) ** (1 / 3))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What the hand does in one repetition of a job; plans are made for it."""
+    """Motion of the hand in one repetition of a job; the unit of planning."""
 
     kind: Kind
     places: tuple[Place, ...]
@@ -206,7 +206,7 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A request for a number of repetitions of a work, with release, due date and value."""
+    """A request for a number of repetitions of a task, with release, due date and value."""
 
     name: str
     work: Work
@@ -218,7 +218,7 @@ class Job:
     after: tuple[str, ...] = ()
     """Names of the jobs that must finish first."""
     expires: bool = False
-    """A hard due date: the job is given up if it waits then, also if an arm has begun and returned it."""
+    """A hard due date: a job that waits then is abandoned, also if an arm has begun and returned it."""
 
     def __post_init__(self) -> None:
         check_bounds(self, "repetitions", "release_s", "value")

@@ -39,7 +39,7 @@ class Phase:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """One variant (elbow, speed) of how an arm does a work: from home, through repeated cycles, back home."""
+    """One variant (elbow, speed) of an arm's motion for a task: from home, through repeated cycles, back home."""
 
     arm: str
     work: Work
@@ -106,7 +106,7 @@ def drive(profile: Array, motors: Motors) -> Drive:
 
 
 def static_drive(tau: Array, motors: Motors) -> Drive:
-    """Heat drive of standing still with torques, N·m, [..., joint]."""
+    """Heat drive at rest with joint torques, N·m, [..., joint]."""
     still = np.zeros_like(tau)
     return Drive(reference_current(tau, still, motors) ** 2, still)
 

@@ -1,6 +1,6 @@
 """The observation of an arm: named fields, and their layout in one vector.
 
-An arm observes its own sensors, its own scores of the open jobs, and its peers' messages with their age. The
+An arm observes its own sensors, its own predictions for the open jobs, and its peers' messages with their age. The
 observation contains no true state of the simulation.
 """
 
@@ -115,7 +115,7 @@ Offsets = namedtuple("Offsets", [field.name for field in FIELDS])  # pyright: ig
 
 @dataclass(frozen=True)
 class Layout:
-    """Place of each field in the vector, for a number of arms, slots and plans."""
+    """Position of each field in the vector, for a number of arms, slots and plans."""
 
     arms: int
     slots: int

@@ -24,7 +24,7 @@ Cooling = Literal["still_air", "heat_sink", "heat_spreader", "forced_air", "liqu
 
 @dataclass(frozen=True, kw_only=True)
 class CoolingStrategy:
-    """How a way of cooling changes the thermal network of every joint, relative to still air."""
+    """Change of the thermal network of every joint by a cooling strategy, relative to still air."""
 
     ambient_factor: float = 1.0
     """Factor on the conductance from housing to ambient."""
@@ -112,7 +112,7 @@ RATING = PayloadRating()
 
 
 LONGEST_S = 7 * 24 * 3600.0
-"""Longest time until a person moves a faulted arm home, or until its fault is cleared."""
+"""Largest `move_home_s` and `clear_s`."""
 LEAST_LIMIT_C, MOST_LIMIT_C = -60.0, 1000.0
 MOST_OFFSET_K = 50.0
 LEAST_COOLING, MOST_COOLING = 0.01, 100.0
@@ -127,11 +127,11 @@ class ThermalLimits:
     """
 
     lower_c: float = 0.0
-    """A shift must not begin with a motor below this."""
+    """Lowest motor temperature at the start of a shift."""
     warning_c: float = 60.0
     error_c: float = 75.0
     restart_c: float = 50.0
-    """A fault may be cleared once every motor is below this."""
+    """A fault can be cleared when every motor is below this."""
     clear_s: float = 60.0
     """Time to clear the fault once the arm is cool."""
     move_home_s: float = 900.0
@@ -198,7 +198,7 @@ class Robot:
     tool_kg: float = 0.0
     """Mass of the gripper at the flange; it counts against the payload rating."""
     payload_limit_kg: float | None = None
-    """Own limit of the payload at any reach; None: only the rating of the Gen3 holds."""
+    """Payload limit of this arm at any reach; None: the rating of the Gen3 only."""
     cooling: Cooling = "still_air"
     cooling_factor: float = 1.0
     """Scales the conductance from housings to ambient; for example 0.7 for a dusty, badly ventilated arm."""
@@ -224,7 +224,8 @@ class Robot:
             check_nonnegative(self, "payload_limit_kg")
 
     def overload(self, payload_kg: float, reach_m: float, carried_s: float) -> str:
-        """Why the arm may not carry a payload at a reach for a time; "" if it may. No payload is never an overload."""
+        """Reason against carrying a payload at a reach for a time; "" if it is allowed. No payload is never an
+        overload."""
         limit_kg = self.payload_limit_kg
         if limit_kg is not None and payload_kg > limit_kg:
             return f"{payload_kg:g} kg is beyond this arm's limit of {limit_kg:g} kg"

@@ -1,6 +1,6 @@
 """Child seeds, and counter-based random numbers.
 
-A counter-based generator gives the same value for the same key and count, in whatever order values are drawn. So a row
+A counter-based generator gives the same value for the same key and count, in any order of calls. So a row
 of a batch needs no generator of its own. SplitMix64 (Steele, Lea & Flood, OOPSLA 2014) scrambles the counter.
 """
 

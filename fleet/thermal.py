@@ -66,7 +66,7 @@ def gen3_network(
     Args:
         cooling: Its `CoolingStrategy` changes edges and capacities.
         cooling_factor: Scales every edge to ambient (dust, a blocked fan).
-        spread: Random differences from the nominal arm, drawn from `rng`.
+        spread: Random differences from the nominal arm, sampled with `rng`.
     """
     if cooling not in COOLING:
         raise ValueError(f"Unknown cooling '{cooling}'. Allowed: {', '.join(COOLING)}.")

@@ -1,4 +1,4 @@
-"""Tables for docs/bus.md and docs/env.md, from the same source as the schemas and the environment."""
+"""Tables for docs/bus/messages.md and docs/env.md, from the same source as the schemas and the environment."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The systemd units of docs/several_machines.md, as systemd itself and the command line read them."""
+"""The systemd units in docs/systemd, as systemd itself and the command line read them."""
 
 import re
 import shlex
@@ -11,9 +11,8 @@ import pytest
 
 from scenarios.cli.main import load_command
 
-PAGE = Path(__file__).parents[1] / "docs" / "several_machines.md"
 PROGRAM = "/opt/thermofleet/bin/thermofleet"
-UNITS = dict(re.findall(r"`/etc/systemd/system/([\w.-]+)`[^`]*```ini\n(.*?)```", PAGE.read_text(), re.DOTALL))
+UNITS = {path.name: path.read_text() for path in (Path(__file__).parents[1] / "docs" / "systemd").glob("*.service")}
 
 
 def test_systemd_accepts_the_documented_units(tmp_path):

@@ -24,7 +24,7 @@ WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
 
 class LearnedPolicy:
-    """Every arm draws its action from the actor's probabilities, as in training. Scope arm: it reads one observation.
+    """Every arm samples its action from the actor's probabilities, as in training. Scope arm: it reads one observation.
 
     The most probable action would be worse: arms with equal observations would all claim the same job, and an arm that
     waits with a high probability would wait forever.
@@ -63,7 +63,7 @@ class LearnedPolicy:
 
 
 def draw(logits: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A draw from softmax(logits) by Gumbel's trick, logits [..., action] to int [...]."""
+    """A sample from softmax(logits) by Gumbel's trick, logits [..., action] to int [...]."""
     return (logits + rng.gumbel(size=logits.shape)).argmax(axis=-1)
 
 

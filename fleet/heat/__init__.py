@@ -1,1 +1,1 @@
-"""Laws of heat beside the thermal network of an arm: cooling strategies, surfaces that people touch, and more."""
+"""Thermal laws besides the network of an arm: cooling, limits, insulation, tool drift and surfaces."""

@@ -35,7 +35,7 @@ LONGEST_S = 1e5
 
 
 class Published(NamedTuple):
-    """What is published of the motor."""
+    """Published figures of the motor."""
 
     limit_s: dict[Arrangement, float]
     """Time from 26 °C to 125 °C."""

@@ -1,4 +1,4 @@
-"""Temperature limits of a Gen3's actuators, and what is known of the core, which has no model.
+"""Temperature limits of a Gen3's actuators, and a bound for the core, which has no model.
 
 The core is the microcontroller of an actuator. Its heat P_c is part of the idle heat, and it sits in the housing, so it
 settles R_c P_c above the housing. Neither number is published, and no log has its temperature, so it cannot be

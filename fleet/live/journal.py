@@ -34,7 +34,7 @@ Salvage = Callable[[bytes, str], Sequence[Record]]
 
 _REMEDY = (
     "Bring back a copy. Without its journal a participant has forgotten jobs, and may do them twice: see Epochs in "
-    "docs/bus.md before you move the file away."
+    "docs/bus/auctioneer.md before you move the file away."
 )
 _HEAD, _MIDDLE, _TAIL = b'{"crc":"', b'","records":', b"}\n"
 _CRC_END = len(_HEAD) + 8

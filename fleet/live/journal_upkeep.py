@@ -51,7 +51,8 @@ def own_records(journal: Journal[Record], name: str) -> Iterator[Record]:
         if isinstance(record, Started) and record.name not in ("", name):
             raise JournalError(
                 f"Journal '{journal.path}' is of '{printable(record.name)}'; '{name}' needs its own. If journals were "
-                f"swapped or copied, bring that of '{name}' back. See Epochs in docs/bus.md before you move one away."
+                f"swapped or copied, bring that of '{name}' back. See Epochs in docs/bus/auctioneer.md before you "
+                "move one away."
             )
         yield record
 

@@ -226,8 +226,8 @@ def example(small_workshop, small_batch, monkeypatch, tmp_path) -> Callable[[str
         _, _, section = PAGE.read_text(encoding="utf-8").partition(f"## {trainer}\n")
         code = section.split("```python\n")[1].split("```")[0]
         workshop = small_workshop()
-        monkeypatch.setattr("scenarios.make_env", workshop, raising=False)
-        monkeypatch.setattr("scenarios.make_batch", small_batch, raising=False)
+        monkeypatch.setattr("thermofleet.make_env", workshop, raising=False)
+        monkeypatch.setattr("thermofleet.make_batch", small_batch, raising=False)
         monkeypatch.chdir(tmp_path)
         told: dict[str, Any] = {}
         exec(code, told)

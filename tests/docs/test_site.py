@@ -50,7 +50,7 @@ def test_search_works_from_a_folder_without_network(site: Path) -> None:
         found.wait_for(timeout=20_000)
         found.click()
         view.wait_for_selector("article:has-text('clearance')", timeout=20_000)
-        for page in ("index", "cli", "bus", "tutorials/judge_a_policy", "notebooks/evaluate_policies"):
+        for page in ("index", "cli", "bus/messages", "tutorials/judge_a_policy", "notebooks/evaluate_policies"):
             view.set_viewport_size({"width": 390, "height": 844})
             view.goto((site / f"{page}.html").as_uri())
             width = view.evaluate("document.documentElement.scrollWidth")

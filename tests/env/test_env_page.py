@@ -75,8 +75,8 @@ def test_the_example_of_the_page_runs(monkeypatch, cell, folder) -> None:
         assert scenario == "quickstart"
         return make_batch(**small(given), num_envs=num_envs)
 
-    monkeypatch.setattr("scenarios.make_env", env, raising=False)
-    monkeypatch.setattr("scenarios.make_batch", batch, raising=False)
+    monkeypatch.setattr("thermofleet.make_env", env, raising=False)
+    monkeypatch.setattr("thermofleet.make_batch", batch, raising=False)
     monkeypatch.setattr("scenarios.prepare.env_registration.make_env", env)
     namespace: dict[str, Any] = {}
     exec(TEXT.split("```python\n")[1].split("```")[0], namespace)

@@ -37,7 +37,7 @@ def test_the_examples_make_a_fleet_of_their_own(bus):
 
 
 def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
-    """The auctioneer of `thermofleet auction`, an arm and a submitter that know it from docs/bus.md alone."""
+    """The auctioneer, an arm and a submitter that know it from docs/bus alone."""
     port, link = bus
     watcher, heard = link(), []
     watcher.subscribe(
@@ -64,7 +64,7 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
 
 @pytest.mark.slow
 def test_own_allocator_has_real_arms_do_the_jobs(bus, tmp_path):
-    """`thermofleet arm`, which plans and simulates, under an allocator that knows it from docs/bus.md alone."""
+    """An arm that plans and simulates, under an allocator that knows it from docs/bus alone."""
     port, link = bus
     watcher, heard = link(), []
     watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))

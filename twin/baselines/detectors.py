@@ -66,7 +66,7 @@ def mahalanobis(cool: CoolWindows) -> WindowScorer:
 
 
 def isolation_forest(cool: CoolWindows, seed: np.random.SeedSequence) -> WindowScorer:
-    """Isolation forest; trees drawn by the seed."""
+    """Isolation forest; the seed determines the trees."""
     seeds = seed.generate_state(cool.scaler.joints).tolist()
     return _detector("isolation forest", cool, lambda j: IsolationForest(random_state=seeds[j]), isolation_score)
 

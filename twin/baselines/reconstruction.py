@@ -63,7 +63,7 @@ class CoolWindows:
 
 
 def cool_windows(records: Sequence[Array], config: TwinConfig, seed: np.random.SeedSequence) -> CoolWindows:
-    """Training windows of records [time, 3, joint]; at most `config.max_windows`, drawn by the seed.
+    """Training windows of records [time, 3, joint]; at most `config.max_windows`, sampled by the seed.
 
     Raises:
         ValueError: no records, or one that is misshapen or not finite.

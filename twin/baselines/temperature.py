@@ -1,4 +1,4 @@
-"""An LSTM that predicts temperatures from torques: supervised, as the sibling of the twin's paper has it.
+"""An LSTM that predicts temperatures from torques: supervised, as in the sibling of the twin's paper.
 
 It needs labelled motion: the temperature that each job leads to. Here a window of torques of all joints gives the
 rise of every motor at the end of the job's horizon, and the rise by a job is the mean over its windows.
@@ -79,7 +79,7 @@ def train_regressor(
     Args:
         rise_k: Rise of every motor at the end of each job, K, [job, joint].
         config: How windows are cut.
-        steps: Steps of Adam, each with 128 windows drawn at random.
+        steps: Steps of Adam, each with 128 random windows.
 
     Raises:
         ValueError: not one row of rises for each job.

@@ -1,7 +1,8 @@
 """Identification of an arm's thermal network from its logs, with 95 % intervals.
 
 Nonlinear least squares through the exact step, with log-normal priors around a nominal arm. The ambient temperature is
-given: motor temperatures alone cannot tell it from idle heat. An error of two kelvin changes idle heat and cooling by
+given: motor temperatures alone do not distinguish it from idle heat. An error of two kelvin changes idle heat and
+cooling by
 some 6 %; predictions in the same room hardly change.
 """
 

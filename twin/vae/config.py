@@ -32,7 +32,8 @@ class TwinConfig:
     hidden: int = 16
     layers: int = 1
     window: int = 12
-    """Samples per window: about a second. Longer ones rank jobs worse and take longer (docs/paper.md, the sweep)."""
+    """Samples per window: about a second. Longer ones rank jobs worse and take longer (docs/results/paper.md, the
+    sweep)."""
     rate_hz: float = 12.5
     """Samples per second inside a window."""
     record_hz: float = RATE_HZ
@@ -42,7 +43,7 @@ class TwinConfig:
     score_stride: int = 12
     """Samples from one scored window to the next; the last window ends at the end."""
     max_windows: int = 1792
-    """Most training windows, drawn at random; 14 batches."""
+    """Maximum number of training windows, sampled at random; 14 batches."""
     beta: float = 1.0
     """Weight of the KL term."""
     loss: Loss = "sum"

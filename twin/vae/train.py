@@ -46,7 +46,7 @@ class Diverged(FleetError):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Motion:
-    """What the twin of one arm is trained on."""
+    """Training data of the twin of one arm."""
 
     arm: str
     records: Sequence[Array]

@@ -1,4 +1,4 @@
-"""What determines the weights of a training."""
+"""Cache key of everything that determines the weights of a training."""
 
 import hashlib
 from collections.abc import Sequence

@@ -24,7 +24,7 @@ _CHUNK = 128
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """How well one network reconstructs its training windows, and how its training went."""
+    """Reconstruction quality of one network on its training windows, and its training history."""
 
     elbo: float
     """Nats per window, without the constant of the likelihood; of an autoencoder, minus half the squared error."""

@@ -94,7 +94,7 @@ def windows_of(records: Sequence[Array], config: TwinConfig) -> Array:
 
 
 def draw_windows(windows: Array, most: int, seed: np.random.SeedSequence) -> Array:
-    """At most `most` of the windows, drawn without replacement and in their order."""
+    """At most `most` of the windows, sampled without replacement, in their order."""
     if len(windows) <= most:
         return windows
     return windows[np.sort(np.random.default_rng(seed).choice(len(windows), most, replace=False))]

@@ -68,7 +68,7 @@ class Rule:
 
     @property
     def guarantee(self) -> str:
-        """What the verdict bounds, as a sentence."""
+        """Guarantee of the verdict, as a sentence."""
         kinds = len(np.unique(self.calibration.group))
         return (
             f"At most {self.alpha:.3g} of new cool jobs are called anomalous, if they are like the held-out ones "

@@ -105,7 +105,7 @@ def asyncapi() -> Schema:
         "info": {
             "title": "thermofleet",
             "version": f"{messages.VERSION}.0.0",
-            "description": "Arms, auctioneers and outsiders of one fleet on a Zenoh router. See docs/bus.md.",
+            "description": "Arms, auctioneers and outsiders of one fleet on a Zenoh router. See docs/bus/messages.md.",
             "license": {"name": "Apache-2.0"},
         },
         "defaultContentType": "application/json",
