@@ -123,8 +123,8 @@ def demo_command(
     seed: options.SeedOption = 20,
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
-    from scenarios.report.pair_page import Side, pair_page
     from scenarios.run.shift import summary
+    from scenarios.show.run_page import Side, pair_page
 
     chosen = load("quickstart")
     results: dict[str, RunResult] = {}

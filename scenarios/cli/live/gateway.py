@@ -27,8 +27,8 @@ from scenarios.live.http_access import MIN_TOKEN, ROLES, Role, check_token, read
 from scenarios.live.http_app import STUCK_S, Readers, application
 from scenarios.live.http_page import LivePage
 from scenarios.load import load
-from scenarios.report.three import three_js
 from scenarios.schema import Scenario
+from scenarios.show.replay import three_js
 
 TOKEN = "THERMOFLEET_TOKEN"
 PORT = 8080

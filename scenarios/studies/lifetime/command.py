@@ -11,7 +11,7 @@ from scenarios.cli.terminal import out_console, plain_table, print_json, progres
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
-    from scenarios.report.page import Table
+    from scenarios.show.page import Table
 
 Name = Literal["transfer", "features", "augmentation", "drift"]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenarios.report.page import escape
+from scenarios.show.page import escape
 
 Array = np.ndarray
 
