@@ -160,7 +160,7 @@ def demo_command(
 
 
 def _named(faults: "list[Event]") -> str:
-    return ", ".join(dict.fromkeys(f"{fault.arm} (motor {fault.joint})" for fault in faults))
+    return ", ".join(dict.fromkeys(f"{fault.arm} (joint {fault.joint})" for fault in faults))
 
 
 def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, risk: str, channel: Channel) -> "RunSpec":

@@ -300,7 +300,7 @@ def _heat_charts(judged: Judged) -> Iterator[Chart]:
         if rows:
             drawn = points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
             alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
-            yield Chart(key=f"heat_{number}", figure=drawn, alt=alt)
+            yield Chart(key=f"heat_{number}", figure=drawn, alt=alt, shrinks=False)
 
 
 def _figures(result: Comparison) -> dict[str, object]:
@@ -414,7 +414,7 @@ def lines(
     return {
         "data": [*bands, *curves],
         "layout": LAYOUT
-        | {"height": HEIGHT_PX + 60, "margin": MARGIN | {"t": 72}, "showlegend": True, "legend": legend}
+        | {"height": HEIGHT_PX + 28, "margin": MARGIN | {"t": 40}, "showlegend": True, "legend": legend}
         | {"xaxis": AXIS | {"range": [x[0], x[-1]], "title": {"text": x_title}}}
         | {"yaxis": AXIS | {"range": [0, 1.02], "title": {"text": y_title}}},
     }

@@ -80,6 +80,8 @@ class Chart:
     figure: Figure
     alt: str
     """Text in place of the figure."""
+    shrinks: bool = True
+    """Whether it is readable on a phone; if not, it keeps its width there and is scrolled."""
 
 
 @dataclass(frozen=True, kw_only=True)

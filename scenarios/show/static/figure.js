@@ -42,7 +42,7 @@ async function drawFigure(element, options) {
     last = element.clientWidth;
     const shift = drawn.layout.xaxis2; // of a shift: the time axis of the work has the title of the one below
     const narrow = shift && last < 600;
-    const needed = legend.getBoundingClientRect().height + 50;
+    const needed = legend.getBoundingClientRect().height + (shift ? 50 : 20);
     const margin = Math.max(room, Math.ceil(needed));
     if (narrow || Math.abs(margin - element.layout.margin.t) > 4)
       await Plotly.relayout(element, {
