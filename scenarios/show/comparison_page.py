@@ -56,7 +56,8 @@ def comparison_table(result: Comparison) -> Table:
         caption += f"\nChannel: {result.channel_text}."
     if result.randomise:
         caption += f"\nRandomisation: {result.randomise.text}."
-    groups = {"scope": [(label(policy), scope, "", "", "", "") for policy, scope in result.scopes.items()]}
+    scopes: list[tuple[str, ...]] = [(label(policy), scope, "", "", "", "") for policy, scope in result.scopes.items()]
+    groups = {"scope": scopes}
     for name in FIGURES:
         figures = {policy: each[name] for policy, each in result.figures.items()}
         groups[HEADINGS[name]] = figure_rows(figures, result.baseline, label, LEAST_DIGITS.get(name, 1))

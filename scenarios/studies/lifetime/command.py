@@ -60,7 +60,7 @@ def study_command(
         print_json(result)
         return
     for table in tables:
-        shown = plain_table(*table.head, title=table.caption)
+        shown = plain_table(*table.headings, title=table.caption)
         for row in table.rows:
             shown.add_row(*row)
         out_console.print(shown)
