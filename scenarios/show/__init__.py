@@ -1,1 +1,1 @@
-"""Reports, figures and tables of a shift."""
+"""How results are shown: tables, pages, films, and files of other viewers."""
