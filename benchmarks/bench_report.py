@@ -24,9 +24,9 @@ from playwright.sync_api import Browser, sync_playwright
 from fleet.physics.cell_model import cell_model
 from fleet.robot import Mount, Robot
 from fleet.telemetry import Telemetry
-from scenarios.report.run_page import report_html
 from scenarios.run.run_folder import run_html
 from scenarios.run.stored_run import StoredRun, read_run
+from scenarios.show.run_page import report_html
 
 CHROMIUM = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 COLUMNS = {

@@ -167,8 +167,9 @@ def _span(kind: Schema, low: str, high: str) -> str:
 
 def table(head: tuple[str, ...], rows: Iterable[Sequence[str]]) -> str:
     """A table in Markdown."""
-    lines = [head, tuple("---" for _ in head), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    from scenarios.show.table import Table
+
+    return Table(head=head, rows=tuple(map(tuple, rows))).markdown()
 
 
 def _time_table() -> str:

@@ -9,7 +9,7 @@ EXTRAS = {
     "twin": ("joblib", "safetensors", "sklearn", "torch"),
     "bus": ("zenoh",),
     "tls": ("cryptography",),
-    "report": ("matplotlib", "PIL", "plotly", "pyarrow", "trimesh"),
+    "report": ("jinja2", "matplotlib", "PIL", "plotly", "pyarrow", "trimesh"),
     "film": ("av",),
     "gateway": ("starlette", "uvicorn"),
     "learn": ("tensordict", "torchrl"),
@@ -17,7 +17,6 @@ EXTRAS = {
     "meshes": ("mujoco_menagerie",),
     "onnx": ("onnx", "onnxruntime"),
     "ray": ("ray",),
-    "rerun": ("rerun",),
     "ros2": ("rosbags",),
 }
 """Top-level modules of the libraries of each extra."""

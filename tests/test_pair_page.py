@@ -3,7 +3,7 @@
 import re
 
 from fleet.events import Event
-from scenarios.report.pair_page import Side, other_choices, pair_page
+from scenarios.show.run_page import Side, other_choices, pair_page
 
 ARMS = ["arm_a", "arm_b"]
 

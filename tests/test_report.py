@@ -19,10 +19,9 @@ from plotly.offline import get_plotlyjs
 
 from fleet.events import Event
 from fleet.telemetry import Telemetry
-from scenarios.report.gantt import stream_of
-from scenarios.report.run_page import ROWS, report_html
-from scenarios.report.schedule import schedule
-from scenarios.report.timeline import decimate, figure
+from scenarios.run.schedule import schedule
+from scenarios.show.run_page import ROWS, report_html
+from scenarios.show.timeline import decimate, figure, stream_of
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
@@ -167,7 +166,7 @@ def test_every_fault_is_marked_in_gantt_lane_and_table() -> None:
     shown = drawn(text)
     (marks,) = [t for t in shown["data"] if t.get("name") == "fault"]
     assert marks["x"] == [20.0]  # 1200 s in minutes
-    assert "motor 2 passed 75" in marks["customdata"][0]
+    assert "joint 2 passed 75" in marks["customdata"][0]
     lines = [s for s in shown["layout"]["shapes"] if s.get("xref") == "x2" and s["type"] == "line"]
     assert [(s["x0"], s["x1"], s["yref"]) for s in lines] == [(20.0, 20.0, "y2 domain")]
     (block,) = [t for t in shown["data"] if t.get("name") == "out after a fault"]

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.events import Event
-from scenarios.report.schedule import schedule
+from scenarios.run.schedule import schedule
 
 ARMS = ("arm_0", "arm_1")
 HORIZON_S = 1000.0

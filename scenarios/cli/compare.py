@@ -116,17 +116,16 @@ def compare_command(
     """
     from scenarios.prepare.fleet import DifficultyName, RiskName
     from scenarios.run.evaluate import FIGURES
+    from scenarios.show.comparison_page import Judged, comparison_page, result_text, verdict
     from scenarios.statistics.marl_eval import to_marl_eval
     from scenarios.trials.cases import cases_of, suite_label, suite_of
     from scenarios.trials.contest import run_study
     from scenarios.trials.plan import Study, columns
-    from scenarios.trials.report.page import Judged, comparison_page, verdict
     from scenarios.trials.scores import references_of
     from scenarios.trials.summary import (
         check_baseline,
         comparisons,
         competitors,
-        result_page,
         rows_without_failures,
         scores_over_all,
     )
@@ -183,7 +182,7 @@ def compare_command(
         print_json(results[0] if len(results) == 1 else results)
         return
     for result in results:
-        out_console.print(result_page(result))
+        out_console.print(result_text(result))
     out_console.print("", *verdict(judged), sep="\n")
     if out:
         say(f"Written to {out}; open {out / PAGE}.")

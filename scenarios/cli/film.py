@@ -41,7 +41,7 @@ def film_command(
     if sys.platform.startswith("linux"):  # MuJoCo chooses its OpenGL when it is loaded, and the default needs a display
         os.environ.setdefault("MUJOCO_GL", "egl")
     from scenarios.run.stored_run import read_run
-    from scenarios.view.film import Shot, frames, times, write_film
+    from scenarios.show.film import Shot, frames, times, write_film
 
     shot = Shot(
         speed=speed,

@@ -67,7 +67,7 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
     The thermal load factor is the heat of all jobs relative to the capacity of
     the fleet. Above 1.2 no policy keeps all motors below the warning limit.
     """
-    from scenarios.report.describe import describe
+    from scenarios.show.describe import describe
 
     chosen = load(scenario)
     if as_json:
@@ -76,7 +76,7 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
     with progress_bar() as progress:
         parts = describe(chosen, progress)
     for part in parts:
-        out_console.print(part)
+        out_console.print(part, "")
 
 
 def layout_command(
@@ -90,8 +90,7 @@ def layout_command(
     Lists all problems of the cell, for example two arms that are too close at
     home. Exit code 2: there are problems.
     """
-    from scenarios.report.layout import layout_report, layout_scene
-    from scenarios.report.layout_tables import layout_tables
+    from scenarios.show.layout import layout_report, layout_scene, layout_tables
 
     chosen = load(scenario)
     if out is not None:
@@ -101,8 +100,10 @@ def layout_command(
     if as_json:
         print_json(report)
     else:
-        for part in layout_tables(chosen, report):
-            out_console.print(part)
+        tables, at_once = layout_tables(chosen, report)
+        for table in tables:
+            out_console.print(table, "")
+        say(at_once, out_console)
     if out is not None:
         from matplotlib.image import imsave
 

@@ -50,7 +50,7 @@ COMMANDS = {
     "layout": LazyCommand(_LOOK, "library:layout_command", "Show reach, space and problems of a cell."),
     "film": LazyCommand(_LOOK, "film:film_command", "Film a recorded shift."),
     "view": LazyCommand(_LOOK, "view:view_command", "Play a shift in MuJoCo's viewer."),
-    "trace": LazyCommand(_LOOK, "scenarios.trace.command:trace_command", "Follow an event to its causes."),
+    "trace": LazyCommand(_LOOK, "scenarios.cli.trace:trace_command", "Follow an event to its causes."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
     "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of predictions under one policy."),
     "bounds": LazyCommand(_POLICIES, "scenarios.bounds.command:bounds_command", "Bound the reward of shifts."),

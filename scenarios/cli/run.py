@@ -123,8 +123,8 @@ def demo_command(
     seed: options.SeedOption = 20,
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
-    from scenarios.report.pair_page import Side, pair_page
     from scenarios.run.shift import summary
+    from scenarios.show.run_page import Side, pair_page
 
     chosen = load("quickstart")
     results: dict[str, RunResult] = {}
@@ -160,7 +160,7 @@ def demo_command(
 
 
 def _named(faults: "list[Event]") -> str:
-    return ", ".join(dict.fromkeys(f"{fault.arm} (motor {fault.joint})" for fault in faults))
+    return ", ".join(dict.fromkeys(f"{fault.arm} (joint {fault.joint})" for fault in faults))
 
 
 def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, risk: str, channel: Channel) -> "RunSpec":

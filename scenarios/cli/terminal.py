@@ -184,7 +184,7 @@ WIDE = 200
 """Columns of a table with many columns in a file or a pipe, which have no width of their own."""
 
 
-def print_wide(table: Table) -> None:
+def print_wide(table: RenderableType) -> None:
     """Print a table with many columns: in the width of the terminal, without one in `WIDE`."""
     wide = out_console.is_terminal or "COLUMNS" in os.environ
     (out_console if wide else SafeConsole(width=WIDE)).print(table)

@@ -17,7 +17,7 @@ from scenarios.result_folder import check_file, disk_errors
 
 NO_DISPLAY = (
     "MuJoCo's viewer needs a display, and there is none (DISPLAY and WAYLAND_DISPLAY are not set). Use "
-    "`thermofleet film RUN`, `--rerun` or `--mcap`, or open the run's report.html."
+    "`thermofleet film RUN` or `--mcap`, or open the run's report.html."
 )
 
 
@@ -26,14 +26,11 @@ def view_command(
     speed: Annotated[float, number("Shift seconds per second.", 0.1, 3600)] = 30.0,
     begin: Annotated[float, number("First second of the shift.", 0, 1e9)] = 0.0,
     meshes: Annotated[bool, typer.Option("--meshes", help="Kinova's shells; needs the extra `meshes`.")] = False,
-    rerun: Annotated[
-        Path | None, typer.Option(help="Write the run as this file (.rrd) instead, for Rerun; needs the extra `rerun`.")
-    ] = None,
     mcap: Annotated[
         Path | None,
         typer.Option(
-            help="Write the run as this file (.mcap) instead, in messages of ROS 2, for Foxglove, RViz or PlotJuggler; "
-            "needs the extra `mcap`."
+            help="Write the run as this file (.mcap) instead, in messages of ROS 2, for Foxglove, Rerun, RViz or "
+            "PlotJuggler; needs the extra `mcap`."
         ),
     ] = None,
     gltf: Annotated[
@@ -53,13 +50,13 @@ def view_command(
 ) -> None:
     """Play a recorded shift in MuJoCo's viewer, or show the cell of a scenario; close its window to end.
 
-    With --rerun, --mcap or --gltf the shift is written as a file instead, without a display.
+    With --mcap or --gltf the shift is written as a file instead, without a display.
     """
-    if rerun is not None or mcap is not None or gltf is not None:
-        _write_files(what, rerun, mcap, gltf, every, speed, overwrite)
+    if mcap is not None or gltf is not None:
+        _write_files(what, mcap, gltf, every, speed, overwrite)
         return
     if every is not None:
-        raise FleetError("--every is for --rerun, --mcap and --gltf.")
+        raise FleetError("--every is for --mcap and --gltf.")
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise FleetError(NO_DISPLAY)
     import numpy as np
@@ -67,7 +64,7 @@ def view_command(
     from fleet.physics.cell_player import CellPlayer
     from scenarios.load import load
     from scenarios.run.stored_run import read_run
-    from scenarios.view.film import Film, show_heat
+    from scenarios.show.film import Film, show_heat
 
     if (Path(what) / "run.json").exists():
         run = read_run(Path(what))
@@ -93,44 +90,38 @@ def view_command(
 
 def _write_files(
     what: str,
-    rerun: Path | None,
     mcap: Path | None,
     gltf: Path | None,
     every_s: float | None,
     speed: float,
     overwrite: bool,
 ) -> None:
-    wanted = [("rerun", rerun, ".rrd"), ("mcap", mcap, ".mcap"), ("gltf", gltf, ".glb")]
+    wanted = [("mcap", mcap, ".mcap"), ("gltf", gltf, ".glb")]
     files = {name: (path, ending) for name, path, ending in wanted if path is not None}
-    extras = {"rerun": ("rerun",), "mcap": ("mcap", "ros2"), "gltf": ("report",)}
+    extras = {"mcap": ("mcap", "ros2"), "gltf": ("report",)}
     for name, (path, ending) in files.items():
         check_file(path, (ending,), overwrite, f"--{name}")
         for extra in extras[name]:
             require_extra(extra)
     if not (Path(what) / "run.json").exists():
-        raise FleetError(f"--rerun, --mcap and --gltf need the folder of a `thermofleet run` (got '{what}').")
+        raise FleetError(f"--mcap and --gltf need the folder of a `thermofleet run` (got '{what}').")
     from scenarios.run.stored_run import read_run
-    from scenarios.view.moments import Moments
+    from scenarios.show.moments import Moments
 
     moments = Moments(read_run(Path(what)), every_s)
     for name, (path, _) in files.items():
         with progress_bar(kept="") as progress, disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(path) as file:
-                if name == "rerun":
-                    from scenarios.view.rerun_file import write_rerun
-
-                    write_rerun(file, moments, progress)
-                elif name == "mcap":
-                    from scenarios.view.mcap_file import write_mcap
+                if name == "mcap":
+                    from scenarios.show.mcap import write_mcap
 
                     write_mcap(file, moments, progress)
                 else:
-                    from scenarios.view.gltf_file import write_gltf
+                    from scenarios.show.gltf import write_gltf
 
                     write_gltf(file, moments, speed, progress)
         hints = {
-            "rerun": f"rerun {path}",
             "mcap": f"open it in Foxglove, or: ros2 bag play {path}",
             "gltf": f"{speed:g} × real time; open it in Blender or a web viewer",
         }

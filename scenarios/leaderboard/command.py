@@ -35,7 +35,7 @@ def leaderboard_command(
     """
     from scenarios.leaderboard.board import best_text, board_of, board_text, read_all, remark_text
     from scenarios.load import SplitName
-    from scenarios.statistics.scores import score_tables
+    from scenarios.show.comparison_page import narrow_score_tables
     from scenarios.statistics.tables import LEGEND
 
     split = choose("split", split, SplitName)
@@ -62,7 +62,9 @@ def leaderboard_command(
             for name, each in board.entries.items()
         }
         about = f"Predictions: {', '.join(sources)}. (arm): scope arm, others central. {LEGEND}."
-        out_console.print(best_text(board), about, *score_tables(board.scores, labels), remark_text(board), sep="\n")
+        out_console.print(
+            best_text(board), about, *narrow_score_tables(board.scores, labels), remark_text(board), sep="\n"
+        )
 
 
 def submit_command(

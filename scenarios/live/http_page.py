@@ -8,7 +8,6 @@ import asyncio
 import gzip
 from collections.abc import Awaitable, Callable, Mapping
 from functools import cached_property
-from importlib.resources import files
 from typing import Any  # values of JSON
 
 from starlette.requests import Request
@@ -18,7 +17,6 @@ from starlette.types import Scope
 from fleet.bus.protocol.cell import Cell
 from fleet.env.render.heat import heat_scale
 from fleet.errors import BusError
-from scenarios.report.three import three_js
 
 PAGE = "dashboard.html"
 FILES = ("page.css", "dashboard.css", "cell.js", "stream.js", "tables.js", "actions.js", "dashboard.js")
@@ -68,8 +66,10 @@ class LivePage:
     @cached_property
     def contents(self) -> Mapping[str, bytes]:
         """The page and its files by name, compressed."""
-        folder = files("scenarios.report").joinpath("static")
-        texts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in (PAGE, *FILES)}
+        from scenarios.show.html import static
+        from scenarios.show.replay import three_js
+
+        texts = {name: static(name) for name in (PAGE, *FILES)}
         texts["three.js"] = three_js()
         return {name: gzip.compress(text.encode(), mtime=0) for name, text in texts.items()}
 

@@ -30,9 +30,7 @@ from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
 from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
-from scenarios.report.gantt import clock
-from scenarios.report.run_page import report_html
-from scenarios.report.schedule import SAME_MOMENT_DIGITS
+from scenarios.run.schedule import SAME_MOMENT_DIGITS
 from scenarios.schema import Scenario
 from scenarios.shift_records import Offer
 
@@ -56,6 +54,8 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
     Raises:
         FleetError: it is no recording, has no states of arms yet, or has arms that the scenario does not have.
     """
+    from scenarios.show.run_page import report_html
+
     card = read_card(folder)
     epochs = dict.fromkeys(epoch for count in card.speakers.values() for epoch in count.epochs)
     table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in MESSAGES)
@@ -353,6 +353,8 @@ def _submitters(results: pa.Table) -> Mapping[str, int]:
 
 def _describe_request(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Time, action, what it concerns, and who asked."""
+    from scenarios.show.words import clock
+
     action = json.loads(row["content"])["action"]
     details = (
         f"{key.removesuffix('_s')} {action[key]}".removeprefix("outcome ")

@@ -171,7 +171,7 @@ class Search:
         reasons = ", ".join(f"{reason} {times}" for reason, times in passed_over.most_common())
         return (
             f"No better posture near: of {count} within {self.near.joint_rad:g} rad per joint and "
-            f"{self.near.tool_m:g} m of the tool, {passed_over.total()} are easier for motor {self.hottest + 1}"
+            f"{self.near.tool_m:g} m of the tool, {passed_over.total()} are easier for joint {self.hottest + 1}"
             + (f", and all of them were rejected ({reasons})" if reasons else "")
             + ". Allow more displacement, or put the payload down."
         )

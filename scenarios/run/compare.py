@@ -3,22 +3,22 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Group
-from rich.text import Text
 
 from fleet.bus.exchange.channel import PERFECT, Channel
-from scenarios.policy_loader import has_trainings, label
+from scenarios.policy_loader import has_trainings
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
-from scenarios.report.page import table
 from scenarios.run.evaluate import COUNTS, FIGURES, POSSIBLE, Outcome
 from scenarios.schema import Scenario
 from scenarios.statistics.scores import Scores
-from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
+from scenarios.statistics.tables import Figure, figures_of
+
+if TYPE_CHECKING:
+    from scenarios.show.table import Table
 
 Array = np.ndarray
 
@@ -89,18 +89,15 @@ class Comparison:
         seeds = f", seeds {first} to {last}" if consecutive else ""
         return f"{self.scenario}{seeds} ({self.unit})"
 
-    def _repr_html_(self) -> str:
-        head = ("policy", *(HEADINGS[name] for name in FIGURES))
-        rows = [[label(policy), *map(self._cell, figures.values())] for policy, figures in self.figures.items()]
-        what = f"mean [interval] and paired difference to {label(self.baseline)}; {LEGEND}"
-        more = "".join(f" {each}" for each in remarks(self.figures, self.draws))
-        return table(head, rows, caption=f"{self.scenario}, {self.unit}: {what}.{more}")
+    @property
+    def table(self) -> "Table":
+        """A group per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
+        from scenarios.show.comparison_page import comparison_table
 
-    @staticmethod
-    def _cell(figure: Figure) -> str:
-        bounds = f" [{figure.low:.3g}, {figure.high:.3g}]" if figure.low == figure.low else ""
-        difference = f" {figure.difference:+.3g}{figure.stars}" if figure.difference else ""
-        return f"{figure.mean:.4g}{bounds}{difference}"
+        return comparison_table(self)
+
+    def _repr_html_(self) -> str:
+        return str(self.table.html())
 
 
 def compare(
@@ -166,24 +163,3 @@ def figures_of_shifts(
 
     values = {policy: {name: values_of(policy, rows, name) for name in FIGURES} for policy, rows in by_policy.items()}
     return figures_of(values, baseline, counts=COUNTS, possible=POSSIBLE)
-
-
-def comparison_table(result: Comparison) -> Group:
-    """A block per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
-    title = f"{result.title}: mean, paired difference to {result.baseline}, {LEGEND}"
-    if result.channel != PERFECT.described():
-        title += f"\nChannel: {result.channel_text}."
-    if result.randomise:
-        title += f"\nRandomisation: {result.randomise.text}."
-    table = empty_table()
-    table.add_row("[bold]scope[/bold]")
-    for policy, scope in result.scopes.items():
-        table.add_row(f"  {label(policy)}", scope)
-    for name in FIGURES:
-        figures = {policy: each[name] for policy, each in result.figures.items()}
-        add_block(table, HEADINGS[name], figures, result.baseline, label, LEAST_DIGITS.get(name, 1))
-    below = list(remarks(result.figures, result.draws))
-    central = [label(policy) for policy, scope in result.scopes.items() if scope == "central"]
-    if result.channel != PERFECT.described() and central:
-        below.append(f"Central policies read no messages: {', '.join(central)}.")
-    return Group(Text(title), table, *map(Text, below))

@@ -16,7 +16,6 @@ from fleet.events import Event
 from fleet.physics.cell_model import cell_model
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
-from scenarios.report.run_page import report_html
 from scenarios.result_folder import ResultKind, disk_errors
 from scenarios.run.shift import RUN_FORMAT, RunResult, summary
 from scenarios.schema import Scenario
@@ -65,6 +64,8 @@ def run_html(
     Raises:
         FleetError: the meshes are not available.
     """
+    from scenarios.show.run_page import report_html
+
     robots, limits = [arm.robot() for arm in scenario.arms], scenario.limits
     return report_html(
         card,

@@ -72,7 +72,7 @@ class RunResult:
     total_reward: float
 
     def _repr_html_(self) -> str:
-        from scenarios.report.notebook import run_html
+        from scenarios.show.run_page import run_html
 
         return run_html(summary(self), self.events, self.offers)
 

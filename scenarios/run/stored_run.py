@@ -16,10 +16,8 @@ from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
-from scenarios.report.notebook import run_html
-from scenarios.report.playback import payloads
-from scenarios.report.schedule import Schedule, schedule
 from scenarios.run.run_folder import UNITS, check_format
+from scenarios.run.schedule import Schedule, payloads, schedule
 from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer
 
@@ -52,6 +50,8 @@ class StoredRun:
         return payloads(self.telemetry, self.plan, self.arms, {job.job: job.payload_kg for job in self.jobs})
 
     def _repr_html_(self) -> str:
+        from scenarios.show.run_page import run_html
+
         return run_html(self.card, self.events, self.offers)
 
 

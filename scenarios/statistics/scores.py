@@ -1,11 +1,10 @@
 """Normalised scores of policies over instances: mean, difference to a baseline, and the figures of `suites`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from rich.table import Table
 
 from scenarios.statistics.holm import holm
 from scenarios.statistics.means import Interval, interval, paired
@@ -189,18 +188,3 @@ def score_cells(scores: Scores, name: str, digits: int = 2) -> tuple[str, ...]:
         "" if base else each.improvement.text(digits),
         f"{each.bound_gap.mean:.{digits}f}",
     )
-
-
-def score_tables(scores: Scores, labels: Mapping[str, str]) -> Sequence[Table]:
-    """Two tables of all policies, the best first, each narrow enough for 80 columns."""
-    parts: list[Table] = []
-    for columns in ((0, 1, 2, 6), (3, 4, 5)):
-        table = Table(box=None, pad_edge=False)
-        table.add_column("normalised score" if not columns[0] else "", overflow="fold")
-        for column in columns:
-            table.add_column(HEADS[1 + column], justify="right")
-        for name in ranked(scores):
-            cells = score_cells(scores, name)
-            table.add_row(labels[name], *(cells[column] for column in columns))
-        parts.append(table)
-    return parts

@@ -5,7 +5,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.table import Table
 from scipy.stats import trim_mean
 
 from scenarios.statistics.counts import count_interval, paired_counts, share_bounds
@@ -16,6 +15,7 @@ Array = np.ndarray
 
 LEGEND = "95 % intervals; * excludes 0, ** also after Holm's correction over the table"
 EQUAL = "all equal"
+HEAD = ("", "mean", "interval", "difference", "interval", "")
 MORE_DIGITS = 3
 """Decimals that a row may have beyond the least, so that no interval that excludes 0 seems to include it."""
 
@@ -98,33 +98,20 @@ def _figure(own: Interval, to_base: Interval, values: Array, p_holm: float) -> F
     )
 
 
-def empty_table() -> Table:
-    """A table for the rows of `add_block`, narrow enough for 80 columns."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("", overflow="fold")
-    for name in ("mean", "interval", "difference", "interval", ""):
-        table.add_column(name, justify="right")
-    return table
-
-
-def add_block(
-    table: Table,
-    heading: str,
-    figures: Mapping[str, Figure],
-    baseline: str,
-    label: Callable[[str], str],
-    least_digits: int = 1,
-) -> None:
-    """Add a heading and a row for each policy: mean and paired difference, each with its interval."""
-    table.add_row(f"[bold]{heading}[/bold]")
-    digits = _digits(list(figures.values()), least_digits)
+def figure_rows(
+    figures: Mapping[str, Figure], baseline: str, label: Callable[[str], str], least_digits: int = 1
+) -> list[tuple[str, ...]]:
+    """A row of `HEAD` for each policy: mean and paired difference, each with its interval."""
+    digits, rows = _digits(list(figures.values()), least_digits), list[tuple[str, ...]]()
     for policy, f in figures.items():
-        cells = [f"  {label(policy)}", f"{f.mean:z.{digits}f}", _span(f.low, f.high, digits)]
-        if policy != baseline:
-            low, high = (round(bound, digits) for bound in (f.difference_low, f.difference_high))
-            shown = f.stars if low > 0 or high < 0 else ""
-            cells += [f"{f.difference:+z.{digits}f}", _span(low, high, digits, "+"), shown]
-        table.add_row(*cells)
+        cells = (label(policy), f"{f.mean:z.{digits}f}", _span(f.low, f.high, digits))
+        if policy == baseline:
+            rows.append((*cells, "", "", ""))
+            continue
+        low, high = (round(bound, digits) for bound in (f.difference_low, f.difference_high))
+        stars = f.stars if low > 0 or high < 0 else ""
+        rows.append((*cells, f"{f.difference:+z.{digits}f}", _span(low, high, digits, "+"), stars))
+    return rows
 
 
 def remarks(figures: Mapping[str, Mapping[str, Figure]], draws: int) -> Iterator[str]:

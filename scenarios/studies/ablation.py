@@ -13,8 +13,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from rich.console import Group
-from rich.text import Text
 
 from fleet.errors import FleetError, nearest
 from fleet.files import atomic_path, cache_folder
@@ -24,8 +22,9 @@ from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import COUNTS, POSSIBLE, outcomes
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
+from scenarios.show.table import Table
 from scenarios.statistics.means import unit
-from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
+from scenarios.statistics.tables import HEAD, LEGEND, Figure, figure_rows, figures_of, remarks
 from scenarios.studies.score_sources import ALL_SOURCES, SOURCES, DrawnFleet
 from scenarios.trials.cells import drawn
 
@@ -229,14 +228,17 @@ def _values(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row], name
     )
 
 
-def ablation_table(result: Ablation) -> Group:
-    """Table with a block per figure: mean and difference to the first source of each source, with intervals."""
+def ablation_table(result: Ablation) -> Table:
+    """Table with a group per figure: mean and difference to the first source of each source, with intervals."""
     plan = result.plan
     title = (
         f"{result.scenario}, {label(plan.policy)}, {unit((plan.fleets, plan.trainings, plan.seeds))}: mean, paired "
         f"difference to {plan.label(plan.scores[0])}, {LEGEND}"
     )
-    table = empty_table()
-    for name in FIGURES:
-        add_block(table, name, {scores: e[name] for scores, e in result.effects.items()}, plan.scores[0], plan.label, 2)
-    return Group(Text(title), table, *map(Text, remarks(result.effects, min(plan.fleets, plan.seeds))))
+    groups = {
+        name: figure_rows(
+            {scores: e[name] for scores, e in result.effects.items()}, plan.scores[0], plan.label, least_digits=2
+        )
+        for name in FIGURES
+    }
+    return Table.grouped(HEAD, groups, caption=title, notes=(*remarks(result.effects, min(plan.fleets, plan.seeds)),))

@@ -27,7 +27,7 @@ Bus = Literal["perfect", "late", "lossy", "ring", "cut"]
 
 
 class Severity(NamedTuple):
-    """What a heat severity asks of the arms, as time loads of the expected jobs (`scenarios.report.load_factor`)."""
+    """What a heat severity asks of the arms, as time loads of the expected jobs (`scenarios.prepare.load_factor`)."""
 
     heating: float
     """Of the tasks that heat."""

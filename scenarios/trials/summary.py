@@ -1,34 +1,21 @@
-"""From rows to figures and differences, and what a table says of policies that failed."""
+"""From rows to figures and differences."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
-
 from fleet.errors import FleetError
-from scenarios.policy_loader import label, scope_of
+from scenarios.policy_loader import scope_of
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.run.compare import Comparison, Failed, comparison_table, figures_of_shifts
+from scenarios.run.compare import Comparison, Failed, figures_of_shifts
 from scenarios.run.evaluate import Outcome
 from scenarios.statistics.means import fewest, unit
-from scenarios.statistics.scores import FEWEST, Normalised, and_trainings, score_tables, scores_of
-from scenarios.statistics.tables import LEGEND
+from scenarios.statistics.scores import Normalised, and_trainings, scores_of
 from scenarios.trials.cases import suite_label
 from scenarios.trials.plan import Row, Study
 from scenarios.trials.scores import Shift, normalised
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.bounds.references import Reference
-
-NO_SCORES = (
-    f"No normalised scores: they need {FEWEST} or more shifts with references. Make references with thermofleet "
-    "bounds, then compare with --references FILE."
-)
-NO_SCORES_RANDOMISED = "No normalised scores: references are of shifts without randomisation."
-MOST_FAILURES = 8
-"""Failed policies whose first failure a table tells."""
 
 
 def competitors(study: Study) -> dict[tuple[str, str], str]:
@@ -150,38 +137,3 @@ def comparisons(
         return [comparison_of(study, rows, baseline, suite_label(suite), references)]
     of = {case.name: [row for row in rows if row.key.instance == case.name] for case in study.cases}
     return [comparison_of(study, own, baseline, references=references) for own in of.values()]
-
-
-def result_page(result: Comparison) -> Group:
-    """The table of a comparison, then its illegal actions and failures."""
-    parts: list[RenderableType] = [comparison_table(result)] if result.figures else []
-    if result.scores:
-        names = {policy: label(policy) for policy in result.scores.policies}
-        title = f"\nNormalised scores, paired difference to {label(result.baseline)}, {LEGEND}"
-        parts += [Text(title), *score_tables(result.scores, names), *map(Text, result.scores.remarks)]
-    elif result.figures:
-        parts.append(Text(NO_SCORES_RANDOMISED if result.randomise else NO_SCORES))
-    if any(result.illegal.values()):
-        told = ", ".join(f"{label(policy)} {count}" for policy, count in result.illegal.items() if count)
-        parts.append(Text(f"Illegal actions, which count as waits: {told}."))
-    if result.failures:
-        parts.append(failure_table(result.failures))
-    if not result.figures:
-        parts.append(Text(f"No differences: the baseline {label(result.baseline)} failed. Give another --baseline."))
-    return Group(*parts)
-
-
-def failure_table(failures: Sequence[Failed]) -> Group:
-    """How often each policy failed, with its first failure."""
-    first: dict[str, Failed] = {}
-    for each in failures:
-        first.setdefault(each.policy, each)
-    table = Table(box=None, pad_edge=False)
-    for head in ("failed policy", "shifts", "first in", "seed"):
-        table.add_column(head, justify="right" if head in ("shifts", "seed") else "left", overflow="fold")
-    for policy, each in first.items():
-        count = sum(other.policy == policy for other in failures)
-        table.add_row(label(policy), str(count), each.instance, str(each.seed))
-    shown = list(first.values())[:MOST_FAILURES]
-    texts = [Text(f"\n{label(each.policy)}: {each.error}\n{each.trace}".rstrip()) for each in shown]
-    return Group(table, *texts)

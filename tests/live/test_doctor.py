@@ -20,7 +20,7 @@ from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.protocol.messages import State
 from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
-from scenarios.live.watch_screen import space_line
+from scenarios.show.watch import space_line
 
 PATIENCE_S = 30.0
 ASKED = ClockProbe(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)

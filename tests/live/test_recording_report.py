@@ -24,8 +24,8 @@ from scenarios.live.recorder import Recorder
 from scenarios.live.recording import read_parts
 from scenarios.live.recording_report import heat_use, order_events, recording_html, telemetry_of
 from scenarios.live.replayer import Replay
-from scenarios.report.run_page import report_html
-from scenarios.report.schedule import schedule
+from scenarios.run.schedule import schedule
+from scenarios.show.run_page import report_html
 
 ARMS = ("arm_0", "arm_1")
 

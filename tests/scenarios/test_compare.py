@@ -12,7 +12,7 @@ from rich.console import Console
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.load import load
-from scenarios.run.compare import FIGURES, HEADINGS, Comparison, compare, comparison_table
+from scenarios.run.compare import FIGURES, HEADINGS, Comparison, compare
 from scenarios.schema import Scenario
 from scenarios.statistics.tables import Figure
 
@@ -82,7 +82,7 @@ def test_a_comparison_that_makes_no_sense_is_told(scenario, plans, changes, sent
 def test_the_table_fits_eighty_columns_without_losing_a_word(scenario, plans):
     result = compared(scenario, plans, workers=1)
     page = io.StringIO()
-    Console(file=page, width=80).print(comparison_table(result))
+    Console(file=page, width=80).print(result.table)
     text = page.getvalue()
     assert "…  " not in text
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
@@ -106,7 +106,7 @@ def shown(difference, low, high, p_holm):
     figures = {"a": dict.fromkeys(FIGURES, same), "b": dict.fromkeys(FIGURES, other)}
     result = Comparison("s", (0, 1), "2 seeds", 2, "a", figures, {"a": "arm", "b": "arm"}, PERFECT.described(), "")
     page = io.StringIO()
-    Console(file=page, width=80).print(comparison_table(result))
+    Console(file=page, width=80).print(result.table)
     rows = [line.split() for line in page.getvalue().splitlines()]
     return rows[rows.index(["faults"]) + 2]
 
@@ -131,7 +131,7 @@ def test_the_scope_of_every_policy_is_shown_and_which_read_no_messages(scenario,
         result = compared(scenario, plans, workers=1, seeds=range(2), channel=channel)
         assert result.scopes == {"random": "arm", "round_robin": "central"}
         page = io.StringIO()
-        Console(file=page, width=80).print(comparison_table(result))
+        Console(file=page, width=80).print(result.table)
         lines = [" ".join(line.split()) for line in page.getvalue().splitlines()]
         assert {"random arm", "round_robin central"} <= set(lines)
         assert ("Central policies read no messages: round_robin." in lines) is said

@@ -1,21 +1,26 @@
 """The page of a comparison: its verdict against values by hand, nothing loaded or unescaped; the command repeats."""
 
+import base64
+import gzip
+import io
+import json
 import re
 import shlex
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import numpy as np
+import plotly.graph_objects as go
 import pytest
 import typer
+from plotly.offline import get_plotlyjs
+from rich.console import Console
 
 from scenarios.cli import options
 from scenarios.load import load
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.evaluate import FIGURES, Outcome
+from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
 from scenarios.trials.plan import Case, Key, Row, Study
-from scenarios.trials.report.charts import points, spans
-from scenarios.trials.report.page import Judged, comparison_page, verdict
 from scenarios.trials.scores import Shift
 from scenarios.trials.summary import comparisons, scores_over_all
 
@@ -85,12 +90,16 @@ def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
     assert failed.startswith("Failed: random;")
     page = comparison_page(about)
     assert page == comparison_page(about)
-    assert not re.search(r"<script|https?://|src=", page)
+    packed, *drawn = re.findall(r'<script type="text/plain" id="\w+">([^<]*)</script>', page)
+    assert gzip.decompress(base64.b64decode(packed)).decode() == get_plotlyjs()
+    own = page.replace(packed, "")
+    assert not re.search(r"https?://|src=", own)
+    assert own.count("<script") == 1 + 1 + len(drawn)
     assert "Oops: &lt;script&gt;" in page
     assert "Illegal actions, which count as waits: wspt 12" in page
-    for chart in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
-        ElementTree.fromstring(chart)
-    assert page.count("<svg") == 3
+    assert page.count("data-drawn=") == len(drawn) == 3
+    for figure in drawn:
+        go.Figure(json.loads(figure))  # raises on any property or value that Plotly does not know
 
 
 def test_a_baseline_that_failed_has_no_differences(study: Study):
@@ -126,11 +135,30 @@ def test_without_references_the_verdict_is_of_rewards(study: Study):
 
 def test_charts_place_points_by_value():
     chart = spans([("a", 0.0, -0.5, 0.5), ("b", 1.0, 0.9, 1.1), ("c", -9.0, -9.9, 2.0)], "score", least=-1.0)
-    near, far = (float(x) for x in re.findall(r'circle cx="([\d.]+)"', chart))
-    assert near < far
-    assert "◂ -9.00" in chart
-    drawn = points([("a", (1.0, 0.5, 2.5), (2.0, 2.0, 2.0))], "x", "y")
-    assert (drawn.count("<circle"), drawn.count("stroke-opacity")) == (1, 1)
+    (dots,) = chart["data"]
+    assert (dots["x"], dots["y"]) == ([0.0, 1.0], [0, 1])
+    assert dots["error_x"]["array"] == pytest.approx([0.5, 0.1])
+    assert dots["error_x"]["arrayminus"] == pytest.approx([0.5, 0.1])
+    assert [note["text"] for note in chart["layout"]["annotations"]] == ["◂ -9.00"]
+    unknown = float("nan")
+    near = points([("a", (1.0, 0.5, 2.5), (2.0, unknown, unknown)), ("b", (1.0, 1.0, 1.0), (2.0, 2.0, 2.0))], "x", "y")
+    (dots,) = near["data"]
+    assert (dots["error_x"]["array"], dots["error_x"]["arrayminus"]) == ([1.5, 0.0], [0.5, 0.0])
+    assert (dots["error_y"]["array"], dots["error_y"]["arrayminus"]) == ([0.0, 0.0], [0.0, 0.0])
+    assert len(set(dots["textposition"])) == 2  # labels of points at one place are apart
+
+
+def test_a_comparison_is_one_table_in_every_form(study: Study):
+    (result,) = judged(study, rows_of(study), {}).results
+    page = io.StringIO()
+    Console(file=page, width=120).print(result.table)
+    figure = result.figures["wsept"]["reward"]
+    text, html, markdown, csv = page.getvalue(), result.table.html(), result.table.markdown(), result.table.csv()
+    assert re.search(rf"^  wsept +{figure.mean:.1f} ", text, re.MULTILINE)
+    assert f"<td>{figure.mean:.1f}</td>" in html
+    assert f"| wsept | {figure.mean:.1f} |" in markdown
+    assert f"reward,wsept,{figure.mean:.1f}," in csv
+    assert result._repr_html_() == html
 
 
 def test_the_command_line_has_what_is_no_default():

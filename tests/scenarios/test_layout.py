@@ -13,8 +13,8 @@ from scenarios.cli.main import main
 from scenarios.job_stream import all_works
 from scenarios.load import library, load, parse_scenario
 from scenarios.prepare.fleet import prepare, prepare_arm
-from scenarios.report.layout import layout_report
 from scenarios.schema import Ambient
+from scenarios.show.layout import layout_report
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleet.thermal import WINDING, drive_heat, gen3_network, thermal_model
-from scenarios.report.load_factor import LoadFactor, load_factor
+from scenarios.prepare.load_factor import LoadFactor, load_factor
 
 TICKS = 60
 HORIZON_S = 600.0

@@ -78,7 +78,7 @@ def test_results_say_how_they_were_randomised(thermofleet, small_toml, tmp_path)
     assert "references are of shifts without randomisation" in said.out
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert text in page
-    assert "--randomise &#x27;ambient_k=[-2, 8]&#x27; --randomise &#x27;arrivals=[1,1.5]&#x27;" in page
+    assert "--randomise &#39;ambient_k=[-2, 8]&#39; --randomise &#39;arrivals=[1,1.5]&#39;" in page
     expected = {"ambient_k": [-2.0, 8.0], "arrivals": [1.0, 1.5], "variants": []}
     assert json.loads((tmp_path / "out" / "study.json").read_text())["randomise"] == expected
     same = thermofleet(*how, "--randomise", "arrivals=[1.0, 1.5]\nambient_k=[-2.0, 8.0]", "--json")  # of a file, say

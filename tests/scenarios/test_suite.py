@@ -9,7 +9,7 @@ from fleet.errors import ScenarioError
 from scenarios.job_stream import all_works
 from scenarios.load import SPLITS, load
 from scenarios.prepare.fleet import prepare
-from scenarios.report.load_factor import load_factor
+from scenarios.prepare.load_factor import load_factor
 from scenarios.scenario_hash import scenario_content
 from scenarios.schema import BusSpec, Scenario
 from scenarios.suite.axes import BUSES, DUE, Axes, scenario_of
@@ -113,7 +113,7 @@ def test_a_layout_refuses_numbers_that_it_cannot_have() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("cell", [cell for cell in CELLS if cell.arms <= 8], ids=lambda cell: cell.name)
 def test_three_quarters_of_the_arms_of_a_cell_can_work_at_once(cell) -> None:
-    from scenarios.report.layout import layout_report
+    from scenarios.show.layout import layout_report
 
     report = layout_report(scenario_of("x", cell, PLAIN, 0))
     assert report.problems == ()

@@ -12,14 +12,14 @@ from fleet.errors import FleetError
 from fleet.events import Event
 from scenarios.cli.main import main
 from scenarios.cli.terminal import out_console
+from scenarios.cli.trace import last_folder
 from scenarios.live.recorder import Recorder
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.provenance import code_hash
 from scenarios.run.run_folder import write
 from scenarios.run.shift import RunSpec, run
-from scenarios.trace.command import last_folder, thread_screen
-from scenarios.trace.thread import NOT_RECORDED, rows_of, thread_of
+from scenarios.show.trace import NOT_RECORDED, rows_of, thread_of, thread_table
 
 JOBS = ("a", "b")
 LOG = [
@@ -105,7 +105,7 @@ def test_the_command_shows_one_screen_or_json(folder: Path, capsys, monkeypatch)
     assert all(head in screen for head in ("event", "job", "award", "plan", "offers", "twin", "configuration", "code"))
     thread = thread_of(Path("runs/one"), "finish")
     odd = replace(thread, event=replace(thread.event, reason="[bold]a[/b] of others"))
-    out_console.print(thread_screen(odd))
+    out_console.print(thread_table(odd))
     assert "[bold]a[/b] of others" in capsys.readouterr().out
     shown = json.loads("{" + text)
     assert (shown["event"]["kind"], shown["award"]["kind"]) == ("finish", "award")

@@ -18,10 +18,11 @@ from scenarios.prepare.fleet import prepare
 from scenarios.prepare.planned_arm import plan_arms
 from scenarios.run.evaluate import FIGURES, outcomes
 from scenarios.schema import Scenario
+from scenarios.show.comparison_page import result_text
 from scenarios.trials import contest, fleets, run_unit
 from scenarios.trials.plan import Case, Key, Row, Study, Unit, policy_hash, seeds_of_instance
 from scenarios.trials.store import RESULTS, opened, read_rows
-from scenarios.trials.summary import comparison_of, comparisons, result_page
+from scenarios.trials.summary import comparison_of, comparisons
 from tests.own_policies import IDLE
 
 BAD = (
@@ -183,7 +184,7 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     assert {(each.policy, each.seed) for each in result.failures} == {(names[n], s) for n in said for s in (0, 1)}
     failed = comparison_of(study, rows, names["Raises"])
     assert not failed.figures
-    assert result_page(failed)
+    assert result_text(failed)
 
 
 def test_a_policy_that_catches_every_alarm_ends_with_its_process():
@@ -335,7 +336,7 @@ def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet,
     assert len(read_rows(out)) == 6
     page = (out / "index.html").read_text(encoding="utf-8")
     assert f"thermofleet compare {small_toml} --policies round_robin,{bad}:Raises" in page
-    assert "KeyError: &#x27;nobody&#x27; (at 30 s of the shift)" in page
+    assert "KeyError: &#39;nobody&#39; (at 30 s of the shift)" in page
     told = thermofleet("compare", "--suite", small_toml, "--policies", "wspt,random", *how, "--fleets", "2", "--json",
                        "--marl-eval")  # fmt: skip
     assert msgspec.json.decode(told.out)["scenario"] == str(small_toml)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scenarios.cli.main import main
-from scenarios.report.page import Section
+from scenarios.show.page import Section
 from twin.vae.checkpoint import load
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.report.page import PNG_HEAD, Picture, Section, Table, sections_page
+from scenarios.show.page import PNG_HEAD, Picture, Section, Table, sections_page
 from scenarios.studies.epochs import epoch_study
 from scenarios.studies.ranking import spread
 from scenarios.studies.report.build import provenance, write

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from scenarios.report.page import sections_page
+from scenarios.show.page import sections_page
 from scenarios.studies.detection_metrics import Detection
 from scenarios.studies.ranking import QUESTIONS, Quality, by_measure, side_by_side
 from scenarios.studies.report import baseline_chapters as worth

@@ -3,9 +3,9 @@
 import pytest
 
 from fleet.events import Event
-from scenarios.report.schedule import schedule
-from scenarios.report.verdict import verdict
+from scenarios.run.schedule import schedule
 from scenarios.shift_records import Offer
+from scenarios.show.verdict import verdict
 
 ARMS = ("hot", "cool")
 MIN = 60.0

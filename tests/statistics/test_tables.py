@@ -1,14 +1,11 @@
 """Tables of several policies: pairs, Holm's correction over all differences, and cells without variation."""
 
-import io
-
 import numpy as np
 import pytest
-from rich.console import Console
 
 from scenarios.statistics.holm import holm
 from scenarios.statistics.means import interval, paired
-from scenarios.statistics.tables import EQUAL, add_block, empty_table, figures_of, remarks
+from scenarios.statistics.tables import EQUAL, figure_rows, figures_of, remarks
 
 
 @pytest.fixture
@@ -46,12 +43,9 @@ def test_a_policy_differs_from_itself_by_nothing_and_two_without_faults_by_a_bou
 
 def test_cells_without_variation_say_so(values):
     found = figures_of(values, "base", counts=("faults",))
-    table = empty_table()
-    add_block(table, "value", {policy: each["value"] for policy, each in found.items()}, "base", str)
-    page = io.StringIO()
-    Console(file=page, width=80).print(table)
-    rows = {line.split()[0]: line.split() for line in page.getvalue().splitlines() if line.strip()}
-    assert rows["same"][-3:] == ["+2.0", *EQUAL.split()]
+    shown = figure_rows({policy: each["value"] for policy, each in found.items()}, "base", str)
+    rows = {name: cells for name, *cells in shown}
+    assert rows["same"][-3:] == ["+2.0", EQUAL, ""]
     assert rows["better"][-1] == "**"
     assert list(remarks(found, 10)) == [
         "all equal: no variation in 10, which is not certainty; up to 31% of all may differ.",

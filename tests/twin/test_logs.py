@@ -119,7 +119,7 @@ def test_columns_may_come_in_any_order_and_currents_and_temperatures_may_lack(tm
         ({(4, "Time (s)"): "0.2"}, 4, "time runs backwards: 0.2 s beside 0.5 s"),
         ({(4, "Time (s)"): "0.5"}, 4, "time repeats: 0.5 s"),
         ({(3, "Time (s)"): "900"}, 3, "time jumps ahead: 900 s"),
-        ({(5, "Temp_2"): "310.2"}, 5, "motor 3 at 310.2 is not a motor temperature"),
+        ({(5, "Temp_2"): "310.2"}, 5, "joint 3 at 310.2 is not a motor temperature"),
     ],
 )
 def test_a_damaged_line_is_named_and_the_rest_read_on_demand(gen3, cells, line, match, caplog):

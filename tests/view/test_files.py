@@ -1,7 +1,6 @@
 """Recorded shifts as files of other viewers, opened by the readers of those, and compared with the telemetry."""
 
 from collections import defaultdict
-from importlib.util import find_spec
 from pathlib import Path
 
 import mujoco
@@ -12,15 +11,15 @@ from fleet.ros2.cdr import read, read_diagnostics, read_joints
 from fleet.telemetry import MODES
 from scenarios.cli.main import main
 from scenarios.run.stored_run import StoredRun, read_run
-from scenarios.view.film import Film
-from scenarios.view.moments import Moments
+from scenarios.show.film import Film
+from scenarios.show.moments import Moments
 
 EVERY_S = 20
 
 
 def written(run_folder: Path, path: Path) -> Path:
     with pytest.raises(SystemExit) as ended:
-        main(["view", str(run_folder), f"--{ {'.rrd': 'rerun'}.get(path.suffix, 'mcap') }", str(path), "--every", "20"])
+        main(["view", str(run_folder), "--mcap", str(path), "--every", "20"])
     assert ended.value.code in (0, None)
     return path
 
@@ -105,73 +104,12 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, run: 
     assert [each.temperature for _, each in messages["/limits/error"]] == [run.scenario.limits.error_c] * 2
 
 
-@pytest.mark.skipif(find_spec("rerun") is None, reason="needs the extra `rerun` (170 MB)")
-def test_a_rerun_file_has_the_shift_and_a_layout(run_folder: Path, run: StoredRun, tmp_path: Path) -> None:
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(written(run_folder, tmp_path / "shift.rrd"))
-    tables: dict[str, list] = defaultdict(list)
-    for chunk in reader.stream().to_chunks():
-        tables[chunk.entity_path].append(chunk.to_record_batch())
-
-    def column(entity: str, name: str) -> tuple[np.ndarray, list]:
-        """Times in s and values of a component."""
-        times, values = [], []
-        for batch in tables[entity]:
-            if (
-                field := next((f for f in batch.schema.names if f.endswith(name)), None)
-            ) and "shift" in batch.schema.names:
-                times += (batch.column("shift").to_numpy().astype(int) / 1e9).tolist()
-                values += batch.column(field).to_pylist()
-        order = np.argsort(times, kind="stable")
-        return np.array(times)[order], [values[i] for i in order]
-
-    readings, moments = run.telemetry, Moments(run, EVERY_S)
-    for index, arm in enumerate(run.arms):
-        for entity, name, rows in (("temperature", "temp_c", moments.heats), ("angle", "q", moments.poses)):
-            times, values = column(f"/{entity}/{arm}", "Scalars:scalars")
-            assert times == pytest.approx(readings.time_s[rows])
-            assert np.array(values) == pytest.approx(getattr(readings, name)[rows, index])
-        times, states = column(f"/mode/{arm}", "StateChange:state")
-        shown = np.searchsorted(times, readings.time_s + 1e-6, side="right") - 1
-        assert [states[i][0] for i in shown] == [MODES[mode] for mode in readings.mode[:, index]]
-    _, time_s = hottest_moment(run)
-    expected = positions_in_mujoco(run, time_s)
-    model = moments.model
-    for index, arm in enumerate(run.arms):
-        mount, path = model["arms"][index], f"/cell/{arm}"
-        parents, poses = {path: "/cell"}, {path: (mount["position"], mount["quaternion"])}
-        joint = 0
-        for i, link in enumerate(model["links"]):
-            parent, path = path, f"{path}/link_{i}"
-            parents[path] = parent
-            poses[path] = (link["position"], link["quaternion"])
-            if link["turns"]:
-                times, moves = column(path, "Transform3D:translation")
-                _, turns = column(path, "Transform3D:quaternion")
-                row = int(np.flatnonzero(np.isclose(times, time_s))[0])
-                x, y, z, w = turns[row][0]
-                poses[path] = (moves[row][0], [w, x, y, z])
-                assert along(parents, poses, path) == pytest.approx(expected[index, joint], abs=1e-4)
-                joint += 1
-    faults = [event.time_s for event in run.events if event.kind == "fault"]
-    logged = [
-        t
-        for arm in run.arms
-        for t, (text,) in zip(*column(f"/events/{arm}", "TextLog:text"), strict=True)
-        if text.startswith("fault")
-    ]
-    assert sorted(logged) == pytest.approx(faults)
-    assert faults
-    assert len(reader.blueprints()) == 1
-
-
 @pytest.mark.parametrize(
     ("options", "needed"),
     [
         (["--mcap", "shift.bag"], "--mcap must end in .mcap (got 'shift.bag')"),
         (["--mcap", "there.mcap"], "'there.mcap' exists; give another --mcap"),
-        (["--every", "5"], "--every is for --rerun, --mcap and --gltf"),
+        (["--every", "5"], "--every is for --mcap and --gltf"),
     ],
 )
 def test_a_file_that_cannot_be_is_refused(

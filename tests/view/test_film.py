@@ -10,7 +10,7 @@ import pytest
 
 from fleet.errors import FleetError
 from scenarios.run.stored_run import read_run
-from scenarios.view.film import Film, Shot, times
+from scenarios.show.film import Film, Shot, times
 
 FILM = "from scenarios.cli.main import main; main()"
 
@@ -48,7 +48,7 @@ import sys, numpy as np
 from pathlib import Path
 from fleet.physics.cell_player import CellCamera
 from scenarios.run.stored_run import read_run
-from scenarios.view.film import Film
+from scenarios.show.film import Film
 run = read_run(Path(sys.argv[1]))
 film, t = Film(run), run.telemetry
 row, arm, joint = np.unravel_index(t.temp_c.argmax(), t.temp_c.shape)

@@ -19,9 +19,9 @@ from PIL import Image
 
 from scenarios.cli.main import main
 from scenarios.run.stored_run import StoredRun, read_run
-from scenarios.view.film import Film
-from scenarios.view.gltf_file import LONGEST_TURN_RAD, SAME_RAD, Z_UP, divided, keys_of
-from scenarios.view.moments import motor_spheres
+from scenarios.show.film import Film
+from scenarios.show.gltf import LONGEST_TURN_RAD, SAME_RAD, Z_UP, divided, keys_of
+from scenarios.show.moments import motor_spheres
 from tests.view.test_pages import CHROMIUM, browser  # noqa: F401  # a fixture
 
 SPEED = 60.0

@@ -14,9 +14,9 @@ import pytest
 from fleet.errors import FleetError
 from fleet.telemetry import Telemetry
 from scenarios.cli.main import main
-from scenarios.report.playback import packed
 from scenarios.run.run_folder import telemetry_table
 from scenarios.run.stored_run import read_run
+from scenarios.show.replay import packed
 
 
 def unpacked(text: str) -> dict[str, tuple[dict, np.ndarray]]:

@@ -121,6 +121,6 @@ def implausible_readings(layout: Format, readings: dict[str, Array], where: Arra
         reason = "joint {joint} at {value:.5g} is beyond its stops; q is in rad"
         damage += out_of_range(q, where, (-np.pi, np.pi), reason)
     if "temp_c" in readings:
-        reason = "motor {joint} at {value:.5g} is not a motor temperature in °C"
+        reason = "joint {joint} at {value:.5g} is not a motor temperature in °C"
         damage += out_of_range(readings["temp_c"], where, TEMP_RANGE_C, reason)
     return damage

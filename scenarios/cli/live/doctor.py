@@ -20,8 +20,8 @@ from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number
 from scenarios.cli.terminal import echo, out_console, say
-from scenarios.live.watch_screen import arm_table, format_time, jobs_line, space_line
 from scenarios.load import load
+from scenarios.show.watch import arm_table, format_time, jobs_line, space_line
 
 UNHEALTHY = 1
 """Exit code; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""

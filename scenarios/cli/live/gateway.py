@@ -26,8 +26,8 @@ from scenarios.cli.terminal import Interrupted, echo
 from scenarios.live.http_app import MIN_TOKEN, ROLES, STUCK_S, Readers, Role, application, check_token, read_tokens
 from scenarios.live.http_page import LivePage
 from scenarios.load import load
-from scenarios.report.three import three_js
 from scenarios.schema import Scenario
+from scenarios.show.replay import three_js
 
 TOKEN = "THERMOFLEET_TOKEN"
 PORT = 8080

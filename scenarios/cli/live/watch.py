@@ -22,7 +22,8 @@ from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot, describe_s
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, err_console, out_console, say
-from scenarios.live.watch_screen import (
+from scenarios.load import load
+from scenarios.show.watch import (
     JobBars,
     arm_line,
     format_time,
@@ -32,7 +33,6 @@ from scenarios.live.watch_screen import (
     space_line,
     time_line,
 )
-from scenarios.load import load
 
 WAIT_S, GONE_S = 0.5, 3.0
 """Real seconds: between two looks for a fleet; without any participant, after which a settled shift has ended."""

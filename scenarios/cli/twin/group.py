@@ -124,7 +124,7 @@ def score_command(
     check_source(scenario, log)
     choose("format", format_, Literal["table", "csv", "json"])
     from scenarios.prepare.twin_folder import open_twin
-    from scenarios.report.score_table import job_rows, jobs_of_arm, render, window_rows
+    from scenarios.show.twin_scores import job_rows, jobs_of_arm, render, window_rows
 
     chosen, twin = load(scenario) if scenario else None, open_twin(twins, arm)
     if chosen is not None:

@@ -51,7 +51,7 @@ def verdict_command(
     import numpy as np
 
     from scenarios.prepare.twin_folder import open_twin
-    from scenarios.report.score_table import job_rows, jobs_of_arm, log_rows, render, with_verdicts
+    from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, render, with_verdicts
     from twin.vae.measures import Features
     from twin.verdict.log_features import log_features
     from twin.verdict.rule import Rule

@@ -11,7 +11,7 @@ from scenarios.cli.terminal import out_console, plain_table, print_json, progres
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
-    from scenarios.report.page import Table
+    from scenarios.show.page import Table
 
 Name = Literal["transfer", "features", "augmentation", "drift"]
 
@@ -60,7 +60,7 @@ def study_command(
         print_json(result)
         return
     for table in tables:
-        shown = plain_table(*table.head, title=table.caption)
+        shown = plain_table(*table.headings, title=table.caption)
         for row in table.rows:
             shown.add_row(*row)
         out_console.print(shown)

@@ -5,7 +5,7 @@ from math import isfinite
 
 import numpy as np
 
-from scenarios.report.page import Table
+from scenarios.show.page import Table
 from scenarios.statistics.means import interval
 from scenarios.studies.lifetime.arm_transfer import FURTHER, NOTHING, RESCALED, STARTS, Cell
 from scenarios.studies.lifetime.augmentation import DATA, NETWORK, REAL, Fitted

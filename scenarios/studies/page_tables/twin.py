@@ -122,7 +122,7 @@ def _study(path: Path, place: int) -> str:
             msgspec.convert(rows, list[Life]), msgspec.convert(stored["size"], DriftSize)
         ),
     }[stored["study"]]()[place]
-    return table(made.head, made.rows)
+    return table(made.headings, made.rows)
 
 
 def _with_nan(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from scenarios.report.page import Section, Table
+from scenarios.show.page import Section, Table
 from scenarios.studies import self_training
 from scenarios.studies.benchmark import BASELINES, THERMAL, VAE, quality
 from scenarios.studies.exploration import coverage

@@ -12,9 +12,9 @@ from joblib import cpu_count
 
 from fleet.files import cache_folder
 from scenarios.progress import Progress, quiet
-from scenarios.report.page import Section, Table, sections_page
 from scenarios.result_folder import ResultKind
 from scenarios.schema import Scenario
+from scenarios.show.page import Section, Table, sections_page
 from scenarios.studies import real_logs
 from scenarios.studies.benchmark import VAE, variants
 from scenarios.studies.report import baseline_chapters as baseline

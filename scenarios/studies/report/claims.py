@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from scenarios.report.page import Section, Table
+from scenarios.show.page import Section, Table
 from scenarios.studies.benchmark import BASELINES, THERMAL, VAE
 from scenarios.studies.ranking import LABELS, spread
 

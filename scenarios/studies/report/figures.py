@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from scenarios.report.page import Picture
+from scenarios.show.page import Picture
 
 Array = np.ndarray
 Pair = Sequence[Array]

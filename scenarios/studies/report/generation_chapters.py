@@ -7,7 +7,7 @@ from fleet.robot import POSTURES
 from scenarios.motion.generate import Verification, generate
 from scenarios.motion.perform import bare_arm
 from scenarios.motion.recover import hold_until, recover
-from scenarios.report.page import Section, Table
+from scenarios.show.page import Section, Table
 from scenarios.studies.ranking import CARRIER
 from scenarios.studies.report.context import Lab
 from scenarios.studies.report.figures import ACCENT, CRITICAL, NORMAL, Line, lines_figure, picture

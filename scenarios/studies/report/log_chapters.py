@@ -10,7 +10,7 @@ from sklearn.metrics import roc_curve
 
 from fleet.motion import CHANNELS
 from scenarios.progress import Progress
-from scenarios.report.page import Section, Table
+from scenarios.show.page import Section, Table
 from scenarios.studies.epochs import epoch_study
 from scenarios.studies.ranking import CARRIER, spread
 from scenarios.studies.real_logs import AHEAD_S, HOT_C, HotAndCool, LogStudy, hot_and_cool, log_study

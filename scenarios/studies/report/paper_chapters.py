@@ -8,7 +8,7 @@ from sklearn.metrics import roc_auc_score
 
 from fleet.errors import FleetError
 from fleet.motion import CHANNELS, RATE_HZ, Plan
-from scenarios.report.page import Picture, Section, Table
+from scenarios.show.page import Picture, Section, Table
 from scenarios.studies.epochs import EpochStudy, epoch_study
 from scenarios.studies.ranking import CARRIER, spread
 from scenarios.studies.report.context import Lab

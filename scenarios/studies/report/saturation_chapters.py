@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from scenarios.prepare.simulated_logs import LOGS, identify_from_work
-from scenarios.report.page import Section, Table
+from scenarios.show.page import Section, Table
 from scenarios.studies.ranking import spread
 from scenarios.studies.report.claims import HEAD_TARGETS, RC_TARGETS, against_targets
 from scenarios.studies.report.context import Lab

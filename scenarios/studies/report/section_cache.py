@@ -22,7 +22,7 @@ from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.processes import worker_processes
 from scenarios.progress import COUNTED, Progress, quiet
-from scenarios.report.page import Section
+from scenarios.show.page import Section
 
 log = logging.getLogger(__name__)
 

@@ -1,1 +1,0 @@
-"""Reports, figures and tables of a shift."""

@@ -1,0 +1,198 @@
+"""Schedule of a shift, derived from its events: assignments, outages and payloads of each arm."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from math import isfinite
+from typing import Literal
+
+import numpy as np
+
+from fleet.errors import nearest
+from fleet.events import Event
+from fleet.telemetry import Telemetry
+
+Array = np.ndarray
+
+Outcome = Literal["finished", "returned", "given_up", "running"]
+
+_ORDER = ("recover", "finish", "give_back", "home", "award", "fault", "return", "give_up")
+"""The event kinds that determine a schedule, in the order in which they can occur at the same time."""
+
+SAME_MOMENT_DIGITS = 6
+"""Times are rounded to microseconds: the end of a tick and the start of the next may differ in the last bit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assignment:
+    """One arm on one job, from the award until it is home again or faults."""
+
+    arm: str
+    job: str
+    start_s: float
+    end_s: float
+    """Time of arrival home or of the fault, or the horizon."""
+    finished_s: float | None = None
+    """End of the last cycle; None if it was not reached."""
+    outcome: Outcome
+    """finished: all cycles done, even if the arm was not home yet; returned: it is back in the queue, after a fault,
+    because the policy gave it back, or because a live arm had to return it;
+    given_up: the job faulted too often."""
+    late_s: float | None = None
+    """Tardiness of a finished job; 0 if on time."""
+    faulted: bool = True
+    """Of a returned or given-up job: a fault was the reason."""
+    cycles_kept: int | None = None
+    """Cycles of a returned or given-up job that this arm has done and that count."""
+    difficulty: float = float("nan")
+    """Score of the award."""
+    prediction: str = ""
+    """Predicted peak temperature and P(saturation) at the award, in words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outage:
+    """Time of one arm lost to a fault."""
+
+    arm: str
+    start_s: float
+    end_s: float
+    """Time of recovery, or the horizon."""
+    joint: int
+    """Motor that caused it, 1..7."""
+    recovered: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Assignments and outages up to a horizon, in order of the arms, then of time."""
+
+    assignments: tuple[Assignment, ...]
+    outages: tuple[Outage, ...]
+    horizon_s: float
+
+
+def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float, *, env: int = 0) -> Schedule:
+    """Schedule of an event log; the order of events within the log does not matter.
+
+    Args:
+        horizon_s: End of the log; open assignments and outages last until then.
+        env: Index of one of several parallel shifts.
+
+    Raises:
+        ValueError: an arm that is not in the fleet, or an impossible sequence (an award to a busy arm, an arrival
+            home without a finished job).
+    """
+    own: dict[str, list[Event]] = {arm: [] for arm in arms}
+    for event in events:
+        if event.env != env or event.kind not in _ORDER:
+            continue
+        if event.arm not in own:
+            raise ValueError(f"No arm '{event.arm}' in this fleet{nearest(event.arm, own)}")
+        own[event.arm].append(event)
+    assignments: list[Assignment] = []
+    outages: list[Outage] = []
+    for arm, log in own.items():
+        log.sort(key=lambda e: (round(e.time_s, SAME_MOMENT_DIGITS), _ORDER.index(e.kind)))
+        assignments += _assignments(arm, log, horizon_s)
+        outages += _outages(arm, log, horizon_s)
+    return Schedule(tuple(assignments), tuple(outages), horizon_s)
+
+
+def payloads(telemetry: Telemetry, plan: Schedule, arms: Sequence[str], payload_of: Mapping[str, float]) -> Array:
+    """Payloads in the hands, kg, [sample, arm].
+
+    Args:
+        plan: Which arm worked on what.
+        payload_of: Payload of each job, kg; none for others.
+    """
+    load_kg = np.zeros(telemetry.mode.shape, np.float32)
+    for work in plan.assignments:
+        rows = slice(*np.searchsorted(telemetry.time_s, (work.start_s, work.finished_s or work.end_s)))
+        load_kg[rows, arms.index(work.arm)] = payload_of.get(work.job, 0.0)
+    return load_kg
+
+
+def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[Assignment]:
+    """Assignments of one arm, from its events in order."""
+    out: list[Assignment] = []
+    award: Event | None = None
+    finish: Event | None = None
+    given_back: Event | None = None
+    stopped = False  # by a fault, away from home
+    for i, event in enumerate(log):
+        if event.kind == "award":
+            if award is not None:
+                raise ValueError(f"{_at(event)}: '{arm}' is awarded '{event.job}' while at '{award.job}'.")
+            award, finish, given_back, stopped = event, None, None, False
+        elif event.kind == "finish":
+            if award is None or award.job != event.job:
+                raise ValueError(f"{_at(event)}: '{arm}' finishes '{event.job}', which it was not awarded.")
+            finish = event
+        elif event.kind == "give_back" and award is not None and award.job == event.job:
+            given_back = event
+        elif event.kind == "home" and not stopped and award is not None and given_back is not None:
+            out.append(replace(_assignment(award, None, event.time_s, "returned", given_back), faulted=False))
+            award = None
+        elif event.kind == "home" and not stopped:
+            if award is None or finish is None:
+                raise ValueError(f"{_at(event)}: '{arm}' is home from '{event.job}', which it did not finish.")
+            out.append(_assignment(award, finish, event.time_s, "finished"))
+            award = None
+        elif event.kind == "fault" and award is not None:
+            ends = (e for e in log[i + 1 :] if e.kind in ("return", "give_up") and e.job == award.job)
+            after = given_back or next(ends, None)
+            outcome = "given_up" if after and after.kind == "give_up" else "returned"
+            out.append(_assignment(award, finish, event.time_s, outcome, after))
+            award, stopped = None, True
+        elif (
+            event.kind == "return" and award is not None and award.job == event.job
+        ):  # in a live fleet, without a fault
+            out.append(replace(_assignment(award, finish, event.time_s, "returned", event), faulted=False))
+            award = None
+    if award is not None:
+        out.append(_assignment(award, finish, max(horizon_s, award.time_s), "running"))
+    return out
+
+
+def _assignment(
+    award: Event, finish: Event | None, end_s: float, outcome: Outcome, returned: Event | None = None
+) -> Assignment:
+    return Assignment(
+        arm=award.arm,
+        job=award.job,
+        start_s=award.time_s,
+        end_s=end_s,
+        finished_s=finish.time_s if finish else None,
+        outcome="finished" if finish else outcome,
+        late_s=finish.value if finish else None,
+        cycles_kept=round(returned.value) if returned and not finish and isfinite(returned.value) else None,
+        difficulty=award.value,
+        prediction=award.reason,
+    )
+
+
+def _outages(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
+    """Outages of one arm, from its events in order."""
+    changes = [event for event in log if event.kind in ("fault", "recover")]
+    for i, event in enumerate(changes):
+        if event.kind == "fault" and i % 2:
+            raise ValueError(f"{_at(event)}: '{arm}' faults while it is faulted.")
+        if event.kind == "recover" and not i % 2:
+            raise ValueError(f"{_at(event)}: '{arm}' recovers without a fault.")
+    return [
+        Outage(
+            arm=arm,
+            start_s=fault.time_s,
+            end_s=recovery.time_s if recovery else max(horizon_s, fault.time_s),
+            joint=fault.joint,
+            recovered=recovery is not None,
+            reason=fault.reason,
+        )
+        for fault, recovery in zip_longest(changes[::2], changes[1::2])
+    ]
+
+
+def _at(event: Event) -> str:
+    return f"Event log at {event.time_s:g} s"

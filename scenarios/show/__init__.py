@@ -1,0 +1,1 @@
+"""How results are shown: tables, pages, films, and files of other viewers."""

@@ -1,0 +1,494 @@
+"""A comparison as text and as a page: one HTML file that opens offline, with verdict, intervals, charts and how to
+repeat.
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any  # values of a card, and of Plotly's schema
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from fleet.bus.exchange.channel import PERFECT
+from scenarios.policy_loader import is_on_bus, label
+from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison, Failed
+from scenarios.run.evaluate import FIGURES
+from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, plain
+from scenarios.show.table import Column, Table
+from scenarios.statistics.means import LEVEL, Interval
+from scenarios.statistics.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
+from scenarios.statistics.suites import profile
+from scenarios.statistics.tables import HEAD, LEGEND, figure_rows, remarks
+
+Array = np.ndarray
+Range = tuple[float, float, float]
+"""A value with its lower and upper bound."""
+
+NO_SCORES = (
+    f"No normalised scores: they need {FEWEST} or more shifts with references. Make references with thermofleet "
+    "bounds, then compare with --references FILE."
+)
+NO_SCORES_RANDOMISED = "No normalised scores: references are of shifts without randomisation."
+MOST_CURVES = 8
+"""Policies in the chart of profiles: the best ones, and the baseline."""
+MOST_FAILURES, MOST_TRACES = 20, 8
+"""Failed shifts of a page with their traceback, and failed policies of a text with that of their first failure."""
+THRESHOLDS = np.linspace(-0.5, 1.1, 81)
+WORST = -1.5
+"""Scores below are cut in charts."""
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a8a8a", "#7a5195")
+"""Of lines (Okabe & Ito, who are for colour-blind readers, and two more)."""
+DASHES = ("solid", "dash", "dot", "dashdot")
+WIDTH_PX, HEIGHT_PX, ROW_PX, LETTER_PX = 820, 400, 24, 7.0
+"""Of a chart, of a row of `spans`, and of a letter."""
+MARGIN = {"l": 60, "r": 20, "t": 12, "b": 48}
+NAME = 28
+"""Most characters of a policy's name in a chart."""
+
+
+def comparison_table(result: Comparison) -> Table:
+    """A group per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
+    caption = f"{result.title}: mean, paired difference to {result.baseline}, {LEGEND}"
+    perfect = result.channel == PERFECT.described()
+    if not perfect:
+        caption += f"\nChannel: {result.channel_text}."
+    if result.randomise:
+        caption += f"\nRandomisation: {result.randomise.text}."
+    scopes: list[tuple[str, ...]] = [(label(policy), scope, "", "", "", "") for policy, scope in result.scopes.items()]
+    groups = {"scope": scopes}
+    for name in FIGURES:
+        figures = {policy: each[name] for policy, each in result.figures.items()}
+        groups[HEADINGS[name]] = figure_rows(figures, result.baseline, label, LEAST_DIGITS.get(name, 1))
+    notes = list(remarks(result.figures, result.draws))
+    central = [label(policy) for policy, scope in result.scopes.items() if scope == "central"]
+    if not perfect and central:
+        notes.append(f"Central policies read no messages: {', '.join(central)}.")
+    return Table.grouped(HEAD, groups, caption=caption, notes=notes)
+
+
+def score_table(scores: Scores, labels: Mapping[str, str] | None = None) -> Table:
+    """Normalised scores of all policies, the best first."""
+    rows = [((labels or {}).get(name, label(name)), *score_cells(scores, name)) for name in ranked(scores)]
+    return Table(head=HEADS, rows=tuple(rows))
+
+
+def narrow_score_tables(scores: Scores, labels: Mapping[str, str] | None = None) -> tuple[Table, Table]:
+    """The table of scores in two parts, each narrow enough for 80 columns."""
+    table = score_table(scores, labels)
+    return table.select(0, 1, 2, 3, 7), table.select(0, 4, 5, 6)
+
+
+def failure_table(failures: Sequence[Failed]) -> Table:
+    """How often each policy failed, with its first failure."""
+    first = _first(failures)
+    counts = {policy: sum(each.policy == policy for each in failures) for policy in first}
+    rows = tuple((label(p), str(counts[p]), each.instance, str(each.seed)) for p, each in first.items())
+    return Table(head=("failed policy", "shifts", Column("first in", words=True), "seed"), rows=rows)
+
+
+def _first(failures: Sequence[Failed]) -> dict[str, Failed]:
+    """The first failure of each policy."""
+    first: dict[str, Failed] = {}
+    for each in failures:
+        first.setdefault(each.policy, each)
+    return first
+
+
+def result_text(result: Comparison) -> Group:
+    """The table of a comparison, then its scores, illegal actions and failures, for a console of rich."""
+    parts: list[RenderableType] = [comparison_table(result)] if result.figures else []
+    if result.scores:
+        title = f"\nNormalised scores, paired difference to {label(result.baseline)}, {LEGEND}"
+        parts += [Text(title), *narrow_score_tables(result.scores), *map(Text, result.scores.remarks)]
+    elif result.figures:
+        parts.append(Text(NO_SCORES_RANDOMISED if result.randomise else NO_SCORES))
+    if illegal := _illegal([result]):
+        parts.append(Text(illegal))
+    if result.failures:
+        shown = list(_first(result.failures).values())[:MOST_TRACES]
+        texts = [Text(f"\n{label(each.policy)}: {each.error}\n{each.trace}".rstrip()) for each in shown]
+        parts += [failure_table(result.failures), *texts]
+    if not result.figures:
+        parts.append(Text(f"No differences: the baseline {label(result.baseline)} failed. Give another --baseline."))
+    return Group(*parts)
+
+
+def _illegal(results: Sequence[Comparison]) -> str:
+    """Number of illegal actions of each policy in a sentence; "" for none."""
+    illegal: dict[str, int] = {}
+    for result in results:
+        for policy, count in result.illegal.items():
+            illegal[policy] = illegal.get(policy, 0) + count
+    some = ", ".join(f"{label(policy)} {count}" for policy, count in illegal.items() if count)
+    return f"Illegal actions, which count as waits: {some}." if some else ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """The results of a page."""
+
+    title: str
+    results: Sequence[Comparison]
+    """One for all instances, or one for each."""
+    values: Normalised | None
+    """Scores over all instances; None without references."""
+    card: Mapping[str, Any]
+    """Of the study: hashes, versions and settings."""
+    command: str
+    """That repeats it."""
+
+    @property
+    def baseline(self) -> str:
+        """That differences refer to."""
+        return self.results[0].baseline
+
+    @property
+    def scored(self) -> Normalised | None:
+        """Scores, if there are some of the baseline: it has none if it failed."""
+        return self.values if self.values and self.baseline in self.values.score else None
+
+    @cached_property
+    def scores(self) -> Scores | None:
+        """The figures of `scored`, which a single comparison has made."""
+        if len(self.results) == 1:
+            return self.results[0].scores
+        return scores_of(self.scored, self.baseline) if self.scored else None
+
+
+def comparison_page(judged: Judged) -> str:
+    """The page; the same input gives the same text."""
+    scored = judged.scores is not None
+    charts = [*(_score_charts(judged) if scored else []), *_heat_charts(judged)]
+    failures = [each for result in judged.results for each in result.failures]
+    content = {
+        "verdict": verdict(judged),
+        "scores": score_table(judged.scores) if judged.scores else None,
+        "remarks": judged.scores.remarks if judged.scores else (),
+        "baseline": label(judged.baseline),
+        "legend": LEGEND,
+        "by_cell": _cell_table(judged),
+        "charts": {chart.key: chart for chart in charts},
+        "figures": [_figures(result) for result in judged.results],
+        "several": len(judged.results) > 1,
+        "failures": [(_failure_text(each), each.trace) for each in failures[:MOST_FAILURES]],
+        "more_failures": max(0, len(failures) - MOST_FAILURES),
+        "illegal": _illegal(judged.results) or "No illegal action.",
+        "command": judged.command,
+        "card": _card_table(judged.card),
+        "hashes": Table(head=("", ""), rows=tuple(judged.card["instances"].items()), numbers=False),
+    }
+    return Page(title=judged.title, template="comparison.html", content=content, charts=charts, narrow=True).html()
+
+
+def verdict(judged: Judged) -> list[str]:
+    """What came out, in sentences: the best policy against the baseline, and against the next one.
+
+    The best one is chosen by its figures, so p-values count as many differences as there are other policies
+    (Bonferroni).
+    """
+    values, scores, base = judged.scored, judged.scores, judged.baseline
+    failed = {each.policy for result in judged.results for each in result.failures}
+    last = [f"Failed: {', '.join(sorted(map(label, failed)))}; a policy with a failed shift has no figures."] * bool(
+        failed
+    )
+    if values is None or scores is None:
+        return [*_reward_verdict(judged.results), *last]
+    best, *rest = ranked(scores)
+    others = {base: "the baseline "} if best != base else {}
+    others |= {name: "the next one, " for name in [name for name in rest if name != base][:1]}
+    compared = [_against(other, values.difference(best, other), role, len(rest)) for other, role in others.items()]
+    told = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
+    whose = "Its mean score" if compared else f"The mean score of {label(best)}"
+    told.append(
+        f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies, where 0 is "
+        f"random and 1 the best schedule known for each of {scores.instances} instances."
+    )
+    return [*told, *last]
+
+
+def _against(other: str, difference: Interval, role: str, tests: int) -> str:
+    """`beats the baseline wspt by 0.12 [0.08, 0.16] of the way from random to the best known`."""
+    by = f"{difference.text()} of the way from random to the best known"
+    if difference.low > 0 and _significant(difference.p, tests):
+        return f"beats {role}{label(other)} by {by}"
+    among = f", not significant among {tests} policies" if difference.low > 0 else ""
+    return f"is not shown to beat {role}{label(other)}: the difference is {by}{among}"
+
+
+def _significant(p: float, tests: int) -> bool:
+    return p * tests < 1 - LEVEL
+
+
+def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
+    """By reward, for instances without references."""
+    for result in results:
+        where = f"{result.scenario}, {result.unit}: "
+        if not result.figures:
+            yield f"{where}no differences, as the baseline {label(result.baseline)} failed."
+            continue
+        base = result.baseline
+        best, *others = sorted(result.figures, key=lambda name: -result.figures[name]["reward"].mean)
+        reward = f"{result.figures[best]['reward'].mean:.1f}"
+        if not others:
+            yield f"{where}no policy has more reward than the baseline {label(base)} ({reward})."
+            continue
+        compared = best if best != base else others[0]
+        figure = result.figures[compared]["reward"]
+        span = figure.to_base.text(1)
+        significant = figure.to_base.excludes_zero and _significant(figure.p, len(others))
+        if best == base:
+            doubt = "" if significant else ", which is not significant"
+            yield (
+                f"{where}no policy has more reward than the baseline {label(base)} ({reward}); "
+                f"the difference of {label(compared)} to it is {span}{doubt}."
+            )
+            continue
+        doubt = "" if significant else ", which is not significant"
+        yield f"{where}{label(best)} has the most reward, {reward}; {span} more reward than {label(base)}{doubt}."
+
+
+def _score_charts(judged: Judged) -> list[Chart]:
+    """Mean scores with their intervals, and profiles of the best policies and of the baseline."""
+    values, scores = judged.scored, judged.scores
+    assert values is not None
+    assert scores is not None
+    order = ranked(scores)
+    means = [(label(name), scores.policies[name].mean) for name in order]
+    rows = [(name, mean.mean, mean.low, mean.high) for name, mean in means]
+    base = label(judged.baseline)
+    means_figure = spans(rows, "mean normalised score, 95 % interval", least=WORST, marked=base)
+    chosen = order[:MOST_CURVES]
+    if judged.baseline not in chosen:
+        chosen = [*chosen[:-1], judged.baseline]
+    curves = {name: profile(values.score[name], THRESHOLDS, "both", groups=values.groups) for name in chosen}
+    bands = {label(name): (each.share, each.low, each.high) for name, each in curves.items()}
+    share = "share of instances above"
+    profiles = lines(THRESHOLDS, bands, {label(chosen[0]), base}, "normalised score", share)
+    numbers = ", ".join(f"{name} {value:.2f}" for name, value, _, _ in rows)
+    return [
+        Chart(key="means", figure=means_figure, alt=f"mean normalised score: {numbers}"),
+        Chart(key="profiles", figure=profiles, alt=f"{share} each normalised score of {', '.join(bands)}"),
+    ]
+
+
+def _cell_table(judged: Judged) -> Table | None:
+    """Mean score of each policy in each cell of a split, or in each scenario; None if there is only one."""
+    values = judged.scored
+    if values is None:
+        return None
+    names = sorted(set(values.cells))
+    if len(names) < 2 or len(names) == len(values.instances):
+        return None
+    member = {name: np.array(values.cells) == name for name in names}
+    order = sorted(values.score, key=lambda policy: -values.score[policy].mean())
+    means = {policy: [float(values.score[policy][:, member[name]].mean()) for name in names] for policy in order}
+    best = [max(column) for column in zip(*means.values(), strict=True)]
+    rows = tuple(
+        (label(policy), *(f"{v:.2f}{' ●' if v == top else ''}" for v, top in zip(own, best, strict=True)))
+        for policy, own in means.items()
+    )
+    head = ("policy", *(f"{name.replace('_', ' ')} ({int(member[name].sum())})" for name in names))
+    return Table(head=head, rows=rows)
+
+
+def _heat_charts(judged: Judged) -> Iterator[Chart]:
+    """Value against heat, one chart for each result."""
+    for number, result in enumerate(judged.results):
+        figures = {label(name): (each["peak_c"], each["value"]) for name, each in result.figures.items()}
+        rows = [(name, (x.mean, x.low, x.high), (y.mean, y.low, y.high)) for name, (x, y) in figures.items()]
+        if rows:
+            drawn = points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
+            alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
+            yield Chart(key=f"heat_{number}", figure=drawn, alt=alt, shrinks=False)
+
+
+def _figures(result: Comparison) -> dict[str, object]:
+    """Every figure of every policy, with the difference to the baseline, the best reward first."""
+    about = f"{result.scenario}, {result.unit}. Mean and paired difference to {label(result.baseline)}"
+    settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
+    table = comparison_table(result)
+    return {
+        "scenario": result.scenario,
+        "baseline": label(result.baseline),
+        "about": f"{about}; {LEGEND}. {settings}",
+        "groups": list(table.split()) if result.figures else [],
+        "notes": table.notes,
+    }
+
+
+def _failure_text(each: Failed) -> str:
+    where = f"{label(each.policy)}, {each.instance}, fleet {each.fleet}, training {each.training}, seed {each.seed}"
+    return f"{where}: {each.error}"
+
+
+def _card_table(card: Mapping[str, Any]) -> Table:
+    """Code, versions, settings and policies of a study."""
+    rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
+    rows += [(name, _plain(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
+    rows += [(f"policy {label(name)}", digest or _without_file(name)) for name, digest in card["policies"].items()]
+    return Table(head=("", ""), rows=tuple(rows), numbers=False)
+
+
+def _without_file(policy: str) -> str:
+    return "in another process, no file" if is_on_bus(policy) else "of the code"
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items())
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least: float, marked: str = "") -> Figure:
+    """A row for each name: a point and its interval.
+
+    Args:
+        rows: Name, value, low and high.
+        title: Of the axis.
+        least: Intervals that reach below this are cut there, so that one bad row does not squeeze the others.
+        marked: A name in bold.
+    """
+    ends = np.array([row[1:] for row in rows])
+    ends = ends[np.isfinite(ends)]
+    low, high = max(least, float(ends.min())), float(ends.max())
+    room = 0.04 * (high - low or 1.0)
+    shown = [(y, *row) for y, row in enumerate(rows) if row[1] >= low - room]
+    error = {
+        "type": "data",
+        "symmetric": False,
+        "array": [_length(upper - value) for _, _, value, _, upper in shown],
+        "arrayminus": [_length(value - max(lower, low - room)) for _, _, value, lower, _ in shown],
+        "thickness": 3,
+        "width": 0,
+        "color": "rgba(0,114,178,.55)",
+    }
+    names = [plain(name, NAME) for name, *_ in rows]
+    bold = [f"<b>{name}</b>" if row[0] == marked else name for name, row in zip(names, rows, strict=True)]
+    dots = _dots([value for _, _, value, _, _ in shown], [y for y, *_ in shown], [name for _, name, *_ in shown])
+    cut = [
+        {"text": f"◂ {value:.2f}", "x": low - room, "y": y, "xanchor": "left", "showarrow": False}
+        for y, (_, value, _, _) in enumerate(rows)
+        if value < low - room
+    ]
+    height = MARGIN["t"] + ROW_PX * len(rows) + MARGIN["b"]
+    return {
+        "data": [dots | {"error_x": error}],
+        "layout": LAYOUT
+        | {"height": height, "margin": MARGIN, "annotations": cut, "showlegend": False}
+        | {
+            "xaxis": AXIS | {"range": [low - room, high + room], "title": {"text": title}},
+            "yaxis": AXIS
+            | {"tickvals": list(range(len(rows))), "ticktext": bold, "range": [len(rows) - 0.5, -0.5]}
+            | {"automargin": True, "showgrid": False},
+        },
+    }
+
+
+def lines(
+    x_values: Array,
+    by_name: Mapping[str, tuple[Array, Array, Array]],
+    banded: Collection[str],
+    x_title: str,
+    y_title: str,
+) -> Figure:
+    """Curves of shares, some with bands.
+
+    Args:
+        x_values: [point].
+        by_name: Value, low and high of each curve, [point].
+        banded: Curves whose low and high are shown.
+    """
+    x = x_values.round(4).tolist()
+    bands, curves = list[dict[str, Any]](), list[dict[str, Any]]()
+    for n, (name, (value, low, high)) in enumerate(by_name.items()):
+        colour, dash = COLOURS[n % len(COLOURS)], DASHES[n // len(COLOURS) % len(DASHES)]
+        if name in banded:
+            around = {"x": [*x, *x[::-1]], "y": [*high.round(4).tolist(), *low.round(4).tolist()[::-1]]}
+            look = {"fill": "toself", "fillcolor": colour, "opacity": 0.12, "line": {"width": 0}, "hoverinfo": "skip"}
+            bands.append({"type": "scatter", "mode": "lines", "showlegend": False, **around, **look})
+        line = {"color": colour, "width": 2, "dash": dash}
+        curve = {"x": x, "y": value.round(4).tolist(), "line": line}
+        curves.append({"type": "scatter", "mode": "lines", "name": plain(name, NAME), **curve})
+    legend = {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"}
+    return {
+        "data": [*bands, *curves],
+        "layout": LAYOUT
+        | {"height": HEIGHT_PX + 28, "margin": MARGIN | {"t": 40}, "showlegend": True, "legend": legend}
+        | {"xaxis": AXIS | {"range": [x[0], x[-1]], "title": {"text": x_title}}}
+        | {"yaxis": AXIS | {"range": [0, 1.02], "title": {"text": y_title}}},
+    }
+
+
+def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str) -> Figure:
+    """A point for each name with its intervals, and its name beside it where there is room.
+
+    Args:
+        rows: Name, x and y; each of the two with its lower and upper bound.
+    """
+    ranges = np.array([row[1:] for row in rows])  # [name, axis, value and bounds]
+    ranges = np.where(np.isfinite(ranges), ranges, ranges[..., :1])
+    room = np.array([0.06, 0.08]) * np.maximum(np.ptp(ranges, axis=(0, 2)), 1e-9)
+    low, high = ranges.min(axis=(0, 2)) - room, ranges.max(axis=(0, 2)) + room
+    names = [name for name, *_ in rows]
+    size = np.array([WIDTH_PX - MARGIN["l"] - MARGIN["r"], HEIGHT_PX - MARGIN["t"] - MARGIN["b"]])
+    at = (ranges[..., 0] - low) / (high - low) * size
+    sides = _label_sides(at, [plain(name, NAME) for name in names], size)
+    texts = [plain(name, NAME) if side else "" for name, side in zip(names, sides, strict=True)]
+    dots = _dots(ranges[:, 0, 0].tolist(), ranges[:, 1, 0].tolist(), names)
+    dots |= {"mode": "markers+text", "text": texts, "textposition": [side or "top center" for side in sides]}
+    for axis, name in enumerate(("error_x", "error_y")):
+        value, lower, upper = ranges[:, axis].T
+        bounds = {"array": (upper - value).tolist(), "arrayminus": (value - lower).tolist()}
+        dots[name] = {"type": "data", "symmetric": False, "width": 0, "thickness": 1.5} | bounds
+        dots[name]["color"] = "rgba(0,114,178,.4)"
+    axes = {
+        f"{axis}axis": AXIS | {"range": [float(low[n]), float(high[n])], "title": {"text": title}}
+        for n, (axis, title) in enumerate((("x", x_title), ("y", y_title)))
+    }
+    layout = LAYOUT | {"height": HEIGHT_PX, "margin": MARGIN, "showlegend": False} | axes
+    return {"data": [dots], "layout": layout}
+
+
+def _dots(x: list[float], y: list[float], names: Sequence[str]) -> dict[str, Any]:
+    """Markers with their names as hover texts."""
+    look = {"marker": {"color": COLOURS[0], "size": 9}, "hovertemplate": "%{customdata}: %{x:.3~f}<extra></extra>"}
+    return {"type": "scatter", "mode": "markers", "x": x, "y": y, "customdata": [plain(n) for n in names], **look}
+
+
+def _length(value: float) -> float:
+    """A part of an interval; 0 for one that is not known."""
+    return value if np.isfinite(value) else 0.0
+
+
+def _label_sides(at: Array, texts: Sequence[str], size: Array) -> list[str]:
+    """On which side of each point its label has room, as Plotly names it; "" for none.
+
+    Args:
+        at: Points from the lower left corner, px, [point, axis].
+        size: Of the plot, px, [axis].
+    """
+    taken = [(x - 5, y - 5, x + 5, y + 5) for x, y in at.tolist()]
+    sides: list[str] = []
+    for (x, y), text in zip(at.tolist(), texts, strict=True):
+        wide, half = LETTER_PX * len(text), LETTER_PX * len(text) / 2
+        boxes = {
+            "middle right": (x + 8, y - 7, x + 8 + wide, y + 7),
+            "middle left": (x - 8 - wide, y - 7, x - 8, y + 7),
+            "top center": (x - half, y + 6, x + half, y + 20),
+            "bottom center": (x - half, y - 20, x + half, y - 6),
+        }
+        side = next((name for name, box in boxes.items() if _fits(box, taken, size)), "")
+        if side:
+            taken.append(boxes[side])
+        sides.append(side)
+    return sides
+
+
+def _fits(box: tuple[float, ...], taken: Sequence[tuple[float, ...]], size: Array) -> bool:
+    """Whether a box (left, bottom, right, top) is inside the plot and overlaps no other."""
+    inside = box[0] >= 2 and box[1] >= 2 and box[2] <= size[0] - 2 and box[3] <= size[1] - 2
+    return inside and not any(
+        box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3] for other in taken
+    )

@@ -1,0 +1,351 @@
+"""A recorded shift as a glTF file (.glb): arms that move, and motors as spheres in the colour of their temperature.
+
+Viewers of augmented reality and of the web open it: model-viewer, Scene Viewer, three.js, Babylon.js, Blender. The
+movement is one animation: a rotation per joint. glTF 2.0 itself cannot animate a colour, and few viewers have the
+extension that can (KHR_animation_pointer). So each motor has a sphere for every band of `BAND_K` of the colour scale,
+and the animation gives all but one the scale 0, which is how the specification hides a node.
+
+Source: Khronos Group, glTF 2.0 specification (ISO/IEC 12113:2022), sections 3.6 (binary data) and 4 (GLB).
+"""
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any  # plain values of JSON
+
+import numpy as np
+
+from fleet.env.render.heat import heat_marks
+from fleet.robot import JOINTS
+from scenarios.progress import Progress, quiet
+from scenarios.show.moments import Moments, motor_spheres
+
+Array = np.ndarray
+
+BAND_K = 5.0
+"""Width of a band of temperatures with one colour and one radius."""
+SAME_RAD = 2e-5
+"""A joint angle is left out where interpolation between its neighbours gives it this well: less than 0.1 mm at the tool
+point of a stretched arm."""
+LONGEST_TURN_RAD = 2.0
+"""Largest turn of a joint between two keys: a turn of more than π would go the other way round."""
+Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
+"""Rotation from z up, as here, to y up, as in glTF; x, y, z, w."""
+PLACE_M = 0.03
+PLACE_RGB, FIXTURE_RGB, LOAD_RGB = (0.95, 0.55, 0.10), (0.55, 0.50, 0.43), (0.25, 0.45, 0.71)
+Json = dict[str, Any]
+
+VERTICES, INDICES = 34962, 34963
+"""Targets of buffer views."""
+_COMPONENT = {"<f4": 5126, "<u2": 5123}
+_TYPE = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
+ALIGNMENT = 4
+
+
+def write_gltf(path: Path, moments: Moments, speed: float, progress: Progress = quiet) -> None:
+    """Write a shift.
+
+    Nodes: `ARM`, its links `ARM/link_0` to `ARM/link_7` one below the other, and below each link that a joint turns
+    `ARM/motor_J/BAND`; `ARM/payload`, `place/NAME`, `fixture/NAME`.
+
+    Args:
+        speed: Shift seconds per second of the animation.
+    """
+    file = _File(moments, speed)
+    for index, arm in enumerate(moments.model["arms"]):
+        progress("writing arms", index / len(moments.model["arms"]))
+        file.add_arm(index, arm)
+    file.add_surroundings()
+    file.write(path)
+
+
+class _File:
+    def __init__(self, moments: Moments, speed: float) -> None:
+        self.moments, self.buffer, self.speed = moments, Buffer(), speed
+        self.nodes: list[Json] = [{"name": "cell", "rotation": Z_UP, "children": []}]
+        self.meshes: list[Json] = []
+        self.materials: list[Json] = []
+        self.channels: list[Json] = []
+        self.samplers: list[Json] = []
+        time_s = moments.run.telemetry.time_s
+        self._begin_s = float(time_s[0])
+        self.pose_s, self.heat_s = self._played(time_s[moments.poses]), self._played(time_s[moments.heats])
+        self._shapes = [
+            [self._mesh(self._geometry(_solid(shape)), shape["colour"]) for shape in link["shapes"]]
+            for link in moments.model["links"]
+        ]
+        self._ball, self._box = self._geometry(_ball()), self._geometry(_box([0.5] * 3))
+        self._made: dict[tuple[str, float], int] = {}
+        """Meshes by kind, and the temperature of a band."""
+        limits = moments.limits
+        marks = heat_marks(limits.warning_c, limits.error_c)
+        self._edges_c = np.arange(np.ceil(marks[0] / BAND_K), np.floor(marks[-1] / BAND_K) + 1) * BAND_K
+
+    def _played(self, time_s: Array) -> Array:
+        """Times in the animation, s."""
+        return (time_s - self._begin_s) / self.speed
+
+    def _geometry(self, shape: tuple[Array, Array, Array]) -> Json:
+        """A primitive without a material, of vertices, normals and faces."""
+        vertices, normals, faces = shape
+        attributes = {
+            "POSITION": self.buffer.add(vertices, target=VERTICES, bounds=True),
+            "NORMAL": self.buffer.add(normals, target=VERTICES),
+        }
+        return {"attributes": attributes, "indices": self.buffer.add(faces.ravel(), target=INDICES)}
+
+    def _mesh(self, geometry: Json, rgb: Sequence[float], *, unlit: bool = False) -> int:
+        """Index of a new mesh of one colour (RGB from 0 to 1, as on a screen)."""
+        linear = [((c + 0.055) / 1.055) ** 2.4 if c > 0.04045 else c / 12.92 for c in rgb]
+        plain: Json = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7}
+        self.materials.append(
+            {"pbrMetallicRoughness": plain} | ({"extensions": {"KHR_materials_unlit": {}}} if unlit else {})
+        )
+        self.meshes.append({"primitives": [geometry | {"material": len(self.materials) - 1}]})
+        return len(self.meshes) - 1
+
+    def _once(self, kind: str, geometry: Json, rgb: Sequence[float], temp_c: float = 0.0) -> int:
+        """Index of the mesh of a kind, made at its first use."""
+        if (kind, temp_c) not in self._made:
+            self._made[kind, temp_c] = self._mesh(geometry, rgb, unlit=kind == "motor")
+        return self._made[kind, temp_c]
+
+    def _node(self, parent: int, name: str, given: Mapping[str, Any] | None = None, **more: Any) -> int:
+        """Index of a new node; `given` is a pose with a quaternion w, x, y, z."""
+        node: Json = {"name": name, **more}
+        if given is not None:
+            w, x, y, z = given["quaternion"]
+            length = float(np.linalg.norm((w, x, y, z)))
+            node |= {"translation": list(given["position"]), "rotation": [v / length for v in (x, y, z, w)]}
+        self.nodes.append(node)
+        self.nodes[parent].setdefault("children", []).append(len(self.nodes) - 1)
+        return len(self.nodes) - 1
+
+    def _animate(self, node: int, path: str, time_s: Array, values: Array, interpolation: str) -> None:
+        times = self.buffer.add(time_s, bounds=True)
+        self.samplers.append({"input": times, "output": self.buffer.add(values), "interpolation": interpolation})
+        self.channels.append({"sampler": len(self.samplers) - 1, "target": {"node": node, "path": path}})
+
+    def add_arm(self, index: int, arm: Mapping[str, Any]) -> None:
+        """Nodes and animations of an arm."""
+        moments, readings = self.moments, self.moments.run.telemetry
+        links, name = moments.model["links"], arm["name"]
+        root = self._node(0, name, arm)
+        q = readings.q[moments.poses, index].astype(float)
+        band = np.digitize(readings.temp_c[moments.heats, index], self._edges_c)  # [moment, joint]
+        nodes: list[int] = []
+        joints = iter(range(JOINTS))
+        for i, link in enumerate(links):
+            node = self._node(root if link["parent"] < 0 else nodes[link["parent"]], f"{name}/link_{i}", link)
+            nodes.append(node)
+            for mesh, shape in zip(self._shapes[i], link["shapes"], strict=True):
+                self._node(node, f"{name}/link_{i}/{shape['kind']}", shape, mesh=mesh)
+            if not link["turns"]:
+                continue
+            joint = next(joints)
+            self._turn(node, i, joint, q[:, joint])
+            self._add_motor(node, f"{name}/motor_{joint + 1}", band[:, joint])
+        self._add_payload(self._node(nodes[-1], f"{name}/hand", moments.model["hand"]), name, index)
+
+    def _turn(self, node: int, link: int, joint: int, angle_rad: Array) -> None:
+        """Animate the rotation of a link by its joint's angles [moment]."""
+        time_s, angle_rad = divided(self.pose_s, angle_rad)
+        kept = keys_of(time_s, angle_rad)
+        q = np.zeros((len(kept), JOINTS))
+        q[:, joint] = angle_rad[kept]
+        rotations = self.moments.link_quaternions(q)[:, link][:, [1, 2, 3, 0]]
+        rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
+        self.nodes[node]["rotation"] = rotations[0].tolist()
+        if np.ptp(q[:, joint]):
+            self._animate(node, "rotation", time_s[kept], rotations, "LINEAR")
+
+    def _add_motor(self, link: int, name: str, band: Array) -> None:
+        """One sphere per temperature band of a motor; only the current one is visible."""
+        for number in np.unique(band).tolist():
+            temp_c = float(self._edges_c[0]) + (number - 0.5) * BAND_K
+            rgb, radius_m = motor_spheres(np.array(temp_c), self.moments.limits)
+            mesh = self._once("motor", self._ball, rgb.tolist(), temp_c)
+            node = self._node(link, f"{name}/{temp_c:g}", mesh=mesh)
+            self._switch(node, self.heat_s, np.where(band == number, float(radius_m), 0.0))
+
+    def _add_payload(self, hand: int, name: str, index: int) -> None:
+        radius_m = self.moments.payload_m[:, index][self.moments.poses]
+        if not radius_m.any():
+            return
+        node = self._node(hand, f"{name}/payload", mesh=self._once("payload", self._ball, LOAD_RGB))
+        changed = self._switch(node, self.pose_s, radius_m)
+        centres = np.zeros((len(changed), 3))
+        centres[:, 2] = radius_m[changed]
+        self.nodes[node]["translation"] = centres[0].tolist()
+        if len(changed) > 1:
+            self._animate(node, "translation", self.pose_s[changed], centres, "STEP")
+
+    def _switch(self, node: int, time_s: Array, radius_m: Array) -> Array:
+        """Give a node radii [moment] in steps; returns the moments at which they change."""
+        changed = np.flatnonzero(np.diff(radius_m, prepend=np.nan))
+        scales = np.repeat(radius_m[changed, None], 3, axis=1)
+        self.nodes[node]["scale"] = scales[0].tolist()
+        if len(changed) > 1:
+            self._animate(node, "scale", time_s[changed], scales, "STEP")
+        return changed
+
+    def add_surroundings(self) -> None:
+        """Places and fixtures."""
+        for kind, rgb in (("place", PLACE_RGB), ("fixture", FIXTURE_RGB)):
+            for box in self.moments.model[f"{kind}s"]:
+                mesh = self._once(kind, self._box, rgb)
+                self._node(0, f"{kind}/{box['name']}", box, mesh=mesh, scale=box.get("size", [PLACE_M] * 3))
+
+    def write(self, path: Path) -> None:
+        run, limits = self.moments.run, self.moments.limits
+        about = {
+            "scenario": run.scenario.name,
+            "policy": run.card["policy"],
+            "seed": run.card["seed"],
+            "shift_seconds_per_second": self.speed,
+            "begin_s": self._begin_s,
+            "band_k": BAND_K,
+            "warning_c": limits.warning_c,
+            "error_c": limits.error_c,
+        }
+        content: Json = {
+            "asset": {"version": "2.0", "generator": "thermofleet", "extras": about},
+            "extensionsUsed": ["KHR_materials_unlit"],
+            "scene": 0,
+            "scenes": [{"name": run.scenario.name, "nodes": [0]}],
+            "nodes": self.nodes,
+            "meshes": self.meshes,
+            "materials": self.materials,
+        }
+        if self.channels:
+            content["animations"] = [{"name": "shift", "channels": self.channels, "samplers": self.samplers}]
+        self.buffer.write(path, content)
+
+
+def divided(time_s: Array, angle_rad: Array) -> tuple[Array, Array]:
+    """Times and angles, [moment], with further moments within turns of more than `LONGEST_TURN_RAD`."""
+    parts = np.ceil(np.abs(np.diff(angle_rad)) / LONGEST_TURN_RAD).astype(int)
+    if parts.max(initial=0) <= 1:
+        return time_s, angle_rad
+    ends_s = zip(time_s, time_s[1:], np.maximum(parts, 1).tolist(), strict=False)
+    within = [np.linspace(a, b, n, endpoint=False) for a, b, n in ends_s]
+    finer_s = np.concatenate([*within, time_s[-1:]])
+    return finer_s, np.interp(finer_s, time_s, angle_rad)
+
+
+def keys_of(time_s: Array, angle_rad: Array, same_rad: float = SAME_RAD) -> Array:
+    """Moments that reproduce an angle by linear interpolation to within `same_rad`, the first and the last among them.
+
+    A line from the last key has to pass every later moment within the tolerance (swinging door compression: Bristol,
+    ISA Transactions 1990).
+
+    Args:
+        time_s, angle_rad: [moment].
+    """
+    times, angles = time_s.tolist(), angle_rad.tolist()
+    kept, low, high = [0], -np.inf, np.inf
+    for i in range(1, len(times)):
+        run_s, rise = times[i] - times[kept[-1]], angles[i] - angles[kept[-1]]
+        if not low <= rise / run_s <= high or (abs(rise) > LONGEST_TURN_RAD and i - 1 > kept[-1]):
+            kept.append(i - 1)
+            run_s, rise, low, high = times[i] - times[i - 1], angles[i] - angles[i - 1], -np.inf, np.inf
+        low, high = max(low, (rise - same_rad) / run_s), min(high, (rise + same_rad) / run_s)
+    if len(times) > 1:
+        kept.append(len(times) - 1)
+    return np.array(kept)
+
+
+def _solid(shape: Mapping[str, Any]) -> tuple[Array, Array, Array]:
+    """Vertices, normals and faces of a shape of a link in its own frame."""
+    from trimesh import creation
+
+    kind, size = shape["kind"], shape["size"]
+    if kind == "box":
+        return _box(size)
+    if kind == "sphere":
+        return _ball(size[0])
+    if kind == "cylinder":
+        return _flat(creation.cylinder(radius=size[0], height=2 * size[1], sections=32))
+    return _smooth(creation.capsule(radius=size[0], height=2 * size[1], count=[24, 12]))
+
+
+def _box(half: Sequence[float]) -> tuple[Array, Array, Array]:
+    from trimesh import creation
+
+    return _flat(creation.box(extents=[2 * length for length in half]))
+
+
+def _ball(radius: float = 1.0) -> tuple[Array, Array, Array]:
+    from trimesh import creation
+
+    return _smooth(creation.icosphere(subdivisions=2, radius=radius))
+
+
+def _smooth(mesh: Any) -> tuple[Array, Array, Array]:
+    return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces)
+
+
+def _flat(mesh: Any) -> tuple[Array, Array, Array]:
+    """With the vertices of each face apart, so that edges stay sharp."""
+    vertices = np.array(mesh.vertices[mesh.faces]).reshape(-1, 3)
+    return vertices, np.repeat(np.array(mesh.face_normals), 3, axis=0), np.arange(len(vertices))
+
+
+class Buffer:
+    """The buffer of a file, filled array by array."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self.size = 0
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(self, values: Array, *, target: int | None = None, bounds: bool = False) -> int:
+        """Append an array and return the index of its accessor.
+
+        Args:
+            values: [element] or [element, component], of 1, 3 or 4 components; float32 or uint16 in the file.
+            target: `VERTICES` or `INDICES`; None for animations.
+            bounds: State least and largest values, which positions and times of animations need.
+        """
+        kind = "<u2" if values.dtype.kind in "iu" else "<f4"
+        packed = np.ascontiguousarray(values, dtype=kind)
+        raw = packed.tobytes()
+        padded = raw + b"\0" * (-len(raw) % ALIGNMENT)
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.size, "byteLength": len(raw)}
+        self.views.append(view if target is None else view | {"target": target})
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.views) - 1,
+            "componentType": _COMPONENT[kind],
+            "count": len(packed),
+            "type": _TYPE[packed.shape[1] if packed.ndim > 1 else 1],
+        }
+        if bounds:
+            columns = packed.reshape(len(packed), -1)
+            accessor |= {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
+        self.accessors.append(accessor)
+        self._parts.append(padded)
+        self.size += len(padded)
+        return len(self.accessors) - 1
+
+    def write(self, path: Path, content: dict[str, Any]) -> None:
+        """Write the file.
+
+        Args:
+            content: Its JSON part, without buffers, views and accessors.
+        """
+        whole = content | {
+            "buffers": [{"byteLength": self.size}],
+            "bufferViews": self.views,
+            "accessors": self.accessors,
+        }
+        text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % ALIGNMENT)
+        length = 12 + 8 + len(text) + 8 + self.size
+        with path.open("wb") as file:
+            file.write(struct.pack("<III", _MAGIC, _VERSION, length))
+            file.write(struct.pack("<II", len(text), _JSON) + text)
+            file.write(struct.pack("<II", self.size, _BIN))
+            file.writelines(self._parts)

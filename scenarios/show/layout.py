@@ -1,0 +1,243 @@
+"""Layout of a cell: what each arm reaches, which works exclude each other, how many arms can work at once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import csr_array
+
+from fleet.files import cache_folder
+from fleet.motion import Plan
+from fleet.planning.space import SpaceTable
+from scenarios.cell_layout import cell_of
+from scenarios.job_stream import all_works, works_of
+from scenarios.prepare.fleet import space_of
+from scenarios.prepare.planned_arm import PlannedArm, plan_arms
+from scenarios.prepare.problems import problems_of
+from scenarios.progress import Progress, quiet
+from scenarios.schema import Scenario
+from scenarios.show.table import Table
+
+if TYPE_CHECKING:
+    from fleet.env.render.scene import Scene
+
+Array = np.ndarray
+SEARCH_S = 20.0
+"""Time limit of the search for the most arms at work at once."""
+WORST = 8
+"""Pairs of jobs in the table of exclusions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach:
+    """What one arm can do at one place."""
+
+    arm: str
+    place: str
+    payload_kg: float | None
+    """Heaviest payload of the scenario's jobs at this place that the arm can carry; None if it can do none."""
+    reason: str = ""
+    """Why it cannot do some of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exclusion:
+    """How much the jobs of two streams exclude each other when two arms do them."""
+
+    jobs: tuple[str, str]
+    """Names of the streams."""
+    arms: tuple[str, str]
+    share: float
+    """Share of the pairs of plans that come too close to each other."""
+    same_place: bool
+    """Whether both need one station, which one arm at a time may use."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assignment:
+    """One work of one arm among those done at the same time."""
+
+    arm: str
+    job: str
+    places: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayoutReport:
+    """What `thermofleet layout` shows."""
+
+    scenario: str
+    clearance_m: float
+    reach: tuple[Reach, ...]
+    exclusions: tuple[Exclusion, ...]
+    excluded_share: float
+    """Share of the pairs of plans of two arms that exclude each other."""
+    at_once: tuple[Assignment, ...]
+    """A largest set of works that different arms can do at the same time, each at its own stations."""
+    largest: bool
+    """Whether no larger set exists; False if the search ended at its time limit."""
+    problems: tuple[str, ...]
+
+
+def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutReport:
+    """The layout of a scenario's cell. Plans the scenario's work (cached); problems are part of the result."""
+    folder = cache_folder()
+    arms = plan_arms(scenario, range(len(scenario.arms)), all_works(scenario), folder, progress)
+    problems = problems_of(scenario, arms, folder)
+    plans = [plan for arm in arms for plan in arm.all_plans]
+    space = space_of(scenario, [arm.hardware.robot for arm in arms], plans, folder, progress)
+    exclusions = _exclusions(scenario, plans, space)
+    at_once, largest = _most_at_once(scenario, plans, space)
+    pairs = _pairs_of_arms(plans)
+    volumes, conflicts = space.rows(plans)
+    close = conflicts[np.ix_(volumes, volumes)][pairs]
+    return LayoutReport(
+        scenario=scenario.name,
+        clearance_m=scenario.clearance_m,
+        reach=tuple(_reach(scenario, arm, place.name) for place in scenario.places for arm in arms),
+        exclusions=exclusions,
+        excluded_share=float(close.mean()) if close.size else 0.0,
+        at_once=at_once,
+        largest=largest,
+        problems=tuple(problems),
+    )
+
+
+def layout_scene(scenario: Scenario, report: LayoutReport) -> "Scene":
+    """The cell with the arms that can work at once at their stations, for `fleet.env.render.picture.Picture`."""
+    from fleet.env.render.scene import Scene
+    from fleet.telemetry import IDLE, WORKING
+
+    cell = cell_of(scenario)
+    busy = {work.arm: work for work in report.at_once}
+    start_c = float(scenario.ambient.at(np.zeros(1))[0])
+    return Scene(
+        cell=cell,
+        time_s=0.0,
+        horizon_s=scenario.horizon_s,
+        temp_c=np.full((len(cell.arms), 7), start_c),
+        warning_c=scenario.limits.warning_c,
+        error_c=scenario.limits.error_c,
+        mode=tuple(WORKING if arm in busy else IDLE for arm in cell.arms),
+        job=tuple(busy[arm].job if arm in busy else "" for arm in cell.arms),
+        progress=(0.0,) * len(cell.arms),
+        at=tuple(busy[arm].places if arm in busy else () for arm in cell.arms),
+        queue=(),
+        waiting=0,
+        finished=0,
+        faults=0,
+        title=f"{scenario.name}: {len(busy)} arms at work at once",
+    )
+
+
+def layout_tables(scenario: Scenario, report: LayoutReport) -> tuple[list[Table], str]:
+    """Reach matrix, reasons and exclusions; and the most arms at work at once, in a sentence."""
+    arms = [arm.name for arm in scenario.arms]
+    reach = {(entry.place, entry.arm): entry for entry in report.reach}
+    matrix = Table(
+        caption=f"{scenario.name}: heaviest payload (kg) of the jobs that an arm can do at a place; –: it can do none",
+        head=("place", *arms),
+        rows=tuple(
+            (place.name, *(_payload(reach[place.name, arm].payload_kg) for arm in arms)) for place in scenario.places
+        ),
+        numbers=False,
+    )
+    reasons = Table(
+        head=("cannot do", "reason"),
+        rows=tuple((f"{entry.arm} at {entry.place}", entry.reason) for entry in report.reach if entry.reason),
+        numbers=False,
+    )
+    shared = [pair for pair in report.exclusions if not pair.same_place]
+    always = sum(pair.share == 1 for pair in shared)
+    pairs = Table(
+        caption=f"{report.excluded_share:.0%} of the pairs of plans of two arms come closer than "
+        f"{report.clearance_m * 1e3:g} mm and exclude each other. Pairs of jobs at different "
+        f"stations: {always} exclude each other always, {len(shared) - always} for some plans"
+        + (f". The first {WORST}:" if len(shared) > WORST else ":" if shared else "."),
+        head=("job", "excludes", "share of plans") if shared else ("", "", ""),
+        rows=tuple(
+            (*(f"{job}, {arm}" for job, arm in zip(pair.jobs, pair.arms, strict=True)), f"{pair.share:.0%}")
+            for pair in shared[:WORST]
+        ),
+        numbers=False,
+    )
+    most = ", ".join(f"{work.arm} {work.job}" for work in report.at_once)
+    sentence = (
+        f"{'At most' if report.largest else 'At least'} {len(report.at_once)} of {len(arms)} arms can work at once"
+        + (f", for example {most}." if most else ".")
+        + ("" if report.largest else f" The search for more ended after {SEARCH_S:g} s.")
+    )
+    return [matrix, reasons, pairs], sentence
+
+
+def _payload(payload_kg: float | None) -> str:
+    return "–" if payload_kg is None else f"{payload_kg:g}"
+
+
+def _reach(scenario: Scenario, arm: PlannedArm, place: str) -> Reach:
+    name = arm.hardware.robot.name
+    works = [work for work in all_works(scenario) if place in work.stations]
+    able = [work.payload_kg for work in works if work in arm.plans]
+    reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place)
+    return Reach(arm=name, place=place, payload_kg=max(able, default=None), reason="; ".join(reasons))
+
+
+def _pairs_of_arms(plans: Sequence[Plan]) -> Array:
+    """Which pairs of plans are of two arms, each pair once, bool [plan, plan]."""
+    arms = np.array([plan.arm for plan in plans])
+    return np.triu(arms[:, None] != arms)
+
+
+def _streams(scenario: Scenario, plans: Sequence[Plan]) -> list[str]:
+    """Name of the first stream that each plan serves."""
+    streams = {work: s.name for s in reversed(scenario.jobs) for work in works_of(scenario, s)}
+    return [streams[plan.work] for plan in plans]
+
+
+def _exclusions(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) -> tuple[Exclusion, ...]:
+    """Every two streams of two arms with plans that exclude each other, the most excluding first."""
+    volumes, conflicts = space.rows(plans)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for row, (plan, stream) in enumerate(zip(plans, _streams(scenario, plans), strict=True)):
+        groups.setdefault((plan.arm, stream), []).append(row)
+    exclusions = []
+    for (one, rows), (other, others) in combinations(groups.items(), 2):
+        share = float(conflicts[np.ix_(volumes[rows], volumes[others])].mean())
+        if one[0] == other[0] or not share:
+            continue
+        same = not set(plans[rows[0]].work.stations).isdisjoint(plans[others[0]].work.stations)
+        exclusions.append(Exclusion(jobs=(one[1], other[1]), arms=(one[0], other[0]), share=share, same_place=same))
+    return tuple(sorted(exclusions, key=lambda pair: (-pair.share, pair.same_place, pair.jobs, pair.arms)))
+
+
+def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) -> tuple[tuple[Assignment, ...], bool]:
+    """Volumes without conflicts and with different stations, and whether no set is larger; an integer program."""
+    volumes, conflicts = space.rows(plans)
+    used, first = np.unique(volumes, return_index=True)
+    if not len(used):
+        return (), True
+    stations = [set(plans[row].work.stations) for row in first]
+    rows = []  # groups of volumes of which at most one is chosen
+    arms = np.array([plans[row].arm for row in first])
+    for arm in dict.fromkeys(arms.tolist()):
+        rows.append(np.flatnonzero(arms == arm))
+    for station in dict.fromkeys(name for own in stations for name in own):
+        rows.append(np.flatnonzero([station in own for own in stations]))
+    rows += list(np.argwhere(np.triu(conflicts[np.ix_(used, used)] & (arms[:, None] != arms))))
+    columns = np.concatenate(rows)
+    lengths = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    matrix = csr_array((np.ones(len(columns)), (lengths, columns)), shape=(len(rows), len(used)))
+    result = milp(
+        -np.ones(len(used)),
+        integrality=np.ones(len(used)),
+        bounds=Bounds(0, 1),
+        constraints=LinearConstraint(matrix, ub=1.0),
+        options={"time_limit": SEARCH_S},
+    )
+    chosen = [] if result.x is None else first[result.x > 0.5].tolist()
+    streams = _streams(scenario, plans)
+    works = (Assignment(arm=plans[i].arm, job=streams[i], places=plans[i].work.stations) for i in chosen)
+    return tuple(works), result.status == 0

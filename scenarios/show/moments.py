@@ -1,0 +1,120 @@
+"""What every file of a recorded shift holds: which moments, poses of links, motors, payloads, and events in words."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from typing import Any  # plain values of a cell model
+
+import numpy as np
+
+from fleet.env.render.heat import heat_colour, heat_marks
+from fleet.job import payload_radius_m
+from fleet.physics.cell_model import cell_model
+from fleet.robot import ThermalLimits
+from scenarios.run.stored_run import StoredRun
+from scenarios.show.replay import HEAT_STEP_S
+from scenarios.show.words import SEVERITY, event_text, offers_text
+
+Array = np.ndarray
+
+MOST_POSES, MOST_HEATS = 250_000, 40_000
+"""Postures and sets of temperatures of one arm in a file; longer shifts of larger fleets keep fewer moments by default,
+so that a file stays below 100 MB."""
+
+
+MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
+"""Radius of the sphere of a cool motor and of one at the error limit: a hotter motor is also larger."""
+
+
+def motor_spheres(temp_c: Array, limits: ThermalLimits) -> tuple[Array, Array]:
+    """Colours (RGB from 0 to 1, [..., 3]) and radii (m, [...]) of motors at temperatures in °C, [...]."""
+    coolest_c = heat_marks(limits.warning_c, limits.error_c)[0]
+    heat = np.clip((temp_c - coolest_c) / (limits.error_c - coolest_c), 0.0, 1.0)
+    colours = heat_colour(temp_c, limits.warning_c, limits.error_c)
+    return colours, MOTOR_M + heat * (HOT_MOTOR_M - MOTOR_M)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the log."""
+
+    time_s: float
+    severity: str
+    """info, warning or error."""
+    arm: str
+    """"" for none."""
+    text: str
+
+
+class Moments:
+    """A recorded shift at equally spaced moments.
+
+    Args:
+        every_s: Time between two poses; by default the samples of the run, or as few as keep the file small.
+    """
+
+    def __init__(self, run: StoredRun, every_s: float | None = None) -> None:
+        scenario, readings = run.scenario, run.telemetry
+        self.run, self.limits = run, scenario.limits
+        robots = [arm.robot() for arm in scenario.arms]
+        self.model: Mapping[str, Any] = cell_model(robots, scenario.places, scenario.fixtures)
+        time_s = readings.time_s
+        self.sample_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+        wanted = 1 if every_s is None else round(every_s / self.sample_s)
+        size, free = readings.mode.size, every_s is None
+        stride = max(1, wanted, -(-size // MOST_POSES) if free else 1)
+        heat = max(stride, round(HEAT_STEP_S / self.sample_s), -(-size // MOST_HEATS) if free else 1)
+        self.pose_s = stride * self.sample_s
+        self.poses = np.arange(0, len(time_s), stride)
+        """Samples of which the postures are kept."""
+        self.heats = np.arange(0, len(time_s), heat)
+        """Samples of which the temperatures are kept."""
+
+    @property
+    def joint_links(self) -> list[int]:
+        """Index of the link that each joint turns."""
+        return [i for i, link in enumerate(self.model["links"]) if link["turns"]]
+
+    def link_quaternions(self, q: Array) -> Array:
+        """Rotation of each link in its parent's frame, w, x, y, z, [..., link, 4], at angles [..., joint] in rad."""
+        links = self.model["links"]
+        fixed = np.array([link["quaternion"] for link in links])
+        half = np.zeros((*q.shape[:-1], len(links)))
+        half[..., self.joint_links] = q / 2
+        cos, sin = np.cos(half), np.sin(half)
+        w, x, y, z = fixed.T
+        return np.stack([w * cos - z * sin, x * cos + y * sin, y * cos - x * sin, z * cos + w * sin], axis=-1)
+
+    @cached_property
+    def payload_m(self) -> Array:
+        """Radius of the ball in each hand, m, [sample, arm]; 0 without a payload."""
+        load_kg = self.run.load_kg
+        sizes = {kg: payload_radius_m(kg) for kg in np.unique(load_kg).tolist()}
+        return np.vectorize(sizes.__getitem__, otypes=[float])(load_kg)
+
+    def jobs(self, arm: str, time_s: Array) -> list[str]:
+        """Job of an arm at each time; "" for none."""
+        names = [""] * len(time_s)
+        for work in self.run.plan.assignments:
+            if work.arm == arm:
+                begin, end = np.searchsorted(time_s, (work.start_s, work.end_s))
+                names[begin:end] = [work.job] * (end - begin)
+        return names
+
+    def log(self) -> Iterator[Entry]:
+        """Events in order of time; an award is followed by what each arm offered."""
+        offers = {
+            key: list(group) for key, group in groupby(self.run.offers, key=lambda offer: (offer.time_s, offer.job))
+        }
+        for event in sorted(self.run.events, key=lambda event: event.time_s):
+            yield Entry(event.time_s, SEVERITY.get(event.kind, "info"), event.arm, event_text(event))
+            if event.kind == "award" and (made := offers.get((event.time_s, event.job))):
+                yield Entry(event.time_s, "info", "", f"offers for {event.job}: {offers_text(made)}")
+
+
+def ahead(pose: Mapping[str, Any], distance_m: float) -> list[float]:
+    """The point at a distance along a pose's z axis."""
+    w, x, y, z = pose["quaternion"]
+    axis = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    return [p + distance_m * a for p, a in zip(pose["position"], axis, strict=True)]

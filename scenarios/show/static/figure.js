@@ -1,0 +1,55 @@
+// Filters of tables; and draws the page's Plotly figures in the colours of the page, with room for their legends at any width.
+"use strict";
+
+// Fields that show only the rows of their table that have all the words.
+function startFilters() {
+  for (const filter of document.querySelectorAll("input.filter")) filter.addEventListener("input", () => {
+    const words = filter.value.toLowerCase().split(/\s+/);
+    for (const row of document.getElementById(filter.dataset.table).querySelectorAll("tbody tr"))
+      row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
+  });
+}
+
+// Draws every element with `data-drawn` from the JSON in the element of that id; returns the first.
+async function drawFigures(options) {
+  await runLibrary("plotly");
+  const elements = [...document.querySelectorAll("[data-drawn]")];
+  for (const element of elements) await drawFigure(element, options);
+  return elements[0];
+}
+
+async function drawFigure(element, options) {
+  const drawn = JSON.parse(document.getElementById(element.dataset.drawn).textContent);
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  function colours() {
+    const style = getComputedStyle(document.body), out = {
+      "font.color": style.color, paper_bgcolor: style.backgroundColor, plot_bgcolor: style.backgroundColor,
+      "hoverlabel.bgcolor": style.backgroundColor, "hoverlabel.font.color": style.color,
+    };
+    for (const axis of Object.keys(drawn.layout).filter((key) => /^[xy]axis/.test(key)))
+      out[`${axis}.gridcolor`] = dark.matches ? "#33373c" : "#e6e6e6";
+    return out;
+  }
+  await Plotly.newPlot(element, drawn.data, drawn.layout, options);
+  if (dark.matches) await Plotly.relayout(element, colours());
+  dark.addEventListener("change", () => Plotly.relayout(element, colours()));
+  // The layout leaves room for a legend of a wide page; on a narrow one the figure begins lower.
+  const room = drawn.layout.margin.t;
+  let last = 0;
+  async function fit() {
+    const legend = element.querySelector(".legend");
+    if (!legend || element.clientWidth === last) return;
+    last = element.clientWidth;
+    const shift = drawn.layout.xaxis2; // of a shift: the time axis of the work has the title of the one below
+    const narrow = shift && last < 600;
+    const needed = legend.getBoundingClientRect().height + (shift ? 50 : 20);
+    const margin = Math.max(room, Math.ceil(needed));
+    if (narrow || Math.abs(margin - element.layout.margin.t) > 4)
+      await Plotly.relayout(element, {
+        "margin.t": margin, height: drawn.layout.height + margin - room,
+        ...(shift && { "legend2.font.size": narrow ? 9 : 12, "xaxis.title.text": narrow ? "" : shift.title.text }),
+      });
+  }
+  await fit();
+  element.on("plotly_afterplot", fit);
+}

@@ -1,0 +1,166 @@
+// Plays a recorded shift: the cell, a clock, and a cursor in the figure below, all at one time of the shift.
+"use strict";
+
+// Difference-coded 16-bit values after a line of JSON, see scenarios/show/replay.py.
+async function readPlayback(id) {
+  const bytes = new Uint8Array(await unpack(id)), end = bytes.indexOf(10);
+  const listed = JSON.parse(new TextDecoder().decode(bytes.subarray(0, end))), arrays = {};
+  let at = end + 1;
+  for (const { name, shape, scale, first_s, step_s } of listed) {
+    const count = shape.reduce((a, b) => a * b, 1), moments = shape[shape.length - 1];
+    const values = new Int16Array(bytes.slice(at, at + 2 * count).buffer);
+    at += 2 * count;
+    for (let row = 0; row < count; row += moments) for (let i = row + 1; i < row + moments; i++) values[i] += values[i - 1];
+    arrays[name] = { values, scale, moments, first_s, step_s, rows: count / moments };
+  }
+  return arrays;
+}
+
+// Value of a row at a time, linear between moments.
+function valueAt(array, row, timeS) {
+  const x = Math.min(array.moments - 1, Math.max(0, (timeS - array.first_s) / array.step_s));
+  const i = Math.min(array.moments - 2, Math.floor(x)), from = row * array.moments;
+  if (array.moments < 2) return array.values[from] * array.scale;
+  return (array.values[from + i] * (1 - x + i) + array.values[from + i + 1] * (x - i)) * array.scale;
+}
+
+// Value of a row at the last moment not after a time.
+function stateAt(array, row, timeS) {
+  const i = Math.min(array.moments - 1, Math.max(0, Math.floor((timeS - array.first_s) / array.step_s + 1e-6)));
+  return array.values[row * array.moments + i] * array.scale;
+}
+
+// Plays the shift; a figure that is drawn later gets its cursor by `attach`.
+async function startReplay(unitS) {
+  const place = document.getElementById("cell");
+  const model = JSON.parse(document.getElementById("cell-model").textContent);
+  const data = await readPlayback("playback");
+  const joints = data.q.rows / model.arms.length, endS = data.q.first_s + (data.q.moments - 1) * data.q.step_s;
+  const play = document.getElementById("play"), slider = document.getElementById("time"), speed = document.getElementById("speed");
+  const clock = document.getElementById("clock"), now = document.getElementById("now"), chooser = document.getElementById("arm");
+  let cell;
+  try {
+    cell = makeCell(place, model);
+  } catch (error) {
+    place.className = "absent";
+    place.textContent = "This browser cannot draw in 3-D (WebGL is missing). The figures below show the same shift.";
+  }
+  let timeS = data.q.first_s, playing = false, last = 0, shown = null, figure = null, moveCursor = null;
+  slider.min = data.q.first_s;
+  slider.max = endS;
+  slider.step = "any";
+  const radius = (kg) => Math.min(model.load.most_m, Math.cbrt((3 * kg) / (4 * Math.PI * model.load.kg_per_m3)));
+  const words = ["idle", "working", "faulted"];
+
+  function show(t) {
+    timeS = Math.min(endS, Math.max(data.q.first_s, t));
+    slider.value = timeS;
+    const s = Math.round(timeS), text = `${Math.floor(s / 3600)}:${String(Math.floor(s / 60) % 60).padStart(2, "0")}:${String(s % 60).padStart(2, "0")}`;
+    clock.textContent = text;
+    slider.setAttribute("aria-valuetext", text);
+    const lines = [];
+    for (let arm = 0; arm < model.arms.length; arm++) {
+      const q = [], temp = [];
+      for (let j = 0; j < joints; j++) {
+        q.push(valueAt(data.q, arm * joints + j, timeS));
+        temp.push(valueAt(data.temp_c, arm * joints + j, timeS));
+      }
+      const mode = stateAt(data.mode, arm, timeS), hottest = temp.indexOf(Math.max(...temp));
+      if (cell) {
+        if (!shown || shown[arm] !== mode) cell.setMode(arm, mode);
+        cell.setHeat(arm, temp);
+        cell.setPose(arm, q, radius(stateAt(data.payload_kg, arm, timeS)));
+      }
+      lines.push({ arm, mode, hottest: hottest + 1, tempC: temp[hottest] });
+    }
+    shown = lines.map((line) => line.mode);
+    now.textContent = lines.sort((a, b) => b.tempC - a.tempC).slice(0, 8).map(({ arm, mode, hottest, tempC }) =>
+      words[mode] === undefined ? `${model.arms[arm].name}: absent` : `${model.arms[arm].name}: ${words[mode]}, joint ${hottest} at ${tempC.toFixed(1)} °C`
+      + (tempC >= model.heat.error_c ? " (above the limit)" : tempC >= model.heat.warning_c ? " (warm)" : "")).join("\n");
+    if (moveCursor) moveCursor(timeS);
+  }
+  function frame(ms) {
+    if (playing) {
+      show(timeS + (Math.min(0.25, (ms - last) / 1000)) * Number(speed.value));
+      if (timeS >= endS) toggle();
+    }
+    last = ms;
+    if (cell) cell.draw();
+    requestAnimationFrame(frame);
+  }
+  function toggle() {
+    playing = !playing;
+    if (playing && timeS >= endS) show(data.q.first_s);
+    play.textContent = playing ? "❚❚" : "▶";
+    play.setAttribute("aria-label", playing ? "pause" : "play");
+  }
+  // A vertical line over the whole figure; a click in the figure moves it.
+  function addCursor(element) {
+    const line = document.createElement("div");
+    line.className = "cursor";
+    element.append(line);
+    element.addEventListener("click", (event) => {
+      const layout = element._fullLayout;
+      const x = layout.xaxis.p2l(event.clientX - element.getBoundingClientRect().left - layout._size.l);
+      if (event.target.closest(".draglayer") && x >= 0) show(x * unitS);
+    }, true);
+    element.on("plotly_afterplot", () => show(timeS));
+    return (t) => {
+      const { xaxis, _size } = element._fullLayout, px = xaxis.l2p(t / unitS);
+      line.hidden = px < 0 || px > xaxis._length;
+      Object.assign(line.style, { transform: `translateX(${_size.l + px}px)`, top: `${_size.t}px`, height: `${_size.h}px` });
+    };
+  }
+  // Looks at one arm, and shows its temperatures in the last lane of a large fleet; -1: the whole cell.
+  function choose(arm) {
+    chooser.value = arm;
+    if (cell) cell.focus(arm);
+    const lane = figure && figure.layout.meta;
+    if (!lane || arm < 0) return;
+    const { moments, first_s, step_s } = data.temp_c, xs = Array.from({ length: moments }, (_, i) => (first_s + i * step_s) / unitS);
+    const ys = Array.from({ length: joints }, (_, j) => xs.map((_, i) => data.temp_c.values[(arm * joints + j) * moments + i] * data.temp_c.scale));
+    Plotly.restyle(figure, { x: ys.map(() => xs), y: ys }, lane.lane_traces);
+    const name = document.createElement("b");
+    name.textContent = model.arms[arm].name;
+    Plotly.relayout(figure, { [`annotations[${lane.lane_title}].text`]: name.outerHTML });
+  }
+  model.arms.forEach((arm, i) => chooser.append(new Option(arm.name, i)));
+  chooser.addEventListener("change", () => choose(Number(chooser.value)));
+  play.addEventListener("click", toggle);
+  slider.addEventListener("input", () => show(Number(slider.value)));
+  // An element with a moment goes there, by click or Enter.
+  function goTo(event) {
+    const row = event.target.closest("[data-time]");
+    if (!row || (event.type === "keydown" && event.key !== "Enter")) return;
+    const arm = model.arms.findIndex((one) => one.name === row.dataset.arm);
+    show(Number(row.dataset.time));
+    if (arm >= 0) choose(arm);
+    place.scrollIntoView({ block: "center", behavior: "smooth" });
+  }
+  for (const one of document.querySelectorAll("[data-time]")) one.tabIndex = 0;
+  document.addEventListener("click", goTo);
+  document.addEventListener("keydown", goTo);
+  document.addEventListener("keydown", (event) => {
+    if (event.target.closest("input, select, button, canvas, a, summary")) return;
+    if (event.key === " ") toggle();
+    else if (event.key === "ArrowRight") show(timeS + 10);
+    else if (event.key === "ArrowLeft") show(timeS - 10);
+    else return;
+    event.preventDefault();
+  });
+  function attach(element) {
+    figure = element;
+    figure.on("plotly_click", (event) => {
+      const point = event.points[0];
+      if (point.data.type === "heatmap") choose(point.y);
+    });
+    moveCursor = addCursor(figure);
+    if (chooser.value >= 0) choose(Number(chooser.value));
+    moveCursor(timeS);
+  }
+  show(timeS);
+  requestAnimationFrame(frame);
+  window.replay = { show, time: () => timeS };
+  performance.mark("playable");
+  return { attach };
+}

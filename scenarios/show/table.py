@@ -1,0 +1,165 @@
+"""One table for the terminal, pages, notebooks and documents."""
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+    from rich.console import Group
+
+MOST_LABEL = 40
+"""Characters of a row's label on the terminal, so that a long name leaves room for the figures."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A time of the shift, and the arm to look at; a click on an element with a moment goes there in the replay."""
+
+    time_s: float
+    arm: str = ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """Heading of a column."""
+
+    name: str
+    unit: str = ""
+    words: bool = False
+    """Whether its cells are words, aligned to the left, in a table of figures."""
+
+    def __str__(self) -> str:
+        return f"{self.name}, {self.unit}" if self.unit else self.name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows of text under headings; the first column names the row.
+
+    Raises:
+        ValueError: a row has another number of cells than the head.
+    """
+
+    head: tuple[str | Column, ...]
+    rows: tuple[tuple[str, ...], ...]
+    groups: Mapping[int, str] = field(default_factory=dict)
+    """Headings within the table, each by the index of the row below it."""
+    caption: str = ""
+    """Above the table."""
+    notes: tuple[str, ...] = ()
+    """Sentences below the table."""
+    numbers: bool = True
+    """Whether all columns but the first hold figures and are aligned to the right; otherwise all hold words."""
+
+    def __post_init__(self) -> None:
+        odd = [row for row in self.rows if len(row) != len(self.head)]
+        if odd:
+            raise ValueError(f"Every row needs {len(self.head)} cells like the head (got {odd[0]}).")
+
+    @classmethod
+    def grouped(
+        cls,
+        head: Sequence[str | Column],
+        groups: Mapping[str, Sequence[tuple[str, ...]]],
+        *,
+        caption: str = "",
+        notes: Sequence[str] = (),
+    ) -> "Table":
+        """A table of figures from the rows of each group by its heading."""
+        rows, begins = list[tuple[str, ...]](), dict[int, str]()
+        for heading, own in groups.items():
+            begins[len(rows)] = heading
+            rows += own
+        return cls(head=tuple(head), rows=tuple(rows), groups=begins, caption=caption, notes=tuple(notes))
+
+    @property
+    def headings(self) -> tuple[str, ...]:
+        """Texts of the head."""
+        return tuple(map(str, self.head))
+
+    @property
+    def words(self) -> tuple[bool, ...]:
+        """Whether each column holds words: the first one, all of a table without numbers, and those that say so."""
+        named = (isinstance(column, Column) and column.words for column in self.head)
+        return tuple(words or not (self.numbers and number) for number, words in enumerate(named))
+
+    def select(self, *columns: int) -> "Table":
+        """Some of the columns, by index."""
+
+        def of(cells: Sequence[str]) -> tuple[str, ...]:
+            return tuple(cells[column] for column in columns)
+
+        return replace(self, head=tuple(self.head[column] for column in columns), rows=tuple(map(of, self.rows)))
+
+    def split(self) -> Iterator[tuple[str, "Table"]]:
+        """Each group as a table of its own, without caption and notes, after its heading."""
+        begins = sorted(self.groups)
+        for begin, end in zip(begins, [*begins[1:], len(self.rows)], strict=True):
+            part = replace(self, rows=self.rows[begin:end], groups={}, caption="", notes=())
+            yield self.groups[begin], part
+
+    def rich(self) -> "Group":
+        """For a console of rich, without lines."""
+        from rich.console import Group
+        from rich.table import Table as RichTable
+        from rich.text import Text
+
+        table = RichTable(box=None, pad_edge=False, show_header=any(self.headings))
+        for number, (heading, words) in enumerate(zip(self.headings, self.words, strict=True)):
+            widest = MOST_LABEL if self.numbers and not number else None
+            style = "bold" if not number and not table.show_header else None
+            justify = "left" if words else "right"
+            table.add_column(Text(heading), justify=justify, overflow="fold", max_width=widest, style=style)
+        for index, row in enumerate(self.rows):
+            if index in self.groups:
+                table.add_row(Text(self.groups[index], style="bold"))
+            label = f"  {row[0]}" if self.groups else row[0]
+            table.add_row(Text(label), *map(Text, row[1:]))
+        above = [Text(self.caption)] if self.caption else []
+        body = [table] if self.rows or table.show_header else []
+        return Group(*above, *body, *map(Text, self.notes))
+
+    def __rich__(self) -> "Group":
+        return self.rich()
+
+    def html(
+        self, *, style: str = "", kinds: Sequence[str] = (), moments: Sequence[Moment] = (), key: str = ""
+    ) -> "Markup":
+        """For a page.
+
+        Args:
+            style: Classes of the page's style sheet; figures are aligned by the class `numbers`, which this adds.
+            kinds: A class for each row; none by default.
+            moments: Of each row.
+            key: With one, a field above the table filters its rows.
+        """
+        from scenarios.show.html import render
+
+        classes = " ".join([*(["numbers"] if self.numbers else []), *style.split()])
+        return render("table.html", table=self, style=classes, kinds=kinds, moments=moments, key=key)
+
+    def _repr_html_(self) -> str:
+        return str(self.html())
+
+    def markdown(self) -> str:
+        """For a document, without caption and notes; cells are Markdown."""
+        lines = [self.headings, ("---",) * len(self.head)]
+        for index, row in enumerate(self.rows):
+            if index in self.groups:
+                lines.append((f"**{self.groups[index]}**", *[""] * (len(self.head) - 1)))
+            lines.append(row)
+        return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+    def csv(self) -> str:
+        """As comma-separated values, with the group of a row, if any, as its first column."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow((*(["group"] if self.groups else []), *self.headings))
+        group: list[str] = []
+        for index, row in enumerate(self.rows):
+            group = [self.groups[index]] if index in self.groups else group
+            writer.writerow((*group, *row))
+        return text.getvalue()

@@ -1,0 +1,483 @@
+"""Plotly figure of a shift: Gantt chart above, motor temperatures below.
+
+The figure is a plain dict in Plotly's schema, because Plotly's own objects take longer than the rest of a report.
+"""
+
+import base64
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar  # Any: values of Plotly's schema
+
+import numpy as np
+
+from fleet.env.render.heat import HEAT, heat_marks
+from fleet.events import Event
+from fleet.robot import JOINTS
+from fleet.telemetry import Telemetry
+from scenarios.run.schedule import Assignment, Outage, Schedule
+from scenarios.show import page
+from scenarios.show.page import AXIS, INK, plain
+from scenarios.show.words import by_joint, clock
+
+Array = np.ndarray
+Trace = dict[str, Any]
+Span = TypeVar("Span", Assignment, Outage)
+
+STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
+FAULT, WARNING = "#cc2222", "#e08a00"
+BAR = {"type": "bar", "orientation": "h", "legend": "legend"}
+BAR_HEIGHT = 0.62
+"""In rows."""
+LATE = {"color": INK, "width": 1.6}
+HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7, "solidity": 0.35}
+ARM_NAME, STREAM_NAME = 16, 30
+"""Most characters of a name beside an axis and in a legend, which take their place from the figure."""
+UNFINISHED = 0.55
+"""Opacity of work that was returned or is still running."""
+MARKS = (("fault", "x", FAULT), ("warning", "triangle-up", WARNING))
+
+POINTS_PER_TRACE = 2000
+POINTS_IN_ALL = 250_000
+"""Browsers are slow above this; large fleets get fewer points per trace."""
+FEWEST_POINTS = 200
+MOST_LANES, HOTTEST = 16, 5
+"""Fleets of more arms than `MOST_LANES` get a heat map, and lanes of their `HOTTEST` arms."""
+HEAT_BINS = 1440
+"""Columns of the heat map."""
+
+JOINT_LINES = (
+    ("#4a6fd0", "longdashdot"),
+    ("#cc6677", "solid"),
+    ("#228a44", "dash"),
+    ("#2f8fb5", "dot"),
+    ("#b554a8", "longdash"),
+    ("#8a8a2a", "1px,5px"),
+    ("#2f9488", "dashdot"),
+)
+"""Colour and dash of each joint. Each colour has a contrast above 3 on light and dark pages; the dashes tell apart what
+looks alike to people who see few colours."""
+
+MARGIN = {"l": 90, "r": 84, "b": 52}
+NARROW_PX = 860
+"""Width of the plotting area on a small laptop; a legend wraps at this width."""
+LEGEND_ROW_PX = 20.0
+NAME_PX = 20.0
+"""Height of the name of an arm above its lane."""
+MAP_GAP_PX, MAP_ROW_PX = 90.0, 8.0
+GAP_PX = 172.0
+"""Height between the two blocks, for an axis, a title and a legend."""
+BETWEEN_LANES_PX = 28.0
+
+LAYOUT = page.LAYOUT | {"modebar": {"orientation": "v"}, "barmode": "overlay", "dragmode": "zoom"}
+LEGEND = {
+    "orientation": "h",
+    "x": 0,
+    "xanchor": "left",
+    "yanchor": "bottom",
+    "bgcolor": "rgba(255,255,255,0)",
+    "tracegroupgap": 0,
+}
+TEXT = {"xref": "paper", "xanchor": "left", "showarrow": False}
+
+
+def figure(
+    plan: Schedule,
+    telemetry: Telemetry,
+    events: Sequence[Event],
+    arms: Sequence[str],
+    *,
+    warning_c: float,
+    error_c: float,
+) -> dict[str, Any]:
+    """The figure: `data` and `layout` in Plotly's schema.
+
+    Args:
+        telemetry: Temperatures [sample, arm, joint], arms in the order of `arms`; may be empty.
+    """
+    unit, unit_s = time_unit(plan.horizon_s)
+    bars = gantt(plan, events, arms, unit_s)
+    lanes = lanes_of(telemetry, len(arms))
+    overview = len(lanes) < len(arms)
+    time = AXIS | {
+        "range": [0, max(plan.horizon_s / unit_s, 1e-3)],
+        "title": {"text": f"time ({unit})", "standoff": 6},
+        "domain": [0, 1],
+    }
+    limits = (("error", error_c, FAULT, "bottom", "solid"), ("warning", warning_c, WARNING, "top", "longdash"))
+    layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
+    layout["xaxis"] = time | {"anchor": "y"}
+    layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
+    temperature = AXIS | {
+        "range": _temperature_range(telemetry.temp_c, warning_c, error_c),
+        "title": {"text": "°C", "standoff": 8},
+        "anchor": "x2",
+        "nticks": 6,
+    }
+    for lane in range(len(lanes)):
+        layout[f"yaxis{lane + 2}"] = temperature | layout[f"yaxis{lane + 2}"] | ({"matches": "y2"} if lane else {})
+        layout["annotations"] += [_limit_label(lane, name, limit_c, anchor) for name, limit_c, _, anchor, _ in limits]
+    layout["shapes"] = [
+        *(
+            {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": f"y{a + 2}", "y0": limit, "y1": limit}
+            | {"line": {"color": colour, "width": 1, "dash": dash}}
+            for a in range(len(lanes))
+            for _, limit, colour, _, dash in reversed(limits)
+        ),
+        *_outages(plan, [arms[a] for a in lanes], unit_s),
+    ]
+    data = [*bars, *_temperatures(telemetry, arms, lanes, unit, unit_s)]
+    if overview:
+        number = len(lanes) + 2
+        layout["xaxis3"] = time | {"anchor": f"y{number}", "matches": "x"}
+        # The page may show any other arm in the last lane.
+        title = len(lanes)  # annotations: the title of the heat map, then those of the lanes
+        layout["meta"] = {"lane_traces": list(range(len(data) - JOINTS, len(data))), "lane_title": title}
+        heat = heat_map(telemetry, arms, number, unit, unit_s, warning_c=warning_c, error_c=error_c)
+        data.append(heat | {"colorbar": heat["colorbar"] | {"y": layout[f"yaxis{number}"]["domain"][1]}})
+    return {"data": data, "layout": layout}
+
+
+def gantt(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
+    """All traces; the row of an arm is its index, times are in units of `unit_s`."""
+    traces = _work_bars(plan, events, arms, unit_s)
+    if plan.outages:
+        look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": "x"}}
+        traces.append(_bars("out after a fault", plan.outages, _outage_text, arms, unit_s, look))
+    if not traces:  # without a trace Plotly draws no rows
+        traces.append(
+            BAR
+            | {"name": "no job was begun", "showlegend": True, "x": [None], "y": [None], "marker": {"color": "#888888"}}
+        )
+    for kind, symbol, colour in MARKS:  # above the bars of their arm
+        own = [e for e in events if e.kind == kind and e.arm in arms]
+        if own:
+            traces.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": kind,
+                    "x": [round(e.time_s / unit_s, 5) for e in own],
+                    "y": [arms.index(e.arm) - 0.42 for e in own],
+                    "marker": {"symbol": symbol, "color": colour, "size": 9, "line": {"color": "white", "width": 1}},
+                    **_hover([_event_text(e) for e in own]),
+                    "legend": "legend",
+                }
+            )
+    return traces
+
+
+def stream_of(job: str) -> str:
+    """Stream of a job: its name without the part after the last dash."""
+    return job.rpartition("-")[0] or job
+
+
+def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
+    """Bars of every stream, then samples of the looks for the legend."""
+    # Streams of all jobs, done or not, so that a stream has the same colour in every policy's report.
+    streams = sorted({stream_of(event.job) for event in events if event.job})
+    traces = []
+    for i, stream in enumerate(streams):
+        # The legend shows the look of the first one: not that of a late or unfinished job.
+        own = sorted(
+            (a for a in plan.assignments if stream_of(a.job) == stream),
+            key=lambda a: (bool(a.late_s), a.outcome != "finished"),
+        )
+        if not own:
+            continue
+        look = {
+            "color": STREAM_COLOURS[i % len(STREAM_COLOURS)],
+            "opacity": [1.0 if a.outcome == "finished" else UNFINISHED for a in own],
+            "line": {
+                "color": [LATE["color"] if a.late_s else "white" for a in own],
+                "width": [LATE["width"] if a.late_s else 0.6 for a in own],
+            },
+            "pattern": HATCH | {"shape": [_shape(a) for a in own]},
+        }
+        traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, arms, unit_s, look))
+    outcomes = {a.outcome for a in plan.assignments}
+    samples = (
+        (
+            "late",
+            any(a.late_s for a in plan.assignments),
+            {"color": "#888888", "line": LATE, "pattern": HATCH | {"shape": "."}},
+        ),
+        ("returned", "returned" in outcomes, {"color": "#888888", "pattern": HATCH | {"shape": "/"}}),
+        ("still running", "running" in outcomes, {"color": "#888888", "opacity": UNFINISHED}),
+    )
+    return traces + [
+        BAR | {"name": name, "x": [None], "y": [None], "marker": look} for name, used, look in samples if used
+    ]
+
+
+def _shape(a: Assignment) -> str:
+    """Pattern of a bar, for people who see no colours and for dark pages, which show no dark outline."""
+    return "/" if a.outcome == "returned" else "." if a.late_s else ""
+
+
+def _bars(
+    name: str, spans: Sequence[Span], text: Callable[[Span], str], arms: Sequence[str], unit_s: float, look: Trace
+) -> Trace:
+    """Horizontal bars of assignments or outages."""
+    return BAR | {
+        "name": name,
+        "y": [arms.index(span.arm) for span in spans],
+        "base": [round(span.start_s / unit_s, 5) for span in spans],
+        "x": [round((span.end_s - span.start_s) / unit_s, 5) for span in spans],
+        "width": BAR_HEIGHT,
+        "marker": look,
+        **_hover([text(span) for span in spans]),
+    }
+
+
+def _hover(texts: list[str]) -> Trace:
+    return {"customdata": texts, "hovertemplate": "%{customdata}<extra></extra>"}
+
+
+def _assignment_text(a: Assignment) -> str:
+    """Hover text of one assignment."""
+    if a.outcome == "finished":
+        end = "on time" if not a.late_s else f"late by {clock(a.late_s)}"
+        end = f"finished at {clock(a.finished_s or 0.0)}, {end}"
+    elif a.outcome == "returned":
+        kept = "" if a.cycles_kept is None else f", {a.cycles_kept} cycles kept"
+        end = f"returned to the queue{' after a fault' if a.faulted else ''}{kept}"
+    else:
+        end = "still running at the end"
+    scores = [a.prediction] if a.prediction else []
+    scores += [f"difficulty {a.difficulty:.3g}"] if np.isfinite(a.difficulty) else []
+    lines = [f"<b>{plain(a.job)}</b> on {plain(a.arm)}", f"{clock(a.start_s)} – {clock(a.end_s)}", end, *scores]
+    return "<br>".join(lines)
+
+
+def _outage_text(o: Outage) -> str:
+    """Hover text of one outage."""
+    end = "recovered" if o.recovered else "not recovered"
+    return f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s)} – {clock(o.end_s)}, {end}<br>{plain(by_joint(o.reason))}"
+
+
+def _event_text(e: Event) -> str:
+    """Hover text of one event."""
+    job = f"<br>{plain(e.job)}" if e.job else ""
+    return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s)}<br>{plain(by_joint(e.reason))}{job}"
+
+
+def lanes_of(telemetry: Telemetry, arms: int) -> list[int]:
+    """Indices of the arms with a lane of temperatures: all of a small fleet, the hottest of a large one."""
+    if arms <= MOST_LANES:
+        return list(range(arms))
+    peak_c = np.fmax.reduce(telemetry.temp_c, axis=(0, 2), initial=-np.inf)
+    return np.argsort(-peak_c, kind="stable")[:HOTTEST].tolist()
+
+
+def heat_map(
+    telemetry: Telemetry, arms: Sequence[str], axis: int, unit: str, unit_s: float, *, warning_c: float, error_c: float
+) -> Trace:
+    """The hottest motor of each arm over time, one row per arm; y axis `axis`, x axis 3."""
+    samples = len(telemetry.time_s)
+    edges = np.unique(np.linspace(0, samples, min(samples, HEAT_BINS) + 1).astype(int))[:-1]
+    peak_c = np.zeros((len(arms), len(edges)))
+    if samples:
+        peak_c = np.fmax.reduce(np.fmax.reduceat(telemetry.temp_c, edges, axis=0), axis=2, initial=-np.inf).T
+    marks = heat_marks(warning_c, error_c)
+    low, high = float(marks[0]), float(marks[-1])
+    kelvin = np.clip(np.round((peak_c - low) * 2), 0, 255).astype(np.uint8)
+    shares = (marks - low) / (high - low)
+    names = [plain(arm) for arm in arms]
+    return {
+        "type": "heatmap",
+        "z": {
+            "dtype": "u1",
+            "bdata": base64.b64encode(kelvin.tobytes()).decode(),
+            "shape": f"{len(arms)},{len(edges)}",
+        },
+        "x": _packed(telemetry.time_s[edges] / unit_s),
+        "y": list(range(len(arms))),
+        "xaxis": "x3",
+        "yaxis": f"y{axis}",
+        "zmin": 0,
+        "zmax": 2 * (high - low),
+        "colorscale": [[float(share), colour] for share, colour in zip(shares, HEAT, strict=True)],
+        "colorbar": {
+            "title": {"text": "°C"},
+            "tickvals": [0, 2 * (warning_c - low), 2 * (error_c - low)],
+            "ticktext": [f"{low:g}", f"{warning_c:g}", f"{error_c:g}"],
+            "thickness": 12,
+            "lenmode": "pixels",
+            "len": min(200, MAP_ROW_PX * len(arms)),
+            "yanchor": "top",
+        },
+        "customdata": names,
+        "hovertemplate": f"%{{y}}<br>%{{x:.2f}} {unit}<extra></extra>",
+        "showlegend": False,
+    }
+
+
+def time_unit(horizon_s: float) -> tuple[str, float]:
+    """Time unit of the axes and its length in s: minutes up to three hours, else hours."""
+    return ("min", 60.0) if horizon_s <= 3 * 3600 else ("h", 3600.0)
+
+
+def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict[str, Any]:
+    """Heights, titles and legends of the Gantt chart, of the heat map of a large fleet, and of the lanes."""
+    overview = len(lanes) < len(arms)
+    gantt_px = max(90.0, len(arms) * (40.0 if len(arms) <= 8 else 26.0 if not overview else 12.0))
+    lane_px = 120.0 if len(lanes) <= 8 else 84.0
+    map_px = len(arms) * MAP_ROW_PX if overview else 0.0
+    map_top = gantt_px + MAP_GAP_PX
+    first = map_top + map_px if overview else gantt_px
+    tops = [first + GAP_PX + a * (lane_px + BETWEEN_LANES_PX) for a in range(len(lanes))]
+    total_px = tops[-1] + lane_px
+
+    def paper(from_top_px: float) -> float:
+        """Plotly's coordinate: 1 at the top, 0 at the bottom."""
+        return 1.0 - from_top_px / total_px
+
+    def title(text: str, from_top_px: float, size: int = 15) -> dict[str, Any]:
+        place = {"x": 0, "y": paper(from_top_px), "yref": "paper", "yanchor": "bottom"}
+        return TEXT | place | {"text": f"<b>{text}</b>", "font": {"size": size}}
+
+    rows = {
+        "domain": [paper(gantt_px), 1.0],
+        "range": [len(arms) - 0.4, -0.65],
+        "tickvals": list(range(len(arms))),
+        "ticktext": [plain(arm, ARM_NAME) for arm in arms],
+        "showgrid": False,
+        "fixedrange": True,
+        "automargin": True,
+    }
+    small: dict[str, Any] = {"tickfont": {"size": 8}} if overview else {}
+    heat: dict[str, Any] = {}
+    if overview:
+        place = {"domain": [paper(map_top + map_px), paper(map_top)], "anchor": "x3"}
+        every = slice(None, None, -(-len(arms) // 50))
+        marks = {
+            "tickvals": rows["tickvals"][every],
+            "ticktext": rows["ticktext"][every],
+            "range": [len(arms) - 0.5, -0.5],
+        }
+        heat = {f"yaxis{len(lanes) + 2}": AXIS | rows | small | place | marks}
+    return {
+        "height": round(total_px + legend_px + 44.0 + MARGIN["b"]),
+        "margin": MARGIN | {"t": round(legend_px + 44.0)},
+        "yaxis": AXIS | rows | small,
+        **heat,
+        **{f"yaxis{a + 2}": {"domain": [max(0.0, paper(y + lane_px)), paper(y)]} for a, y in enumerate(tops)},
+        "legend": LEGEND | {"y": paper(-6.0), "itemclick": "toggle", "title": _heading("Work of each arm")},
+        "legend2": LEGEND
+        | {
+            "y": paper(tops[0] - NAME_PX - 6.0),
+            "itemdoubleclick": "toggleothers",
+            "title": _heading(f"Motor temperatures{' of the hottest arms' if overview else ''}"),
+        },
+        "annotations": [
+            *([title("Hottest motor of each arm", map_top - 8.0)] if overview else []),
+            *(title(plain(arms[a], STREAM_NAME), y - 2.0, size=12) for a, y in zip(lanes, tops, strict=True)),
+        ],
+    }
+
+
+def _heading(text: str) -> dict[str, Any]:
+    """Title of a legend, above its entries; so the two cannot overlap."""
+    return {"text": f"<b>{text}</b>", "side": "top", "font": {"size": 15}}
+
+
+def _legend_height(bars: Sequence[Trace]) -> float:
+    """Height of the legend of the work, px; on a narrow page it has several lines, with columns of equal width."""
+    wide = [45.0 + 6.5 * len(trace["name"]) for trace in bars]
+    if sum(wide) <= NARROW_PX:
+        return LEGEND_ROW_PX
+    per_row = max(1, int(NARROW_PX // max(wide)))
+    return LEGEND_ROW_PX * -(-len(wide) // per_row)
+
+
+def _temperature_range(temp_c: Array, warning_c: float, error_c: float) -> list[float]:
+    low = float(np.fmin.reduce(temp_c, axis=None, initial=warning_c - 20.0))  # NaN is ignored, and nothing copied
+    high = float(np.fmax.reduce(temp_c, axis=None, initial=error_c))
+    room = 0.06 * (high - low)
+    return [low - room, high + room]
+
+
+def _limit_label(arm: int, name: str, limit: float, anchor: str) -> dict[str, Any]:
+    """Name of a limit at the right of an arm's lane."""
+    return TEXT | {
+        "text": f"{name} {limit:g} °C",
+        "x": 1,
+        "xshift": 4,
+        "y": limit,
+        "yref": f"y{arm + 2}",
+        "yanchor": anchor,
+        "yshift": -5 if anchor == "bottom" else 5,
+        "font": {"size": 10},
+    }
+
+
+def _outages(plan: Schedule, arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
+    """Faults as vertical lines and outages as shade in the lane of their arm; arms without a lane are left out."""
+    shapes = []
+    for o in plan.outages:
+        if o.arm not in arms:
+            continue
+        lane = {"xref": "x2", "yref": f"y{arms.index(o.arm) + 2} domain", "y0": 0, "y1": 1}
+        start, end = round(o.start_s / unit_s, 5), round(o.end_s / unit_s, 5)
+        shapes += [
+            lane | {"type": "rect", "x0": start, "x1": end, "fillcolor": FAULT, "opacity": 0.10, "line": {"width": 0}},
+            lane | {"type": "line", "x0": start, "x1": start, "line": {"color": FAULT, "width": 1.5}},
+        ]
+    return shapes
+
+
+def _temperatures(
+    telemetry: Telemetry, arms: Sequence[str], lanes: Sequence[int], unit: str, unit_s: float
+) -> list[Trace]:
+    points = int(np.clip(POINTS_IN_ALL // max(1, JOINTS * len(lanes)), FEWEST_POINTS, POINTS_PER_TRACE))
+    traces = []
+    for lane, a in enumerate(lanes):
+        arm = arms[a]
+        for j, (colour, dash) in enumerate(JOINT_LINES):
+            value, name = telemetry.temp_c[:, a, j], f"joint {j + 1}"
+            kept = decimate(value, points)
+            traces.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": name,
+                    "legendgroup": name,
+                    "legend": "legend2",
+                    "showlegend": lane == 0,
+                    "x": _packed(telemetry.time_s[kept] / unit_s),
+                    "y": _packed(value[kept]),
+                    "xaxis": "x2",
+                    "yaxis": f"y{lane + 2}",
+                    "line": {"color": colour, "width": 1.5, "dash": dash},
+                    "hovertemplate": f"{plain(arm)} {name}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>",
+                }
+            )
+    return traces
+
+
+def decimate(value: Array, limit: int) -> Array:
+    """Samples that keep the look of a long line: lowest and highest of each bin, and its gap if it has one.
+
+    Args:
+        value: [sample]; NaN is a gap.
+        limit: Most samples to keep, at least 5.
+
+    Returns:
+        Indices in order, with the first, the last and both extremes among them, int [kept <= limit].
+    """
+    if limit < 5:
+        raise ValueError(f"limit must be >= 5 (got {limit}).")
+    if len(value) <= limit:
+        return np.arange(len(value))
+    gap = np.isnan(value)
+    picks = [np.where(gap, np.inf, value), np.where(gap, np.inf, -value), *([~gap] if gap.any() else [])]
+    edges = np.linspace(0, len(value), (limit - 2) // len(picks) + 1).astype(int)
+    keep = [0, len(value) - 1]
+    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        keep += [low + int(pick[low:high].argmin()) for pick in picks]
+    return np.unique(keep)
+
+
+def _packed(values: Array) -> dict[str, str]:
+    """Numbers in Plotly's packed format, a third of the length of decimals."""
+    raw = np.ascontiguousarray(values, dtype="<f4").tobytes()
+    return {"dtype": "f4", "bdata": base64.b64encode(raw).decode("ascii")}

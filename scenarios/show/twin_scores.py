@@ -1,0 +1,175 @@
+"""A twin's scores of a scenario's jobs or of a log, as a table, CSV or JSON."""
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+
+import numpy as np
+
+from fleet.files import cache_folder
+from fleet.motion import Plan
+from scenarios.job_stream import all_works
+from scenarios.prepare.planned_arm import plan_arms
+from scenarios.progress import Progress, quiet
+from scenarios.schema import Scenario
+from scenarios.show.table import Column, Table
+from twin.logs.recording import Recording
+from twin.logs.resampling import Stretch
+from twin.vae.measures import Features, Measures
+from twin.vae.twin import Twin
+from twin.verdict.log_features import log_features, log_windows
+from twin.verdict.rule import Rule, word
+
+Array = np.ndarray
+Cell = str | float | None
+Row = dict[str, Cell]
+LOADED = 2
+"""Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
+OMITTED = ("twin", "data", "log", "elbow", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+"""Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
+
+
+def jobs_of_arm(twin: Twin, scenario: Scenario, progress: Progress = quiet) -> list[tuple[Plan, int]]:
+    """The plans of the twin's arm for each work of a scenario, with their repetitions.
+
+    Raises:
+        FleetError: the scenario has no arm of the twin's name.
+    """
+    (arm,) = plan_arms(scenario, [scenario.index_of(twin.arm)], all_works(scenario), cache_folder(), progress)
+    return [(plan, _repetitions(scenario, plan)) for plan in arm.all_plans]
+
+
+def job_rows(twin: Twin, jobs: Sequence[tuple[Plan, int]]) -> list[Row]:
+    """One row of scores per job."""
+    return [_job_row(twin, plan, repetitions) for plan, repetitions in jobs]
+
+
+def log_rows(twin: Twin, recordings: Sequence[Recording]) -> list[Row]:
+    """One row of mean scores per recording.
+
+    Raises:
+        FleetError: as `twin.verdict.log_features.log_windows`.
+    """
+    return [_log_row(twin, recording) for recording in recordings]
+
+
+def _log_row(twin: Twin, recording: Recording) -> Row:
+    measures = twin.measures_of(log_features(twin, recording))
+    temp_c = recording.temp_c
+    return {
+        "recording": recording.name,
+        "minutes": recording.duration_s / 60,
+        **_scores(measures),
+        "p_value": None if measures.p_value is None else float(measures.p_value),
+        "hottest_c": None if temp_c is None else float(temp_c.max()),
+        "why": measures.why(),
+        "twin": twin.version,
+        "data": twin.data_hash,
+    }
+
+
+def with_verdicts(rows: Sequence[Row], rule: Rule, features: Features) -> list[Row]:
+    """The rows with the p-value and the verdict of a rule on their features [row, joint] before the reasons."""
+    judged = list[Row]()
+    for row, p in zip(rows, rule.p_value(features).tolist(), strict=True):
+        ends = {name: row[name] for name in ("why", "twin", "data")}
+        begins = {name: value for name, value in row.items() if name not in (*ends, "p_value")}
+        judged.append({**begins, "p_value": p, "verdict": word(p <= rule.alpha), **ends})
+    return judged
+
+
+def _repetitions(scenario: Scenario, plan: Plan) -> int:
+    """Largest number of repetitions in the streams of this work."""
+    names = tuple(place.name for place in plan.work.places)
+    return max(s.repetitions[1] for s in scenario.jobs if s.kind == plan.work.kind and tuple(s.places) == names)
+
+
+def _job_row(twin: Twin, plan: Plan, repetitions: int) -> Row:
+    measures = twin.measure(plan, repetitions)
+    calibrated = measures.calibrated
+    return {
+        "job": f"{plan.work.kind} {' → '.join(place.name for place in plan.work.places)}",
+        "payload_kg": plan.work.payload_kg,
+        "elbow": plan.elbow,
+        "speed": plan.speed,
+        "repetitions": repetitions,
+        **_scores(measures),
+        "d_cal": None if calibrated is None else float(calibrated.max()),
+        "p_value": None if measures.p_value is None else float(measures.p_value),
+        "why": measures.why(),
+        "twin": twin.version,
+        "data": twin.data_hash,
+    }
+
+
+def window_rows(twin: Twin, recording: Recording) -> list[Row]:
+    """One row per window of a recording, without overlap, in order of time; gaps are left out.
+
+    Raises:
+        FleetError: the recording has another number of joints than the twin, or is shorter than one window.
+    """
+    return [row for part in log_windows(twin, recording) for row in _stretch_rows(twin, *part)]
+
+
+def _stretch_rows(twin: Twin, stretch: Stretch, first: Array, features: Features) -> list[Row]:
+    window, measures, rows = twin.config.window, twin.measures_of(features), list[Row]()
+    for number, i in enumerate(first.tolist()):
+        one = measures.of_job(number)
+        rows.append(
+            {
+                "log": stretch.recording,
+                "start_s": float(stretch.time_s[i]),
+                "end_s": float(stretch.time_s[i + window - 1]),
+                **_scores(one),
+                "hottest_c": None if stretch.temp_c is None else float(stretch.temp_c[i : i + window].max()),
+                "why": one.why(),
+                "twin": twin.version,
+                "data": twin.data_hash,
+            }
+        )
+    return rows
+
+
+def _scores(measures: Measures) -> Row:
+    """The scores of one job or window."""
+    latent = measures.total_latent
+    return {
+        "d": float(measures.total),
+        **{f"d_{j + 1}": float(d) for j, d in enumerate(measures.difficulty)},
+        "load": float(measures.total_load),
+        "latent": None if latent is None else float(latent),
+    }
+
+
+def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
+    """Rows as a table, or as CSV or JSON text that ends with a line break."""
+    if how == "json":
+        return json.dumps({"twin": caption, "rows": list(rows)}, indent=1, allow_nan=False) + "\n"
+    heads = list(rows[0]) if rows else []
+    if how == "csv":
+        held = io.StringIO()
+        writer = csv.DictWriter(held, heads, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({key: _flat(value) for key, value in row.items()} for row in rows)
+        return held.getvalue()
+    shown = [head for head in heads if head not in OMITTED]
+    return Table(
+        head=tuple(Column(SHORT.get(head, head), words=isinstance(rows[0][head], str)) for head in shown),
+        rows=tuple(tuple(_cell(row[head]) for head in shown) for row in rows),
+        notes=(f"{caption}; --format csv or json for every joint",),
+    )
+
+
+SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c": "°C"}
+"""Short column heads of tables."""
+
+
+def _flat(value: Cell) -> Cell:
+    return f"{value:.6g}" if isinstance(value, float) else "" if value is None else value
+
+
+def _cell(value: Cell) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.2f}" if isinstance(value, float) else str(value)

@@ -1,0 +1,294 @@
+"""A fleet as a table on the terminal, and as plain lines without a terminal."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from math import inf
+from typing import get_args
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from fleet.bus.protocol.auction import ArmEvent, JobState
+from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, JobScore
+from fleet.live.space import ANYWHERE
+from scenarios.progress import brief
+
+HOT_K, WARM_K = 5.0, 10.0
+"""Headroom below which an arm is shown in red, in yellow."""
+COOL_C = 20.0
+"""A bar begins at this temperature and is full at the warning limit."""
+HEAT_CELLS, JOB_CELLS = 10, 6
+"""Characters of the bars."""
+FRAME, EVENTS = 7, 6
+"""Lines of the screen that are neither arms nor events; events shown."""
+WIDE = 120
+"""Columns from which the scores of open jobs and the ages of messages are shown."""
+NOTHING_DONE: Mapping[str, float] = {}
+KEYS = "j: all joints · q: end"
+_MODE_STYLES = {"faulted": "bold red", "working": "green"}
+PLAIN = {
+    "award": "begins {job}",
+    "finish": "has finished {job}",
+    "home": "is home again",
+    "warning": "joint {joint} is above the warning limit",
+    "fault": "has stopped: joint {joint} is above the error limit",
+    "recover": "works again",
+    "moved": "was moved home by a person",
+    "torque_warning": "has a plan above the torque warning",
+    "return": "gives {job} back",
+    "give_back": "gives {job} back after a cycle",
+    "give_up": "gives {job} up",
+    "contact": "has touched something",
+}
+"""Events in words; others are shown by their kind."""
+
+
+class JobBars:
+    """How far each arm is with its job, as seen since the job was first shown."""
+
+    def __init__(self) -> None:
+        self._first: dict[str, tuple[str, float]] = {}
+
+    def update(self, fleet: FleetSnapshot) -> dict[str, float]:
+        """Part of its current job that each arm has done, 0 to 1."""
+        done: dict[str, float] = {}
+        known = self._first
+        self._first = {}
+        for arm in fleet.arms:
+            if arm.job and arm.busy_s > 0:
+                job, first_s = known.get(arm.arm, ("", 0.0))
+                self._first[arm.arm] = (arm.job, max(arm.busy_s, first_s if job == arm.job else 0.0))
+                done[arm.arm] = 1.0 - arm.busy_s / self._first[arm.arm][1]
+        return done
+
+
+def screen(
+    fleet: FleetSnapshot,
+    events: Sequence[str],
+    height: int,
+    *,
+    width: int = 80,
+    joints: bool = False,
+    done: Mapping[str, float] = NOTHING_DONE,
+    end_s: float | None = None,
+) -> Group:
+    """The whole screen in at most `height` lines: if there are too many arms, those with the least headroom stay.
+
+    Args:
+        joints: Show every motor in place of jobs.
+        done: Part of its current job that each arm has done, 0 to 1.
+        end_s: Fleet time at which the shift ends.
+    """
+    events = events[-EVENTS:][max(0, len(events[-EVENTS:]) + FRAME + 1 - height) :]
+    room = max(1, height - FRAME - len(events))
+    arms = fleet.arms
+    if len(arms) > room:
+        urgent = sorted(arms, key=lambda arm: (not arm.token, 1e9 if arm.headroom_k is None else arm.headroom_k))
+        shown = {arm.arm for arm in urgent[: room - 1]}
+        arms = tuple(arm for arm in arms if arm.arm in shown)
+    parts: list[Table | Text] = [heading(fleet), time_line(fleet, end_s)]
+    parts.append(joint_table(arms) if joints else arm_table(arms, done, wide=width >= WIDE))
+    if len(arms) < len(fleet.arms):
+        parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))
+    parts += [jobs_line(fleet), space_line(fleet)]
+    parts += [Text(event, style="dim", no_wrap=True, overflow="ellipsis") for event in events]
+    return Group(*parts, Text(KEYS, style="dim", no_wrap=True, overflow="ellipsis"))
+
+
+def heading(fleet: FleetSnapshot) -> Text:
+    """Fleet, number of arms present, auctioneer."""
+    present = sum(arm.present for arm in fleet.arms)
+    auctioneers = ", ".join(each.auctioneer for each in fleet.auctioneers if each.token)
+    text = Text(no_wrap=True, overflow="ellipsis")
+    text.append(fleet.fleet, style="bold")
+    text.append(f"   {present} of {len(fleet.arms)} arms present", style="" if present == len(fleet.arms) else "yellow")
+    text.append(f"   auctioneer {auctioneers}" if auctioneers else "   no auctioneer")
+    return text
+
+
+def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
+    """Fleet time, its speed, and what is left of the shift."""
+    times = [arm.time_s for arm in fleet.arms if arm.time_s is not None and arm.present]
+    text = Text(no_wrap=True, overflow="ellipsis")
+    if not times:
+        text.append("no time yet")
+        return text
+    now_s = max(times)
+    if end_s is None:
+        text.append(format_time(now_s))
+    else:
+        left_s = max(0.0, end_s - now_s)
+        text.append(f"{bar(now_s / end_s, 2 * HEAT_CELLS)} {format_time(now_s)} of {format_time(end_s)}, ")
+        text.append(f"{format_time(left_s)} left")
+        if fleet.speed and fleet.speed != 1.0:
+            text.append(f" ({brief(left_s / fleet.speed)} at {fleet.speed:g} ×)")
+    return text
+
+
+def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_DONE, *, wide: bool = False) -> Table:
+    """One row per arm; `wide` adds scores of open jobs and ages of messages."""
+    table = _table()
+    table.add_column("arm", min_width=5, no_wrap=True)
+    table.add_column("mode", min_width=7, no_wrap=True)
+    table.add_column("to warning", min_width=HEAT_CELLS + 1, no_wrap=True)
+    table.add_column("hot °C", min_width=7, no_wrap=True, justify="right")
+    table.add_column("room K", min_width=6, no_wrap=True, justify="right")
+    table.add_column("current job", no_wrap=True, overflow="ellipsis", ratio=2, min_width=8)
+    table.add_column("to do", no_wrap=True, min_width=JOB_CELLS + 8)
+    if wide:
+        table.add_column("open jobs: predicted peak, P, d", no_wrap=True, overflow="ellipsis", ratio=4)
+        table.add_column("diff.", justify="right", min_width=5, no_wrap=True)
+        table.add_column("token", justify="right", min_width=5, no_wrap=True)
+    table.add_column("state", justify="right", min_width=5, no_wrap=True)
+    for arm in arms:
+        cells = [
+            *_name_and_mode(arm),
+            heat_bar(arm),
+            "—" if arm.hottest_c is None else f"{arm.hottest_c:.1f} J{arm.joint}",
+            Text("—" if arm.headroom_k is None else f"{arm.headroom_k:.1f}", style=_headroom_style(arm.headroom_k)),
+            arm.job,
+            f"{bar(done[arm.arm], JOB_CELLS)} {brief(arm.busy_s)}" if arm.arm in done else "",
+        ]
+        if wide:
+            token = Text("yes") if arm.token else Text("no", style="red")
+            cells += [format_scores(arm), format_age(arm.difficulty_age_s), token]
+        old = (arm.state_age_s or 0.0) > FRESH_S
+        cells.append(Text(format_age(arm.state_age_s), "red" if old else ""))
+        table.add_row(*cells, style="" if arm.present else "dim")
+    return table
+
+
+def joint_table(arms: Iterable[ArmSnapshot]) -> Table:
+    """One row per arm with the temperature of every motor; ! marks little headroom, !! none."""
+    arms = tuple(arms)
+    table = _table()
+    table.add_column("arm", min_width=5, no_wrap=True)
+    table.add_column("mode", min_width=7, no_wrap=True)
+    joints = max((len(arm.temp_c) for arm in arms), default=0)
+    for joint in range(joints):
+        table.add_column(f"J{joint + 1} °C", justify="right", min_width=6, no_wrap=True)
+    for arm in arms:
+        cells: list[str | Text] = []
+        for temp_c in arm.temp_c:
+            room_k = (
+                None if arm.headroom_k is None or arm.hottest_c is None else arm.headroom_k + arm.hottest_c - temp_c
+            )
+            cells.append(Text(f"{temp_c:.1f}{_mark(room_k)}", style=_headroom_style(room_k)))
+        cells += [""] * (joints - len(cells))
+        table.add_row(*_name_and_mode(arm), *cells, style="" if arm.present else "dim")
+    return table
+
+
+def bar(share: float, cells: int) -> str:
+    """A bar of text."""
+    full = round(min(1.0, max(0.0, share)) * cells)
+    return "█" * full + "·" * (cells - full)
+
+
+def heat_bar(arm: ArmSnapshot) -> Text:
+    """The hottest motor between cool and the warning limit, with a mark of little headroom for people and terminals
+    without colours."""
+    if arm.hottest_c is None or arm.headroom_k is None:
+        return Text("")
+    warning_c = arm.hottest_c + arm.headroom_k
+    share = (arm.hottest_c - COOL_C) / max(1.0, warning_c - COOL_C)
+    return Text(bar(share, HEAT_CELLS) + _mark(arm.headroom_k), style=_headroom_style(arm.headroom_k))
+
+
+def plain_event(event: ArmEvent) -> str:
+    """An event in words, for example `joint 2 is above the warning limit (60.0 °C), crate_1`."""
+    words = PLAIN.get(event.kind, event.kind.replace("_", " "))
+    text = words.format(job=event.job or "its job", joint=event.joint)
+    if event.kind in ("warning", "fault") and event.value is not None:
+        text += f" ({event.value:.1f} °C)"
+    if event.job and "{job}" not in words:
+        text += f", {event.job}"
+    return f"{text}: {event.reason}" if event.reason and event.kind not in ("warning", "fault") else text
+
+
+def jobs_line(fleet: FleetSnapshot) -> Text:
+    """Number of jobs in each state."""
+    counts = ", ".join(f"{fleet.counts[state]} {state}" for state in get_args(JobState) if fleet.counts.get(state))
+    return Text(f"jobs: {counts or 'none'}", no_wrap=True, overflow="ellipsis")
+
+
+def space_line(fleet: FleetSnapshot) -> Text:
+    """The arms whose space is closed to others, and why."""
+    arms = {arm.arm: arm for arm in fleet.arms}
+    parts: list[str] = []
+    for name, spaces in fleet.space.items():
+        arm = arms.get(name)
+        where = "not present" if arm is None or not arm.present else "away from home" if arm.away else "has a job"
+        parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
+    return Text(f"space closed by: {', '.join(parts) or 'none'}", no_wrap=True, overflow="ellipsis")
+
+
+def arm_line(arm: ArmSnapshot, *, joints: bool = False) -> str:
+    """An arm on one line; with `joints`, the temperature of every motor."""
+    scores = format_scores(arm)
+    parts = [
+        f"{arm.arm:<10}",
+        f"{arm.mode or 'unknown':<8}",
+        "" if arm.hottest_c is None else f"{arm.hottest_c:.1f} °C J{arm.joint}",
+        "" if arm.headroom_k is None else f"headroom {arm.headroom_k:.1f} K",
+        "motors " + " ".join(f"{temp_c:.1f}" for temp_c in arm.temp_c) if joints else "",
+        f"job {arm.job}, {brief(arm.busy_s)} left" if arm.job and arm.busy_s else f"job {arm.job}" if arm.job else "",
+        f"open jobs: {scores}" if scores else "",
+        f"state {format_age(arm.state_age_s)}",
+        "" if arm.token else "no token",
+    ]
+    return "  ".join(filter(None, parts))
+
+
+def format_scores(arm: ArmSnapshot) -> str:
+    """Predicted peak, P and difficulty of the open jobs, coolest first; a dash for what the arm does not know."""
+
+    def figure(value: float | None, form: str) -> str:
+        return "—" if value is None else format(value, form)
+
+    def heat(item: tuple[str, JobScore]) -> tuple[float, float, str]:
+        name, score = item
+        peak_c, difficulty = (inf if each is None else each for each in (score.peak_c, score.difficulty))
+        return peak_c, difficulty, name
+
+    parts: list[str] = []
+    for job, score in sorted(arm.scores.items(), key=heat):
+        p, d = figure(score.p_saturation, ".2f"), figure(score.difficulty, ".2f")
+        parts.append(f"{job} {figure(score.peak_c, '.0f')} °C, P {p} (d {d})")
+    return "; ".join(parts)
+
+
+def format_age(seconds: float | None) -> str:
+    """A short age: `0.1 s`, `12 s`, `5 min`."""
+    if seconds is None:
+        return "—"
+    if seconds < 10:
+        return f"{max(0.0, seconds):.1f} s"
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+
+
+def format_time(time_s: float) -> str:
+    """Fleet time: `1:02:03`."""
+    minutes, seconds = divmod(int(time_s), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+
+
+def _headroom_style(headroom_k: float | None) -> str:
+    if headroom_k is None or headroom_k >= WARM_K:
+        return ""
+    return "bold red" if headroom_k < HOT_K else "yellow"
+
+
+def _mark(headroom_k: float | None) -> str:
+    if headroom_k is None or headroom_k >= HOT_K:
+        return ""
+    return "!!" if headroom_k < 0 else "!"
+
+
+def _name_and_mode(arm: ArmSnapshot) -> tuple[str, Text]:
+    mode = (arm.mode or "—") if arm.token else "gone"
+    return arm.arm, Text(mode, style=_MODE_STYLES.get(mode, ""))
+
+
+def _table() -> Table:
+    return Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), expand=True, header_style="dim")

@@ -1,0 +1,64 @@
+"""Times, events and offers in words."""
+
+import re
+from collections.abc import Sequence
+
+from fleet.events import Event
+from scenarios.shift_records import Offer
+
+CANNOT = "cannot do it"
+SEVERITY = {
+    "warning": "warning", "torque_warning": "warning", "return": "warning", "give_up": "error", "expire": "warning",
+    "fault": "error", "contact": "error", "illegal": "warning",
+}  # fmt: skip
+"""Kinds of events that are more than information."""
+LABELS = {"lost": "claim lost", "return": "job returned", "recover": "recovered"}
+
+
+def clock(time_s: float) -> str:
+    """A time of the shift as h:mm:ss."""
+    seconds = round(time_s)
+    return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
+
+
+def duration(time_s: float) -> str:
+    """3 h, 54 min, 1 h 30 min, 20 s."""
+    hours, minutes = divmod(round(time_s / 60), 60)
+    if time_s < 60:
+        return f"{time_s:.0f} s"
+    return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min")) if n)
+
+
+def by_joint(reason: str) -> str:
+    """A reason of an event that numbers motors, with the joints instead: both count from 1."""
+    return re.sub(r"\bmotor (?=\d)", "joint ", reason)
+
+
+def kind_text(kind: str) -> str:
+    """A kind of event."""
+    return LABELS.get(kind, kind.replace("_", " "))
+
+
+def event_text(event: Event) -> str:
+    """An event in words."""
+    joint = f", joint {event.joint}" if event.joint else ""
+    reason = f": {by_joint(event.reason)}" if event.reason else ""
+    return f"{event.kind.replace('_', ' ')}{f' {event.job}' if event.job else ''}{joint}{reason}"
+
+
+def scores_text(offer: Offer) -> list[str]:
+    """P(saturation), predicted peak and difficulty of an offer, as far as they are known."""
+    parts = [f"P {offer.p_saturation:.2f}"] if offer.p_saturation is not None else []
+    parts += [f"{offer.peak_c:.0f} °C"] if offer.peak_c is not None else []
+    parts += [f"d {offer.difficulty:.2f}"] if offer.difficulty is not None else []
+    return parts
+
+
+def offers_text(offers: Sequence[Offer]) -> str:
+    """What each arm knew of a job, the winner first."""
+    parts: list[str] = []
+    for offer in sorted(offers, key=lambda o: (not o.awarded, o.arm)):
+        known = scores_text(offer) if offer.p_saturation is not None else [CANNOT]
+        known += [offer.state] if not offer.free and offer.feasible else []
+        parts.append(f"{offer.arm} ({', '.join(known)})")
+    return "; ".join(parts)
