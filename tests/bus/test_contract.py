@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
-from typer.testing import CliRunner
 
+from docs.tables import fill_tables, main
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import auction as trade
 from fleet.bus.protocol import keys, messages
@@ -23,8 +23,6 @@ from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
 from fleet.bus.protocol.schemas import descriptions, schema_document
 from fleet.events import EVENT_KINDS, MEANINGS
 from fleet.live.arm.simulated_body import _REPORTED
-from scenarios.cli.main import app
-from scenarios.doc_tables import fill_tables
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = schema_document()
@@ -225,26 +223,26 @@ def test_no_binding_is_claimed_that_asyncapi_does_not_know():
     assert '"bindings"' not in json.dumps(asyncapi())
 
 
-def test_the_committed_documents_are_current():
-    done = CliRunner().invoke(app, ["contract", "--check", "--out", str(ROOT / "docs" / "contract")])
-    assert done.exit_code == 0, done.exception
-    for name in ("schemas.json", "asyncapi.json", "bus.md", "cli.md", "env.md", "leaderboard.md", "policies.md"):
-        assert name in done.output
+def test_the_committed_documents_are_current(capsys):
+    assert main(["--check"]) == 0
+    names = ("schemas.json", "asyncapi.json", "bus.md", "cli.md", "env.md", "leaderboard.md", "paper.md", "policies.md")
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in names)
 
 
-def test_stale_documents_are_named_and_made_anew(tmp_path):
-    out = tmp_path / "contract"
-    told = CliRunner().invoke(app, ["contract", "--check", "--out", str(out)])
-    assert "schemas.json" in str(told.exception)
-    assert not out.exists()
-    (tmp_path / "bus.md").write_text("a\n<!-- made by thermofleet contract: patterns -->\nold\n<!-- end -->\nz\n")
-    assert CliRunner().invoke(app, ["contract", "--out", str(out)]).exit_code == 0
+def test_stale_documents_are_named_and_made_anew(tmp_path, capsys):
+    docs = ["--docs", str(tmp_path)]
+    assert main([*docs, "--check"]) == 1
+    assert "schemas.json" in capsys.readouterr().out
+    assert not (tmp_path / "contract").exists()
+    (tmp_path / "bus.md").write_text("a\n<!-- made by docs/tables.py: patterns -->\nold\n<!-- end -->\nz\n")
+    assert main(docs) == 0
     page = (tmp_path / "bus.md").read_text()
     assert "old" not in page
     assert page.startswith("a\n")
     assert page.endswith("<!-- end -->\nz\n")
     assert fill_tables(page) == page
-    assert CliRunner().invoke(app, ["contract", "--check", "--out", str(out)]).exit_code == 0
+    assert main([*docs, "--check"]) == 0
 
 
 def test_every_kind_of_event_has_a_meaning_and_live_ones_are_those_that_arms_report():

@@ -1,7 +1,7 @@
 """The contract of the bus as one table: every key, the message that travels there, and how it is transported.
 
 `fleet.bus.client` publishes, subscribes, queries and replies by this table alone. docs/bus.md and docs/contract are
-generated from it by `thermofleet contract`.
+generated from it by `docs/tables.py`.
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""JSON schemas of every message on the bus, read from the structs; `thermofleet contract` writes them to docs/contract.
+"""JSON schemas of every message on the bus, read from the structs; `docs/tables.py` writes them to docs/contract.
 
 The description of a field is the text under it in the source.
 """
