@@ -26,7 +26,7 @@ from benchmarks.paper.cooling import (
 from fleet.motor import thermal_data
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.thermal import HOUSING, WINDING, gen3_network, housing, node_heat, thermal_model
-from scenarios.load import load
+from scenarios.load import load, override
 from scenarios.prepare.fleet import prepare
 from scenarios.run.evaluate import outcomes
 
@@ -133,9 +133,13 @@ def test_a_joint_settles_lower_with_every_active_cooling_and_later_with_every_pa
     assert rows["immersion"]["whole_w_per_k"] / rows["liquid"]["whole_w_per_k"] == pytest.approx(3.7)
 
 
-def test_an_immersed_fleet_is_cooler_on_the_same_seeds(small_toml, plans):
+def test_an_immersed_fleet_is_cooler_on_the_same_seeds(plans):
     rows = fleet_rows(
-        load(small_toml), [3, 4], policies=["round_robin"], strategies=("still_air", "immersion"), cache_dir=plans
+        override(load("active_waiting"), horizon_s=1800.0),
+        [3, 4],
+        policies=["round_robin"],
+        strategies=("still_air", "immersion"),
+        cache_dir=plans,
     )
     still, immersed = (row["figures"] for row in rows)
     assert still["peak_c"]["difference"] == 0.0

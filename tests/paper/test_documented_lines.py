@@ -26,7 +26,8 @@ TINY = {
     "questions": "--seeds 1 --epochs 1",
     "forecast": "--seeds 1 --epochs 1",
     "identification": "",
-    "transfer": "--seeds 1 --jobs 2 4 --source-jobs 6 --source-steps 4 --held-out 4 --test 9 --steps 4 --further-steps 2",
+    "transfer": "--seeds 1 --jobs 2 4 --source-jobs 6 --source-steps 4 --held-out 4 --test 9 "
+    "--steps 4 --further-steps 2",
     "transfer-logs": "--seeds 1 --source-jobs 4 --source-steps 4 --steps 4 --further-steps 2",
     "features": "--seeds 1 --labels 10 --train 4 --steps 4",
     "augmentation": "--seeds 1 --measured 4 --added 4 --held-out 4 --test 8 --steps 4",
@@ -73,7 +74,6 @@ def test_documented_options_exist_and_stored_rows_are_those_of_the_line(name, op
     "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in MODULES]
 )
 def test_a_tiny_run_writes_its_rows_and_prints_its_tables(name, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("THERMOFLEET_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("benchmarks.paper.sweep.JOBS", (3,))
     words = [name, *TINY[name].split(), "--out", str(tmp_path / "rows.jsonl")]
     if "--log" in " ".join(options for each, options in documented() if each == name):
