@@ -198,7 +198,7 @@ def feature_rows(seed: int, size: FeatureSize, _wanted: Collection[str]) -> Iter
     jobs, targets = worn_jobs(study, np.random.default_rng(child(root, 2)))
     known = job_inputs(twin, jobs)
     values = (known["latent"], job_inputs(untrained, jobs)["latent"], known["raw"], known["both"])
-    inputs = dict(zip(INPUTS, values, strict=True))
+    inputs: dict[str, Array] = dict(zip(INPUTS, values, strict=True))
     yield "", {"seed": seed, "estimates": cross_validated(inputs, targets, size.labels, seed)}
 
 

@@ -114,7 +114,7 @@ def _computed(missing: Sequence[tuple[Unit, list[str]]], workers: int) -> KeyedR
             yield from unit.compute(keys)
         return
     with worker_processes(workers) as pool:
-        for some in pool(delayed(_listed)(unit, keys) for unit, keys in missing):
+        for some in pool(delayed(_listed)(unit, keys) for unit, keys in missing) or ():
             yield from some
 
 

@@ -114,8 +114,8 @@ def thermal_scorer(network: RcTwin) -> Scorer:
     def score(plans: Sequence[Plan], repetitions: Sequence[int]) -> Array:
         check_jobs(plans, repetitions)
         found = [network.score(plan, times) for plan, times in zip(plans, repetitions, strict=True)]
-        if None in found:
-            raise ValueError(f"The thermal network has no score for job {found.index(None)}.")
+        if unknown := [i for i, each in enumerate(found) if each is None]:
+            raise ValueError(f"The thermal network has no score for job {unknown[0]}.")
         return np.stack([each.per_joint for each in found if each is not None])
 
     return score

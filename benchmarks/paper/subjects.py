@@ -398,7 +398,7 @@ def subjects_of(
 
 def usual_study(seed: int | np.random.SeedSequence, **sizes: int) -> Study:
     """`make_study` of the usual arm with sizes by name."""
-    return make_study(np.random.SeedSequence(seed) if isinstance(seed, int) else seed, **sizes)
+    return make_study(np.random.SeedSequence(seed) if isinstance(seed, int) else seed, **sizes)  # pyright: ignore[reportArgumentType]
 
 
 def cached_twin(records: Sequence[Array], config: TwinConfig, seed: np.random.SeedSequence, arm: str = "arm") -> Twin:

@@ -155,7 +155,9 @@ def sweep_rows(
         source = study if configuration.data == "cool" else subject.any_motion()
         plans = subject.seen(source.train.plans, carrier_of(study))
         start_s = time.process_time()
-        (twin,) = train_all([Motion(subject.name, records(plans), subject.entropy)], configuration.config)
+        (twin,) = train_all(
+            [Motion(arm=subject.name, records=records(plans), seed=subject.entropy)], configuration.config
+        )
         cpu_s = round(time.process_time() - start_s, 2)
         card = {"configuration": name, "subject": subject.name, **measures(twin, subject, study)}
         yield key, card | {"epochs": configuration.config.epochs, "cpu_s": cpu_s}
