@@ -3,7 +3,7 @@
     python benchmarks/bench_channel.py [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
         [--out docs/results/channels/SCENARIO.json]
 
-Writes the figures of every shift, and prints them as the table of docs/exchange.md that `thermofleet contract` makes of
+Writes the figures of every shift, and prints them as the table of docs/exchange.md that `docs/tables.py` makes of
 the file. `heard`: share of messages delivered, over all pairs of arms. `lost`: claims for a job or station that another
 arm won. Policies that use no peer messages (round_robin) are equal on every channel. In memory, with the profile plant
 and the arms' twins, on all cores. The defaults are 130 shifts: some eight minutes of CPU time, half of that on two idle
@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
+from result_tables import channel_table
 
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.files import atomic_path, cache_folder
@@ -29,7 +30,6 @@ from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.shift import RunSpec, run
 from scenarios.schema import Scenario
-from scenarios.studies.page_tables.channels import channel_table
 
 FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "heard")
 

@@ -3,7 +3,7 @@
     python benchmarks/bench_policies.py [quickstart] [--speed 240] [--seed 0] [--policies a,b] [--out FILE]
     python benchmarks/bench_policies.py --steps [--difficulty oracle] [--policies a,b] [--out FILE]
 
-Writes the figures, and prints them as the tables of docs/policies.md and docs/learning.md that `thermofleet contract`
+Writes the figures, and prints them as the tables of docs/policies.md and docs/learning.md that `docs/tables.py`
 makes of docs/results/live_policies.json and docs/results/steps.json. A live shift is `thermofleet up` with a process
 for every participant; a shift of 2 h at speed 240 takes 30 s. Policies are blind: no twin is trained.
 
@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import pyarrow.parquet as pq
+from result_tables import live_table, steps_table
 
 from agents.registry import RULES
 from fleet.env.validation import Decisions
@@ -31,8 +32,6 @@ from scenarios.load import library, load
 from scenarios.policy_loader import label, policy_at, scope_of
 from scenarios.prepare.fleet import DifficultyName, Fleet, env_of, prepare
 from scenarios.run.shift import RunSpec, run
-from scenarios.studies.page_tables.policies import live_table
-from scenarios.studies.page_tables.steps import steps_table
 
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 PATIENCE_S = 120.0

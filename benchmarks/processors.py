@@ -17,8 +17,8 @@ import tempfile
 from pathlib import Path
 
 import pyarrow.parquet as parquet
+from result_tables import SAME
 
-from scenarios.studies.page_tables.processors import SAME
 from scenarios.suite.splits import instance, manifest
 
 COMPARE = [sys.executable, "-m", "scenarios", "compare", "--difficulty", "oracle", "--jobs", "1"]

@@ -6,7 +6,7 @@
 
 `make .venv-adapters/benchmarl/.installed` builds the environment of the second command. Every training is appended as a
 line to docs/results/sample_efficiency/heat_wave.jsonl; those that are there are skipped. `plot` draws the curves.
-`thermofleet contract` makes the table of docs/learning.md from the file.
+`docs/tables.py` makes the table of docs/learning.md from the file.
 
 All methods train on `heat_wave` with the scores of the true state and steps from event to event. After every 6000 env
 steps the policy, sampled as in its training, runs the same shifts, whose seeds no training draws. CPU seconds are those
@@ -32,6 +32,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 import torch
+from result_tables import course, trainings
 
 from fleet.engine.reward import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs, random_legal
@@ -43,7 +44,6 @@ from scenarios.run.batch import library_of
 from scenarios.run.provenance import code_hash
 from scenarios.run.suite_batches import Act, returns
 from scenarios.run.train_policy import rule_actions
-from scenarios.studies.page_tables.sample_efficiency import course, trainings
 
 Array = np.ndarray
 Training = tuple[list[dict[str, float]], dict[str, Any]]

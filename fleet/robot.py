@@ -53,7 +53,7 @@ K), so vacuum keeps about half. A heat sink of finned aluminium, 0.3 kg at a lar
 convection at 90 % fin efficiency and leaves radiation. A heat spreader is a copper strip of 1 mm × 100 mm over 0.2 m
 from each housing to the next. Forced air and liquid are the lower ends of the film coefficients in Incropera & DeWitt,
 table 1.1, limited by conduction through the shell; their ratio fits the motor of Zhu et al.
-(`fleet.heat.cooled_motor`). Immersion is that motor's: the liquid reaches the winding, and the whole conductance is
+(`benchmarks/paper/cooling.py`). Immersion is that motor's: the liquid reaches the winding, and the whole conductance is
 3.7 times that with liquid.
 """
 

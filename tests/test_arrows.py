@@ -264,9 +264,8 @@ def test_nobody_but_the_root_imports_an_adapter():
     assert [pair for pair in adapters if not below(pair[0], "fleet.env.adapters", "scenarios")] == []
 
 
-def test_nothing_in_the_product_depends_on_a_study():
-    studies = [(name_of(path), name) for path in SOURCES for name in imports(path) if below(name, "scenarios.studies")]
-    assert [pair for pair in studies if not below(pair[0], "scenarios.studies", "scenarios.cli")] == []
+def test_nothing_in_the_product_depends_on_a_benchmark():
+    assert [name for path in SOURCES for name in imports(path) if below(name, "benchmarks", "tests", "docs")] == []
 
 
 def test_no_folder_holds_more_than_a_reader_takes_in():

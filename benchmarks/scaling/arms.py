@@ -135,7 +135,8 @@ def plot(out: Path) -> None:
     """Print the table, and draw the costs per arm-hour; plans and conflicts per arm."""
     from matplotlib.figure import Figure
 
-    from scenarios.studies.page_tables.speed import halls_table
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from result_tables import halls_table
 
     rows = [json.loads(line) for line in out.read_text("utf-8").splitlines()]
     figure = Figure(figsize=(7, 4.2), layout="constrained")

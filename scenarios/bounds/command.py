@@ -142,7 +142,7 @@ def cells(each: "Reference") -> tuple[str, ...]:
 
 def markdown(references: "Sequence[Reference]") -> str:
     """The table for a page: every instance, and the mean of each scenario."""
-    from scenarios.doc_tables import table
+    from scenarios.show.table import markdown_table as table
 
     lines: list[tuple[str, ...]] = []
     for scenario in dict.fromkeys(each.instance.rpartition("/")[0] for each in references):

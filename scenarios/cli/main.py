@@ -40,7 +40,7 @@ class LazyCommand(NamedTuple):
 
 
 _LOOK, _POLICIES, _LIVE = "Run and look", "Evaluate policies", "Run a live fleet"
-_TWIN, _TOOLS = "Digital twin", "Tools"
+_TWIN = "Digital twin"
 COMMANDS = {
     "demo": LazyCommand(_LOOK, "run:demo_command", "Run the quickstart shift under two policies."),
     "run": LazyCommand(_LOOK, "run:run_command", "Run one shift of a scenario and record it."),
@@ -59,9 +59,6 @@ COMMANDS = {
     ),
     "submit-result": LazyCommand(
         _POLICIES, "scenarios.leaderboard.command:submit_command", "Check a result and write the file to send."
-    ),
-    "cooling": LazyCommand(
-        _POLICIES, "heat.cooling:cooling_command", "Compare ways of cooling motor, joint and fleet."
     ),
     "train": LazyCommand(_POLICIES, "train:train_command", "Train a policy by reinforcement learning."),
     "up": LazyCommand(_LIVE, "live.up:up_command", "Start a whole fleet, one process per participant."),
@@ -87,11 +84,7 @@ COMMANDS = {
     "ros2": LazyCommand(_LIVE, "ros2:ros2_app", "Connect a fleet and ROS 2."),
     "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
     "twin": LazyCommand(_TWIN, "twin.group:twin_app", "Train, score and use the digital twin of an arm."),
-    "study": LazyCommand(
-        _TWIN, "scenarios.studies.lifetime.command:study_command", "Study transfer, augmentation, drift of a twin."
-    ),
     "hold": LazyCommand(_TWIN, "scenarios.motion.hold:hold_command", "Compute how long an arm can hold a payload."),
-    "contract": LazyCommand(_TOOLS, "contract:contract_command", "Generate the bus schemas and the tables in docs."),
 }
 
 

@@ -9,7 +9,7 @@ from statistics import median
 from fleet.errors import FleetError
 from scenarios.bounds.command import markdown
 from scenarios.bounds.references import Reference, load_references
-from scenarios.doc_tables import table
+from scenarios.show.table import markdown_table as table
 from scenarios.leaderboard.submission import Submission, check, read, split_references
 from scenarios.load import SPLITS
 from scenarios.statistics.scores import Scores, ranked, score_cells, scores_of

@@ -1,7 +1,7 @@
 """Train the twin of every arm on motion whose whole horizon stays cool.
 
 Training data hold the motion of the arm's work and random light motions of other kinds. Without the latter, every new
-motion would score as difficult. `scenarios/studies/exploration.py` measures the gain.
+motion would score as difficult. `benchmarks/paper/saturation.py` measures the gain.
 """
 
 import hashlib

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -163,3 +163,8 @@ class Table:
             group = [self.groups[index]] if index in self.groups else group
             writer.writerow((*group, *row))
         return text.getvalue()
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of texts in Markdown."""
+    return Table(head=tuple(head), rows=tuple(map(tuple, rows))).markdown()

@@ -3,11 +3,9 @@
 import json
 import math
 
-from scenarios.studies.page_tables.ablations import ablation_tables
-from scenarios.studies.page_tables.cells import difference
-from scenarios.studies.page_tables.cooling import cooling_tables
-from scenarios.studies.page_tables.policies import live_table
-from scenarios.studies.page_tables.steps import steps_table
+from benchmarks.paper.cooling import cooling_tables
+from benchmarks.result_tables import difference, live_table, steps_table
+from docs.tables import tables_of
 
 
 def cells(text: str) -> list[list[str]]:
@@ -37,7 +35,7 @@ def test_an_ablation_has_means_and_differences_to_the_first_source(tmp_path) -> 
     head = "scores,fleet,training,seed,faults,value,reward"
     (folder / "ablation.csv").write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]) + "\n")
     (tmp_path / "twin_windows" / "active_waiting").symlink_to(folder)
-    text = ablation_tables(tmp_path)["twin_windows"]()
+    text = tables_of(tmp_path)["twin_windows"]()
     faults, value, reward, *_ = cells(text)
     assert faults[:2] == ["`heat_wave`: faults", "0.00"]
     assert value[1] == "10.5"  # of 5, 6, 15 and 16
@@ -47,7 +45,7 @@ def test_an_ablation_has_means_and_differences_to_the_first_source(tmp_path) -> 
     assert "`heat_wave`: 2 fleets × 2 seeds" in text
 
 
-def test_cooling_has_differences_of_value_to_the_first_way(tmp_path) -> None:
+def test_cooling_has_differences_of_value_to_the_first_way() -> None:
     def row(cooling: str, mean: float, change: float) -> dict[str, object]:
         value = {"mean": mean, "difference": change, "difference_low": change - 1, "difference_high": change + 1}
         return {
@@ -57,9 +55,8 @@ def test_cooling_has_differences_of_value_to_the_first_way(tmp_path) -> None:
         }
 
     fleet = [row("still_air", 10.0, 0.0), row("liquid", 12.0, 2.0)]
-    file = {"scenario": "hall", "fleet": fleet, "joint": [], "motor": []}
-    (tmp_path / "cooling_hall.json").write_text(json.dumps(file))
-    assert cells(cooling_tables(tmp_path)["cooling_hall"]()) == [
+    table = cooling_tables([{"scenario": "hall", "fleet": fleet}])["cooling_hall"]
+    assert cells(table.markdown()) == [
         ["`still_air`", "10.0", "0.25", "12"],
         ["`liquid`", "12.0; **+2.0 (+1.0 … +3.0)**", "0.25", "12"],
     ]

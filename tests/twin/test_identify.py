@@ -1,15 +1,14 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.paper.real_logs import held_out_errors, rms
 from fleet.errors import CheckpointError, IdentificationError
 from fleet.motor import friction_heat, gen3_motors, reference_current
 from fleet.robot import JOINTS
 from fleet.thermal import HOUSING, NODES, WINDING, ThermalSpread, drive_heat, gen3_network, spread_motors, thermal_model
 from twin.logs.heat_log import heat_logs
-from twin.logs.reader import read_folder
 from twin.logs.recording import Recording
 from twin.thermal.checkpoint import CARD, load, load_twin, save
 from twin.thermal.identify import identify
@@ -18,32 +17,8 @@ from twin.thermal.parameters import PRIOR_SD, THERMAL, HeatModel, ParameterVecto
 from twin.thermal.result import nominal_heat_model
 from twin.thermal.thermal_twin import RcTwin
 
-LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
-needs_logs = pytest.mark.skipif(not LOGS.is_dir(), reason="the Gen3 logs are not beside this checkout")
 AIR_C = 22.0
 GRAVITY_NM = np.array([3.0, 25.0, 6.0, 12.0, 2.0, 5.0, 2.0])
-
-
-def held_out_errors(arm: HeatModel, recording: Recording) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Simulated minus measured motor temperatures, K, [time, joint], and all simulated nodes per stretch.
-
-    Only the temperatures at the start of each stretch are fitted. Resistance and magnets follow the simulated
-    temperatures, which three rounds settle.
-    """
-    logs = heat_logs(recording, arm.motors, "current", step_s=0.0)
-    layout = ParameterVector(arm)
-    problem = Problem(logs, AIR_C, 0.0, layout, Noise(np.full(JOINTS, 0.01), np.ones(JOINTS)))
-    temps = problem.temperatures(layout.mean)
-    for _ in range(2):
-        middle = [(temp[1:] + temp[:-1]) / 2.0 for temp in temps]
-        problem.winding_c = [each[:, WINDING] for each in middle]
-        problem.housing_c = [each[:, HOUSING] for each in middle]
-        temps = problem.temperatures(layout.mean)
-    return np.concatenate([temp[:, WINDING] - log.temp_c for temp, log in zip(temps, logs, strict=True)]), temps
-
-
-def rms(errors: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.mean(errors**2, axis=0))
 
 
 def prior_draw(rng: np.random.Generator) -> HeatModel:
@@ -299,24 +274,3 @@ def test_an_arm_with_values_of_its_own_gives_them_back(rng, cooling):
     np.testing.assert_allclose(again.thermal().laplacian, body.thermal().laplacian)
     np.testing.assert_allclose(again.thermal().capacity, body.thermal().capacity)
     np.testing.assert_allclose(again.motors.copper_w_per_a2, body.motors.copper_w_per_a2)
-
-
-@needs_logs
-@pytest.mark.slow
-def test_files_of_a_real_arm_predict_its_other_files():
-    recordings = read_folder(LOGS, damaged="skip")
-    rms_k = {}
-    for part in range(2):
-        got = identify(recordings[part::2])
-        rms_k |= {r.name: rms(held_out_errors(got.heat_model, r)[0]) for r in recordings[1 - part :: 2]}
-    table = np.array(list(rms_k.values()))
-    print(f"\n{len(table)} files held out: median rms {np.median(table):.3f} K, worst {table.max():.2f} K")
-    assert np.median(table) <= 0.15
-    step = next(r for r in recordings if "joint_1" in r.name and np.ptp(r.temp_c[:, 1]) > 15.0)
-    others = identify([r for r in recordings if r is not step])
-    held_out = rms(held_out_errors(others.heat_model, step)[0])[1]
-    print(
-        f"joint-2 step of {np.ptp(step.temp_c[:, 1]):.1f} K held out: {held_out:.2f} K; in two folds "
-        f"{rms_k[step.name][1]:.2f} K"
-    )
-    assert held_out <= 0.3

@@ -111,7 +111,7 @@ def fit_saturation(
 
     Args:
         evidence: Features to use; see `twin.saturation.model.evidence_of`. The default has the least Brier score in
-            `scenarios.studies.saturation`, `errors` the largest.
+            `benchmarks/paper/saturation.py`, `errors` the largest.
         method: `isotonic` replaces the logistic function by a monotone curve fitted on cross-validated scores: for a
             few hundred jobs at least.
         horizon_s: Time after the start that `passed` covers; None for the whole job.

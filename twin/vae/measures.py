@@ -197,7 +197,7 @@ READINGS: Mapping[str, Callable[[Features, Calibration], Array]] = {
     "latent": lambda features, calibration: calibration.latent(features),
 }
 """Scores [..., joint] that a verdict may use; the joints are summed with the weights of d. The torque error is not put
-through 1 − exp(−e), which is flat where the heat is (`scenarios.studies.verdict.readings`)."""
+through 1 − exp(−e), which is flat where the heat is (`benchmarks/paper/readings.py`)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

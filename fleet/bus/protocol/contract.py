@@ -1,6 +1,6 @@
 """The contract of the bus as documents: JSON schemas of every message, and the bus as an AsyncAPI 3 document.
 
-`thermofleet contract` writes them to docs/contract. The description of a field is the text under it in the source.
+`docs/tables.py` writes them to docs/contract. The description of a field is the text under it in the source.
 AsyncAPI has no binding for Zenoh and refuses unknown ones; what is specific to Zenoh is under `x-zenoh`.
 """
 

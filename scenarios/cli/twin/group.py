@@ -11,15 +11,13 @@ from rich.table import Table
 
 from fleet.errors import FleetError
 from scenarios.cli import options
-from scenarios.cli.studies.sweep import parsimony_command, sweep_command
 from scenarios.cli.terminal import echo, out_console, plain_table, print_json, print_wide, progress_bar, say
 from scenarios.cli.twin.motion import export_command, generate_command, identify_command, recover_command
-from scenarios.cli.twin.verdict import questions_command, readings_command, sides_command, verdict_command
+from scenarios.cli.twin.verdict import verdict_command
 from scenarios.load import load
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
-    from scenarios.studies.shift_reliability import Awards
     from twin.vae.config import TwinConfig
 
 twin_app = typer.Typer(
@@ -144,63 +142,7 @@ twin_app.command("identify")(identify_command)
 twin_app.command("generate")(generate_command)
 twin_app.command("recover")(recover_command)
 twin_app.command("export")(export_command)
-twin_app.command("sweep")(sweep_command)
-twin_app.command("parsimony")(parsimony_command)
 twin_app.command("verdict")(verdict_command)
-twin_app.command("readings")(readings_command)
-twin_app.command("sides")(sides_command)
-twin_app.command("questions")(questions_command)
-
-
-@twin_app.command("reliability")
-def reliability_command(
-    scenario: options.ScenarioArg,
-    policies: Annotated[str, typer.Option(help="Policies, separated by commas.")] = "wspt,wspt_cool,least_difficulty",
-    risk: Annotated[
-        list[str] | None,
-        typer.Option(help="Models of P, as in `thermofleet run`; may be repeated. Default: rc.", show_default=False),
-    ] = None,
-    seeds: Annotated[int, options.number("Number of seeds.", 1, 1000)] = 4,
-    first_seed: Annotated[
-        int, options.number("First seed; those from 10000 on were not used for tuning.", 0, options.MAX_SEED)
-    ] = 10_000,
-    fleets: Annotated[
-        int, options.number("Number of fleets: draws of the arms' deviations (spread.seed).", 1, 100)
-    ] = 3,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Compare P(saturation) and predicted peaks with the outcomes in simulated shifts.
-
-    P is the probability that a motor is at or above the warning limit from two
-    minutes after the start of a plan until its end, or that a fault ends the plan.
-    A shift takes some seconds, training for each fleet up to a minute per arm.
-    """
-    from scenarios.prepare.fleet import RISK, RiskName
-    from scenarios.studies.shift_reliability import awards_as_json, shift_reliability
-
-    chosen, names = load(scenario), options.split_names(policies)
-    found = {}
-    with progress_bar() as progress:
-        for kind in risk or [RISK]:
-            found[kind] = shift_reliability(
-                chosen,
-                policies=names,
-                seeds=range(first_seed, first_seed + seeds),
-                fleets=fleets,
-                risk=choose("risk", kind, RiskName),
-                progress=progress,
-            )
-    if as_json:
-        print_json(
-            {kind: {name: awards_as_json(awards) for name, awards in rows.items()} for kind, rows in found.items()}
-        )
-        return
-    shifts = f"{chosen.name}, {seeds} seeds from {first_seed}, {fleets} draws of the arms"
-    for kind, rows in found.items():
-        out_console.print(reliability_table(rows, f"P(saturation) by {kind} in the shift: {shifts}"))
-        for name, awards in rows.items():
-            if len(awards):
-                out_console.print(reliability_diagram(awards, f"{kind}, {name}: stated and observed"))
 
 
 def check_source(scenario: str | None, log: Path | None, arm: str | None = None) -> None:
@@ -302,39 +244,4 @@ def quality_table(twin: dict[str, Any]) -> Table:  # JSON of twins.json
             f"{fit['mean_squared_error']:.3f}",
         )
         table.add_row(fit["name"].replace("_", " "), *numbers)
-    return table
-
-
-def reliability_table(rows: "dict[str, Awards]", title: str) -> Table:
-    """Accuracy of P and peaks, one row for each policy and group of arms."""
-    from scenarios.studies.shift_reliability import WARM_K, groups, verdict
-
-    caption = f"warm: a motor within {WARM_K:g} K of the warning limit, or beyond it, at the award"
-    columns = ("policy", "arms", "awards", "passed", "unknown", "ECE", "Brier", "AUROC", "peak RMS, K", "peak bias, K")
-    table = plain_table(*columns, title=title, caption=caption)
-    for policy, awards in rows.items():
-        for group, part in groups(awards).items():
-            v = verdict(part)
-            if v is None:
-                continue
-            unknown = str(awards.unknown) if group == "all" else ""
-            numbers = (
-                f"{v.ece:.3f}",
-                f"{v.brier:.3f}",
-                f"{v.auroc:.3f}",
-                f"{v.peak_rms_k:.2f}",
-                f"{v.peak_bias_k:+.2f}",
-            )
-            table.add_row(policy, group, str(v.awards), str(v.passed), unknown, *numbers)
-    return table
-
-
-def reliability_diagram(awards: "Awards", title: str) -> Table:
-    """The reliability diagram as a table, with Wilson intervals."""
-    from twin.saturation.reliability import reliability
-
-    bins = reliability(awards.p, awards.passed)
-    table = plain_table("mean P", "share passed", "95 % interval", "awards", title=title)
-    for p, share, low, high, count in zip(bins.mean_p, bins.share, bins.low, bins.high, bins.count, strict=True):
-        table.add_row(f"{p:.3f}", f"{share:.3f}", f"{low:.3f} to {high:.3f}", str(count))
     return table

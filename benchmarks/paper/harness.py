@@ -1,0 +1,306 @@
+"""What every study of the paper shares: one resumable store, one table, one command line.
+
+A study is a list of units of work, each with the keys of the rows that it computes, and a function from rows to tables.
+Rows are JSON lines: each is appended when it is known, so the same command continues after an interruption. Equal keys
+mean equal results: a key ends with a hash of everything that a result depends on.
+"""
+
+import hashlib
+import sys
+from argparse import ArgumentParser, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from time import monotonic
+from typing import Any, NamedTuple  # values of JSON
+
+import msgspec
+import numpy as np
+from joblib import delayed
+
+from fleet.errors import FleetError
+from scenarios.json_rows import Row, Rows
+from scenarios.load import load
+from scenarios.processes import worker_processes
+from scenarios.progress import brief
+from scenarios.schema import Scenario
+
+KeyedRows = Iterable[tuple[str, Mapping[str, Any]]]
+
+
+class Unit(NamedTuple):
+    """Work whose rows share something, such as the jobs of an arm."""
+
+    keys: tuple[str, ...]
+    compute: Callable[[Collection[str]], KeyedRows]
+    """Rows of some of the keys, each with its key, as they become known; it must be picklable."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text with headings."""
+
+    head: tuple[str, ...]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        odd = [row for row in self.rows if len(row) != len(self.head)]
+        if odd:
+            raise ValueError(f"Every row needs {len(self.head)} cells like the head (got {odd[0]}).")
+
+    def markdown(self) -> str:
+        """The table as Markdown, without the caption."""
+        return "\n".join(f"| {' | '.join(cells)} |" for cells in (self.head, ["---"] * len(self.head), *self.rows))
+
+    def text(self) -> str:
+        """The table for a terminal: the caption, and Markdown with columns of equal width."""
+        lines = [tuple(self.head), *map(tuple, self.rows)]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        lines.insert(1, tuple("-" * width for width in widths))
+        padded = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines]
+        return "\n".join([self.caption, *padded] if self.caption else padded)
+
+
+def no_options(parser: ArgumentParser) -> None:
+    """Options of a study that has none of its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """One study of the paper."""
+
+    help: str
+    """What it measures, and how long it takes."""
+    units: Callable[[Namespace], Sequence[Unit]]
+    """Its work with these options."""
+    tables: Callable[[Sequence[Row]], Mapping[str, Table]]
+    """Tables by name, from some of its rows."""
+    options: Callable[[ArgumentParser], None] = no_options
+
+
+def content_key(*basis: Any) -> str:
+    """Hash of the values that a result depends on (Any: what msgspec can encode)."""
+    return hashlib.sha256(msgspec.json.encode(list(basis))).hexdigest()[:12]
+
+
+def one_row(key: str, compute: Callable[[], Mapping[str, Any]]) -> Unit:
+    """A unit of a single row."""
+    return Unit((key,), lambda _: [(key, compute())])  # a worker gets it by cloudpickle
+
+
+def compute(units: Sequence[Unit], rows: Rows, *, workers: int = 1) -> None:
+    """Append the missing rows of the units.
+
+    Args:
+        workers: Processes; 1 computes in this one. The rows do not depend on it, except their CPU times.
+
+    Raises:
+        FleetError: the file cannot be written, or as the study says.
+    """
+    rows.check_writable()
+    missing = [(unit, [key for key in unit.keys if key not in rows]) for unit in units]
+    missing = [(unit, keys) for unit, keys in missing if keys]
+    began_s, total = monotonic(), sum(len(keys) for _, keys in missing)
+    for done, (key, row) in enumerate(_computed(missing, workers), start=1):
+        rows.append(key, plain(row))
+        print(f"{done} of {total} rows, {brief(monotonic() - began_s)}: {key}", file=sys.stderr, flush=True)
+
+
+def _computed(missing: Sequence[tuple[Unit, list[str]]], workers: int) -> KeyedRows:
+    if workers == 1:
+        for unit, keys in missing:
+            yield from unit.compute(keys)
+        return
+    with worker_processes(workers) as pool:
+        for some in pool(delayed(_listed)(unit, keys) for unit, keys in missing) or ():
+            yield from some
+
+
+def _listed(unit: Unit, keys: list[str]) -> list[tuple[str, Mapping[str, Any]]]:
+    return list(unit.compute(keys))
+
+
+def plain(row: Mapping[str, Any]) -> Row:
+    """The values of JSON; numbers that are not finite become None."""
+
+    def of_numpy(value: Any) -> Any:
+        return value.tolist() if isinstance(value, np.ndarray | np.generic) else _unknown(value)
+
+    return msgspec.json.decode(msgspec.json.encode(row, enc_hook=of_numpy))
+
+
+def _unknown(value: object) -> Any:
+    raise NotImplementedError(f"A row cannot hold a {type(value).__name__}.")
+
+
+def number(value: float | None) -> float:
+    """A number of a row; NaN for None."""
+    return float("nan") if value is None else float(value)
+
+
+def matching(rows: Iterable[Row], **wanted: Any) -> list[Row]:
+    """The rows with these values."""
+    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+
+
+def main(studies: Mapping[str, Callable[[], Experiment]], argv: Sequence[str] | None = None) -> None:
+    """Run a study by its name: compute the missing rows, and print the tables.
+
+    Errors that the user can correct are one sentence and exit code 2.
+    """
+    given = sys.argv[1:] if argv is None else list(argv)
+    if not given or given[0] not in studies:
+        names = "\n".join(f"  {name:16} {study().help.splitlines()[0]}" for name, study in studies.items())
+        asked_for_help = given[:1] in ([], ["-h"], ["--help"])
+        print(f"usage: python -m benchmarks.paper STUDY [options]\n\n{names}\n\nSTUDY --help lists its options.")
+        if not asked_for_help:
+            print(f"Error: no study '{given[0]}'. Name one of those above.", file=sys.stderr)
+        raise SystemExit(0 if asked_for_help else 2)
+    name = given[0]
+    try:
+        run(name, studies[name](), given[1:])
+    except FleetError as error:
+        print(f"Error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("Interrupted; the same command continues from the rows that are in the file.", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def run(name: str, study: Experiment, argv: Sequence[str]) -> None:
+    """Compute the missing rows of a study and print its tables; `main` without its treatment of errors."""
+    parser = ArgumentParser(
+        prog=f"python -m benchmarks.paper {name}", description=study.help, formatter_class=RawDescriptionHelpFormatter
+    )
+    study.options(parser)
+    out = Path(f"runs/paper/{name}.jsonl")
+    parser.add_argument("--out", type=Path, default=out, help=f"file of the rows, which is continued [{out}]")
+    parser.add_argument("--show", action="store_true", help="compute nothing: print the rows of the file")
+    parser.add_argument("--workers", type=whole(1), default=1, help="processes [1]")
+    given = parser.parse_args(argv)
+    units, rows = study.units(given), Rows(given.out)
+    if not given.show:
+        compute(units, rows, workers=given.workers)
+    wanted = rows.some(key for unit in units for key in unit.keys)
+    if not wanted:
+        raise FleetError(
+            f"'{given.out}' has no such row. Give the options with which its rows were computed, or leave out --show "
+            "to compute them."
+        )
+    with rows.readable():
+        tables = study.tables(wanted).values()
+    print("\n\n".join(table.text() for table in tables))
+    print(f"The rows are in {given.out}.", file=sys.stderr)
+
+
+def whole(least: int) -> Callable[[str], int]:
+    """Converter of an option: a whole number that is not less.
+
+    Raises:
+        ArgumentTypeError: another text; the parser prints it with the name of the option.
+    """
+
+    def convert(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise ArgumentTypeError(f"must be a whole number from {least} (got '{text}')")
+        return int(text)
+
+    return convert
+
+
+def wholes(text: str) -> list[int]:
+    """Converter of an option: whole numbers from 0, separated by commas, each once; raises as `whole`."""
+    return list(dict.fromkeys(whole(0)(part.strip()) for part in text.split(",")))
+
+
+def names(text: str) -> list[str]:
+    """Converter of an option: names separated by commas, each once."""
+    return list(dict.fromkeys(part.strip() for part in text.split(",")))
+
+
+def seed_options(parser: ArgumentParser, count: int, first: int = 1) -> None:
+    """Add the options --seeds and --first-seed."""
+    parser.add_argument("--seeds", type=whole(1), default=count, help=f"number of seeds [{count}]")
+    parser.add_argument("--first-seed", type=whole(0), default=first, help=f"first seed [{first}]")
+
+
+def seeds_of(given: Namespace) -> range:
+    """The seeds of the options."""
+    return range(given.first_seed, given.first_seed + given.seeds)
+
+
+def scenarios_of(given: Sequence[str]) -> list[Scenario]:
+    """The scenarios with these names or files."""
+    return [load(name) for name in given]
+
+
+def size_options(parser: ArgumentParser, size: type[Any]) -> None:
+    """Add --quick if the size has a quick one, and an option for each of its whole numbers, such as --test.
+
+    Tests use tiny ones: results are then of no use.
+
+    Args:
+        size: A dataclass (Any: of any study); its other fields have no options.
+    """
+    quick, group = hasattr(size, "quick"), parser.add_argument_group("numbers of jobs, training steps and the like")
+    if quick:
+        parser.add_argument("--quick", action="store_true", help="smaller networks and fewer jobs")
+    for each in fields(size):
+        default = each.default
+        some = "+" if isinstance(default, tuple) else None
+        if some or (isinstance(default, int) and not isinstance(default, bool)):
+            text = " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
+            help_ = f"[{text}{', fewer with --quick' * quick}]"
+            group.add_argument(f"--{each.name.replace('_', '-')}", type=whole(0), nargs=some, metavar="N", help=help_)
+
+
+def size_given(given: Namespace, size: type[Any]) -> Any:
+    """The size of the options that `size_options` added."""
+    base = size.quick() if getattr(given, "quick", False) else size()
+    own = {each.name: getattr(given, each.name, None) for each in fields(size)}
+    own = {name: tuple(value) if isinstance(value, list) else value for name, value in own.items() if value is not None}
+    return replace(base, **own)
+
+
+def seeded(
+    help_: str,
+    size: type[Any],
+    seeds: int,
+    rows: Callable[[int, Any, Collection[str]], KeyedRows],
+    tables: Callable[[Sequence[Row]], Mapping[str, Table]],
+    parts: Sequence[str] = ("",),
+) -> Experiment:
+    """A study with a unit for each seed.
+
+    Args:
+        size: A dataclass of the numbers of jobs and the like.
+        seeds: Number of seeds, which begin at 1.
+        rows: Rows of a seed in a size, with the names of some of the parts.
+        parts: Names of the rows of each seed.
+    """
+
+    def options(parser: ArgumentParser) -> None:
+        seed_options(parser, seeds)
+        size_options(parser, size)
+
+    def units(given: Namespace) -> list[Unit]:
+        chosen = size_given(given, size)
+        basis = content_key(asdict(chosen))
+        named = {seed: {f"{p}/{seed}/{basis}".lstrip("/"): p for p in parts} for seed in seeds_of(given)}
+        return [Unit(tuple(keys), partial(_seed_rows, rows, seed, chosen, keys)) for seed, keys in named.items()]
+
+    return Experiment(help=help_, options=options, units=units, tables=tables)
+
+
+def _seed_rows(
+    rows: Callable[[int, Any, Collection[str]], KeyedRows],
+    seed: int,
+    size: Any,
+    keys: Mapping[str, str],
+    missing: Collection[str],
+) -> KeyedRows:
+    key_of = {part: key for key, part in keys.items() if key in missing}
+    for part, row in rows(seed, size, key_of):
+        yield key_of[part], row

@@ -1,0 +1,196 @@
+"""Tables of stored results, and their cells: benchmarks print them, `docs/tables.py` puts them into pages."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any  # values of JSON
+
+import numpy as np
+
+from scenarios.show.table import markdown_table as table
+from scenarios.json_rows import Row, Rows
+from scenarios.statistics.counts import paired_counts
+from scenarios.statistics.means import Interval, interval, paired
+
+
+def difference(mean: float, low: float | None, high: float | None, digits: int = 1) -> str:
+    """`**−6.0 (−10.4 … −2.5)**`: a difference with its interval, bold if that excludes 0; else the mean."""
+    text = signed(mean, digits)
+    if low is None or high is None or math.isnan(low + high):
+        return text
+    text += f" ({signed(low, digits)} … {signed(high, digits)})"
+    return bold_if(low > 0 or high < 0, text)
+
+
+def bold_if(shown: bool, text: str) -> str:
+    """The text, bold where a difference is shown."""
+    return f"**{text}**" if shown else text
+
+
+def signed(value: float, digits: int = 1) -> str:
+    """A number with its sign."""
+    return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def read_json(path: Path) -> Any:
+    """The content of a file of results."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+CHANNEL_COLUMNS = {
+    "value": ("value", 1),
+    "on_time": ("on time", 1),
+    "faults": ("faults", 2),
+    "above_warning_min": ("minutes above the warning limit", 0),
+    "lost": ("rejected", 1),
+}
+"""Heading and decimals of a figure."""
+
+
+def channel_table(measured: Mapping[str, Any]) -> str:
+    """Means, and paired differences to the first channel with 95 % intervals, of each policy and channel.
+
+    Args:
+        measured: A result of `benchmarks/bench_channel.py`.
+    """
+    names: list[str] = list(measured["figures"])
+    values = {(row["policy"], row["channel"]): np.array(row["values"]) for row in measured["rows"]}
+    policies = dict.fromkeys(policy for policy, _ in values)
+    rows: list[tuple[str, ...]] = []
+    for (policy, channel), x in values.items():
+        base = next(each for (other, _), each in values.items() if other == policy)
+        cells = [_channel_cell(name, x[:, names.index(name)], base[:, names.index(name)]) for name in CHANNEL_COLUMNS]
+        who = (f"`{policy}`",) if len(policies) > 1 else ()
+        rows.append((*who, channel, *cells, f"{100 * x[:, names.index('heard')].mean():.0f} %"))
+    who = ("policy",) if len(policies) > 1 else ()
+    return table((*who, "channel", *(heading for heading, _ in CHANNEL_COLUMNS.values()), "received"), rows)
+
+
+def _channel_cell(name: str, x: np.ndarray, base: np.ndarray) -> str:
+    digits = CHANNEL_COLUMNS[name][1]
+    mean = f"{x.mean():.{digits}f}"
+    if np.array_equal(x, base):
+        return mean
+    d = (paired_counts if name == "faults" else paired)(x, base)
+    text = d.text(digits, "+")
+    return f"{mean} ({bold_if(d.excludes_zero, text)})"
+
+
+def live_table(measured: dict[str, Any]) -> str:
+    """Jobs finished and faults of each policy, simulated and live.
+
+    Args:
+        measured: A result of `benchmarks/bench_policies.py`.
+    """
+    rows = [
+        (f"`{row['policy']}`", row["scope"], *(str(n) for kind in ("simulated", "live") for n in row[kind].values()))
+        for row in measured["rows"]
+    ]
+    return table(("policy", "scope", "simulated: finished", "faults", "live: finished", "faults"), rows)
+
+
+KINDS = ("interval", "events")
+SHARES = (("env_choices", "env"), ("arm_choices", "arm"))
+"""Steps with a choice, and all steps."""
+STEP_HEADS = ("", "steps per shift: interval", "events", "times fewer", "env steps with a choice: interval", "events")
+
+
+def steps_table(measured: dict[str, Any]) -> str:
+    """The range over all policies, for each scenario."""
+    rows: list[tuple[str, ...]] = []
+    for scenario in dict.fromkeys(row["scenario"] for row in measured["rows"]):
+        own = [row for row in measured["rows"] if row["scenario"] == scenario]
+        counts = (_range(row[kind]["env"] for row in own) for kind in KINDS)
+        fewer = _range(row["interval"]["env"] / row["events"]["env"] for row in own)
+        shares = [
+            _range((100 * row[kind][part] / row[kind][whole] for row in own), digits, " %")
+            for part, whole in SHARES
+            for kind, digits in zip(KINDS, (1, 0), strict=True)
+        ]
+        rows.append((f"`{scenario}`", *counts, fewer, *shares))
+    return table((*STEP_HEADS, "arm steps with a choice: interval", "events"), rows)
+
+
+def _range(values: Iterable[float], digits: int = 0, unit: str = "") -> str:
+    shown = [f"{value:.{digits}f}" for value in sorted(values)]
+    return (shown[0] if shown[0] == shown[-1] else f"{shown[0]}–{shown[-1]}") + unit
+
+
+def halls_table(path: Path) -> str:
+    """The costs of halls of every size, from the rows of `benchmarks/scaling/arms.py`."""
+    rows: list[tuple[str, ...]] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        one = json.loads(line)
+        per_arm = {name: 1000.0 * seconds / one["arms"] for name, seconds in one["cpu_s"].items()}
+        once = (per_arm[name] for name in ("plans", "conflicts"))
+        hourly = (per_arm[name] / one["hours"] for name in ("engine", "matching", "scores"))
+        sizes = (str(one[name]) for name in ("arms", "halls"))
+        rows.append((*sizes, *(f"{cost:.3g}" for cost in (*once, *hourly)), str(one["most_mb"])))
+    heads = ("plans, ms per arm", "conflict table, ms per arm")
+    heads += tuple(f"{name}, ms per arm and hour" for name in ("engine", "matching", "twins"))
+    return table(("arms", "halls", *heads, "peak memory, MB"), rows)
+
+
+SAME = 1e-9
+"""Share of a reward within which it counts as the same: decisions were, and sums were rounded in another order."""
+
+
+def processor_sentence(measured: dict[str, Any]) -> str:
+    """How many shifts have another reward, and how far apart the others are."""
+    policies = " and ".join(f"`{name}`" for name in measured["policies"])
+    share = measured["largest_share"]
+    apart = "all are equal to the last bit" if not share else f"the others differ by at most {share:.0e} of the reward"
+    return (
+        f"{measured['instances']} instances of the test split, {policies}: {len(measured['other_reward'])} of "
+        f"{measured['shifts']} shifts have a reward that differs by more than {SAME:g} of it; {apart}."
+    )
+
+
+TRAININGS = {
+    "random": "`random`",
+    "rule": "the rule `{rule}`",
+    "mappo_warm": "`--algo mappo --warm-start {warm_start}`",
+    "mappo": "`--algo mappo`",
+    "ippo": "`--algo ippo`",
+    "benchmarl_mappo": "BenchMARL, MAPPO",
+    "benchmarl_ippo": "BenchMARL, IPPO",
+}
+"""Methods in the order of the table; the values in braces are those of the configuration."""
+BUDGET_SHARES = (0.0, 0.25, 0.5, 1.0)
+"""Parts of the budget in the table."""
+COSTS = {"hours": "simulated hours", "cpu_s": "CPU s"}
+"""What a training used from its first to its last evaluation, and the heading."""
+
+
+def trainings(path: Path) -> dict[str, list[Row]]:
+    """The trainings of every method, by its label, in the order of the table."""
+    rows = Rows(path)
+    by_method = {method: [row for row in rows.by_key.values() if row["method"] == method] for method in TRAININGS}
+    return {TRAININGS[method].format(**own[0]["config"]): own for method, own in by_method.items() if own}
+
+
+def course(own: Iterable[Row]) -> dict[int, Interval]:
+    """Mean reward of a shift over trainings, by env steps."""
+    by_steps = dict[int, list[float]]()
+    for row in own:
+        for point in row["points"]:
+            by_steps.setdefault(round(point["env_steps"]), []).append(point["reward"])
+    return {steps: interval(rewards) for steps, rewards in by_steps.items()}
+
+
+def efficiency_table(found: dict[str, list[Row]]) -> str:
+    """Rewards at parts of the budget with intervals over trainings, and what the trainings cost.
+
+    Args:
+        found: As `trainings`.
+    """
+    budget = max(steps for own in found.values() for steps in course(own))
+    at = [round(share * budget) for share in BUDGET_SHARES]
+    rows: list[tuple[str, ...]] = []
+    for label, own in found.items():
+        rewards = course(own)
+        cost = [f"{np.mean([row['points'][-1][k] - row['points'][0][k] for row in own]):,.0f}" for k in COSTS]
+        cells = (rewards[steps].text(1) if steps in rewards else "" for steps in at)
+        rows.append((label, str(len(own)), *cells, *cost))
+    return table(("", "seeds", *(f"{steps:,} env steps" for steps in at), *COSTS.values()), rows)

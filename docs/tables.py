@@ -1,0 +1,445 @@
+"""Write the generated parts of the docs: tables of the pages, JSON schemas and AsyncAPI document of the bus.
+
+    python docs/tables.py            # writes what is not current
+    python docs/tables.py --check    # only names it, with exit code 1
+
+A page marks a table by `<!-- made by docs/tables.py: NAME -->` and `<!-- end -->`. Each table is a function without
+arguments from the code or from files in `docs/results` to Markdown; `TABLES` has all of them by name.
+"""
+
+import argparse
+import csv
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any  # values of JSON
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "docs")) if path not in sys.path]
+
+from reference_tables import TABLES as REFERENCE  # noqa: E402  beside this file
+
+from agents.learned.training_log import read_log  # noqa: E402
+from benchmarks.paper.__main__ import study  # noqa: E402
+from benchmarks.result_tables import (  # noqa: E402
+    bold_if,
+    channel_table,
+    difference,
+    efficiency_table,
+    halls_table,
+    live_table,
+    processor_sentence,
+    read_json,
+    signed,
+    steps_table,
+    trainings,
+)
+from fleet.bus.protocol.contract import asyncapi  # noqa: E402
+from fleet.bus.protocol.contract import schema_document  # noqa: E402
+from fleet.errors import FleetError  # noqa: E402
+from scenarios.show.table import markdown_table as table  # noqa: E402
+from scenarios.json_rows import Rows  # noqa: E402
+from scenarios.leaderboard.board import BASELINE, SOURCE, benchmark_tables, read_all  # noqa: E402
+from scenarios.leaderboard.submission import Submission, split_references  # noqa: E402
+from scenarios.policy_loader import trainings_of  # noqa: E402
+from scenarios.run.compare import HEADINGS  # noqa: E402
+from scenarios.run.evaluate import COUNTS, POSSIBLE  # noqa: E402
+from scenarios.statistics.means import Interval, unit  # noqa: E402
+from scenarios.statistics.scores import Normalised, Scores, ranked, scores_of  # noqa: E402
+from scenarios.statistics.tables import figures_of  # noqa: E402
+from scenarios.suite.cells import CELLS  # noqa: E402
+from scenarios.suite.splits import instance  # noqa: E402
+from scenarios.trials.scores import normalised  # noqa: E402
+
+Array = np.ndarray
+Tables = Mapping[str, Callable[[], str]]
+"""Text of each table by the name in its mark."""
+
+MARK = re.compile(r"(<!-- made by [^:>]+: (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+DOCS = ROOT / "docs"
+
+NAMED = ("faults", "value", "on_time", "reward", "hot_surface_min")
+"""Figures of the table of named scenarios; those that are 0 everywhere are left out."""
+SOURCES = {"oracle": "true state", "twin": "identified network"}
+"""Score sources of the measured table, by the end of the file's name."""
+
+
+def ladder(results: Path) -> str:
+    """Rewards and their differences to the baseline, a column for each file, the best mean of the first file first."""
+    files = {path.stem: read_json(path) for path in sorted(results.glob("*_*.json"))}
+    head = ["policy"]
+    for stem, one in files.items():
+        scores = SOURCES[stem.removeprefix(f"{one['scenario']}_")]
+        head.append(f"`{one['scenario']}`, {scores}")
+    first = next(iter(files.values()))["figures"]
+    order = sorted(first, key=lambda policy: -first[policy]["reward"]["mean"])
+    rows = [(f"`{name}`", *(cell(one, name) for one in files.values())) for name in order]
+    return table(tuple(head), rows)
+
+
+def cell(comparison: dict[str, Any], policy: str) -> str:
+    figures = comparison["figures"][policy]
+    reward, faults = figures["reward"], figures["faults"]["mean"]
+    some = f"; {faults:.2f} faults" if faults else ""
+    if policy == comparison["baseline"]:
+        return f"{reward['mean']:.1f}{some}"
+    return difference(*(reward[name] for name in ("difference", "difference_low", "difference_high"))) + some
+
+
+def named(results: Path) -> str:
+    """Mean and difference of several figures, a column for each policy."""
+    files = [read_json(path) for path in sorted(results.glob("*.json"))]
+    rows: list[tuple[str, ...]] = []
+    for one in files:
+        figures = one["figures"]
+        for figure in NAMED:
+            own = {policy: figures[policy][figure] for policy in figures}
+            if any(each["mean"] for each in own.values()):
+                base = one["baseline"]
+                cells = [mean_cell(each, is_base=policy == base) for policy, each in own.items()]
+                rows.append((f"`{one['scenario']}`: {HEADINGS[figure]}", *cells))
+    return table(("", *(f"`{policy}`" for policy in files[0]["figures"])), rows)
+
+
+def mean_cell(figure: dict[str, Any], *, is_base: bool) -> str:
+    text = f"{figure['mean']:.1f}"
+    if is_base:
+        return text
+    low, high = figure["difference_low"], figure["difference_high"]
+    differs = low is not None and (low > 0 or high < 0)
+    text += f" ({signed(figure['difference'])})"
+    return bold_if(differs, text)
+
+
+def decisions(measured: dict[str, Any]) -> str:
+    rows = [(f"`{row['policy']}`", row["scope"], f"{row['median_ms']:.2f}") for row in measured["rows"]]
+    return table(("policy", "scope", "median, ms of CPU time"), rows)
+
+
+ABLATED = ("heat_wave", "active_waiting")
+ABLATION_FIGURES = ("faults", "value", "reward")
+WRAPPED = {"wspt": "wspt@blind", "wsept": "wsept@rc", "least_difficulty": "least_difficulty@blind"}
+"""Policies of the table of wrappers, with their sources."""
+DIGITS = {"faults": 2}
+"""Decimals of a figure; 1 for others."""
+MPC_PARTS = "benchmarks/mpc_parts.py"
+SCORE_SOURCES = {
+    "wsept@rc": "`wsept`, identified network",
+    "wsept@blind": "blind",
+    "wsept@oracle": "oracle",
+    "thermometer@blind": "`thermometer`, blind",
+    "limited:wspt@blind": "`limited:wspt`, blind",
+    "fuzzy:wspt@blind": "`fuzzy:wspt`, blind",
+}
+PARTS_OF_MPC = {
+    "mpc@rc": "`mpc`, identified network",
+    "mpc@oracle": "true network",
+    "mpc@rc-nominal": "nominal network",
+    f"{MPC_PARTS}:WithoutHeat@rc": "without heat",
+    f"{MPC_PARTS}:WithoutDiscount@rc": "without discount",
+    f"{MPC_PARTS}:WithoutSearch@rc": "without search",
+    "wsept@rc": "`wsept`",
+}
+WINDOWS = {
+    "trained-4s-32": "4 s, 32 units",
+    "trained-1s-16": "1 s, 16 units",
+    "untrained": "1 s, 16 units, untrained",
+    "blind": "blind",
+}
+
+
+def ablated(folder: str, results: Path) -> dict[str, Path]:
+    """Folders of stored ablations by scenario, as far as there are some."""
+    return {name: path for name in ABLATED if (path := results / folder.format(name)).is_dir()}
+
+
+def ablated_values(folder: Path) -> tuple[dict[str, dict[str, Array]], tuple[int, int, int]]:
+    """Figures [source][figure] of a stored ablation, each [fleet, training, seed], and the shape.
+
+    A source without trainings has the same values for each.
+    """
+    plan = read_json(folder / "ablation.json")["plan"]
+    shape, first_seed = (plan["fleets"], plan["trainings"], plan["seeds"]), plan["first_seed"]
+    found: dict[str, dict[tuple[int, int, int], dict[str, str]]] = {}
+    with (folder / "ablation.csv").open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            shift = int(row["fleet"]), int(row["training"]), int(row["seed"]) - first_seed
+            found.setdefault(row["scores"], {})[shift] = row
+    values: dict[str, dict[str, Array]] = {}
+    for name in plan["scores"]:
+        own = {training for _, training, _ in found[name]}
+        rows = [found[name][f, t if t in own else 0, s] for f, t, s in np.ndindex(shape)]
+        values[name] = {key: np.array([float(row[key]) for row in rows]).reshape(shape) for key in ABLATION_FIGURES}
+    return values, shape
+
+
+def ablation_rows(folder: Path, names: tuple[str, ...]) -> Iterator[tuple[str, list[str]]]:
+    """Heading and cells of every figure: the mean of the first source and differences to it."""
+    values, _ = ablated_values(folder)
+    values = {names[0]: values[names[0]], **values}
+    effects = figures_of(values, names[0], counts=COUNTS, possible=POSSIBLE)
+    for key in ABLATION_FIGURES:
+        digits = DIGITS.get(key, 1)
+        cells = [f"{effects[names[0]][key].mean:.{digits}f}"]
+        for name in names[1:]:
+            f = effects[name][key] if name in effects else None
+            cells.append(difference(f.difference, f.difference_low, f.difference_high, digits) if f else "–")
+        yield HEADINGS[key], cells
+
+
+def sizes_text(folders: Mapping[str, Path]) -> str:
+    """A line on the numbers of fleets, trainings and seeds."""
+    return "\n\n" + "; ".join(f"`{name}`: {unit(ablated_values(each)[1])}" for name, each in folders.items()) + "."
+
+
+def wrappers_table(folders: Mapping[str, Path]) -> str:
+    """Every policy of `WRAPPED`, bare and in the two wrappers."""
+    rows: list[tuple[str, ...]] = []
+    for policy, bare in WRAPPED.items():
+        for name, folder in folders.items():
+            some = ablation_rows(folder, (bare, f"limited:{bare}", f"fuzzy:{bare}"))
+            rows += [(f"`{policy}`, `{name}`: {heading}", *cells) for heading, cells in some]
+    return table(("policy, scenario", "bare", "`limited:`", "`fuzzy:`"), rows) + sizes_text(folders)
+
+
+def ablation_table(folders: Mapping[str, Path], columns: Mapping[str, str]) -> str:
+    """Mean of the first column and differences to it; `–` for a source that a scenario was not measured with."""
+    rows = [
+        (f"`{name}`: {heading}", *cells)
+        for name, folder in folders.items()
+        for heading, cells in ablation_rows(folder, tuple(columns))
+    ]
+    return table(("", *columns.values()), rows) + sizes_text(folders)
+
+
+TRAINED = {cell.arms for cell in CELLS if cell.split == "train"}
+"""Numbers of arms of the fleets of the training split."""
+UNTRAINED = "wsept_untrained"
+LEARNED = ("train-pairs-*", "wsept_learned", "wsept_learned_local")
+TEST_SIZES: Mapping[str, Callable[[Array], Array]] = {
+    "trained sizes": lambda arms: np.isin(arms, list(TRAINED)),
+    "other sizes": lambda arms: ~np.isin(arms, list(TRAINED)) & (arms < max(TRAINED)),
+    "larger": lambda arms: arms > max(TRAINED),
+}
+OTHER_SIZES: Mapping[str, Callable[[Array], Array]] = {
+    "7 to 10 arms": lambda arms: arms <= 10,
+    "11 to 14 arms": lambda arms: (arms > 10) & (arms < max(TRAINED)),
+    "20 and 24 arms": lambda arms: arms > max(TRAINED),
+}
+"""Groups of instances by their numbers of arms."""
+
+
+def trainings_table(folder: Path) -> str:
+    """Scores in validation of the trainings in a folder: at the beginning, and the best."""
+    rows: list[tuple[str, ...]] = []
+    for training in map(Path, trainings_of(str(folder / "train-pairs-*"))):
+        log = read_log(training)
+        validated = [row for row in log if "validation" in row]
+        best = max(validated, key=lambda row: row["validation"])
+        iterations = max(row.get("number", 0) for row in log)
+        scores = (validated[0]["validation"], best["validation"], validated[-1]["teacher"])
+        rows.append((training.name.rpartition("-")[2], str(iterations), *(f"{score:.3f}" for score in scores)))
+    return table(("training", "iterations", "first parameters", "best", "`wsept`"), rows)
+
+
+def scored(folder: Path, split: str) -> tuple[dict[str, Submission], Normalised]:
+    """The results on a split by policy, and their scores."""
+    found = {each.card.policy: each for each in read_all(folder, split) if each.card.difficulty == SOURCE}
+    values = normalised(
+        {name: each.study_rows() for name, each in found.items()}, split_references(split), failed_as_random=True
+    )
+    assert values is not None
+    return found, values
+
+
+def gain(folder: Path) -> str:
+    """Scores of learned policies less those of the best rule, and of the parameters that training began with."""
+    bases = (BASELINE, UNTRAINED)
+    rows: list[tuple[str, ...]] = []
+    for split in ("test", "sizes"):
+        found, values = scored(folder, split)
+        for name in LEARNED:
+            if name in found:
+                cells = [shown(values.difference(name, base)) for base in bases]
+                rows.append((f"{split}: {found[name].title}", f"{found[name].mean('faults'):.3f}", *cells))
+    return table(("split and policy", "faults per shift", *(f"score less that of `{base}`" for base in bases)), rows)
+
+
+def shown(difference: Interval) -> str:
+    """A difference with its interval, bold if that excludes 0."""
+    return bold_if(difference.excludes_zero, difference.text())
+
+
+def by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Array]]) -> str:
+    """Differences of normalised scores to the best rule on a split: on all instances, and by numbers of arms."""
+    found, values = scored(folder, split)
+    arms = np.array([len(instance(name).scenario.arms) for name in values.instances])
+    parts: dict[str, Scores] = {}
+    for name, chosen in {"all instances": np.ones_like, **groups}.items():
+        own = values.only(chosen(arms).astype(bool))
+        parts[f"{name} ({len(own.instances)} in {len(set(own.cells))} cells)"] = scores_of(own, BASELINE)
+    rows: list[tuple[str, ...]] = []
+    for name in ranked(next(iter(parts.values()))):
+        cells = [found[name].title]
+        for scores in parts.values():
+            cells.append("" if name == BASELINE else shown(scores.policies[name].difference))
+        rows.append((*cells, f"{found[name].mean('faults'):.2f}"))
+    return table(("policy", *parts, "faults"), rows)
+
+
+def workers_table(path: Path) -> str:
+    rows: list[tuple[str, ...]] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        one = json.loads(line)
+        took = (f"{one['median_s'][name]:.0f}" for name in ("one", "two"))
+        rows.append((one["what"], str(one["shifts"]), *took, f"{one['speed_up']:.2f}", f"{one['limit']:.2f}"))
+    return table(("workers", "shifts", "one, s", "two, s", "speed-up", "two loops that share nothing"), rows)
+
+
+def commands_table(folder: Path) -> str:
+    measured = json.loads((folder / "commands.json").read_text(encoding="utf-8"))
+    rows = [
+        (f"`{each['command']}`", f"{each['cpu_s']:.0f}", f"{each['wall_s']:.0f}", f"{each['most_mb'] / 1000:.2f}")
+        for each in measured["commands"]
+    ]
+    return table(("command", "CPU s", "s", "memory, GB"), rows)
+
+
+def coverage_by_law(path: Path) -> str:
+    measured = json.loads(path.read_text(encoding="utf-8"))
+    rows = [(law, *share_cells(shares)) for law, shares in measured["laws"].items()]
+    return table(("values", *(f"n = {n}" for n in measured["seeds"])), rows)
+
+
+def coverage_by_clusters(path: Path) -> str:
+    measured = json.loads(path.read_text(encoding="utf-8"))
+    rows = [(size, *share_cells(shares)) for size, shares in measured["sizes"].items()]
+    rows.append(("200 instances of 9 unequal cells", *share_cells(measured["cells"])))
+    return table(("fleets × trainings × seeds", "normal effects", "exponential effects"), rows)
+
+
+def share_cells(shares: Iterable[float]) -> Iterable[str]:
+    return (f"{share:.3f}" for share in shares)
+
+
+PAPER = {
+    "readings": ("readings_any", "readings_joint"),
+    "sides": ("sides",),
+    "questions": ("questions_25s", "questions_6s"),
+    "sweep": ("sweep",),
+    "parsimony": ("parsimony",),
+    "transfer": ("transfer_errors", "transfer_savings"),
+    "features": ("features_r2",),
+    "augmentation": ("augmentation_errors",),
+    "drift": ("drift_delays", "drift_costs"),
+    "cooling": ("cooling_motor", "cooling_joint", "cooling_active_waiting", "cooling_heat_wave"),
+}
+"""Tables of the studies of the paper that stand in pages, each from `docs/results/paper/STUDY.jsonl`."""
+
+
+def paper_table(name: str, which: str, results: Path) -> str:
+    """A table of a study of the paper, from all of its stored rows."""
+    rows = [*Rows(results / f"paper/{name}.jsonl").by_key.values()]
+    return study(name).tables(rows)[which].markdown()
+
+
+def tables_of(results: Path) -> Tables:
+    """Every table of the pages, by the name in its mark.
+
+    Args:
+        results: docs/results.
+    """
+
+    def of(make: Callable[..., str], *given: Any) -> Callable[[], str]:
+        return lambda: make(*given)
+
+    def of_file(make: Callable[[Any], str], path: str) -> Callable[[], str]:
+        return lambda: make(read_json(results / path))
+
+    board, scaling = results / "leaderboard", results / "scaling"
+    return {
+        **REFERENCE,
+        "ladder": of(ladder, results / "ladder"),
+        "named_scenarios": of(named, results / "named"),
+        "decisions": of_file(decisions, "ladder/decisions.json"),
+        "live_policies": of_file(live_table, "live_policies.json"),
+        "steps": of_file(steps_table, "steps.json"),
+        "processors": of_file(processor_sentence, "processors.json"),
+        **{
+            f"channels_{path.stem}": of_file(channel_table, f"channels/{path.name}")
+            for path in results.glob("channels/*.json")
+        },
+        "coverage": of(coverage_by_law, results / "coverage.json"),
+        "coverage_clusters": of(coverage_by_clusters, results / "coverage.json"),
+        **benchmark_tables(results),
+        "sample_efficiency": lambda: efficiency_table(trainings(results / "sample_efficiency/heat_wave.jsonl")),
+        "trainings": of(trainings_table, results / "learned"),
+        "learned_gain": of(gain, board),
+        "learned_test": of(by_size, board, "test", TEST_SIZES),
+        "learned_sizes": of(by_size, board, "sizes", OTHER_SIZES),
+        "workers": of(workers_table, scaling / "workers.jsonl"),
+        "growing_halls": of(halls_table, scaling / "arms.jsonl"),
+        "large_fleet": of(commands_table, scaling),
+        "wrappers_measured": lambda: wrappers_table(ablated("ablations/sources_{}", results)),
+        "score_sources": lambda: ablation_table(ablated("ablations/sources_{}", results), SCORE_SOURCES),
+        "mpc_parts": lambda: ablation_table(ablated("ablations/mpc_{}", results), PARTS_OF_MPC),
+        "twin_windows": lambda: ablation_table(ablated("twin_windows/{}", results), WINDOWS),
+        **{which: of(paper_table, name, which, results) for name, several in PAPER.items() for which in several},
+    }
+
+
+def fill_tables(page: str, tables: Tables | None = None) -> str:
+    """Replace every marked part of a page; by default from `docs/results`.
+
+    Raises:
+        FleetError: a mark names an unknown table.
+    """
+    known = tables_of(DOCS / "results") if tables is None else tables
+
+    def fill(match: re.Match[str]) -> str:
+        if match["name"] not in known:
+            raise FleetError(f"Unknown table '{match['name']}' in the page. Allowed: {', '.join(known)}.")
+        return f"{match[1]}\n{known[match['name']]()}\n\n{match[3]}"
+
+    return MARK.sub(fill, page)
+
+
+def documents(docs: Path) -> dict[Path, str]:
+    """Text of every generated document by path, and of every page with marks."""
+    tables = tables_of(docs / "results")
+    contract = {"schemas.json": schema_document(), "asyncapi.json": asyncapi()}
+    made = {
+        docs / "contract" / name: json.dumps(each, indent=1, ensure_ascii=False) + "\n"
+        for name, each in contract.items()
+    }
+    pages = {page: page.read_text(encoding="utf-8") for page in sorted(docs.rglob("*.md"))}
+    return made | {page: fill_tables(text, tables) for page, text in pages.items() if MARK.search(text)}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Write the documents that are not current, or with --check name them; 1 if there are some then."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="only check whether the documents are current")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the pages, with results and contract")
+    given = parser.parse_args(argv)
+    made = documents(given.docs)
+    stale = [path for path, text in made.items() if not path.is_file() or path.read_text(encoding="utf-8") != text]
+    names = ", ".join(map(str, stale))
+    if given.check:
+        print(
+            f"Not current: {names}. Run: python docs/tables.py" if stale else f"Current: {', '.join(map(str, made))}."
+        )
+        return int(bool(stale))
+    (given.docs / "contract").mkdir(parents=True, exist_ok=True)
+    for path in stale:
+        path.write_text(made[path], encoding="utf-8")
+    print(f"Written: {names}." if stale else "All documents were current.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""Studies of heat: ways of cooling."""

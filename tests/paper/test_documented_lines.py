@@ -1,0 +1,109 @@
+"""Every line of docs/paper.md runs, with tiny sizes; what it measures with these is of no use."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from benchmarks.paper.__main__ import MODULES, STUDIES, main
+from benchmarks.paper.harness import Experiment
+from scenarios.json_rows import Rows
+
+ROOT = Path(__file__).parents[2]
+LOGS = ROOT / "../shared/data/gen3_logs"
+PAGES = ("paper.md", "twin.md", "twin_studies.md", "identification.md", "concepts/cooling.md")
+COMMAND = re.compile(r"python -m benchmarks\.paper ([\w-]+)((?: [^`#\n>]+)?)")
+RESULTS = "docs/results/"
+
+TINY = {
+    "readings": "--scenarios quickstart --train 20 --exploration 6 --reference 125 --test 60 --novel 70",
+    "sides": "--count 2 --train 20 --exploration 6 --reference 20 --test 60 --novel 2",
+    "sweep": "--scenarios heat_wave --arms 0 --only ours --train 10 --reference 25 --test 60",
+    "parsimony": "--scenarios heat_wave --train 6 --reference 25 --test 60",
+    "quality": "--seeds 1 --train 10 --reference 20 --test 40 --novel 4 --epochs 1",
+    "saturation": "--seeds 1 --train 9 --exploration 2 --reference 1 --novel 9 --labelled 60 --held-out 60 --epochs 1",
+    "reliability": "--policies wspt --seeds 1 --fleets 1",
+    "questions": "--seeds 1 --epochs 1",
+    "forecast": "--seeds 1 --epochs 1",
+    "identification": "",
+    "transfer": "--seeds 1 --jobs 2 4 --source-jobs 6 --source-steps 4 --held-out 4 --test 9 "
+    "--steps 4 --further-steps 2",
+    "transfer-logs": "--seeds 1 --source-jobs 4 --source-steps 4 --steps 4 --further-steps 2",
+    "features": "--seeds 1 --labels 10 --train 4 --steps 4",
+    "augmentation": "--seeds 1 --measured 4 --added 4 --held-out 4 --test 8 --steps 4",
+    "drift": "--seeds 1 --days 24 --onset 8 --reference 4 --full 8 --jobs 3 --window 6 --period 6 --least 4 --train 8 "
+    "--pool 8 --steps 4 --further-steps 2",
+    "cooling": "--scenarios quickstart --seeds 2 --policies round_robin",
+}
+"""Options that make each study small."""
+QUICK = ("sweep", "parsimony", "features", "augmentation")
+
+
+def documented() -> list[tuple[str, str]]:
+    """Study and options of every documented line."""
+    text = "\n".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in PAGES)
+    return [(name, options.split(">")[0]) for name, options in COMMAND.findall(text.replace("\\\n  ", ""))]
+
+
+def test_every_study_has_a_documented_line():
+    assert {name for name, _ in documented()} == set(MODULES)
+
+
+def parsed(experiment: Experiment, words: list[str]):
+    from argparse import ArgumentParser
+
+    parser = ArgumentParser(exit_on_error=False)
+    experiment.options(parser)
+    for option in ("--out", "--workers"):
+        parser.add_argument(option)
+    parser.add_argument("--show", action="store_true")
+    return parser.parse_args(words)
+
+
+@pytest.mark.parametrize(("name", "options"), documented())
+def test_documented_options_exist_and_stored_rows_are_those_of_the_line(name, options):
+    """Second method for "stored results are what the line computes": keys are hashes of all that they depend on."""
+    given = parsed(STUDIES[name](), options.split())
+    if given.out is None or not given.out.startswith(RESULTS) or "--log" in options:
+        return
+    stored = Rows(ROOT / given.out)
+    assert [key for unit in STUDIES[name]().units(given) for key in unit.keys if key not in stored] == []
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in MODULES]
+)
+def test_a_tiny_run_writes_its_rows_and_prints_its_tables(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("benchmarks.paper.sweep.JOBS", (3,))
+    words = [name, *TINY[name].split(), "--out", str(tmp_path / "rows.jsonl")]
+    if "--log" in " ".join(options for each, options in documented() if each == name):
+        if not LOGS.is_dir():
+            pytest.skip("the Gen3 logs are not beside this checkout")
+        words += ["--log", str(LOGS), "--skip-damaged"]
+    main(words)
+    printed = capsys.readouterr()
+    assert "| --" in printed.out
+    rows = Rows(tmp_path / "rows.jsonl").by_key
+    assert len(rows) == printed.err.count(" rows, ") > 0
+    main([*words, "--show"])
+    assert capsys.readouterr().out == printed.out
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not LOGS.is_dir(), reason="the Gen3 logs are not beside this checkout")
+def test_files_of_a_real_arm_predict_its_other_files(tmp_path):
+    main(["identification", "--log", str(LOGS), "--skip-damaged", "--out", str(tmp_path / "rows.jsonl")])
+    first, second, step = Rows(tmp_path / "rows.jsonl").by_key.values()
+    rms_k = sorted(value for row in (first, second) for values in row["rms_k"].values() for value in values)
+    assert rms_k[len(rms_k) // 2] <= 0.15
+    assert step["error_k"] <= 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not LOGS.is_dir(), reason="the Gen3 logs are not beside this checkout")
+def test_real_joint_2_passes_forty_degrees_as_forecast(tmp_path):
+    main(["forecast", "--log", str(LOGS), "--skip-damaged", "--out", str(tmp_path / "rows.jsonl")])
+    for row in Rows(tmp_path / "rows.jsonl").by_key.values():
+        assert row["below"]["auroc"]["rc, load planned"] >= 0.95
+        assert row["every"]["auroc"]["rc, load planned"] >= 0.95
+        assert row["below"]["auroc"]["rc, load continued"] > row["below"]["auroc"]["d"]
