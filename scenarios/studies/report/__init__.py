@@ -1,1 +1,0 @@
-"""The twin report: the tables and figures of the paper, and the rivals."""
