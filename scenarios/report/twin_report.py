@@ -22,8 +22,6 @@ from fleet.errors import FleetError
 from fleet.motion import CHANNELS, RATE_HZ, Plan
 from fleet.planning.random_motions import random_jobs
 from scenarios.job_stream import rehearsal_works
-from scenarios.motion.generate import GenerationError, Verification, generate
-from scenarios.motion.perform import bare_arm
 from scenarios.prepare.cool_motion import cold_peaks, records, require_cool_plans
 from scenarios.prepare.planned_arm import plan_arms
 from scenarios.prepare.train_twins import exploration_records, train_or_load, train_twins, training_seed
@@ -234,6 +232,9 @@ def scenario_subjects(
     Raises:
         FleetError: no motion of the arm stays cool.
     """
+    from scenarios.motion.generate import GenerationError, Verification, generate  # MuJoCo, which logs do not need
+    from scenarios.motion.perform import bare_arm
+
     spec = scenario.twin
     (planned,) = plan_arms(scenario, [arm], rehearsal_works(scenario), folder, progress)
     robot, motors, thermal = planned.hardware
@@ -438,7 +439,7 @@ def epoch_study(
     tasks = sorted(product(range(len(seeds)), range(len(epochs))), key=lambda task: -epochs[task[1]])
     cells = (delayed(_cell)(jobs, tested, base, epochs[e], seeds[s], records) for s, e in tasks)
     with worker_processes(min(len(tasks), cpu_count()) if workers < 0 else workers, in_order=True) as pool:
-        results = dict(zip(tasks, pool(cells), strict=True))
+        results: dict[tuple[int, int], Any] = dict(zip(tasks, pool(cells), strict=True))  # joblib has no types
     known, new = (np.array([[results[s, e][k] for e in range(len(epochs))] for s in range(len(seeds))]) for k in (0, 1))
     return np.moveaxis(known, 2, 0), new
 
@@ -618,7 +619,7 @@ def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
     windows, hot, seeds = s.windows[few], s.window_hot[few], tuple(range(size.epoch_seeds))
     how = {"epochs": size.epochs, "seeds": seeds, "records": s.epoch_records}
     errors, tested = epoch_study(jobs, windows[:, :, upto], config=s.twin.config, **how)
-    of_joint = dict(zip(("trained on", "held out"), errors[:, :, :, s.joint], strict=True))
+    of_joint: dict[str, Array] = dict(zip(("trained on", "held out"), errors[:, :, :, s.joint], strict=True))
     ranks = np.array([[auroc(hot, each[:, s.joint]) for each in row] for row in tested])
     torque = auroc(hot, np.square(windows[:, :, s.joint, TAU], dtype=float).mean(axis=1))
     x, cells = [f"{n}" if n else "untrained" for n in size.epochs], Cells()
