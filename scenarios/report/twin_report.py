@@ -183,13 +183,22 @@ class Subject:
         }
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chart:
+    """One Plotly figure of a page."""
+
+    key: str
+    """Id of the element that holds its data; unique in the page."""
+    figure: Figure
+    alt: str
+    """Text in place of the figure."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Chapter(Section):
-    """A section with one figure of the paper."""
+    """A section with a figure of the paper."""
 
-    figure: Figure | None = None
-    alt: str = ""
-    """Text in place of the figure."""
+    charts: tuple[Chart, ...] = ()
 
 
 def typical(errors: Array) -> int:
@@ -258,8 +267,8 @@ def scenario_subjects(
             return Made(name, strength, (), RATE_HZ, float("nan"), "none passed")
         pairs = tuple((m.source.cycle.profile, m.plan.cycle.profile) for m in made.motions)
         distance_rad = float(np.mean([m.distance_rad for m in made.motions]))
-        outcome = f"{len(pairs)} of {made.draws} passed"
-        return Made(name, strength, pairs, RATE_HZ, distance_rad, outcome, made.truly_cool)
+        passed = f"{len(pairs)} of {made.draws} passed"
+        return Made(name, strength, pairs, RATE_HZ, distance_rad, passed, made.truly_cool)
 
     subjects = []
     for k in seeds:
@@ -484,9 +493,8 @@ def data_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
         sentences=(f"RMS torque of joint {s.joint + 1}: {ratio:.1f} times as large in hot {s.item}s as in training.",),
         how=f"{s.how} Left: joint {s.joint + 1} in the first of {len(s.trained_on)} training records, one after "
         f"another. Right: {s.names[hot]}, a typical hot recording (see Reconstruction).",
-        figure=_figure(cells, x="time (s)", y=CHANNEL_LABELS, heads=("training data", "hot"), shared=True),
+        charts=_charts("data", cells, x="time (s)", y=CHANNEL_LABELS, heads=("training data", "hot"), shared=True),
         tables=(Table(head=("RMS torque, N·m", *_joints(len(load[0]))), rows=tuple(rows)),),
-        alt=f"Position, velocity and torque of joint {s.joint + 1} over time, in training and in a hot recording.",
         numbers={"rms_torque_nm": load, "records": len(s.trained_on)},
     )  # fmt: skip
 
@@ -505,8 +513,7 @@ def latent_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
             | {"marker": {"color": colour, "size": 4, "opacity": 0.6}}
             for kind, label, colour in ((~s.window_hot, s.kinds[COOL], BLUE), (s.window_hot, s.kinds[HOT], ORANGE))
         ]
-    tau = np.sqrt(np.square(s.windows[:, :, s.joint, TAU], dtype=float).mean(axis=1))
-    values["RMS torque"] = auroc(s.window_hot, tau)
+    values["RMS torque"] = auroc(s.window_hot, np.square(s.windows[:, :, s.joint, TAU], dtype=float).mean(axis=1))
     first, other, torque = values.values()
     rows = tuple((name, f"{value:.3f}") for name, value in values.items())
     return Chapter(
@@ -516,9 +523,8 @@ def latent_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
         ),
         how=f"Posterior means of {len(s.windows)} test windows under the network of joint {s.joint + 1}. The distance "
         "is that of Mahalanobis from the means of the training windows.",
-        figure=_figure(cells, x="μ₁", y=("μ₂",), heads=("twin", "untrained network"), height=420),
+        charts=_charts("latent", cells, x="μ₁", y=("μ₂",), heads=("twin", "untrained network"), height=420),
         tables=(Table(head=("hot against cool windows", "AUROC"), rows=rows),),
-        alt="Latent plane with cool and hot windows, of the twin and of an untrained network.",
         numbers={"auroc": values},
     )  # fmt: skip
 
@@ -547,9 +553,8 @@ def reconstruction_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
         sentences=(f"Mean error of the torque of joint {s.joint + 1}: {cool:.2f} N·m cool, {hot:.2f} N·m hot.",),
         how="Decoded from the posterior mean, window by window without overlap. Each example is the recording whose "
         "errors are nearest the median of its kind in all three channels.",
-        figure=_figure(cells, x="time (s)", y=CHANNEL_LABELS, heads=("cool", "hot"), shared=True),
+        charts=_charts("reconstruction", cells, x="time (s)", y=CHANNEL_LABELS, heads=("cool", "hot"), shared=True),
         tables=(Table(head=("mean |error|", *ERROR_HEADS, "RMS torque, N·m"), rows=tuple(rows)),),
-        alt="Position, velocity and torque of a cool and of a hot recording over time, with their reconstructions.",
         numbers={"mean_error_si": errors, "examples": [s.names[i] for i in s.examples]},
     )  # fmt: skip
 
@@ -597,7 +602,7 @@ def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
         ),
         how="d_k = 1 − exp(−e_k), e_k the mean absolute error of joint k summed over the channels; d is their sum with "
         f"the weights of the twin. {len(subjects)} seeds, mean ± standard deviation; figure: the first.",
-        figure=_figure(cells, x="", y=("d of the joint",), heads=("",), height=420),
+        charts=_charts("difficulty", cells, x="", y=("d of the joint",), heads=("",), height=420),
         tables=(
             Table(head=("", *_joints(d.shape[1]), "d"), rows=tuple(rows)),
             Table(
@@ -605,7 +610,6 @@ def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
                 rows=tuple((name, spread(values)) for name, values in by_name.items()),
             ),
         ),
-        alt="Boxes of the difficulty of each joint, cool and hot.",
         numbers={"auroc": by_name},
     )  # fmt: skip
 
@@ -646,9 +650,8 @@ def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
         how=f"A separate training for each number of epochs and each of {len(seeds)} seeds, on a record of "
         f"{s.epoch_records} cool {s.item}s; other cool {s.item}s are held out. Joint {s.joint + 1}; errors in standard "
         "deviations of the training data, mean ± standard deviation over the seeds.",
-        figure=_figure(cells, x="epochs", y=("mean |error| (σ)",), heads=(*CHANNEL_NAMES, "AUROC, hot windows")),
+        charts=_charts("epochs", cells, x="epochs", y=("mean |error| (σ)",), heads=(*CHANNEL_NAMES, "AUROC, hot")),
         tables=(Table(head=("mean |error|, σ", *x), rows=tuple(rows)),),
-        alt="Errors of each channel and AUROC of the error against the number of epochs.",
         numbers={"epochs": size.epochs, **of_joint, "auroc": ranks, "auroc_rms_torque": torque},
     )  # fmt: skip
 
@@ -689,9 +692,10 @@ def generation_chapter(subjects: Sequence[Subject], size: Size) -> Chapter:
         sentences=tuple(sentences),
         how=f"Latents of cool motion are perturbed, mu + s·eps·sigma, and decoded. {how} The figure shows the first "
         f"motion at s = {size.strengths[1]:g}.",
-        figure=_figure(cells, x="time (s)", y=CHANNEL_LABELS[::2], heads=("twin", "untrained network"), shared=True),
+        charts=_charts(
+            "generation", cells, x="time (s)", y=CHANNEL_LABELS[::2], heads=("twin", "untrained network"), shared=True
+        ),
         tables=(Table(head=head, rows=tuple(rows)),),
-        alt="Position and torque over time of a source and of a motion generated from it.",
         numbers={"made": [vars(each) | {"pairs": len(each.pairs)} for each in made]},
     )
 
@@ -723,12 +727,13 @@ def _over_epochs(x: Sequence[str], y: Array, name: str, colour: str) -> dict[str
     return {"type": "scatter", "x": list(x), "y": _plain(y.mean(axis=0)), "name": name, **look}
 
 
-def _figure(
-    cells: Cells, *, x: str, y: Sequence[str], heads: Sequence[str], height: int = 0, shared: bool = False
-) -> Figure:
-    """A grid of panels.
+def _charts(
+    key: str, cells: Cells, *, x: str, y: Sequence[str], heads: Sequence[str], height: int = 0, shared: bool = False
+) -> tuple[Chart, ...]:
+    """A grid of panels as the chart of a section.
 
     Args:
+        key: Of the section.
         x: Title of the x axes, below the last row.
         y: Titles of the y axes of the first column.
         heads: Titles of the columns.
@@ -761,7 +766,8 @@ def _figure(
             axes = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
             data.append(trace | axes | {"showlegend": trace["name"] not in named})
             named.add(trace["name"])
-    return {"data": data, "layout": layout}
+    alt = f"{', '.join(y)} by {x or 'joint'}: {', '.join(filter(None, heads)) or 'cool and hot'}"
+    return (Chart(key=f"chart_{key}", figure={"data": data, "layout": layout}, alt=alt),)
 
 
 DRAW = """
@@ -807,11 +813,10 @@ def chapters_of(subjects: Sequence[Subject], size: Size, progress: Progress = qu
 
 def origin_of(subjects: Sequence[Subject]) -> dict[str, str]:
     """Twins, data and version from which the figures of a page come."""
-    first = subjects[0]
     return {
         "twins": ", ".join(each.twin.version for each in subjects),
-        "training data": first.twin.data_hash,
-        "test data": first.how,
+        "training data": subjects[0].twin.data_hash,
+        "test data": subjects[0].how,
         "thermofleet": version("thermofleet"),
     }
 
@@ -823,16 +828,15 @@ def report_page(title: str, chapters: Sequence[Chapter], origin: Mapping[str, st
     status = f"{len(failed)} of {len(chapters)} sections could not be computed: {', '.join(failed)}."
     badge = paragraph(status, "status bad") if failed else paragraph("All sections were computed.", "status good")
     body = [badge, *map(paragraph, LIMITS), f"<nav>{links}</nav>"]
-    first = next((each for each in chapters if each.figure), None)
+    first = next((chart for each in chapters for chart in each.charts), None)
     for each in chapters:
         body += [f'<section id="{each.key}">', f"<h2>{escape(each.title)}</h2>", *map(paragraph, each.sentences)]
         body += [paragraph(f"Not computed: {each.failed}", "status bad")] if each.failed else []
-        if each is first:
-            body.append(figure_place())
-        elif each.figure:
-            text = json.dumps(each.figure, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-            marks = f'class="plot" role="img" aria-label="{escape(each.alt)}" data-chart="chart-{each.key}"'
-            body += [f"<div {marks}></div>", f'<script type="text/plain" id="chart-{each.key}">{text}</script>']
+        for chart in each.charts:
+            text = json.dumps(chart.figure, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+            marks = f'class="plot" role="img" aria-label="{escape(chart.alt)}" data-chart="{chart.key}"'
+            place = f'<div {marks}></div><script type="text/plain" id="{chart.key}">{text}</script>'
+            body.append(figure_place() if chart is first else place)
         body += [table(one.head, one.rows, style="numbers") for one in each.tables]
         body += [paragraph(f"Method: {each.how}", "faint")] if each.how else []
         body.append("</section>")

@@ -128,7 +128,7 @@ def test_a_whole_recording_is_reconstructed_in_si_units(subject, chapters):
 
 
 def test_the_latent_map_has_the_posterior_means_of_every_window(subject, chapters):
-    data = chapters["latent"].figure["data"]
+    data = chapters["latent"].charts[0].figure["data"]
     mu = subject.twin.posterior(subject.windows)[0][:, 1]
     cool, hot = (np.array([trace["x"], trace["y"]], dtype=float).T for trace in data[:2])
     np.testing.assert_allclose(cool, mu[~subject.window_hot], rtol=1e-3)
@@ -184,7 +184,7 @@ def test_the_page_holds_every_chapter_in_the_order_of_the_paper(chapters, subjec
     stored = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert stored["failed"] == card["failed"] == {}
     assert list(stored["chapters"]) == order
-    assert all(chapter.figure for chapter in chapters.values())
+    assert all(len(chapter.charts) == 1 for chapter in chapters.values())
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html", "report.json"]
 
 
