@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fleet.errors import FleetError, InfeasibleJob
-from fleet.job import Place, Work
+from fleet.job import LONGEST_GRASP_S, Place, Work
 from fleet.motion import Plan
 from fleet.physics.models import ArmModel
 from fleet.planning.collision import CollisionChecker
@@ -53,7 +53,8 @@ def plan_motion(
 
     Args:
         stops: Postures, rad, [stop, joint].
-        dwell_s: Standstill at each stop, > 0, one for all or one per stop; for a hold, the length of one repetition.
+        dwell_s: Standstill at each stop, > 0, one for all or one per stop; for a hold, the length of one repetition,
+            within `fleet.job.BOUNDS`.
         payload_kg: Point mass at the flange.
         speed: Share of the joint limits, (0, 1].
         name: The plan's places are called `{name}/stop_1` and so on.
@@ -70,11 +71,13 @@ def plan_motion(
         raise ValueError(f"payload_kg must be >= 0 and finite (got {payload_kg}).")
     places = _places(arm, stops, name)
     _check_path(arm, stops, places)
+    holds = len(places) == 1
     work = Work(
-        kind="hold" if len(places) == 1 else "sort",
-        places=places if len(places) == 1 else (places[0], places[-1]),
+        kind="hold" if holds else "sort",
+        places=places if holds else (places[0], places[-1]),
         payload_kg=float(payload_kg),
-        dwell_s=float(dwell.max()),
+        # That of a sort is the time of the hand; a longer standstill waits with the payload in the hand.
+        dwell_s=float(dwell.max() if holds else min(dwell.max(), LONGEST_GRASP_S)),
     )
     home, first = arm.robot.home_q(), stops[0]
 

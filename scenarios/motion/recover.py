@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet.engine.world import Arm
 from fleet.errors import InfeasibleJob
-from fleet.job import Fixture
+from fleet.job import BOUNDS, Fixture
 from fleet.motion import static_drive
 from fleet.physics.models import ArmModel
 from fleet.planning.random_motions import plan_motion
@@ -31,6 +31,10 @@ MOST_PAYLOAD_KG = 4.5
 specifications)."""
 TICK_S = 2.0
 """Time step of temperatures while a hold is performed."""
+MOST_HOLD_S = BOUNDS["dwell_s"].high
+"""Longest hold that is planned, s."""
+LEAST_REST_S = BOUNDS["dwell_s"].low
+"""Shortest hold in the new posture, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,11 +116,7 @@ def recover(
     near = nearby or Nearby()
     model = ArmModel(arm.robot, fixtures)
     check_hold(model, q, payload_kg)
-    if not hold_s > near.watch_s:
-        raise RecoveryError(
-            f"The arm observes its motors for {near.watch_s:g} s before it moves, so the hold must be longer (got "
-            f"{hold_s:g} s)."
-        )
+    check_hold_time(hold_s, near)
     try:
         stay = plan_motion(model, np.stack([q]), dwell_s=[hold_s], payload_kg=payload_kg, speed=near.speed, name="hold")
     except InfeasibleJob as error:
@@ -168,6 +168,17 @@ def check_hold(model: ArmModel, q: Array, payload_kg: float) -> None:
         raise RecoveryError(
             f"Joint {j + 1} turns from {low[j]:.2f} to {high[j]:.2f} rad, so the arm cannot hold at {posture[j]:.2f}."
         )
+
+
+def check_hold_time(hold_s: float, near: Nearby) -> None:
+    """Raise RecoveryError if the remaining time of a hold is out of range."""
+    if not hold_s - near.watch_s >= LEAST_REST_S:
+        raise RecoveryError(
+            f"The arm observes its motors for {near.watch_s:g} s before it moves, so the hold must be longer by "
+            f"{LEAST_REST_S:g} s or more (got {hold_s:g} s)."
+        )
+    if hold_s > MOST_HOLD_S:
+        raise RecoveryError(f"A hold lasts {MOST_HOLD_S:g} s at most (got {hold_s:g} s).")
 
 
 def hold_until(

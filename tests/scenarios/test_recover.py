@@ -1,5 +1,8 @@
 """Posture recovery in the simulator: what the hottest motor does with and without, and when there is nothing to do."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +10,8 @@ from fleet.job import Fixture
 from fleet.physics.models import ArmModel
 from scenarios.motion.generate import Verification
 from scenarios.motion.posture_search import Nearby, RecoveryError
-from scenarios.motion.recover import hold_until, recover
+from scenarios.motion.recover import TICK_S, hold_until, recover
+from twin.vae.checkpoint import save
 
 HOLDS = {
     "reaching": ((0.0, 60.0, 180.0, -30.0, 0.0, 55.0, 90.0), 3.0, 57.0),
@@ -60,10 +64,54 @@ def test_nothing_better_near_is_said(subject, asked):
     assert "put the payload down" in str(said.value)
 
 
-def test_a_hold_that_is_over_before_the_arm_has_watched_is_refused(subject, asked):
+@pytest.mark.parametrize("hold_s", [120.0, 240.0, 600.0])
+def test_every_allowed_time_of_a_hold_can_be_recovered(subject, asked, hold_s):
+    """Also those longer than a hand takes to close or open, LONGEST_GRASP_S."""
     q = np.deg2rad(HOLDS["reaching"][0])
-    with pytest.raises(RecoveryError, match=r"observes its motors for 30 s .* \(got 20 s\)"):
-        recover(subject.twin, subject.arm, q, 3.0, start_c=np.full(14, 50.0), verification=asked, hold_s=20.0)
+    start_c = hold_until(subject.arm, q, 3.0, ambient_c=23.0, until_c=57.0)
+    near = Nearby(candidates=100, cooling_k=0.01)
+    how = {"start_c": start_c, "verification": asked, "nearby": near}
+    found = recover(subject.twin, subject.arm, q, 3.0, hold_s=hold_s, **how)
+    assert found.time_s[-1] == pytest.approx(hold_s, abs=TICK_S)
+    assert np.all(np.isfinite(found.with_c))
+    assert found.with_c[-1, 1] <= found.without_c[-1, 1] + 0.1
+
+
+@pytest.mark.parametrize(
+    ("hold_s", "said"), [(20.0, r"30 s before .* \(got 20 s\)"), (30.01, "30.01"), (3601.0, "3600 s at most")]
+)
+def test_a_hold_of_another_time_is_refused(subject, asked, hold_s, said):
+    q = np.deg2rad(HOLDS["reaching"][0])
+    with pytest.raises(RecoveryError, match=said):
+        recover(subject.twin, subject.arm, q, 3.0, start_c=np.full(14, 50.0), verification=asked, hold_s=hold_s)
+
+
+def test_the_documented_command_recovers_an_arm(thermofleet, small_toml, subject, tmp_path):
+    """`thermofleet twin recover quickstart --payload 3 --posture raised`, with a small cell and a small twin."""
+    save(replace(subject.twin, arm="left"), tmp_path / "left.twin")
+    out = tmp_path / "recovery"
+    recover_left = ("twin", "recover", small_toml, "--twins", tmp_path / "left.twin", "--payload", 3)
+    said = thermofleet(*recover_left, "--posture", "raised", "--out", out)
+    assert said.code == 0, said.err
+    assert "in 600 s; without the new posture to" in said.out
+    assert json.loads((out / "recovery.json").read_text(encoding="utf-8"))["payload_kg"] == 3.0
+    for option, value, sentence in (
+        ("--hold", 86_400, "--hold must be > 0 and at most 3600 (got 86400)"),
+        ("--hold", 20, "observes its motors for 30 s before it moves"),
+        ("--payload", 50, "rated for a payload of 0 … 4.5 kg"),
+        ("--posture", "rised", "No posture 'rised'; did you mean 'raised'"),
+        ("--warm", 190, "does not get warm"),
+    ):
+        wrong = thermofleet(*recover_left, option, value, "--out", tmp_path / "other")
+        assert wrong.code == 2, option
+        assert sentence in " ".join(wrong.err.split())
+        assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.slow
+def test_the_documented_command_recovers_an_arm_of_quickstart(thermofleet, tmp_path):
+    said = thermofleet("twin", "recover", "quickstart", "--payload", 3, "--posture", "raised", "--out", tmp_path / "r")
+    assert said.code == 0, said.err
 
 
 def test_a_light_hold_does_not_get_warm(subject):

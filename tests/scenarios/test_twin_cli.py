@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scenarios.cli.main import main
-from scenarios.show.page import Section
+from scenarios.show.twin_report import Size
 from twin.vae.checkpoint import load
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU
@@ -248,10 +248,9 @@ def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_co
     thermofleet, logs, tmp_path, monkeypatch
 ):
     small = TwinConfig(rate_hz=2.0, record_hz=2.0, hidden=8, epochs=3, restarts=1, max_windows=64, allow_collapse=True)
-    monkeypatch.setattr("scenarios.studies.real_logs.CONFIG", small)
-    monkeypatch.setattr(
-        "scenarios.studies.report.log_chapters.log_epochs_chapter", lambda book: Section(key="epochs", title="Epochs")
-    )
+    size = Size(windows=40, epochs=(0, 2), epoch_seeds=1, generated=1)
+    monkeypatch.setattr("scenarios.show.twin_report.LOG_CONFIG", small)
+    monkeypatch.setattr("scenarios.show.twin_report.SIZE", size)
     some = tmp_path / "logs"
     some.mkdir()
     for day in ("monday", "tuesday", "friday"):
@@ -259,7 +258,7 @@ def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_co
     out = tmp_path / "report"
     said = thermofleet("twin", "report", "--log", some, "--seeds", 1, "--out", out)
     assert said.code == 1
-    assert "test windows are hot" in said.err
+    assert "of 1 recordings or jobs get hot" in said.err
     told = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert "difficulty" in told["failed"]
     assert "epochs" not in told["failed"]

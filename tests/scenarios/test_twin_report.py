@@ -1,246 +1,326 @@
-"""The page of a twin report: whole, offline, honest about what is missing; and the folder it lies in."""
+"""The page of a twin report: its numbers on small inputs, what it says of missing data, and the documented commands."""
 
-import base64
 import json
-import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from operator import itemgetter
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.show.page import PNG_HEAD, Picture, Section, Table, sections_page
-from scenarios.studies.epochs import epoch_study
-from scenarios.studies.ranking import spread
-from scenarios.studies.report.build import provenance, write
-from scenarios.studies.report.claims import claims
-from scenarios.studies.report.figures import picture, sheet
-from scenarios.studies.report.paper_chapters import active_units
-from scenarios.studies.report.section_cache import Chapter, SectionCache, basis, compute_sections
+from fleet.motion import RATE_HZ
+from fleet.planning.random_motions import random_jobs
+from fleet.robot import Robot
+from scenarios.load import load
+from scenarios.prepare.planned_arm import hardware_of
+from scenarios.prepare.simulated_logs import own_logs
+from scenarios.show import twin_report as report
+from scenarios.show.table import Table
+from twin.logs.recording import Recording
 from twin.vae.config import TwinConfig
+from twin.vae.measures import TAU
+from twin.vae.twin import Twin
+from twin.vae.window import cut
+
+SMALL = report.Size(jobs=40, windows=80, epochs=(0, 2), epoch_seeds=1, strengths=(0.0, 1.0), generated=1)
+TINY = TwinConfig(
+    rate_hz=2.0, record_hz=2.0, window=20, stride=10, score_stride=20, hidden=6, epochs=3, restarts=1, max_windows=64,
+    allow_collapse=True,
+)  # fmt: skip
 
 
-def dots(alt="Three dots."):
-    figure, ((axes,),) = sheet(width=2, height=2)
-    axes.plot([1, 2, 3])
-    return picture("dots", figure, alt)
+def logged(name: str, temp_2_c: float, *, seed: int = 0, minutes: float = 2.0, load: float = 1.0) -> Recording:
+    """Sines at 2 Hz, all motors at 30 °C but for joint 2."""
+    time_s = np.arange(0.0, 60 * minutes, 0.5)
+    rng = np.random.default_rng(seed)
+    q = 0.4 * np.sin(rng.uniform(0.2, 0.6, 7) * time_s[:, None] + rng.uniform(0, 6, 7))
+    temp_c = np.full_like(q, 30.0)
+    temp_c[:, 1] = temp_2_c
+    qd, tau = np.gradient(q, time_s, axis=0), load * (20 * np.sin(q) + 8.0)
+    return Recording(name=name, time_s=time_s, q=q, qd=qd, tau=tau, temp_c=temp_c)
+
+
+COOL = [logged(f"cool_{i}", 35.0, seed=i) for i in range(8)]
+HOT = [logged(f"hot_{i}", 45.0, seed=20 + i, load=3.0) for i in range(3)]
 
 
 @pytest.fixture(scope="module")
-def section():
-    return Section(
-        key="dots",
-        title="Dots & <lines>",
-        sentences=("Three dots were found.",),
-        how="by looking",
-        pictures=(dots(),),
-        tables=(Table(head=("what", "σ"), rows=(("a <b>", "1.0"),)),),
-        numbers={"dots": np.arange(3), "none": float("nan"), "one": np.float64(1.5)},
-    )
+def subject(tmp_path_factory):
+    """The twin of small logs."""
+    folder = tmp_path_factory.mktemp("cache")
+    return report.log_subject([*COOL, *HOT], 3, size=SMALL, folder=folder, config=TINY)
 
 
-class Seen(HTMLParser):
-    """What stands in a page."""
+@pytest.fixture(scope="module")
+def chapters(subject):
+    return {each.key: each for each in report.chapters_of([subject], SMALL)}
 
-    def __init__(self, text):
+
+class Page(HTMLParser):
+    """Sections, addresses and text of a page."""
+
+    def __init__(self, text: str) -> None:
         super().__init__()
-        self.images, self.sections, self.words, self.outside = [], [], "", []
+        self.sections, self.outside, self.words = list[str](), list[str](), ""
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
-        given = dict(attrs)
-        if tag == "img":
-            self.images.append(given)
         if tag == "section":
-            self.sections.append(given["id"])
-        self.outside += [v for k, v in attrs if k in ("src", "href") and not v.startswith(("data:", "#"))]
+            self.sections.append(str(dict(attrs)["id"]))
+        self.outside += [v for k, v in attrs if k in ("src", "href") and not str(v).startswith(("data:", "#"))]
 
     def handle_data(self, data):
         self.words += data
 
 
-def test_a_page_holds_every_section_and_picture_inside_itself(section):
-    other = replace(section, key="more", title="More")
-    seen = Seen(sections_page("Title & more", ["Lead."], [section, other]))
-    assert seen.sections == ["dots", "more"]
-    assert seen.outside == []
-    assert [image["alt"] for image in seen.images] == ["Three dots.", "Three dots."]
-    data = base64.b64decode(seen.images[0]["src"].removeprefix("data:image/png;base64,"))
-    assert data == section.pictures[0].png
-    assert data.startswith(PNG_HEAD)
-    for words in ("Title & more", "Dots & <lines>", "Three dots were found.", "by looking", "a <b>", "All 2 sections"):
-        assert words in seen.words
+def test_an_example_is_usual_in_every_channel():
+    """By hand: the first row has the median sum, but a torque error of five times the median; the last is usual."""
+    errors = np.array([[0.1, 0.1, 2.0], [1.0, 1.0, 0.1], [2.0, 2.0, 0.4], [0.9, 0.8, 0.5]])
+    assert report.typical(errors) == 3
+    assert report.typical(errors[:1]) == 0
+    rng = np.random.default_rng(0)
+    many = rng.lognormal(size=(200, 3))
+    usual = many[report.typical(many)] / np.median(many, axis=0)
+    assert np.all((usual > 0.7) & (usual < 1.4))
+    # Units do not matter.
+    assert report.typical(many * [1.0, 50.0, 0.01]) == report.typical(many)
 
 
-def test_what_failed_is_said_on_top_and_in_its_place(section):
-    text = sections_page("Title", [], [section, Section(key="hard", title="Hard", failed="no job is critical.")])
-    seen = Seen(text)
-    assert "1 of 2 sections could not be computed: Hard." in seen.words
-    assert "Not computed: no job is critical." in seen.words
+def test_no_file_is_trained_on_and_tested(subject):
+    names = report.training_files([*COOL, *HOT], 3)
+    assert len(names) == 5
+    assert set(subject.names) == {r.name for r in [*COOL, *HOT]} - names
+    assert [name.startswith("hot") for name in subject.names] == subject.recorded_hot.tolist()
+    assert report.training_files([*COOL, *HOT], 4) != names
+    assert (subject.kind == report.HOT).sum() == 3 * len(cut(np.zeros((240, 3, 7)), TINY.window, TINY.stride))
 
 
-def test_a_chapter_that_fails_leaves_its_reason_and_the_others(section):
-    def fails(_):
-        raise FleetError("nothing is hot")
-
-    found = compute_sections([entry("a", fails), entry("dots", lambda _: section)], None)
-    assert [s.failed for s in found] == ["nothing is hot", None]
-    assert "Chapter a" in claims(found).sentences[-1]
+def test_the_examples_are_the_most_typical_recordings_of_their_kind(subject):
+    errors = subject.recorded.errors[:, 1]
+    for hot, chosen in zip((False, True), subject.examples, strict=True):
+        group = np.flatnonzero(subject.recorded_hot == hot)
+        assert chosen == group[report.typical(errors[group])]
 
 
-def entry(key, chapter, **more):
-    return Chapter(key, f"Chapter {key}", chapter, **more)
+def test_training_data_are_beside_their_rms_torque(subject, chapters):
+    (table,) = chapters["data"].tables
+    every = np.concatenate([record[:, TAU] for record in subject.trained_on])
+    assert table.rows[0][1:] == tuple(f"{v:.2f}" for v in np.sqrt((every**2).mean(axis=0)))
+    tau = np.concatenate([r.tau[:, 1] for r in HOT])
+    assert float(table.rows[2][2]) == pytest.approx(np.sqrt(np.mean(tau**2)), rel=0.05)
 
 
-def test_a_finished_section_is_kept_though_a_later_one_breaks(section, tmp_path):
-    def breaks(_):
-        raise KeyboardInterrupt
-
-    cache = SectionCache(tmp_path, basis("inputs", 1))
-    chapters = [entry("dots", lambda _: section, load=2), entry("late", breaks)]
-    with pytest.raises(KeyboardInterrupt):
-        compute_sections(chapters, None, cache=cache)
-    kept = cache.read("dots")
-    numbers = {"dots": [0, 1, 2], "none": None, "one": 1.5}
-    assert kept == replace(section, title="Chapter dots", numbers=numbers)
-
-    def never(_):
-        raise AssertionError("was kept")
-
-    assert compute_sections([entry("dots", never)], None, cache=cache) == [kept]
-    assert SectionCache(tmp_path, basis("inputs", 2)).read("dots") is None
+def test_a_whole_recording_is_reconstructed_in_si_units(subject, chapters):
+    motion = subject.motion(0)
+    recorded, made = report.reconstruct(subject.twin, motion)
+    assert recorded.shape == made.shape == motion.shape == (240, 3, 7)
+    np.testing.assert_allclose(recorded[:, 1:], motion[:, 1:], atol=1e-4)
+    first = motion[None, : TINY.window].transpose(0, 1, 3, 2)
+    np.testing.assert_allclose(made[: TINY.window], subject.twin.reconstruct(first)[0].transpose(0, 2, 1), atol=1e-6)
+    short = report.reconstruct(subject.twin, motion[:7])
+    assert short[0].shape == short[1].shape == (7, 3, 7)
+    (table,) = chapters["reconstruction"].tables
+    for row, i in zip((table.rows[0], table.rows[3]), subject.examples, strict=True):
+        seen, again = report.reconstruct(subject.twin, subject.motion(i))
+        assert row[1:4] == tuple(f"{e:.3g}" for e in np.abs(seen - again)[:, :, 1].mean(axis=0))
+        assert float(row[4]) == pytest.approx(np.sqrt(np.mean(subject.motion(i)[:, TAU, 1] ** 2)), abs=0.06)
 
 
-def test_what_failed_or_is_damaged_is_computed_anew(section, tmp_path):
-    def fails(_):
-        raise FleetError("not yet")
-
-    cache = SectionCache(tmp_path, "b")
-    assert compute_sections([entry("dots", fails)], None, cache=cache)[0].failed == "not yet"
-    assert cache.read("dots") is None
-    cache.write(section)
-    (kept,) = (tmp_path / "sections").iterdir()
-    kept.write_bytes(kept.read_bytes()[:-20])
-    assert compute_sections([entry("dots", lambda _: section)], None, cache=cache) == [
-        replace(section, title="Chapter dots")
-    ]
+def test_the_latent_map_has_the_posterior_means_of_every_window(subject, chapters):
+    data = chapters["latent"].charts[0].figure["data"]
+    mu = subject.twin.posterior(subject.windows)[0][:, 1]
+    cool, hot = (np.array([trace["x"], trace["y"]], dtype=float).T for trace in data[:2])
+    np.testing.assert_allclose(cool, mu[~subject.window_hot], rtol=1e-3)
+    np.testing.assert_allclose(hot, mu[subject.window_hot], rtol=1e-3)
+    values = chapters["latent"].numbers["auroc"]
+    tau = subject.windows[:, :, 1, TAU].astype(float)
+    assert values["RMS torque"] == report.auroc(subject.window_hot, (tau**2).mean(axis=1))
+    assert len(values) == 3
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_sections_come_in_order_whatever_is_computed_first_or_beside(processes, tmp_path):
-    how = {"a": {}, "b": {"group": "g"}, "c": {"group": "g", "load": 9}}
-    chapters = [entry(key, itemgetter(key), **more) for key, more in how.items()]
-    sections = {key: Section(key=key, title=f"Chapter {key}") for key in how}
-    cache = SectionCache(tmp_path, "basis")
-    told = []
-    found = compute_sections(
-        chapters, sections, cache=cache, processes=processes, progress=lambda *tell: told.append(tell)
-    )
-    assert found == list(sections.values())
-    stages = [stage for stage, _ in told if stage.startswith("computing ")]
-    assert sorted(stage[-1] for stage in stages) == ["a", "b", "c"]
-    assert [stage[:-1] for stage in stages] == [f"computing sections, {n} of 3 done: Chapter " for n in (1, 2, 3)]
-    assert [cache.read(key) for key in how] == found
+def test_the_difficulty_in_the_table_is_the_twins_score(subject, chapters):
+    medians, ranks = chapters["difficulty"].tables
+    scores = subject.twin.measures_of(subject.features)
+    for row, kind in zip(medians.rows, (report.COOL, report.HOT), strict=False):
+        chosen = subject.kind == kind
+        expected = [*np.median(scores.difficulty[chosen], axis=0), np.median(scores.total[chosen])]
+        assert row[1:] == tuple(f"{v:.3f}" for v in expected)
+    hot = subject.kind == report.HOT
+    by_name = dict(ranks.rows)
+    assert by_name["d of joint 2"] == f"{report.auroc(hot, scores.difficulty[:, 1]):.3f}"
+    assert by_name["RMS torque of joint 2"] == f"{report.auroc(hot, subject.features.torque_sq[:, 1]):.3f}"
+    assert "d of joint 2, untrained network" in by_name
 
 
-def quality_of(**auroc):
-    return {"joint 2, joint 2": {name: {"auroc": values} for name, values in auroc.items()}}
+def test_an_event_that_never_or_always_happens_has_no_auroc():
+    score = np.array([0.1, 0.4, 0.3, 0.9])
+    assert report.auroc(np.array([False, True, False, True]), score) == 1.0
+    assert np.isnan(report.auroc(np.ones(4, bool), score))
 
 
-def test_a_baseline_is_named_only_if_it_is_better_in_every_seed():
-    def sentence(**baselines):
-        numbers = quality_of(VAE=[0.9, 0.92], **baselines)
-        for values in numbers["joint 2, joint 2"].values():
-            values |= {key: [0.9, 0.9] for key in ("auprc", "spearman")}
-        return claims([Section(key="quality", title="Q", numbers=numbers)], simulated=True).sentences[1]
-
-    baselines = {"kNN-5": [0.95, 0.95], "PCA-2": [0.99, 0.80], "rc nominal": [0.99, 0.98]}
-    assert "with motion alone: kNN-5 (0.950 ± 0.000)" in sentence(**baselines)
-    assert "with thermal knowledge: rc nominal (0.985 ± 0.007)" in sentence(**baselines)
-    assert "PCA-2" not in sentence(**baselines)
-    assert sentence(**{"PCA-2": [0.99, 0.80]}).startswith("No baseline")
+def test_generated_windows_lie_near_their_source(subject, chapters):
+    (table,) = chapters["generation"].tables
+    assert [row[0] for row in table.rows] == ["twin, s = 0", "twin, s = 1", "untrained network, s = 1"]
+    made = subject.make("twin", subject.twin, 0.0, 1)
+    ((source, motion),) = made.pairs
+    assert made.distance_rad == pytest.approx(np.sqrt(np.mean((motion - source)[:, 0] ** 2)))
+    assert table.rows[0][2] == f"{made.distance_rad:.3f}"
+    assert table.rows[0][3] == f"{np.sqrt(np.mean(source[:, TAU, 1] ** 2)):.1f}"
+    assert table.rows[0][5] == "–"
 
 
-def test_claims_are_judged_by_the_figures():
-    def row(cooled_k):
-        made = claims([Section(key="recovery", title="R", numbers={"cooled_k": cooled_k})], simulated=True)
-        return made.tables[0].rows[0]
-
-    assert row(2.5)[1:] == ("+2.5 K in ten minutes", "yes")
-    assert row(-1.0)[1:] == ("-1.0 K in ten minutes", "no")
-    hot = {"below": {"auroc": {"d": 0.6, "rc": 0.96}}}
-    found = claims([Section(key="rc", title="rc", numbers=hot)])
-    assert found.tables[0].rows[0][1:] == ("0.960 (rc); d alone 0.600", "yes")
-
-
-def test_the_folder_holds_page_pictures_and_numbers(section, tmp_path):
-    thread = provenance({"twin": "abc123"}, (0, 1), "thermofleet twin report x")
-    card = write([section, thread], tmp_path, title="Title")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["dots.png", "report.html", "report.json"]
-    told = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
-    assert told["sections"]["dots"]["numbers"] == {"dots": [0, 1, 2], "none": None, "one": 1.5}
-    assert told["failed"] == card["failed"] == {}
-    assert told["sections"]["provenance"]["numbers"]["twin"] == "abc123"
-    assert told["sections"]["provenance"]["numbers"]["command"] == "thermofleet twin report x"
-    assert re.search(r"abc123", (tmp_path / "report.html").read_text(encoding="utf-8"))
+def test_the_page_holds_every_chapter_in_the_order_of_the_paper(chapters, subject, tmp_path):
+    origin = report.origin_of([subject]) | {"command": "thermofleet twin report <x>"}
+    card = report.write(list(chapters.values()), origin, tmp_path, "The twin & more")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = Page(text)
+    order = ["data", "latent", "reconstruction", "difficulty", "epochs", "generation"]
+    assert page.sections == list(chapters) == order
+    assert page.outside == []
+    for words in ("The twin & more", "twin report <x>", subject.twin.version, "untrained", "RMS torque"):
+        assert words in page.words
+    assert text == report.report_page("The twin & more", list(chapters.values()), origin)
+    stored = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert stored["failed"] == card["failed"] == {}
+    assert list(stored["chapters"]) == order
+    assert all(len(chapter.charts) == 1 for chapter in chapters.values())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html", "report.json"]
 
 
-def test_what_is_no_picture_or_no_table_is_refused():
-    with pytest.raises(ValueError, match="must be a PNG"):
-        Picture(name="x", png=b"GIF89a", alt="x")
-    with pytest.raises(ValueError, match="needs an alt text"):
-        replace(dots(), alt="")
-    with pytest.raises(ValueError, match="Every row needs 2 cells"):
-        Table(head=("a", "b"), rows=(("1",),))
+def test_a_chapter_that_fails_leaves_its_reason_and_the_others(subject):
+    cold = replace(subject, recorded_hot=np.zeros_like(subject.recorded_hot))
+    chapters = report.chapters_of([cold], SMALL)
+    failed = {each.key: each.failed for each in chapters if each.failed}
+    assert set(failed) == {"data", "reconstruction", "difficulty"}
+    assert "0 of 6 recordings or jobs get hot" in str(failed["data"])
+    page = Page(report.report_page("Title", chapters, {}))
+    assert "3 of 6 sections could not be computed: Training data" in page.words
+    assert page.words.count("Not computed: ") == 3
+
+
+def test_logs_that_cannot_be_studied_say_why(tmp_path):
+    def subject_of(*recordings: Recording):
+        return report.log_subject(recordings, 0, size=SMALL, folder=tmp_path, config=TINY)
+
+    with pytest.raises(FleetError, match="0 of 1 logs stay below 40 °C on joint 2"):
+        subject_of(logged("hot", 45.0))
+    with pytest.raises(FleetError, match=r"None of the 1 test logs lasts 10 s"):
+        subject_of(logged("a", 35.0), logged("hot", 45.0, minutes=0.1))
+    with pytest.raises(FleetError, match="'blind' has no motor temperatures"):
+        subject_of(replace(logged("blind", 35.0), temp_c=None))
 
 
 def test_spread_is_the_sample_deviation():
     values = [0.1, 0.2, 0.6]
-    assert spread(values) == f"{np.mean(values):.3f} ± {np.std(values, ddof=1):.3f}"
-    assert spread([0.5]) == "0.500"
-    assert spread([float("nan")]) == "–"
+    assert report.spread(values) == f"{np.mean(values):.3f} ± {np.std(values, ddof=1):.3f}"
+    assert report.spread([0.5]) == "0.500"
+    assert report.spread([float("nan")]) == "–"
+
+
+def test_not_a_number_becomes_null():
+    values = {"dots": np.arange(3), "none": float("nan"), "one": np.float64(1.5), "rows": ((1,),)}
+    assert report.plain(values) == {"dots": [0, 1, 2], "none": None, "one": 1.5, "rows": [[1]]}
+
+
+def test_a_table_with_odd_rows_is_refused():
+    with pytest.raises(ValueError, match="Every row needs 2 cells"):
+        Table(head=("a", "b"), rows=(("1",),))
 
 
 @pytest.fixture(scope="module")
 def waves():
     rng = np.random.default_rng(2)
-    time_s = np.arange(0, 8, 1 / 50)
+    time_s = np.arange(0, 8, 1 / RATE_HZ)
     jobs = []
     for _ in range(6):
         q = np.sin(np.outer(time_s, rng.uniform(0.5, 2.0, 2)) + rng.uniform(0, 6, 2))
-        jobs.append([np.stack([q, np.gradient(q, 1 / 50, axis=0), 10 * q], axis=1).astype(np.float32)])
+        jobs.append([np.stack([q, np.gradient(q, 1 / RATE_HZ, axis=0), 10 * q], axis=1).astype(np.float32)])
     return jobs
 
 
-SHORT = {"epochs": (2, 60), "seeds": (0, 1), "config": TwinConfig(hidden=8, restarts=1, batch=32), "records": 2}
+SHORT = {"epochs": (0, 60), "seeds": (0, 1), "config": TwinConfig(hidden=8, restarts=1, batch=32), "records": 2}
 
 
 def test_more_epochs_know_the_record_better(waves):
-    found = epoch_study(waves, **SHORT, workers=1)
-    assert found.trained_on.shape == found.held_out.shape == (2, 2, 2, 3)  # seed, epochs, joint, channel
-    known = found.trained_on.mean(axis=(2, 3))
+    tested = np.zeros((5, 12, 2, 3))
+    errors, of_tested = report.epoch_study(waves, tested, **SHORT, workers=1)
+    assert errors.shape == (2, 2, 2, 2, 3)  # trained on or held out, seed, epochs, joint, channel
+    assert of_tested.shape == (2, 2, 5, 2)  # seed, epochs, window, joint
+    known = errors[0].mean(axis=(2, 3))
     assert (known[:, 1] < known[:, 0]).all()
-    np.testing.assert_array_equal(
-        found.rising(0)[0], (np.diff(found.trained_on[:, :, 0], axis=1) > 0).mean(axis=(0, 1))
-    )
 
 
 @pytest.mark.slow
-def test_workers_do_not_change_the_epoch_table(waves):
-    one, two = (epoch_study(waves, **SHORT, workers=n) for n in (1, 2))
-    np.testing.assert_array_equal(one.trained_on, two.trained_on)
-    np.testing.assert_array_equal(one.held_out, two.held_out)
+def test_workers_do_not_change_the_error_by_epochs(waves):
+    one, two = (report.epoch_study(waves, np.zeros((5, 12, 2, 3)), **SHORT, workers=n) for n in (1, 2))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_too_few_jobs_or_no_epochs_are_refused(waves):
     with pytest.raises(ValueError, match="needs 10 cool jobs or more"):
-        epoch_study(waves)
+        report.epoch_study(waves, np.zeros((5, 12, 2, 3)), **SHORT | {"records": 5})
     with pytest.raises(ValueError, match="needs seeds, and epochs"):
-        epoch_study(waves, epochs=(), records=2)
+        report.epoch_study(waves, np.zeros((5, 12, 2, 3)), **SHORT | {"epochs": ()})
 
 
-def test_a_unit_that_stays_at_zero_is_not_active():
-    mu = np.stack([np.linspace(-1, 1, 50), np.linspace(-0.01, 0.01, 50)], axis=1)
-    assert active_units(mu).startswith("1 of 2 units")
+@pytest.mark.slow
+def test_the_documented_report_of_a_scenario_has_every_chapter(thermofleet, tmp_path):
+    out = tmp_path / "report"
+    said = thermofleet("twin", "report", "quickstart", "--out", out)
+    assert said.code == 0, said.err
+    card = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert card["failed"] == {}
+    assert card["origin"]["command"] == "thermofleet twin report quickstart --arm arm_0 --seeds 3"
+    auroc = card["chapters"]["difficulty"]["numbers"]["auroc"]
+    assert np.mean(auroc["d of joint 2"]) > 0.95
+    assert np.mean(auroc["RMS torque of joint 2"]) > 0.95
+    errors = card["chapters"]["reconstruction"]["numbers"]["mean_error_si"]
+    assert errors["hot, twin"][TAU] > errors["cool, twin"][TAU]
+    assert len(card["chapters"]["epochs"]["numbers"]["held out"][0]) == 6
+
+
+@pytest.fixture
+def simulated_logs(tmp_path) -> Path:
+    """Logs of an arm at simulated work, each half an hour, as files."""
+    hardware = hardware_of(load("quickstart"), 0)
+    rng = np.random.default_rng(0)
+    jobs = random_jobs(hardware.robot, 5, rng, payload_kg=(0.0, 0.5), name="light")
+    jobs += random_jobs(Robot(name=hardware.robot.name, tool_kg=2.0), 3, rng, payload_kg=(3.0, 4.0), name="heavy")
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for r in own_logs(hardware, jobs, rng, ambient_c=22.0):
+        assert r.temp_c is not None
+        columns = {"q": r.q, "qd": r.qd, "tau": r.tau, "temp_c": r.temp_c}
+        head = ["time_s", *(f"{name}_{j}" for name in columns for j in range(1, 8))]
+        rows = np.hstack([r.time_s[:, None], *columns.values()])
+        text = "\n".join([",".join(head), *(",".join(f"{v:.6f}" for v in row) for row in rows)])
+        (folder / f"{r.name.replace(' ', '_')}.csv").write_text(text + "\n", encoding="utf-8")
+    return folder
+
+
+@pytest.mark.slow
+def test_the_documented_report_of_simulated_logs_has_every_chapter(thermofleet, simulated_logs, tmp_path):
+    out = tmp_path / "report"
+    said = thermofleet("twin", "report", "--log", simulated_logs, "--seeds", 1, "--out", out)
+    assert said.code == 0, said.err
+    card = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert card["failed"] == {}
+    assert set(card["chapters"]) == {"data", "latent", "reconstruction", "difficulty", "epochs", "generation"}
+
+
+LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not LOGS.is_dir(), reason="the Gen3 logs are not beside this checkout")
+def test_the_hot_example_of_a_real_arm_is_reconstructed_worse_as_hot_motion_is(tmp_path):
+    from twin.logs.reader import read_folder
+
+    subject = report.log_subject(read_folder(LOGS), 0, size=report.SIZE, folder=tmp_path)
+    assert isinstance(subject.twin, Twin)
+    assert (subject.kind == report.HOT).sum() == 526
+    chapter = report.reconstruction_chapter([subject], report.SIZE)
+    errors = chapter.numbers["mean_error_si"]
+    assert np.all(errors["hot, twin"] > errors["cool, twin"])

@@ -170,51 +170,47 @@ def explain_in_options() -> Iterator[None]:
 def report_command(
     scenario: options.ScenarioOrLog = None,
     log: options.LogOption = None,
-    out: Annotated[Path, typer.Option(help="Folder of report.html, report.json and the pictures.")] = Path(
-        "runs/twin_report"
-    ),
+    out: Annotated[Path, typer.Option(help="Folder of report.html and report.json.")] = Path("runs/twin_report"),
     arm: Annotated[str | None, typer.Option(help="Arm of the scenario; default: the first.")] = None,
-    seeds: Annotated[int, options.number("Number of seeds; figures with a spread are repeated for each.", 1, 100)] = 3,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Fewer jobs, smaller trainings: about 20 min on two cores.")
-    ] = False,
+    seeds: Annotated[int, options.number("Number of trainings, whose results give the spread.", 1, 100)] = 3,
     skip_damaged: options.DamagedOption = False,
     overwrite: options.OverwriteOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Write the paper's pictures and tables as one offline HTML page, with PNGs and report.json.
+    """Write the paper's figures and tables as one offline HTML page, with all numbers in report.json.
 
-    For a scenario, one arm is studied on 1 200 test jobs, and every baseline is
-    trained for each seed: hours. --quick uses 200 jobs and fewer, smaller trainings.
-    After an interruption the same command continues from the cache.
-    A section that fails gives its reason in the page, and the exit code is 1.
+    RMS torque and an untrained network stand beside each result of the twin. A
+    scenario takes up to two minutes, a day of logs a minute for each seed. A
+    chapter that fails gives its reason in the page, and the exit code is 1.
     """
     check_source(scenario, log, arm)
+    from fleet.files import cache_folder
+    from scenarios.show import twin_report
     from scenarios.result_folder import check_free, new_folder
-    from scenarios.studies.report.build import REPORT, report_logs, report_scenario, write
-    from scenarios.studies.report.context import QUICK, Size
 
-    check_free(out, REPORT, overwrite=overwrite)
-    command = f"thermofleet twin report {f'--log {log.name}' if log else scenario} --seeds {seeds}{' --quick' * quick}"
-    bar = progress_bar(kept="Twins and sections already made are")
-    with bar as progress, new_folder(out, REPORT, overwrite=overwrite) as folder:
-        common: dict[str, Any] = {"seeds": range(seeds), "command": command, "progress": progress}  # arguments
+    check_free(out, twin_report.REPORT, overwrite=overwrite)
+    bar = progress_bar(kept="Twins already trained are")
+    with bar as progress, new_folder(out, twin_report.REPORT, overwrite=overwrite) as folder:
+        how: Any = {"size": twin_report.SIZE, "folder": cache_folder(), "progress": progress}  # arguments
         if log is not None:
-            sections = report_logs(options.recordings_of(log, skip_damaged), quick=quick, **common)
-            title = f"The twin of the logs in {log.name}"
+            title, source = f"The twin of the logs in {log.name}", f"--log {log.name}"
+            subjects = twin_report.log_subjects(options.recordings_of(log, skip_damaged), range(seeds), **how)
         else:
-            of_scenario = load(str(scenario))
-            index = 0 if arm is None else of_scenario.index_of(arm)
-            sections = report_scenario(of_scenario, index, size=QUICK if quick else Size(), **common)
-            title = f"The twin of {of_scenario.arms[index].name} in {of_scenario.name}"
-        card = write(sections, folder, title=title, lead=("Every section gives a result and the method.",))
+            chosen = load(str(scenario))
+            index = 0 if arm is None else chosen.index_of(arm)
+            name = chosen.arms[index].name
+            title, source = f"The twin of {name} in {chosen.name}", f"{scenario} --arm {name}"
+            subjects = twin_report.scenario_subjects(chosen, index, range(seeds), **how)
+        chapters = twin_report.chapters_of(subjects, twin_report.SIZE, progress)
+        origin = {"command": f"thermofleet twin report {source} --seeds {seeds}", **twin_report.origin_of(subjects)}
+        card = twin_report.write(chapters, origin, folder, title)
     if as_json:
-        echo((out / "report.json").read_text(encoding="utf-8"), nl=False)
+        echo((out / twin_report.CARD).read_text(encoding="utf-8"), nl=False)
     else:
-        say(f"Open {out / 'report.html'} in a browser.", out_console)
+        say(f"Open {out / twin_report.PAGE} in a browser.", out_console)
     if card["failed"]:
         reasons = "; ".join(f"{key}: {why}" for key, why in card["failed"].items())
-        say(f"{len(card['failed'])} of {len(sections)} sections could not be computed ({reasons})")
+        say(f"{len(card['failed'])} of {len(chapters)} chapters could not be computed ({reasons})")
         raise typer.Exit(1)
 
 

@@ -8,6 +8,7 @@ import typer
 from rich.table import Table
 
 from fleet.errors import FleetError
+from fleet.job import BOUNDS
 from fleet.robot import POSTURES
 from scenarios.cli import options
 from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
@@ -136,7 +137,9 @@ def recover_command(
     payload: Annotated[float, options.number("Payload held, kg.", 0, 100)] = 2.0,
     posture: Annotated[str, typer.Option(help=f"{', '.join(POSTURES)}, or seven angles in degrees.")] = "raised",
     warm: Annotated[float, options.number("Temperature of the hottest motor at the start, °C.", -40, 200)] = 50.0,
-    hold_s: Annotated[float, options.number("Remaining time to hold, s.", 0, 86_400, "--hold", above=True)] = 600.0,
+    hold_s: Annotated[
+        float, options.number("Remaining time to hold, s.", 0, BOUNDS["dwell_s"].high, "--hold", above=True)
+    ] = 600.0,
     seed: SeedOption = 0,
     format_: FormatOption = "parquet",
     overwrite: options.OverwriteOption = False,
@@ -150,7 +153,8 @@ def recover_command(
     from scenarios.motion.known_arm import known_arm
     from scenarios.motion.motion_files import RECOVERY, Format, recovery_summary, save_recovery
     from scenarios.motion.posture import parse_posture
-    from scenarios.motion.recover import check_hold, hold_until, recover
+    from scenarios.motion.posture_search import Nearby
+    from scenarios.motion.recover import check_hold, check_hold_time, hold_until, recover
     from scenarios.result_folder import check_free
 
     chosen, format_name = load(scenario), choose("format", format_, Format)
@@ -159,6 +163,7 @@ def recover_command(
     q = parse_posture(posture, model.position_range)
     check_free(out, RECOVERY, overwrite=overwrite)
     check_hold(model, q, payload)  # before the training
+    check_hold_time(hold_s, Nearby())
     with progress_bar() as progress:
         known = known_arm(chosen, spec.name, twin=twin_of(twins, spec.name), progress=progress)
         progress("recovering", 0.0)

@@ -86,10 +86,9 @@ def check_one_source(scenario: str | None, log: Path | None) -> None:
 def draw_map(path: Path, rule: "Rule", features: "Features") -> None:
     """Write the latent plane with the verdicts."""
     from fleet.files import atomic_path
-    from scenarios.studies.report.figures import picture
-    from scenarios.studies.verdict.latent_map import verdict_map
+    from scenarios.motion.latent_map import verdict_png
 
-    png = picture("verdict", verdict_map(rule, features), "Latent plane with verdicts.").png
+    png = verdict_png(rule, features)
     with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as draft:

@@ -1,11 +1,14 @@
-"""The latent plane of the joint that carries the load, with the verdicts on jobs."""
+"""The latent plane of the joint that carries the load, with the verdicts on jobs, as a PNG."""
+
+import io
+import textwrap
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from fleet.errors import FleetError
-from scenarios.studies.report.figures import BETWEEN, CRITICAL, INK, NORMAL, sheet
 from twin.vae.measures import Features
 from twin.verdict.rule import ANOMALOUS, UNCRITICAL, Rule
 
@@ -13,6 +16,18 @@ Array = np.ndarray
 
 RADII = (1.0, 2.0)
 """Mahalanobis distances that are drawn round the cool jobs."""
+BLUE, ORANGE, GREY, INK = "#0072B2", "#D55E00", "#8A8A8A", "#222222"
+"""Uncritical, anomalous, held-out, ellipses; of Okabe and Ito, for colour-blind readers."""
+DPI = 110
+TITLE_CHARACTERS = 63
+"""Characters of a title in one line."""
+
+
+def verdict_png(rule: Rule, features: Features) -> bytes:
+    """`verdict_map` as PNG; the same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    verdict_map(rule, features).savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def verdict_map(rule: Rule, features: Features) -> Figure:
@@ -27,16 +42,20 @@ def verdict_map(rule: Rule, features: Features) -> Figure:
     anomalous = rule.anomalous(features)
     count = int(anomalous.sum())
     title = f"Joint {joint + 1}: {count} of {len(anomalous)} are anomalous at {rule.alpha:g} by {rule.reading}"
-    figure, ((axes,),) = sheet(width=7.5, height=6.0, title=title)
+    figure = Figure(figsize=(7.5, 6.0), layout="constrained", dpi=DPI)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    figure.suptitle(textwrap.fill(title, TITLE_CHARACTERS), fontweight="bold", color=INK, x=0.01, ha="left")
     centre, inverse = (each[joint] for each in calibration.cluster)
     known, own = (each.latent_moments[0][:, joint, :2] for each in (calibration.reference, features))
-    axes.scatter(*known.T, s=14, color=BETWEEN, alpha=0.6, linewidths=0, label="held-out cool jobs")
-    kinds = ((~anomalous, NORMAL, UNCRITICAL, "o"), (anomalous, CRITICAL, ANOMALOUS, "^"))
+    axes.scatter(*known.T, s=14, color=GREY, alpha=0.6, linewidths=0, label="held-out cool jobs")
+    kinds = ((~anomalous, BLUE, UNCRITICAL, "o"), (anomalous, ORANGE, ANOMALOUS, "^"))
     for kind, colour, name, mark in kinds:
         axes.scatter(*own[kind].T, s=26, color=colour, marker=mark, alpha=0.8, linewidths=0, label=name)
     for radius in RADII:
         axes.add_patch(_ellipse(centre[:2], np.linalg.inv(inverse)[:2, :2], radius))
     axes.set(xlabel=f"μ₁ of joint {joint + 1}", ylabel=f"μ₂ of joint {joint + 1}")
+    axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
     return figure
 

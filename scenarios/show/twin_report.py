@@ -1,0 +1,831 @@
+"""`thermofleet twin report`: the figures of the paper on one page, from simulated jobs of an arm or from its logs.
+
+The order is that of the paper (E. Guiffo Kaigom, arXiv 2509.12740): training data, latent map, reconstruction,
+difficulty, error by epochs, generated motion. RMS torque and an untrained network stand beside every result of the
+twin.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from typing import Any  # values of JSON and of Plotly's schema
+
+import numpy as np
+from joblib import cpu_count, delayed
+from sklearn.metrics import roc_auc_score
+
+from fleet.errors import FleetError
+from fleet.motion import CHANNELS, RATE_HZ, Plan
+from fleet.planning.random_motions import random_jobs
+from scenarios.job_stream import rehearsal_works
+from scenarios.prepare.cool_motion import cold_peaks, records, require_cool_plans
+from scenarios.prepare.planned_arm import plan_arms
+from scenarios.prepare.train_twins import exploration_records, train_or_load, train_twins, training_seed
+from scenarios.prepare.twin_folder import LOG_INPUT
+from scenarios.processes import worker_processes
+from scenarios.progress import Count, Progress, quiet
+from scenarios.result_folder import ResultKind
+from scenarios.schema import Scenario
+from scenarios.show.page import AXIS, LAYOUT, Chart, Section, sections_page
+from scenarios.show.table import Table
+from twin.baselines.reconstruction import untrained_config
+from twin.logs.recording import Recording
+from twin.logs.resampling import stretches
+from twin.training_data import cool_stretches
+from twin.vae.config import TwinConfig
+from twin.vae.measures import TAU, Calibration, Features
+from twin.vae.train import train
+from twin.vae.twin import Twin
+from twin.vae.window import cut, cut_jobs, draw_windows, resample, starts, windows_of
+from twin.verdict.log_features import log_windows
+
+Array = np.ndarray
+Cells = dict[tuple[int, int], list[dict[str, Any]]]
+"""Plotly traces by row and column of a chart."""
+
+CARD, PAGE = "report.json", "report.html"
+REPORT = ResultKind(name="twin report", card=CARD, files=(CARD, PAGE))
+CHANNEL_NAMES = ("position", "velocity", "torque")
+ERROR_HEADS = ("position, rad", "velocity, rad/s", "torque, N·m")
+CHANNEL_LABELS = ("q (rad)", "dq/dt (rad/s)", "τ (N·m)")
+BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"
+"""Cool or the twin, hot, untrained, other; of Okabe and Ito, for colour-blind readers."""
+EPOCH_COLOURS = (("trained on", BLUE), ("held out", GREY))
+LEAST_ERROR = 1e-6
+"""Errors below it, in z units, count as equal."""
+MOST_POINTS = 1500
+"""Points of a line; a long recording is drawn with fewer samples."""
+QUANTILES = {"lowerfence": 5, "q1": 25, "median": 50, "q3": 75, "upperfence": 95}
+COOL, BETWEEN, HOT = 0, 1, 2
+"""Kinds of jobs and windows."""
+TEST_JOBS = 5
+"""Spawn key, different from those of `scenarios.prepare.train_twins` and `calibrate_twins` for the same arm."""
+LOADED_JOINT = 1
+"""The joint whose temperature divides logs into cool and hot, index 0..6: joint 2 carries a standing arm."""
+LOG_HOT_C = 40.0
+"""Mean temperature of joint 2 from which a window of a log is hot; a file that never reaches it is cool."""
+LOG_TRAIN_SHARE = 0.6
+"""Share of the cool files that train the twin of logs."""
+LOG_CONFIG = TwinConfig(record_hz=2.0, epochs=40, restarts=1).changed(**LOG_INPUT)
+"""Windows of 25 s at the sampling rate of the logs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """Amount of computation of a report."""
+
+    jobs: int = 600
+    """Random test jobs of an arm of a scenario."""
+    windows: int = 2000
+    """Most windows of each kind in a latent map."""
+    epochs: tuple[int, ...] = (0, 20, 40, 60, 120, 240)
+    """0 is the untrained network."""
+    epoch_seeds: int = 3
+    strengths: tuple[float, ...] = (0.0, 1.0, 4.0)
+    """Perturbations of generated motion, in posterior standard deviations."""
+    generated: int = 5
+    """Motions for each strength."""
+
+
+SIZE = Size()
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """Motions that one network generated at one strength, and their sources."""
+
+    network: str
+    strength: float
+    pairs: tuple[tuple[Array, Array], ...]
+    """Source and motion, q, qd, tau, [time, 3, joint] each."""
+    rate_hz: float
+    distance_rad: float
+    """RMS distance of the positions from those of the source, mean over the motions; NaN without motions."""
+    outcome: str
+    """Result of the verification."""
+    cool_share: float | None = None
+    """Share of the motions whose true motors stay cool; None if it is not known."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Subject:
+    """One twin, and the motion on which it is judged. An item is a job of a scenario, or a window of a log."""
+
+    twin: Twin
+    untrained: Twin
+    """The same network with its initial weights."""
+    joint: int
+    """The joint that is shown, index 0..6."""
+    item: str
+    """What is scored: job or window."""
+    kinds: tuple[str, str, str]
+    """What cool, between and hot mean."""
+    how: str
+    """Origin of the test data."""
+    trained_on: Sequence[Array]
+    """Training records, [time, 3, joint] each, at `twin.config.record_hz`."""
+    kind: Array
+    """COOL, BETWEEN or HOT, [item]."""
+    features: Features
+    """Of the items under the twin, [item, joint]."""
+    untrained_features: Features
+    windows: Array
+    """Windows of test motion, SI, [window, time, joint, channel]."""
+    window_hot: Array
+    """bool [window]."""
+    names: Sequence[str]
+    """Whole recordings of the test motion."""
+    recorded_hot: Array
+    """bool [recording]."""
+    recorded: Features
+    """Of the recordings under the twin, [recording, joint]."""
+    motion: Callable[[int], Array]
+    """Motion of a recording at the rate of the twin, [time, 3, joint]."""
+    cool_jobs: Sequence[Sequence[Array]]
+    """Profiles of the phases of cool test items, [time, 3, joint] at `twin.config.record_hz`, for the epoch table."""
+    epoch_records: int
+    """Number of them that its networks learn: few, so that more epochs still help."""
+    make: Callable[[str, Twin, float, int], Made]
+    """Generate motions: name of the network, network, strength, number."""
+
+    @cached_property
+    def examples(self) -> tuple[int, int]:
+        """A typical cool and a typical hot recording.
+
+        Raises:
+            FleetError: a kind is missing.
+        """
+        groups = [np.flatnonzero(self.recorded_hot == hot) for hot in (False, True)]
+        if not all(map(len, groups)):
+            raise FleetError(
+                f"{len(groups[1])} of {sum(map(len, groups))} recordings or jobs get hot: there is nothing to compare. "
+                "Add hotter or cooler ones, or take another arm."
+            )
+        errors = self.recorded.errors[:, self.joint]
+        cool, hot = (int(group[typical(errors[group])]) for group in groups)
+        return cool, hot
+
+    def scores(self) -> dict[str, Array]:
+        """Scores of the items, higher for harder ones, each [item]; the first is that of the paper for one joint."""
+        j, of = self.joint, f"joint {self.joint + 1}"
+        return {
+            f"d of {of}": self.features.errors[:, j].sum(axis=-1),
+            "d, weighted": self.features.difficulty @ self.twin.joint_weight,
+            "Σ d (paper)": self.features.difficulty.sum(axis=1),
+            f"RMS torque of {of}": np.sqrt(self.features.torque_sq[:, j]),
+            f"d of {of}, untrained network": self.untrained_features.errors[:, j].sum(axis=-1),
+        }
+
+
+def typical(errors: Array) -> int:
+    """Index of the row whose errors are nearest the median of each channel, by the ratio in the worst channel.
+
+    A recording whose error is usual in one channel can be unusual in another, and then misrepresents its kind there.
+
+    Args:
+        errors: [row, channel], one row or more.
+    """
+    ratio = np.maximum(errors, LEAST_ERROR) / np.maximum(np.median(errors, axis=0), LEAST_ERROR)
+    return int(np.argmin(np.abs(np.log(ratio)).max(axis=1)))
+
+
+def auroc(event: Array, score: Array) -> float:
+    """Area under the ROC curve, NaN if the event [item] is always true or never."""
+    return float(roc_auc_score(event, score)) if event.any() and not event.all() else float("nan")
+
+
+def spread(values: Sequence[float] | Array, digits: int = 3) -> str:
+    """Mean and sample standard deviation over the seeds as text, `0.941 ± 0.006`; the mean alone for one seed."""
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    if not len(finite):
+        return "–"
+    mean = f"{finite.mean():.{digits}f}"
+    return mean if len(finite) == 1 else f"{mean} ± {finite.std(ddof=1):.{digits}f}"
+
+
+# Subjects: an arm of a scenario, and a real arm's logs.
+
+
+def scenario_subjects(
+    scenario: Scenario, arm: int, seeds: Sequence[int], size: Size, folder: Path, progress: Progress = quiet
+) -> list[Subject]:
+    """The twin of an arm of a scenario under each seed of its training, judged on random jobs with true outcomes.
+
+    The first seed, 0, gives the twin with which the arm works in the scenario's fleet.
+
+    Raises:
+        FleetError: no motion of the arm stays cool.
+    """
+    from scenarios.motion.generate import GenerationError, Verification, generate  # MuJoCo, which logs do not need
+    from scenarios.motion.perform import bare_arm
+
+    spec = scenario.twin
+    (planned,) = plan_arms(scenario, [arm], rehearsal_works(scenario), folder, progress)
+    robot, motors, thermal = planned.hardware
+    own = require_cool_plans(planned.all_plans, planned.hardware, scenario)
+    progress("drawing jobs", 0.0)
+    draw = np.random.SeedSequence([scenario.spread.seed, arm], spawn_key=(TEST_JOBS,))
+    plans = random_jobs(robot, size.jobs, np.random.default_rng(draw), name="test")
+    peak_c = cold_peaks(plans, motors, thermal, ambient_c=spec.ambient_c, horizon_s=spec.horizon_s)
+    warning_c, hottest_c = scenario.limits.warning_c, peak_c.max(axis=1)
+    kind = np.where(hottest_c <= spec.cool_c, COOL, np.where(hottest_c < warning_c, BETWEEN, HOT))
+    repetitions = [max(1, int(np.ceil(spec.horizon_s / plan.cycle.duration_s))) for plan in plans]
+    shown = np.flatnonzero(kind != BETWEEN)
+    trained_on = [*records(own), *exploration_records(scenario, planned)]
+    verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
+
+    def make(name: str, twin: Twin, strength: float, count: int) -> Made:
+        how = {"s": strength, "count": count, "verification": verification, "fixtures": scenario.fixtures}
+        try:
+            made = generate(twin, bare_arm(robot, motors, thermal), own, **how)
+        except GenerationError:
+            return Made(name, strength, (), RATE_HZ, float("nan"), "none passed")
+        pairs = tuple((m.source.cycle.profile, m.plan.cycle.profile) for m in made.motions)
+        distance_rad = float(np.mean([m.distance_rad for m in made.motions]))
+        passed = f"{len(pairs)} of {made.draws} passed"
+        return Made(name, strength, pairs, RATE_HZ, distance_rad, passed, made.truly_cool)
+
+    subjects = []
+    for k in seeds:
+        seed = training_seed(scenario, k)
+        (twin,) = train_twins(scenario, [planned], folder, progress, seed=None if k == 0 else seed)
+        untrained = _untrained(trained_on, twin.config, seed, robot.name, folder)
+        joint = int(np.argmax(twin.joint_weight))
+        cut_up = cut_jobs([plans[i] for i in shown], [1] * len(shown), twin.config)
+        few = _few(kind[shown][cut_up.job] == HOT, size.windows)
+        subjects.append(
+            Subject(
+                twin=twin, untrained=untrained, joint=joint, item="job",
+                kinds=(f"cool, to {spec.cool_c:g} °C", "between", f"hot, from {warning_c:g} °C"),
+                how=f"{len(plans)} random jobs, on none of which the twin was trained. The kind of a job is that of "
+                f"its hottest motor when it repeats for {spec.horizon_s / 60:g} min, by the true heat of the arm.",
+                trained_on=trained_on, kind=kind, features=twin.features(plans, repetitions),
+                untrained_features=untrained.features(plans, repetitions), windows=cut_up.windows[few],
+                window_hot=kind[shown][cut_up.job[few]] == HOT, names=[_job_name(plans[i]) for i in shown],
+                recorded_hot=kind[shown] == HOT, recorded=twin.features([plans[i] for i in shown], [1] * len(shown)),
+                motion=lambda i, twin=twin: _profile(plans[shown[i]], twin.config),
+                cool_jobs=[records([plans[i]]) for i in np.flatnonzero(kind == COOL)],
+                epoch_records=5, make=make,
+            )
+        )  # fmt: skip
+    return subjects
+
+
+def _job_name(plan: Plan) -> str:
+    return f"{plan.work.places[0].name.partition('/')[0]} ({plan.work.kind}, {plan.work.payload_kg:.1f} kg)"
+
+
+def _profile(plan: Plan, config: TwinConfig) -> Array:
+    """One repetition of a plan at the rate of a twin, [time, 3, joint]."""
+    return resample(np.concatenate([phase.profile for phase in plan.phases]), RATE_HZ, config.rate_hz)
+
+
+def _untrained(trained_on: Sequence[Array], config: TwinConfig, seed: int, arm: str, folder: Path) -> Twin:
+    entropy = np.random.SeedSequence(seed)
+    return train_or_load(list(trained_on), untrained_config(config), entropy, arm=arm, folder=folder)
+
+
+def _few(hot: Array, most: int) -> Array:
+    """Indices of at most `most` random windows of each kind, in order."""
+    chosen = (np.random.default_rng(0).permutation(np.flatnonzero(hot == kind))[:most] for kind in (False, True))
+    return np.sort(np.concatenate(list(chosen)))
+
+
+def log_subjects(
+    recordings: Sequence[Recording], seeds: Sequence[int], size: Size, folder: Path, progress: Progress = quiet
+) -> list[Subject]:
+    """Twins trained on cool logs of an arm, each seed with its own choice of files, judged on all other files.
+
+    Raises:
+        FleetError: a log has no temperatures, or too few are cool.
+    """
+    subjects = []
+    for done, seed in enumerate(seeds):
+        progress("training", Count(done, len(seeds)))
+        subjects.append(log_subject(recordings, seed, size=size, folder=folder))
+    return subjects
+
+
+def log_subject(
+    recordings: Sequence[Recording], seed: int, *, size: Size, folder: Path, config: TwinConfig | None = None
+) -> Subject:
+    """The subject of one seed; see `log_subjects`."""
+    config, joint = config or LOG_CONFIG, LOADED_JOINT
+    names = training_files(recordings, seed)
+    training, test = ([r for r in recordings if (r.name in names) == wanted] for wanted in (True, False))
+    normal = cool_stretches(training, config.rate_hz, cool_c=LOG_HOT_C, horizon_s=np.inf, joints=(joint,))
+    trained_on = [stretch.profile for stretch in normal]
+    twin = train_or_load(trained_on, config, np.random.SeedSequence(seed), arm="logged", folder=folder)
+    untrained = _untrained(trained_on, config, seed, "logged", folder)
+    windows, temps, owners = [], [], []
+    for r in test:
+        for stretch in (s for s in stretches(r, config.rate_hz) if len(s.time_s) >= config.window):
+            assert stretch.temp_c is not None
+            first = starts(len(stretch.time_s), config.window, config.stride)
+            windows.append(cut(stretch.profile, config.window, config.stride).astype(np.float32))
+            temps += [stretch.temp_c[a : a + config.window, joint].mean() for a in first]
+            owners += [r.name] * len(first)
+    if not windows:
+        raise FleetError(
+            f"None of the {len(test)} test logs lasts {config.window / config.rate_hz:g} s; add longer logs."
+        )
+    every, temp_c, owner = np.concatenate(windows), np.array(temps), np.array(owners)
+    hot, long = temp_c >= LOG_HOT_C, [r for r in test if r.name in set(owners)]
+    few = _few(hot, size.windows)
+    cool = [[w.transpose(0, 2, 1)] for r in long for w in every[(owner == r.name) & ~hot][:40:4]]
+    own = draw_windows(windows_of(trained_on, config), size.windows, np.random.SeedSequence(seed))
+
+    def make(name: str, network: Twin, strength: float, count: int) -> Made:
+        rng = np.random.default_rng(seed)
+        source = own[np.sort(rng.choice(len(own), min(count, len(own)), replace=False))]
+        mu, sigma = network.posterior(source)
+        decoded = network.decode((mu + strength * rng.standard_normal(mu.shape) * sigma).astype(np.float32))
+        near = network.scaler.to_si(network.scaler.to_z(source))
+        apart = np.sqrt(np.square(decoded - near)[..., 0].mean(axis=(1, 2)))
+        pairs = tuple((a.transpose(0, 2, 1), b.transpose(0, 2, 1)) for a, b in zip(near, decoded, strict=True))
+        return Made(name, strength, pairs, config.rate_hz, float(apart.mean()), f"{len(pairs)} windows, not verified")
+
+    def motion(i: int) -> Array:
+        return max((stretch.profile for stretch in stretches(long[i], config.rate_hz)), key=len)
+
+    whole = [np.concatenate([part.packed for *_, part in log_windows(twin, r)]).mean(axis=0) for r in long]
+    return Subject(
+        twin=twin, untrained=untrained, joint=joint, item="window",
+        kinds=(f"cool, below {LOG_HOT_C:g} °C", "between", f"hot, from {LOG_HOT_C:g} °C"),
+        how=f"{len(training)} of {len(recordings)} files, which never reach {LOG_HOT_C:g} °C on joint {joint + 1}, "
+        f"train the twin; the other {len(test)} are tested, {len(hot)} windows of {config.window / config.rate_hz:g} s "
+        f"of which {hot.sum()} are hot.",
+        trained_on=trained_on, kind=np.where(hot, HOT, COOL), features=twin.window_features(every),
+        untrained_features=untrained.window_features(every), windows=every[few], window_hot=hot[few],
+        names=[r.name for r in long],
+        recorded_hot=np.array([hot[owner == r.name].any() for r in long]), recorded=Features(np.stack(whole)),
+        motion=motion, cool_jobs=cool, epoch_records=len(cool) // 3, make=make,
+    )  # fmt: skip
+
+
+def training_files(recordings: Sequence[Recording], seed: int) -> set[str]:
+    """Names of `LOG_TRAIN_SHARE` of the cool recordings, drawn by the seed.
+
+    Raises:
+        FleetError: a recording has no temperatures, too few are cool, or none is left to test on.
+    """
+    cool = []
+    for r in recordings:
+        if r.temp_c is None:
+            raise FleetError(f"'{r.name}' has no motor temperatures; leave it out, or log temp_c.")
+        if r.temp_c[:, LOADED_JOINT].max(initial=-np.inf) < LOG_HOT_C:
+            cool.append(r.name)
+    count = round(LOG_TRAIN_SHARE * len(cool))
+    if not 0 < count < len(recordings):
+        raise FleetError(
+            f"{len(cool)} of {len(recordings)} logs stay below {LOG_HOT_C:g} °C on joint {LOADED_JOINT + 1}: to train "
+            f"on {LOG_TRAIN_SHARE:.0%} of them and test on the rest needs at least two; add logs of light work."
+        )
+    return {cool[i] for i in np.random.default_rng(seed).permutation(len(cool))[:count]}
+
+
+# Error by epochs.
+
+
+def epoch_study(
+    jobs: Sequence[Sequence[Array]],
+    tested: Array,
+    *,
+    epochs: Sequence[int],
+    seeds: Sequence[int],
+    config: TwinConfig,
+    records: int,
+    workers: int = -1,
+) -> tuple[Array, Array]:
+    """Mean |error| of a new twin for every number of epochs and seed, z units; each seed draws the jobs of its record.
+
+    Args:
+        jobs: Profiles [time, 3, joint] of the phases of each job, all cool; at least twice `records` of them.
+        tested: Further windows, [window, time, joint, channel].
+        epochs: 0 gives the initial weights.
+        config: Of the twins; one restart, because the paper has none. A collapse is a result too.
+        records: Jobs that make up a record.
+        workers: Processes, -1 for one per core; the result does not depend on it.
+
+    Returns:
+        Mean over the windows of the training record and over those of other jobs, [2, seed, epochs, joint, channel],
+        and of each test window the sum over the channels, [seed, epochs, window, joint].
+
+    Raises:
+        ValueError: too few jobs, or no epochs or seeds.
+    """
+    if records < 1 or len(jobs) < 2 * records:
+        raise ValueError(f"The epoch table needs {2 * max(records, 1)} cool jobs or more (got {len(jobs)}).")
+    if not epochs or not seeds or min(epochs) < 0:
+        raise ValueError(f"The epoch table needs seeds, and epochs >= 0 (got {seeds!r}, {epochs!r}).")
+    base = replace(config, restarts=1, allow_collapse=True)
+    # Longest first, so that no core ends with a long training alone.
+    tasks = sorted(product(range(len(seeds)), range(len(epochs))), key=lambda task: -epochs[task[1]])
+    cells = (delayed(_cell)(jobs, tested, base, epochs[e], seeds[s], records) for s, e in tasks)
+    with worker_processes(min(len(tasks), cpu_count()) if workers < 0 else workers, in_order=True) as pool:
+        results: dict[tuple[int, int], Any] = dict(zip(tasks, pool(cells), strict=True))  # joblib has no types
+    known, new = (np.array([[results[s, e][k] for e in range(len(epochs))] for s in range(len(seeds))]) for k in (0, 1))
+    return np.moveaxis(known, 2, 0), new
+
+
+def _cell(
+    jobs: Sequence[Sequence[Array]], tested: Array, config: TwinConfig, epochs: int, seed: int, records: int
+) -> tuple[Array, Array]:
+    """Errors [trained on/held out, joint, channel] and [window, joint]."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
+    chosen = rng.permutation(len(jobs))
+    record, others = (
+        [phase for i in some for phase in jobs[i] if len(phase)]
+        for some in (chosen[:records], chosen[records : 5 * records])
+    )
+    config = replace(config, epochs=epochs) if epochs else untrained_config(config)
+    twin = train(record, config, np.random.SeedSequence(seed), arm="epochs")
+    errors = [twin.window_errors(windows_of(part, config)).mean(axis=0) for part in (record, others)]
+    return np.stack(errors), twin.window_errors(tested).sum(axis=-1)
+
+
+# Chapters, in the order of the paper.
+
+
+def data_chapter(subjects: Sequence[Subject], size: Size) -> Section:
+    """Training motion, and a hot recording."""
+    s = subjects[0]
+    config, hot = s.twin.config, s.examples[1]
+    gap = np.full((1, len(CHANNELS)), np.nan)
+    parts = [resample(each, config.record_hz, config.rate_hz)[:, :, s.joint] for each in s.trained_on]
+    seen = s.motion(hot)[:, :, s.joint]
+    train = np.concatenate([piece for part in parts if len(part) for piece in (part, gap)])[: len(seen)]
+    load = [np.sqrt(np.square(np.concatenate(s.trained_on)[:, TAU], dtype=float).mean(axis=0))]
+    load += [np.sqrt(s.features.torque_sq[s.kind == kind].mean(axis=0)) for kind in (COOL, HOT)]
+    cells: Cells = {}
+    for c in range(3):
+        cells[c, 0] = [_line(train[:, c], config.rate_hz, "training data", BLUE)]
+        cells[c, 1] = [_line(seen[:, c], config.rate_hz, "hot recording", ORANGE)]
+    ratio = load[2][s.joint] / load[0][s.joint]
+    names = ("training data", f"cool {s.item}s", f"hot {s.item}s")
+    rows = [(name, *(f"{v:.2f}" for v in row)) for name, row in zip(names, load, strict=True)]
+    return Section(
+        sentences=(f"RMS torque of joint {s.joint + 1}: {ratio:.1f} times as large in hot {s.item}s as in training.",),
+        how=f"{s.how} Left: joint {s.joint + 1} in the first of {len(s.trained_on)} training records, one after "
+        f"another. Right: {s.names[hot]}, a typical hot recording (see Reconstruction).",
+        charts=_charts("data", cells, x="time (s)", y=CHANNEL_LABELS, heads=("training data", "hot"), shared=True),
+        tables=(Table(head=("RMS torque, N·m", *_joints(len(load[0]))), rows=tuple(rows)),),
+        numbers={"rms_torque_nm": load, "records": len(s.trained_on)},
+    )  # fmt: skip
+
+
+def latent_chapter(subjects: Sequence[Subject], size: Size) -> Section:
+    """The latent plane of the joint, of the twin and of the untrained network."""
+    s, cells, values = subjects[0], Cells(), dict[str, float]()
+    known = windows_of(s.trained_on, s.twin.config)
+    for column, (name, twin) in enumerate((("twin", s.twin), ("untrained network", s.untrained))):
+        mu = twin.posterior(s.windows)[0][:, min(s.joint, len(twin.nets) - 1)]
+        features = twin.window_features(known)
+        distance = Calibration(features, np.zeros(len(known), int)).latent(twin.window_features(s.windows))
+        values[f"latent distance, {name}"] = auroc(s.window_hot, distance[:, s.joint])
+        cells[0, column] = [
+            {"type": "scatter", "mode": "markers", "x": _plain(mu[kind, 0]), "y": _plain(mu[kind, 1]), "name": label}
+            | {"marker": {"color": colour, "size": 4, "opacity": 0.6}}
+            for kind, label, colour in ((~s.window_hot, s.kinds[COOL], BLUE), (s.window_hot, s.kinds[HOT], ORANGE))
+        ]
+    values["RMS torque"] = auroc(s.window_hot, np.square(s.windows[:, :, s.joint, TAU], dtype=float).mean(axis=1))
+    first, other, torque = values.values()
+    rows = tuple((name, f"{value:.3f}") for name, value in values.items())
+    return Section(
+        sentences=(
+            f"The distance from the training cluster tells hot from cool windows with AUROC {first:.2f}; in the latent "
+            f"space of an untrained network {other:.2f}, by RMS torque of the window {torque:.2f}.",
+        ),
+        how=f"Posterior means of {len(s.windows)} test windows under the network of joint {s.joint + 1}. The distance "
+        "is that of Mahalanobis from the means of the training windows.",
+        charts=_charts("latent", cells, x="μ₁", y=("μ₂",), heads=("twin", "untrained network"), height=420),
+        tables=(Table(head=("hot against cool windows", "AUROC"), rows=rows),),
+        numbers={"auroc": values},
+    )  # fmt: skip
+
+
+def reconstruction_chapter(subjects: Sequence[Subject], size: Size) -> Section:
+    """A whole cool and a whole hot recording, and their reconstructions in the unit of each channel."""
+    s, cells, rows, errors = subjects[0], Cells(), list[tuple[str, ...]](), dict[str, Array]()
+    for column, (kind, i) in enumerate(zip(("cool", "hot"), s.examples, strict=True)):
+        motion, rate_hz = s.motion(i), s.twin.config.rate_hz
+        made = {name: reconstruct(twin, motion) for name, twin in (("twin", s.twin), ("untrained", s.untrained))}
+        for c in range(3):
+            cells[c, column] = [_line(made["twin"][0][:, c, s.joint], rate_hz, "recorded", GREY)]
+            cells[c, column] += [
+                _line(made[name][1][:, c, s.joint], rate_hz, f"reconstructed, {name}", colour, dash)
+                for name, colour, dash in (("untrained", GREEN, "dot"), ("twin", BLUE, "solid"))
+            ]
+        for name, (recorded, again) in made.items():
+            errors[f"{kind}, {name}"] = np.abs(recorded - again)[:, :, s.joint].mean(axis=0)
+        torque = float(np.sqrt(np.square(motion[:, TAU, s.joint]).mean()))
+        typical_of = np.median(s.recorded.errors[s.recorded_hot == bool(column), s.joint], axis=0)
+        rows.append((f"{kind}: {s.names[i]}", *(f"{e:.3g}" for e in errors[f"{kind}, twin"]), f"{torque:.1f}"))
+        rows.append(("the same, untrained network", *(f"{e:.3g}" for e in errors[f"{kind}, untrained"]), ""))
+        rows.append((f"median of all {kind} ones", *(f"{e:.3g}" for e in typical_of * s.twin.scaler.std[s.joint]), ""))
+    cool, hot = (errors[f"{kind}, twin"][TAU] for kind in ("cool", "hot"))
+    return Section(
+        sentences=(f"Mean error of the torque of joint {s.joint + 1}: {cool:.2f} N·m cool, {hot:.2f} N·m hot.",),
+        how="Decoded from the posterior mean, window by window without overlap. Each example is the recording whose "
+        "errors are nearest the median of its kind in all three channels.",
+        charts=_charts("reconstruction", cells, x="time (s)", y=CHANNEL_LABELS, heads=("cool", "hot"), shared=True),
+        tables=(Table(head=("mean |error|", *ERROR_HEADS, "RMS torque, N·m"), rows=tuple(rows)),),
+        numbers={"mean_error_si": errors, "examples": [s.names[i] for i in s.examples]},
+    )  # fmt: skip
+
+
+def reconstruct(twin: Twin, motion: Array) -> tuple[Array, Array]:
+    """Motion [time, 3, joint] near the training data in whole turns, and its reconstruction, both [time, 3, joint]."""
+    window = twin.config.window
+    windows, first = cut(motion, window, window), starts(len(motion), window, window)
+    result = []
+    for values in (twin.scaler.to_si(twin.scaler.to_z(windows)), twin.reconstruct(windows)):
+        whole = np.zeros((max(len(motion), window), *motion.shape[1:]))
+        for start, samples in zip(first, values.transpose(0, 1, 3, 2), strict=True):
+            whole[start : start + window] = samples
+        result.append(whole[: len(motion)])
+    return result[0], result[1]
+
+
+def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Section:
+    """Difficulty of cool and hot items, and how well it tells them apart, for each seed."""
+    s = subjects[0]
+    d, cells, rows = s.features.difficulty, Cells(), list[tuple[str, ...]]()
+    total = d @ s.twin.joint_weight
+    for kind, colour in ((COOL, BLUE), (BETWEEN, GREY), (HOT, ORANGE)):
+        chosen = s.kind == kind
+        if chosen.any():
+            name = f"{s.kinds[kind]} ({chosen.sum()} {s.item}s)"
+            quantiles = {n: np.percentile(d[chosen], q, axis=0) for n, q in QUANTILES.items()}
+            cells.setdefault((0, 0), []).append(
+                {"type": "box", "x": _joints(d.shape[1]), "name": name, "marker": {"color": colour}}
+                | {n: _plain(v) for n, v in quantiles.items()}
+            )
+            medians = (*np.median(d[chosen], axis=0), np.median(total[chosen]))
+            rows.append((f"median, {name}", *(f"{v:.3f}" for v in medians)))
+    for name, i in zip(("cool", "hot"), s.examples, strict=True):
+        own = s.recorded.difficulty[i]
+        rows.append((f"the {name} example", *(f"{v:.3f}" for v in (*own, own @ s.twin.joint_weight))))
+    ranks = [{name: auroc(each.kind == HOT, v) for name, v in each.scores().items()} for each in subjects]
+    by_name = {name: [rank[name] for rank in ranks] for name in ranks[0]}
+    first, *_, torque, other = by_name
+    ours, theirs = spread(by_name[first]), spread(by_name[torque])
+    return Section(
+        sentences=(
+            f"Hot against all other {s.item}s: {first} has AUROC {ours}, RMS torque {theirs}, the untrained network "
+            f"{spread(by_name[other])}.",
+        ),
+        how="d_k = 1 − exp(−e_k), e_k the mean absolute error of joint k summed over the channels; d is their sum with "
+        f"the weights of the twin. {len(subjects)} seeds, mean ± standard deviation; figure: the first.",
+        charts=_charts("difficulty", cells, x="", y=("d of the joint",), heads=("",), height=420),
+        tables=(
+            Table(head=("", *_joints(d.shape[1]), "d"), rows=tuple(rows)),
+            Table(
+                head=(f"hot against all other {s.item}s", "AUROC"),
+                rows=tuple((name, spread(values)) for name, values in by_name.items()),
+            ),
+        ),
+        numbers={"auroc": by_name},
+    )  # fmt: skip
+
+
+def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Section:
+    """Reconstruction error against epochs, and how well the error then tells hot from cool."""
+    s = subjects[0]
+    upto = slice(s.joint + 1)  # Further joints would only take time: each has a network of its own.
+    jobs = [[phase[:, :, upto] for phase in job] for job in s.cool_jobs]
+    few = _few(s.window_hot, size.windows // 4)
+    windows, hot, seeds = s.windows[few], s.window_hot[few], tuple(range(size.epoch_seeds))
+    how = {"epochs": size.epochs, "seeds": seeds, "records": s.epoch_records}
+    errors, tested = epoch_study(jobs, windows[:, :, upto], config=s.twin.config, **how)
+    of_joint: dict[str, Array] = dict(zip(("trained on", "held out"), errors[:, :, :, s.joint], strict=True))
+    ranks = np.array([[auroc(hot, each[:, s.joint]) for each in row] for row in tested])
+    torque = auroc(hot, np.square(windows[:, :, s.joint, TAU], dtype=float).mean(axis=1))
+    x, cells = [f"{n}" if n else "untrained" for n in size.epochs], Cells()
+    for c in range(3):
+        cells[0, c] = [_over_epochs(x, of_joint[kind][:, :, c], kind, colour) for kind, colour in EPOCH_COLOURS]
+    cells[0, 3] = [_over_epochs(x, ranks, "error of the test windows", ORANGE)]
+    cells[0, 3].append(_over_epochs(x, np.full((1, len(x)), torque), "RMS torque", GREEN))
+    held_out = of_joint["held out"].mean(axis=0)
+    left = held_out[-1] / held_out[0]
+    rows = [
+        (f"{name}, {kind}", *(spread(seeds_of, 2) for seeds_of in values[:, :, c].T))
+        for c, name in enumerate(CHANNEL_NAMES)
+        for kind, values in of_joint.items()
+    ]
+    rows += [("AUROC, hot test windows", *(spread(v, 2) for v in ranks.T))]
+    rows += [("the same by RMS torque", *(f"{torque:.2f}" for _ in x))]
+    shares = ", ".join(f"{share:.0%} for {name}" for name, share in zip(CHANNEL_NAMES, left, strict=True))
+    return Section(
+        sentences=(
+            f"After {x[-1]} epochs the error on held-out motion, relative to the first column, is {shares}. AUROC of "
+            f"the error on hot windows: {spread(ranks[:, 0], 2)} in the first column, {spread(ranks[:, -1], 2)} after "
+            f"{x[-1]} epochs; RMS torque {torque:.2f}.",
+        ),
+        how=f"A separate training for each number of epochs and each of {len(seeds)} seeds, on a record of "
+        f"{s.epoch_records} cool {s.item}s; other cool {s.item}s are held out. Joint {s.joint + 1}; errors in standard "
+        "deviations of the training data, mean ± standard deviation over the seeds.",
+        charts=_charts("epochs", cells, x="epochs", y=("mean |error| (σ)",), heads=(*CHANNEL_NAMES, "AUROC, hot")),
+        tables=(Table(head=("mean |error|, σ", *x), rows=tuple(rows)),),
+        numbers={"epochs": size.epochs, **of_joint, "auroc": ranks, "auroc_rms_torque": torque},
+    )  # fmt: skip
+
+
+def generation_chapter(subjects: Sequence[Subject], size: Size) -> Section:
+    """Motion that the twin generates near its training data."""
+    s, cells = subjects[0], {(row, column): [] for row in range(2) for column in range(2)}
+    networks = (("twin", s.twin, size.strengths), ("untrained network", s.untrained, size.strengths[1:2]))
+    made = [s.make(name, twin, strength, size.generated) for name, twin, all_of in networks for strength in all_of]
+    rows = []
+    for each in made:
+        load = [np.sqrt(np.mean([np.square(pair[k][:, TAU, s.joint]).mean() for pair in each.pairs] or [np.nan]))
+                for k in (0, 1)]  # fmt: skip
+        cool = float("nan") if each.cool_share is None else each.cool_share
+        numbers = (f"{each.distance_rad:.3f}", f"{load[0]:.1f}", f"{load[1]:.1f}", f"{cool:.0%}")
+        texts = (value.replace("nan%", "–").replace("nan", "–") for value in numbers)
+        rows.append((f"{each.network}, s = {each.strength:g}", each.outcome, *texts))
+        column = int(each.network != "twin")
+        for source, motion in each.pairs[:1] if each.strength == size.strengths[1] else ():
+            for row, c in enumerate((0, TAU)):
+                cells[row, column] = [
+                    _line(motion[:, c, s.joint], each.rate_hz, "generated", GREEN if column else BLUE),
+                    _line(source[:, c, s.joint], each.rate_hz, "source", GREY, "dot"),
+                ]
+    ours = [each for each in made if each.network == "twin"]
+    far = ", ".join(f"{each.distance_rad:.2f} rad at s = {each.strength:g}" for each in ours)
+    known = [each.cool_share for each in ours if each.cool_share is not None]
+    sentences = [f"RMS distance of the positions from the source: {far}."]
+    how = "A log has no model of its arm: position and torque are shown as decoded, and nothing is verified."
+    if known:
+        sentences.append(f"{np.mean(known):.0%} of the accepted motions truly stay cool.")
+        how = (
+            "Torque follows from inverse dynamics. Accepted motions are inside the limits, predicted to stay cool and "
+            "executed in MuJoCo; the true motors are only measured."
+        )
+    head = ("network", "result", "distance, rad", "RMS torque of source, N·m", "of motion, N·m", "truly cool")
+    return Section(
+        sentences=tuple(sentences),
+        how=f"Latents of cool motion are perturbed, mu + s·eps·sigma, and decoded. {how} The figure shows the first "
+        f"motion at s = {size.strengths[1]:g}.",
+        charts=_charts(
+            "generation", cells, x="time (s)", y=CHANNEL_LABELS[::2], heads=("twin", "untrained network"), shared=True
+        ),
+        tables=(Table(head=head, rows=tuple(rows)),),
+        numbers={"made": [vars(each) | {"pairs": len(each.pairs)} for each in made]},
+    )
+
+
+# Charts.
+
+
+def _plain(values: Array) -> list[float | None]:
+    """Numbers with four digits, as JSON allows them."""
+    return [float(f"{v:.4g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
+
+
+def _joints(count: int) -> list[str]:
+    return [f"joint {j + 1}" for j in range(count)]
+
+
+def _line(values: Array, rate_hz: float, name: str, colour: str, dash: str = "solid") -> dict[str, Any]:
+    """A curve over time from samples [time]."""
+    every = max(1, len(values) // MOST_POINTS)
+    line = {"color": colour, "width": 1.3, "dash": dash}
+    points = {"x": _plain(np.arange(len(values))[::every] / rate_hz), "y": _plain(values[::every])}
+    return {"type": "scatter", "mode": "lines", "name": name, "line": line, **points}
+
+
+def _over_epochs(x: Sequence[str], y: Array, name: str, colour: str) -> dict[str, Any]:
+    """The mean over the seeds of y [seed, epochs], with the standard deviation as bars."""
+    bars = {"type": "data", "array": _plain(y.std(axis=0, ddof=1)), "thickness": 1} if len(y) > 1 else None
+    look = {"mode": "lines+markers", "line": {"color": colour}, "marker": {"size": 5}, "error_y": bars}
+    return {"type": "scatter", "x": list(x), "y": _plain(y.mean(axis=0)), "name": name, **look}
+
+
+def _charts(
+    key: str, cells: Cells, *, x: str, y: Sequence[str], heads: Sequence[str], height: int = 0, shared: bool = False
+) -> tuple[Chart, ...]:
+    """A grid of panels as the chart of a section.
+
+    Args:
+        key: Of the section.
+        x: Title of the x axes, below the last row.
+        y: Titles of the y axes of the first column.
+        heads: Titles of the columns.
+        shared: Give the panels of a row the same y axis.
+        height: Pixels; by default by the number of rows.
+    """
+    rows, columns = (1 + max(place[axis] for place in cells) for axis in (0, 1))
+    layout: dict[str, Any] = LAYOUT | {
+        "grid": {"rows": rows, "columns": columns, "pattern": "independent", "xgap": 0.12, "ygap": 0.16},
+        "height": height or 150 + 170 * rows,
+        "margin": {"l": 60, "r": 20, "t": 80, "b": 50},
+        "boxmode": "group",
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yref": "container", "yanchor": "top"},
+        "annotations": [],
+    }
+    data, named = list[dict[str, Any]](), set[str]()
+    for (row, column), traces in sorted(cells.items()):
+        n = row * columns + column + 1
+        number = "" if n == 1 else str(n)
+        layout[f"xaxis{number}"] = AXIS | {"title": {"text": x if row == rows - 1 else ""}}
+        if any(isinstance(value, str) for trace in traces for value in trace["x"][:1]):
+            layout[f"xaxis{number}"]["type"] = "category"
+        layout[f"yaxis{number}"] = AXIS | {"title": {"text": "" if column else y[row]}}
+        if shared and column:
+            layout[f"yaxis{number}"]["matches"] = f"y{n - column}" if n - column > 1 else "y"
+        if row == 0:
+            place = {"xref": f"x{number} domain", "yref": f"y{number} domain", "x": 0, "y": 1.02, "yanchor": "bottom"}
+            layout["annotations"].append({"text": heads[column], "showarrow": False, "xanchor": "left", **place})
+        for trace in traces:
+            axes = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
+            data.append(trace | axes | {"showlegend": trace["name"] not in named})
+            named.add(trace["name"])
+    alt = f"{', '.join(y)} by {x or 'joint'}: {', '.join(filter(None, heads)) or 'cool and hot'}"
+    return (Chart(key=f"chart_{key}", figure={"data": data, "layout": layout}, alt=alt),)
+
+
+# The report.
+
+CHAPTERS: tuple[tuple[str, str, Callable[[Sequence[Subject], Size], Section]], ...] = (
+    ("data", "Training data", data_chapter),
+    ("latent", "Latent map", latent_chapter),
+    ("reconstruction", "Reconstruction of whole recordings", reconstruction_chapter),
+    ("difficulty", "Difficulty, cool and hot", difficulty_chapter),
+    ("epochs", "Error by epochs", epochs_chapter),
+    ("generation", "Generated motion", generation_chapter),
+)
+
+
+def chapters_of(subjects: Sequence[Subject], size: Size, progress: Progress = quiet) -> list[Section]:
+    """Every chapter; one that cannot be computed gives the reason."""
+    chapters = []
+    for done, (key, title, compute) in enumerate(CHAPTERS):
+        progress("chapters", Count(done, len(CHAPTERS)))
+        try:
+            chapter = compute(subjects, size)
+        except (FleetError, ValueError) as error:
+            chapter = Section(failed=str(error))
+        chapters.append(replace(chapter, key=key, title=title))
+    return chapters
+
+
+def origin_of(subjects: Sequence[Subject]) -> dict[str, str]:
+    """Twins, data and version from which the figures of a page come."""
+    return {
+        "twins": ", ".join(each.twin.version for each in subjects),
+        "training data": subjects[0].twin.data_hash,
+        "test data": subjects[0].how,
+        "thermofleet": version("thermofleet"),
+    }
+
+
+def report_page(title: str, chapters: Sequence[Section], origin: Mapping[str, str]) -> str:
+    """The page as HTML text, which opens offline; the same input gives the same text."""
+    facts = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
+    return sections_page(title, LIMITS, [*chapters, Section(key="origin", title="Origin", tables=(facts,))])
+
+
+LIMITS = (
+    "d uses motion and torque alone. It ignores the temperatures at the start and the duration of a job; a thermal "
+    "network uses both. A high d means new motion or more load than usual, and only load heats.",
+    "Simulated temperatures are those of a thermal network whose absolute scale is known to ± 25 %.",
+)
+
+
+def write(chapters: Sequence[Section], origin: Mapping[str, str], folder: Path, title: str) -> dict[str, Any]:  # JSON
+    """Write page and numbers into an existing folder; returns the content of report.json.
+
+    `status` is finished even where chapters failed; `failed` gives the reasons.
+    """
+    (folder / PAGE).write_text(report_page(title, chapters, origin), encoding="utf-8")
+    card = {
+        "status": "finished",
+        "title": title,
+        "origin": dict(origin),
+        "failed": {each.key: each.failed for each in chapters if each.failed},
+        "chapters": {
+            each.key: {"title": each.title, "found": each.sentences, "how": each.how, "numbers": each.numbers}
+            | {"tables": [{"head": one.head, "rows": one.rows} for one in each.tables]}
+            for each in chapters
+        },
+    }
+    text = json.dumps(plain(card), indent=1, allow_nan=False) + "\n"
+    (folder / CARD).write_text(text, encoding="utf-8")
+    return card
+
+
+def plain(value: Any) -> Any:  # JSON
+    """Plain JSON values: NaN becomes null, NumPy scalars and arrays become numbers and lists."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    return None if isinstance(value, float) and not np.isfinite(value) else value
