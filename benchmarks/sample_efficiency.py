@@ -41,9 +41,9 @@ from scenarios.load import load
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.batch import library_of
 from scenarios.run.provenance import code_hash
-from scenarios.run.suite_batches import Act, returns
-from scenarios.run.train_policy import rule_actions
 from scenarios.studies.page_tables.sample_efficiency import course, trainings
+from scenarios.train.instances import Act, returns
+from scenarios.train.networks import rule_actions
 
 Array = np.ndarray
 Training = tuple[list[dict[str, float]], dict[str, Any]]
@@ -104,7 +104,7 @@ def train_here(algorithm: Any, seed: int, warm_start: str = "") -> Training:
     """PPO of `agents.learned`; 30 envs and 20 steps instead of 32 and 16, so that `EVERY` is a whole number of
     iterations."""
     from agents.learned.ppo import PpoConfig
-    from scenarios.run.train_policy import DEMONSTRATIONS, STEPS, TEACHERS, imitate_rule, trainer_of
+    from scenarios.train.networks import DEMONSTRATIONS, STEPS, TEACHERS, imitate_rule, trainer_of
 
     config = PpoConfig(algorithm=algorithm, envs=30, steps=20, warm_start=warm_start, seed=seed)
     cells, curve, hours = [cell()[1:]], Curve(), 0.0

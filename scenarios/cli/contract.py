@@ -34,7 +34,7 @@ def documents(out: Path) -> dict[Path, str]:
     from fleet.bus.protocol.asyncapi import asyncapi
     from fleet.bus.protocol.schemas import schema_document
     from scenarios.doc_tables import MARK, fill_tables
-    from scenarios.leaderboard.board import benchmark_tables
+    from scenarios.evaluate.leaderboard import benchmark_tables
     from scenarios.studies.page_tables.ablations import ablation_tables
     from scenarios.studies.page_tables.channels import channel_tables
     from scenarios.studies.page_tables.cooling import cooling_tables

@@ -52,14 +52,9 @@ COMMANDS = {
     "view": LazyCommand(_LOOK, "view:view_command", "Play a shift in MuJoCo's viewer."),
     "trace": LazyCommand(_LOOK, "scenarios.trace.command:trace_command", "Follow an event to its causes."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
-    "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of predictions under one policy."),
-    "bounds": LazyCommand(_POLICIES, "scenarios.bounds.command:bounds_command", "Bound the reward of shifts."),
-    "leaderboard": LazyCommand(
-        _POLICIES, "scenarios.leaderboard.command:leaderboard_command", "Print the leaderboard of a split."
-    ),
-    "submit-result": LazyCommand(
-        _POLICIES, "scenarios.leaderboard.command:submit_command", "Check a result and write the file to send."
-    ),
+    "bounds": LazyCommand(_POLICIES, "bounds:bounds_command", "Bound the reward of shifts."),
+    "leaderboard": LazyCommand(_POLICIES, "leaderboard:leaderboard_command", "Print the leaderboard of a split."),
+    "submit-result": LazyCommand(_POLICIES, "leaderboard:submit_command", "Check a result and write the file to send."),
     "cooling": LazyCommand(
         _POLICIES, "heat.cooling:cooling_command", "Compare ways of cooling motor, joint and fleet."
     ),

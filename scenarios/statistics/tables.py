@@ -8,9 +8,7 @@ import numpy as np
 from rich.table import Table
 from scipy.stats import trim_mean
 
-from scenarios.statistics.counts import count_interval, paired_counts, share_bounds
-from scenarios.statistics.holm import holm
-from scenarios.statistics.means import Interval, interval, paired
+from scenarios.evaluate.statistics import Interval, count_interval, holm, interval, paired, paired_counts, share_bounds
 
 Array = np.ndarray
 

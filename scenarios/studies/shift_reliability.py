@@ -12,12 +12,12 @@ from fleet.difficulty import SETTLING_S
 from fleet.engine.shift import StepRecord
 from fleet.events import Event
 from fleet.thermal import WINDING
+from scenarios.evaluate.sources import drawn
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import RISK, Fleet, RiskName, env_of, prepare
 from scenarios.prepare.known_cell import let_plan
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
-from scenarios.trials.cells import drawn
 from twin.saturation.reliability import Reliability, brier, reliability
 
 Array = np.ndarray

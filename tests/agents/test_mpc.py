@@ -18,8 +18,7 @@ from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.errors import FleetError
 from fleet.observation import Layout
 from fleet.robot import ThermalLimits
-from scenarios.bounds.exhaustive import optimum
-from scenarios.bounds.schedule import ShiftSimulator
+from scenarios.evaluate.hindsight import ShiftSimulator, optimum
 from scenarios.live.allocation import central_allocation
 from scenarios.load import load
 from scenarios.policy_loader import policy_of, without_simulator

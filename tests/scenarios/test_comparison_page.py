@@ -10,14 +10,14 @@ import pytest
 import typer
 
 from scenarios.cli import options
+from scenarios.evaluate.comparison import comparisons, scores_over_all
+from scenarios.evaluate.rollout import FIGURES, Outcome
+from scenarios.evaluate.scores import Shift
+from scenarios.evaluate.study import Case, Key, Row, Study
 from scenarios.load import load
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.run.evaluate import FIGURES, Outcome
-from scenarios.trials.plan import Case, Key, Row, Study
 from scenarios.trials.report.charts import points, spans
 from scenarios.trials.report.page import Judged, comparison_page, verdict
-from scenarios.trials.scores import Shift
-from scenarios.trials.summary import comparisons, scores_over_all
 
 REWARD = {"wspt": 10.0, "wsept": 14.0, "fifo": 6.0}
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from scenarios.evaluate.rollout import outcomes
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
-from scenarios.run.evaluate import outcomes
 from scenarios.studies.heat.cooling import STRATEGIES, fleet_rows, joint_rows, motor_rows
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
+from scenarios.evaluate.statistics import interval
 from scenarios.prepare.twin_folder import train_log
-from scenarios.statistics.means import interval
 from scenarios.studies.verdict.log_questions import QUESTIONS, Windows, answers, judged_windows
 from scenarios.studies.verdict.readings import ALPHA, JOINTS, MEASURES, SIZES, TOTALS, Errors, summary
 from scenarios.studies.verdict.sides import share_of

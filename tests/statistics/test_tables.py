@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from scenarios.statistics.holm import holm
-from scenarios.statistics.means import interval, paired
+from scenarios.evaluate.statistics import holm, interval, paired
 from scenarios.statistics.tables import EQUAL, add_block, empty_table, figures_of, remarks
 
 

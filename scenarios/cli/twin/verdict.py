@@ -14,7 +14,7 @@ from scenarios.result_folder import check_file, disk_errors
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
-    from scenarios.statistics.means import Interval
+    from scenarios.evaluate.statistics import Interval
     from twin.vae.measures import Features
     from twin.verdict.rule import Rule
 
@@ -156,8 +156,8 @@ def sides_command(
     import numpy as np
 
     from fleet.files import cache_folder
+    from scenarios.evaluate.statistics import Interval
     from scenarios.prepare.train_twins import train_or_load
-    from scenarios.statistics.means import Interval
     from scenarios.studies.setup import make_study
     from scenarios.studies.verdict.readings import SIZES
     from scenarios.studies.verdict.sides import COMMON_KG, sides

@@ -7,11 +7,11 @@ from pathlib import Path
 from fleet.heat.cooled_motor import ZHU_MOTOR, published
 from fleet.robot import Cooling
 from fleet.thermal import gen3_network, housing, in_series, winding
+from scenarios.evaluate.comparison import figures_of_shifts
+from scenarios.evaluate.rollout import Outcome, outcomes
 from scenarios.motion.hold import hold
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
-from scenarios.run.compare import figures_of_shifts
-from scenarios.run.evaluate import Outcome, outcomes
 from scenarios.schema import Scenario
 from scenarios.statistics.tables import Figure
 

@@ -5,8 +5,8 @@ from math import isfinite
 
 import numpy as np
 
+from scenarios.evaluate.statistics import interval
 from scenarios.report.page import Table
-from scenarios.statistics.means import interval
 from scenarios.studies.lifetime.arm_transfer import FURTHER, NOTHING, RESCALED, STARTS, Cell
 from scenarios.studies.lifetime.augmentation import DATA, NETWORK, REAL, Fitted
 from scenarios.studies.lifetime.drift import D_CAL, NEVER, NONE, P_VALUE, THERMAL, WATCHED, DriftSize, Life, delay_days

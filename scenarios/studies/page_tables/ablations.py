@@ -4,9 +4,10 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from scenarios.doc_tables import table
-from scenarios.run.compare import HEADINGS
-from scenarios.statistics.means import unit
+from scenarios.evaluate.comparison import HEADINGS
+from scenarios.evaluate.statistics import unit
 from scenarios.studies.page_tables.cells import difference
+from scenarios.studies.page_tables.stored_ablations import FIGURES, stored
 
 SCENARIOS = ("heat_wave", "active_waiting")
 WRAPPED = {"wspt": "wspt@blind", "wsept": "wsept@rc", "least_difficulty": "least_difficulty@blind"}
@@ -21,7 +22,7 @@ def ablation_tables(results: Path) -> dict[str, Callable[[], str]]:
 
     Args:
         results: With the folders `ablations/sources_SCENARIO`, `ablations/mpc_SCENARIO` and `twin_windows/SCENARIO` of
-            `thermofleet ablate --out`, for one or more of `SCENARIOS`.
+            `thermofleet compare --out`, for one or more of `SCENARIOS`.
     """
     sources, parts, windows = (
         {name: path for name in SCENARIOS if (path := results / each.format(name)).is_dir()}
@@ -85,18 +86,13 @@ def _table(folders: Mapping[str, Path], columns: Mapping[str, str]) -> str:
 
 def _sizes(folders: Mapping[str, Path]) -> str:
     """A line on the numbers of fleets, trainings and seeds."""
-    from scenarios.studies.ablation import stored_plan
-
-    plans = {name: stored_plan(folder)[1] for name, folder in folders.items()}
-    sizes = {name: unit((plan.fleets, plan.trainings, plan.seeds)) for name, plan in plans.items()}
+    sizes = {name: unit(stored(folder).shape) for name, folder in folders.items()}
     return "\n\n" + "; ".join(f"`{name}`: {size}" for name, size in sizes.items()) + "."
 
 
 def _rows(folder: Path, scores: tuple[str, ...]) -> Iterator[tuple[str, list[str]]]:
     """Heading and cells of every figure."""
-    from scenarios.studies.ablation import FIGURES, stored
-
-    effects = stored(folder, scores[0]).effects
+    effects = stored(folder).effects(scores[0])
     for name in FIGURES:
         digits = DIGITS.get(name, 1)
         cells = [f"{effects[scores[0]][name].mean:.{digits}f}"]

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenarios.doc_tables import table
-from scenarios.statistics.counts import paired_counts
-from scenarios.statistics.means import paired
+from scenarios.evaluate.statistics import paired, paired_counts
 from scenarios.studies.page_tables.cells import bold_if
 
 COLUMNS = {

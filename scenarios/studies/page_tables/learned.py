@@ -7,15 +7,13 @@ import numpy as np
 
 from agents.learned.training_log import read_log
 from scenarios.doc_tables import table
-from scenarios.leaderboard.board import BASELINE, SOURCE, read_all
-from scenarios.leaderboard.submission import Submission, split_references
+from scenarios.evaluate.leaderboard import BASELINE, SOURCE, Submission, read_all, split_references
+from scenarios.evaluate.scores import Normalised, Scores, normalised, ranked, scores_of
+from scenarios.evaluate.statistics import Interval
 from scenarios.policy_loader import trainings_of
-from scenarios.statistics.means import Interval
-from scenarios.statistics.scores import Normalised, Scores, ranked, scores_of
 from scenarios.studies.page_tables.cells import bold_if
 from scenarios.suite.cells import CELLS
 from scenarios.suite.splits import instance
-from scenarios.trials.scores import normalised
 
 Array = np.ndarray
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from agents.registry import RULES, WRAPPERS
 from scenarios.doc_tables import table
-from scenarios.run.compare import HEADINGS
+from scenarios.evaluate.comparison import HEADINGS
 from scenarios.studies.page_tables.cells import bold_if, difference, read_json, signed
 
 NAMED = ("faults", "value", "on_time", "reward", "hot_surface_min")

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from scenarios.doc_tables import table
+from scenarios.evaluate.statistics import Interval, interval
 from scenarios.json_rows import Row, Rows
-from scenarios.statistics.means import Interval, interval
 
 LABELS = {
     "random": "`random`",

@@ -9,8 +9,8 @@ from typing import Any  # JSON values
 import msgspec
 
 from scenarios.doc_tables import table
+from scenarios.evaluate.statistics import Interval
 from scenarios.json_rows import Rows
-from scenarios.statistics.means import Interval
 from scenarios.studies.page_tables.cells import read_json
 
 READING_HEADS = ("AUROC", "AUPRC", "Spearman", "overheating jobs found", "false alarms, new work", "before")

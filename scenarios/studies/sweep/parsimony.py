@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 
 from fleet.motion import RATE_HZ
+from scenarios.evaluate.statistics import mean_by_group
 from scenarios.json_rows import Row, Rows
 from scenarios.prepare.cool_motion import records
 from scenarios.progress import Count, Progress, quiet
-from scenarios.statistics.means import mean_by_group
 from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.detection_metrics import detection
 from scenarios.studies.ranking import LABELS, RANKING

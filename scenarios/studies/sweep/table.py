@@ -6,8 +6,8 @@ from functools import reduce
 
 import numpy as np
 
+from scenarios.evaluate.statistics import Interval, mean_by_group
 from scenarios.json_rows import Row
-from scenarios.statistics.means import Interval, mean_by_group
 from scenarios.studies.sweep.configurations import OURS, Configuration
 from scenarios.studies.sweep.subjects import arm_of
 

@@ -12,9 +12,8 @@ import numpy as np
 from sklearn.metrics import roc_auc_score
 
 from fleet.errors import FleetError
+from scenarios.evaluate.statistics import Interval, percentile_interval
 from scenarios.progress import Count, Progress, quiet
-from scenarios.statistics.means import Interval
-from scenarios.statistics.suites import percentile_interval
 from scenarios.studies.ranking import CARRIER
 from scenarios.studies.real_logs import CONFIG, HOT_C, LogStudy, recording_peaks, study_of
 from twin.logs.recording import READINGS, Recording

@@ -18,11 +18,11 @@ from sklearn.metrics import average_precision_score, roc_auc_score
 
 from fleet.errors import FleetError
 from fleet.files import atomic_path
+from scenarios.evaluate.statistics import Interval, mean_by_group
 from scenarios.prepare.train_twins import train_or_load
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import disk_errors
 from scenarios.schema import Scenario
-from scenarios.statistics.means import Interval, mean_by_group
 from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.setup import Sample, Study, make_study
 from scenarios.studies.sweep.subjects import arm_of

@@ -8,13 +8,12 @@ from typing import Any  # values of a card
 
 import numpy as np
 
+from scenarios.evaluate.comparison import HEADINGS, LEAST_DIGITS, Comparison
+from scenarios.evaluate.rollout import FIGURES
+from scenarios.evaluate.scores import HEADS, Normalised, Scores, ranked, score_cells, scores_of
+from scenarios.evaluate.statistics import LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.report.page import escape, html_page, paragraph, table
-from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison
-from scenarios.run.evaluate import FIGURES
-from scenarios.statistics.means import LEVEL, Interval
-from scenarios.statistics.scores import HEADS, Normalised, Scores, ranked, score_cells, scores_of
-from scenarios.statistics.suites import profile
 from scenarios.statistics.tables import EQUAL, LEGEND, Figure, remarks
 from scenarios.trials.report.charts import Range, lines, points, spans
 

@@ -11,7 +11,7 @@ from scenarios.cli.terminal import echo, out_console, print_json, progress_bar, 
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
-    from scenarios.leaderboard.submission import Submission
+    from scenarios.evaluate.leaderboard import Submission
 
 FOLDER = Path("docs/results/leaderboard")
 """Of the results in a checkout."""
@@ -33,9 +33,9 @@ def leaderboard_command(
     Every file is checked as by `thermofleet submit-result`. A failed shift counts
     as the mean of random. With --verify, repeated shifts must give equal figures.
     """
-    from scenarios.leaderboard.board import best_text, board_of, board_text, read_all, remark_text
+    from scenarios.evaluate.leaderboard import best_text, board_of, board_text, read_all, remark_text
+    from scenarios.evaluate.scores import score_tables
     from scenarios.load import SplitName
-    from scenarios.statistics.scores import score_tables
     from scenarios.statistics.tables import LEGEND
 
     split = choose("split", split, SplitName)
@@ -43,7 +43,7 @@ def leaderboard_command(
         raise FleetError(f"'{folder}' is no folder; give the folder of the results.")
     found = read_all(folder, split)
     if verify:
-        from scenarios.leaderboard.repeat import check_repeated
+        from scenarios.evaluate.leaderboard import check_repeated
 
         with progress_bar() as progress:
             for each in found:
@@ -82,9 +82,9 @@ def submit_command(
     from scenarios.extras import require_extra
 
     require_extra("report")
-    from scenarios.leaderboard.submission import check, read_card, split_references, submissions_of, write
+    from scenarios.evaluate.leaderboard import check, read_card, split_references, submissions_of, write
+    from scenarios.evaluate.store import read_rows
     from scenarios.policy_loader import label
-    from scenarios.trials.store import read_rows
 
     try:
         made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)

@@ -9,37 +9,33 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from fleet.errors import FleetError
-from scenarios.trials.plan import Row, Unit
-from scenarios.trials.run_unit import Settings, run_unit
+from scenarios.processes import Result, Work
 
 START_S = 60.0
-"""So long a CPU that another program uses is waited for."""
+"""Time to wait for a CPU that another program uses."""
 
 
 @ray.remote(num_cpus=1, max_restarts=0)
 class _Runner:
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-
     def ready(self) -> None:
         """Return when it runs."""
 
-    def run(self, unit: Unit) -> list[Row]:
-        return run_unit(unit, self._settings)
+    def run(self, work: Work[Any]) -> Any:
+        return work()
 
 
 class Cluster:
     """A Ray cluster, and how many actors of ours it has."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings, self._actors = ray.put(settings), 0
+    def __init__(self) -> None:
+        self._actors = 0
 
     def start(self) -> Any:  # Ray makes the class of an actor's handle
         """A new actor; None if every CPU has one."""
         if self._actors >= int(ray.cluster_resources().get("CPU", 0)):
             return None
         self._actors += 1
-        return _Runner.options(scheduling_strategy="SPREAD").remote(self._settings)
+        return _Runner.options(scheduling_strategy="SPREAD").remote()
 
     def stop(self, actor: Any) -> None:
         """End an actor, dead or not."""
@@ -64,12 +60,12 @@ class RayWorker:
         """What ends when the actor begins to run."""
         return self._actor.ready.remote()
 
-    def submit(self, unit: Unit) -> "Future[list[Row]]":
-        """Begin a unit."""
-        return self._actor.run.remote(unit).future()
+    def submit(self, work: Work[Result]) -> "Future[Result]":
+        """Begin a piece of work."""
+        return self._actor.run.remote(work).future()
 
     def died(self, error: BaseException) -> bool:
-        """Whether an error of a unit says that the actor died, or its machine."""
+        """Whether an error of its work says that the actor died, or its machine."""
         return isinstance(error, RayError) and not isinstance(error, RayTaskError)
 
     def renew(self) -> bool:
@@ -85,7 +81,7 @@ class RayWorker:
             self._actor = None
 
 
-def ray_workers(address: str, settings: Settings) -> list[RayWorker]:
+def ray_workers(address: str) -> list[RayWorker]:
     """An actor for each free CPU of a cluster.
 
     Raises:
@@ -97,9 +93,10 @@ def ray_workers(address: str, settings: Settings) -> list[RayWorker]:
         except (ConnectionError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise FleetError(
-                f"There is no Ray cluster at '{address}' ({reason}). Start one with `ray start --head`, or give --jobs."
+                f"There is no Ray cluster at '{address}' ({reason}). Start one with `ray start --head`, or give "
+                "--workers."
             ) from error
-    cluster = Cluster(settings)
+    cluster = Cluster()
     workers: list[RayWorker] = []
     while (worker := RayWorker(cluster)).started:
         workers.append(worker)

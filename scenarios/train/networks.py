@@ -24,10 +24,10 @@ from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
-from scenarios.run.suite_batches import Act, Ground, returns
-from scenarios.run.training_folder import NETWORK_STATE, check_folder, holds_training, skip_complete, write_card
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
+from scenarios.train.folder import NETWORK_STATE, check_folder, holds_training, skip_complete, write_card
+from scenarios.train.instances import Act, Ground, returns
 
 Array = np.ndarray
 

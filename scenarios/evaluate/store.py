@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 
 from fleet.errors import FleetError
 from fleet.files import atomic_path
+from scenarios.evaluate.rollout import FIGURES, Outcome
+from scenarios.evaluate.study import CARD, Key, Row, columns
 from scenarios.result_folder import disk_errors
-from scenarios.run.evaluate import FIGURES, Outcome
-from scenarios.trials.plan import CARD, Key, Row, columns
 
 RESULTS, PARTS = "results.parquet", "parts"
 MOST_PARTS = 500

@@ -11,8 +11,8 @@ from agents.learned.evolution import Evolution, EvolutionConfig
 from agents.learned.training_log import CURVE, TrainingLength, TrainingLog, read_log
 from agents.pair_scores import PARAMETERS, first_parameters, save_pairs
 from fleet.files import atomic_path
-from scenarios.run.suite_batches import Ground, rewards
-from scenarios.run.training_folder import PAIRS_STATE, check_folder, holds_training, skip_complete, write_card
+from scenarios.train.folder import PAIRS_STATE, check_folder, holds_training, skip_complete, write_card
+from scenarios.train.instances import Ground, rewards
 
 Array = np.ndarray
 

@@ -13,13 +13,23 @@ import numpy as np
 from joblib import delayed
 
 from agents.registry import RULES
-from fleet.errors import ScenarioError
+from fleet.errors import FleetError, ScenarioError
 from fleet.files import cache_folder
 from fleet.seeding import child
-from scenarios.bounds.hindsight import SIDE_BY_SIDE, Budget, hindsight
-from scenarios.bounds.relaxation import Relaxation
-from scenarios.bounds.schedule import Claim, Replay, ShiftSimulator, Simulated, without_scores
-from scenarios.bounds.upper import upper_bound
+from scenarios.evaluate.hindsight import (
+    SIDE_BY_SIDE,
+    Budget,
+    Claim,
+    Replay,
+    ShiftSimulator,
+    Simulated,
+    hindsight,
+    without_scores,
+)
+from scenarios.evaluate.rollout import DECISION_LIMIT_S, DecisionLimit
+from scenarios.evaluate.sources import Fleets, plan_content
+from scenarios.evaluate.study import suite_of
+from scenarios.evaluate.upper_bound import Relaxation, upper_bound
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import blaming, policy_at, policy_of
@@ -27,12 +37,9 @@ from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
 from scenarios.prepare.known_cell import simulator_of_shift
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
-from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit
 from scenarios.run.provenance import code_hash
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
-from scenarios.trials.fleets import Fleets, plan_content
-from scenarios.trials.plan import Case, Unit
 
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""
@@ -182,7 +189,7 @@ def references(
     *,
     difficulty: DifficultyName = "oracle",
     cache: Path | None = None,
-    jobs: int = 1,
+    workers: int = 1,
     policies: Sequence[str] = STARTS,
     progress: Progress = quiet,
 ) -> list[Reference]:
@@ -193,7 +200,7 @@ def references(
     names, whatever was computed first.
 
     Args:
-        jobs: Processes.
+        workers: Processes.
         policies: Those that the searches start from.
 
     Raises:
@@ -208,7 +215,7 @@ def references(
     first: dict[object, Task] = {}
     cells = [first.setdefault(plan_content(task.scenario), task) for task in left]
     order = [task for cell in first.values() for task, own in zip(left, cells, strict=True) if own is cell]
-    if jobs > 1:
+    if workers > 1:
         for task in first.values():
             _fleet_of(task, difficulty, folder, progress)  # so that no two processes plan the same motions
     work = (
@@ -217,7 +224,7 @@ def references(
     )
     done = len(tasks) - len(left)
     progress("bounding", Count(done, max(1, len(tasks))))
-    with worker_processes(max(1, min(jobs, len(left)))) as pool:
+    with worker_processes(max(1, min(workers, len(left)))) as pool:
         for new in pool(work):
             assert isinstance(new, Reference)
             rows.append(_key(new.instance, new.scenario_hash, new.seed, difficulty), asdict(new))
@@ -232,8 +239,7 @@ _fleets = Fleets()
 
 def _fleet_of(task: Task, difficulty: DifficultyName, folder: Path, progress: Progress = quiet) -> Fleet:
     """The prepared fleet of an instance; instances of one cell share it."""
-    case = Case(name=task.instance, scenario=task.scenario, seeds=(task.seed,))
-    return _fleets.of(Unit("", case, 0, 0, difficulty), RISK, folder, progress)
+    return _fleets.of(task.scenario, difficulty, RISK, folder, progress)
 
 
 def _bounded(
@@ -293,3 +299,52 @@ def load_references(path: Path, keys: Iterable[str] | None = None) -> list[Refer
 def _references_in(rows: Rows, keys: Iterable[str]) -> list[Reference]:
     with rows.readable():
         return msgspec.convert(rows.some(keys), list[Reference])
+
+
+def tasks_of(names: str, seeds: int, first_seed: int) -> list[Task]:
+    """What is to be bounded: a split, or names separated by commas. An instance has one seed."""
+    tasks: list[Task] = []
+    for case in suite_of(names, seeds, first_seed):
+        if "/" in case.name:
+            tasks.append(Task(case.name, case.scenario, case.seeds[0]))
+        else:
+            tasks += [Task(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
+    for i, task in enumerate(tasks):
+        if task.instance in {other.instance for other in tasks[:i]}:
+            raise FleetError(f"The instance '{task.instance}' is given twice.")
+    return tasks
+
+
+HEADS = ("instance", "random", "best start", "reward", "hindsight", "upper bound", "its score", "gap", "CPU s")
+
+
+def heads_of(references: Sequence[Reference]) -> tuple[str, ...]:
+    """Heads of the table of these references; that of times, the last one, only if times are known."""
+    return HEADS if any(each.seconds is not None for each in references) else HEADS[:-1]
+
+
+def cells(each: Reference) -> tuple[str, ...]:
+    """One line of the table."""
+    rewards = [f"{value:.1f}" for value in (each.best_rule, each.hindsight, each.upper)]
+    score = f"{each.normalised(each.best_rule):.3f}"
+    seconds = "" if each.seconds is None else f"{each.seconds:.0f}"
+    return each.instance, f"{each.random:.1f}", each.rule, *rewards, score, f"{each.gap:.3f}", seconds
+
+
+def reference_table(references: Sequence[Reference]) -> str:
+    """The table for a page, as Markdown: every instance, and the mean of each scenario."""
+    from scenarios.doc_tables import table  # loads the live fleet
+
+    lines: list[tuple[str, ...]] = []
+    for scenario in dict.fromkeys(each.instance.rpartition("/")[0] for each in references):
+        own = [each for each in references if each.instance.rpartition("/")[0] == scenario]
+        lines += [cells(each) for each in own]
+        figures = ("random", "best_rule", "hindsight", "upper")
+        random, *rewards = (f"**{sum(getattr(each, name) for each in own) / len(own):.1f}**" for name in figures)
+        score = sum(each.normalised(each.best_rule) for each in own) / len(own)
+        gap = sum(each.gap for each in own) / len(own)
+        times = [each.seconds for each in own if each.seconds is not None]
+        seconds = f"{sum(times) / len(times):.0f}" if times else ""
+        lines.append((f"**{scenario}**, mean", random, "", *rewards, f"**{score:.3f}**", f"**{gap:.3f}**", seconds))
+    heads = heads_of(references)
+    return table(heads, [line[: len(heads)] for line in lines])

@@ -1,4 +1,4 @@
-"""What a study runs: every policy on every instance, fleet, training and seed, with every source of scores."""
+"""What a study runs: every policy on every instance, fleet, training and seed, with every source of predictions."""
 
 import hashlib
 import platform
@@ -11,17 +11,18 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.errors import FleetError
+from fleet.errors import FleetError, nearest
 from fleet.seeding import child
-from scenarios.policy_loader import Unusable, label, policy_of, source_of, trainings_of
-from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
+from scenarios.evaluate.rollout import DECISION_LIMIT_S, FIGURES, DecisionLimit, Outcome, TooSlow
+from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, plan_content
+from scenarios.load import INSTANCE, SPLITS, library, load
+from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
+from scenarios.prepare.fleet import RISK, RiskName
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
-from scenarios.run.decision_limit import DECISION_LIMIT_S, DecisionLimit, TooSlow
-from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.run.provenance import code_hash
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
-from scenarios.trials.cells import plan_content
+from scenarios.suite.splits import Instance, instance, split
 
 CARD = "study.json"
 """File of a study with its plan, in the folder of its results."""
@@ -82,21 +83,25 @@ class Unit:
     """With the seeds of this unit only."""
     fleet: int
     training: int
-    difficulty: DifficultyName
+    difficulty: str
+    """Source of predictions."""
     played: str = ""
     """The policy itself, or the one of its trainings."""
     twins: int = 0
     """Training of the twins."""
     cell: int = field(default=-1, compare=False)
-    """Number of what its plans depend on, see `scenarios.trials.cells`; by default each instance is a cell."""
-    deaths: int = field(default=0, compare=False)
-    """How many processes died while they ran it."""
+    """Number of what its plans depend on (`scenarios.evaluate.sources.plan_content`); default: of each instance."""
 
     @property
     def keys(self) -> list[Key]:
         """The rows it gives."""
         of = (self.policy, self.case.name, self.fleet, self.training, self.difficulty)
         return [Key(*of, seed) for seed in self.case.seeds]
+
+    @property
+    def scenario(self) -> Scenario:
+        """With the draw of its arms."""
+        return drawn(self.case.scenario, self.fleet)
 
     @property
     def size(self) -> int:
@@ -114,12 +119,15 @@ class Study:
     """Policies, instances and everything that they are run with."""
 
     policies: Sequence[str]
+    """Each runs with every one of `difficulties`, but POLICY@SOURCE with that source alone."""
     cases: Sequence[Case]
     fleets: int = 1
     trainings: int = 1
-    """Only difficulty `twin` has trainings; the others have one."""
-    difficulties: Sequence[DifficultyName] = ("twin",)
+    """Of sources that are trained; the others have one."""
+    difficulties: Sequence[str] = ("twin",)
+    """Sources of predictions, see `scenarios.evaluate.sources`."""
     risk: RiskName = RISK
+    """Model of P(saturation) of the source `twin`."""
     randomise: Randomisation | None = None
     channel: Channel = PERFECT
     """Of scenarios that have no channel of their own."""
@@ -134,6 +142,11 @@ class Study:
             for i, name in enumerate(given):
                 if name in given[:i]:
                     raise FleetError(f"The {what} '{name}' is given twice; names must be unique.")
+        for source in self.difficulties:
+            check_source(source)
+        if len(set(self.pairs)) < len(self.pairs):
+            policy, source = next(pair for i, pair in enumerate(self.pairs) if pair in self.pairs[:i])
+            raise FleetError(f"The policy '{policy}@{source}' is given twice; names must be unique.")
         randomise = randomisation_of(self.randomise)
         for case in self.cases:
             randomise.scenarios_of(case.scenario)  # before the first shift, as an error of a late one comes late
@@ -158,11 +171,11 @@ class Study:
         cells: dict[object, int] = {}
         for case in self.cases:
             cell = cells.setdefault(plan_content(case.scenario), len(cells))
-            for difficulty in self.difficulties:
+            for difficulty, policies in self._policies_with.items():
                 for fleet in range(self.fleets):
-                    most = max(self.trainings_of(policy, difficulty) for policy in self.policies)
+                    most = max(self.trainings_of(policy, difficulty) for policy in policies)
                     for training in range(most):
-                        for policy in self.policies:
+                        for policy in policies:
                             if training >= self.trainings_of(policy, difficulty):
                                 continue
                             of = (policy, case.name, fleet, training, difficulty)
@@ -173,21 +186,47 @@ class Study:
                                 member, twins = (training, 0) if len(own) > 1 else (0, training)
                                 yield Unit(policy, part, fleet, training, difficulty, own[member], twins, cell)
 
+    @cached_property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Policy and source of predictions of everything that is compared."""
+        given = [split_source(name) for name in self.policies]
+        everywhere = ((policy, each) for each in self.difficulties for policy, source in given if source is None)
+        return (*everywhere, *((policy, source) for policy, source in given if source is not None))
+
+    @cached_property
+    def competitors(self) -> dict[tuple[str, str], str]:
+        """What a table calls each of `pairs`: POLICY, or POLICY@SOURCE if there are several sources."""
+        several = len(self._policies_with) > 1
+        return {(policy, source): f"{policy}@{source}" if several else policy for policy, source in self.pairs}
+
+    @cached_property
+    def _policies_with(self) -> dict[str, list[str]]:
+        """The policies that run with each source."""
+        found: dict[str, list[str]] = {}
+        for policy, source in self.pairs:
+            found.setdefault(source, []).append(policy)
+        return found
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The sources that are used."""
+        return tuple(self._policies_with)
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """Fleets, trainings and seeds of an instance: the order of a policy's rows."""
-        trainings = max(self.trainings_of(policy, each) for policy in self.policies for each in self.difficulties)
+        trainings = max(self.trainings_of(*pair) for pair in self.pairs)
         return self.fleets, trainings, len(self.cases[0].seeds)
 
     @cached_property
     def own_trainings(self) -> dict[str, tuple[str, ...]]:
         """The trainings of each policy, as they were when the study began; itself if it has none."""
-        return {policy: trainings_of(policy) for policy in self.policies}
+        return {policy: trainings_of(policy) for policy, _ in self.pairs}
 
     @cached_property
     def policy_hashes(self) -> dict[str, str]:
         """Of each policy, as its files were when the study began."""
-        return {policy: policy_hash(policy) for policy in self.policies}
+        return {policy: policy_hash(policy) for policy, _ in self.pairs}
 
     @property
     def channel_text(self) -> str:
@@ -200,10 +239,10 @@ class Study:
         """Of those policies that have trainings of their own."""
         return max(map(len, self.own_trainings.values()))
 
-    def trainings_of(self, policy: str, difficulty: DifficultyName) -> int:
-        """How many trainings a policy has with a source of scores: of its own, or else of the twins."""
+    def trainings_of(self, policy: str, source: str) -> int:
+        """How many trainings a policy has with a source of predictions: of its own, or else of the twins."""
         own = len(self.own_trainings[policy])
-        return self.trainings if own == 1 and difficulty == "twin" else own
+        return self.trainings if own == 1 and is_trained(source) else own
 
     @cached_property
     def card(self) -> dict[str, object]:
@@ -227,6 +266,19 @@ def _versions() -> Iterator[tuple[str, str | None]]:
             yield name, version(name)
         except PackageNotFoundError:
             yield name, None
+
+
+def split_source(name: str) -> tuple[str, str | None]:
+    """Policy and source of POLICY@SOURCE; a name without a source has None.
+
+    Raises:
+        FleetError: there is no such source of predictions.
+    """
+    policy, _, source = name.rpartition("@")
+    if not policy or (source not in ALL_SOURCES and (is_on_bus(name) or not source.replace("-", "").isalnum())):
+        return name, None  # also the router of a policy in another process, and a path with @
+    check_source(source)
+    return policy, source
 
 
 def check_policy(name: str, limit_s: float | None = None) -> None:
@@ -271,3 +323,53 @@ def columns(row: Row) -> dict[str, object]:
     """A row as columns: key, figures, illegal, error, trace."""
     figures = dict.fromkeys(FIGURES) if row.outcome is None else asdict(row.outcome)
     return {**row.key._asdict(), **figures, "illegal": row.illegal, "error": row.error, "trace": row.trace}
+
+
+MOST_NAMES = 3
+"""Instances of a suite that a title names each."""
+
+
+def cases_of(names: Sequence[str], seeds: int, first_seed: int = 0) -> list[Case]:
+    """Scenarios by library name or file, each with the same seeds, and instances, as `test/0017`, each with its own.
+
+    Raises:
+        FleetError: there is no such scenario, or two have one name.
+    """
+    found: list[Case] = []
+    for name in names:
+        if INSTANCE.fullmatch(name):
+            found.append(_case(instance(name), seeds))
+        else:
+            scenario = load(name)
+            found.append(
+                Case(name=scenario.name, scenario=scenario, seeds=tuple(range(first_seed, first_seed + seeds)))
+            )
+    return found
+
+
+def _case(instance: Instance, seeds: int) -> Case:
+    return Case(name=instance.name, scenario=instance.scenario, seeds=seeds_of_instance(instance.seed, seeds))
+
+
+def suite_of(name: str, seeds: int, first_seed: int = 0) -> list[Case]:
+    """The instances of a split, each with its own seed and others drawn from it; or names separated by commas.
+
+    Raises:
+        FleetError: there is no such split, instance or scenario.
+    """
+    if name in SPLITS:
+        return [_case(each, seeds) for each in split(name)]
+    names = [each.strip() for each in name.split(",")]
+    for each in names:
+        if not (INSTANCE.fullmatch(each) or each in library() or each.endswith(".toml")):
+            near = nearest(each, [*SPLITS, *library()])
+            raise FleetError(
+                f"No instances '{each}'{near} An instance of a split is named as test/0017; a split stands alone."
+            )
+    return cases_of(names, seeds, first_seed)
+
+
+def suite_label(name: str) -> str:
+    """What a table calls a suite: its name, or the first and the last of many instances."""
+    names = [each.strip() for each in name.split(",")]
+    return ", ".join(names) if len(names) <= MOST_NAMES else f"{names[0]} to {names[-1]}"

@@ -1,10 +1,9 @@
 """`thermofleet bounds`: random, best rule, hindsight and upper bound of shifts."""
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -12,9 +11,6 @@ from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
 from scenarios.schema_errors import choose
-
-if TYPE_CHECKING:  # slow to import
-    from scenarios.bounds.references import Reference, Task
 
 
 def bounds_command(
@@ -53,7 +49,7 @@ def bounds_command(
             show_default=False,
         ),
     ] = None,
-    jobs: Annotated[int, options.number("Number of processes.", 1, 1024)] = 1,
+    workers: Annotated[int, options.number("Number of processes.", 1, 1024)] = 1,
     difficulty: options.DifficultyOption = "oracle",
     out: Annotated[Path, typer.Option(help="File of the rows; finished ones are not computed again.")] = Path(
         "runs/bounds.jsonl"
@@ -70,8 +66,16 @@ def bounds_command(
     With --evaluations in place of --budget, a repetition gives the same file.
     """
     choose("format", format_, Literal["table", "markdown", "json"])
-    from scenarios.bounds.hindsight import Budget
-    from scenarios.bounds.references import STARTS, load_references, references
+    from scenarios.evaluate.hindsight import Budget
+    from scenarios.evaluate.references import (
+        STARTS,
+        cells,
+        heads_of,
+        load_references,
+        reference_table,
+        references,
+        tasks_of,
+    )
     from scenarios.policy_loader import scope_of
     from scenarios.prepare.fleet import DifficultyName
 
@@ -90,14 +94,14 @@ def bounds_command(
         policies = options.split_names(starts) if starts else STARTS
         for name in policies:
             scope_of(name)
-        chosen: Any = {"difficulty": source, "jobs": jobs, "policies": policies}
+        chosen: Any = {"difficulty": source, "workers": workers, "policies": policies}
         with progress_bar(kept="Finished rows are", file=out) as progress:
             found = references(tasks, out, limit, **chosen, progress=progress)
     if format_ == "json":
         print_json([asdict(each) | {"gap": each.gap, "rule_score": each.normalised(each.best_rule)} for each in found])
         return
     if format_ == "markdown":
-        echo(markdown(found))
+        echo(reference_table(found))
         return
     shown = plain_table(*heads_of(found))
     for each in found:
@@ -105,55 +109,3 @@ def bounds_command(
     out_console.print(shown)
     if not show_only:
         say(f"Written to {out}.")
-
-
-def tasks_of(names: str, seeds: int, first_seed: int) -> "list[Task]":
-    """What is to be bounded: a split, or names separated by commas. An instance has one seed."""
-    from scenarios.bounds.references import Task
-    from scenarios.trials.cases import suite_of
-
-    tasks: list[Task] = []
-    for case in suite_of(names, seeds, first_seed):
-        if "/" in case.name:
-            tasks.append(Task(case.name, case.scenario, case.seeds[0]))
-        else:
-            tasks += [Task(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
-    for i, task in enumerate(tasks):
-        if task.instance in {other.instance for other in tasks[:i]}:
-            raise FleetError(f"The instance '{task.instance}' is given twice.")
-    return tasks
-
-
-HEADS = ("instance", "random", "best start", "reward", "hindsight", "upper bound", "its score", "gap", "CPU s")
-
-
-def heads_of(references: "Sequence[Reference]") -> tuple[str, ...]:
-    """Heads of the table of these references; that of times, the last one, only if times are known."""
-    return HEADS if any(each.seconds is not None for each in references) else HEADS[:-1]
-
-
-def cells(each: "Reference") -> tuple[str, ...]:
-    """One line of the table."""
-    rewards = [f"{value:.1f}" for value in (each.best_rule, each.hindsight, each.upper)]
-    score = f"{each.normalised(each.best_rule):.3f}"
-    seconds = "" if each.seconds is None else f"{each.seconds:.0f}"
-    return each.instance, f"{each.random:.1f}", each.rule, *rewards, score, f"{each.gap:.3f}", seconds
-
-
-def markdown(references: "Sequence[Reference]") -> str:
-    """The table for a page: every instance, and the mean of each scenario."""
-    from scenarios.doc_tables import table
-
-    lines: list[tuple[str, ...]] = []
-    for scenario in dict.fromkeys(each.instance.rpartition("/")[0] for each in references):
-        own = [each for each in references if each.instance.rpartition("/")[0] == scenario]
-        lines += [cells(each) for each in own]
-        figures = ("random", "best_rule", "hindsight", "upper")
-        random, *rewards = (f"**{sum(getattr(each, name) for each in own) / len(own):.1f}**" for name in figures)
-        score = sum(each.normalised(each.best_rule) for each in own) / len(own)
-        gap = sum(each.gap for each in own) / len(own)
-        times = [each.seconds for each in own if each.seconds is not None]
-        seconds = f"{sum(times) / len(times):.0f}" if times else ""
-        lines.append((f"**{scenario}**, mean", random, "", *rewards, f"**{score:.3f}**", f"**{gap:.3f}**", seconds))
-    heads = heads_of(references)
-    return table(heads, [line[: len(heads)] for line in lines])
