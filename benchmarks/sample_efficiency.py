@@ -35,6 +35,7 @@ import torch
 
 from fleet.engine.reward import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs, random_legal
+from scenarios.evaluate.rollout import Act, rollout
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Rows
 from scenarios.load import load
@@ -42,7 +43,6 @@ from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.batch import library_of
 from scenarios.run.provenance import code_hash
 from scenarios.studies.page_tables.sample_efficiency import course, trainings
-from scenarios.train.instances import Act, returns
 from scenarios.train.networks import rule_actions
 
 Array = np.ndarray
@@ -86,7 +86,7 @@ class Curve:
     def add(self, env_steps: int, hours: float, act: Act) -> None:
         """Evaluate the policy after a number of env steps and simulated hours."""
         self._cpu_s += process_time() - self._since_s
-        reward = float(returns(self.env, act, SHIFTS).mean())
+        reward = float(rollout(self.env, self.env.reset(seed=list(SHIFTS))[0], act).mean())
         point = {"env_steps": env_steps, "hours": hours, "cpu_s": self._cpu_s, "reward": reward}
         self.points.append({name: round(value, 3) for name, value in point.items()})
         print(self.points[-1], flush=True)

@@ -82,12 +82,13 @@ def submit_command(
     from scenarios.extras import require_extra
 
     require_extra("report")
-    from scenarios.evaluate.leaderboard import check, read_card, split_references, submissions_of, write
-    from scenarios.evaluate.store import read_rows
+    from scenarios.evaluate.leaderboard import check, split_references, submissions_of, write
+    from scenarios.evaluate.store import read_card, read_rows
+    from scenarios.evaluate.study import SHIFTS
     from scenarios.policy_loader import label
 
     try:
-        made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
+        made: list[Submission] = submissions_of(read_card(results, SHIFTS), read_rows(results, SHIFTS), author, about)
     except (KeyError, TypeError, AttributeError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else f"has a value of another type ({error})"
         raise FleetError(f"'{results}' is damaged: its study.json {what}. Run the comparison again.") from error

@@ -325,24 +325,6 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
     return made
 
 
-def read_card(out: Path) -> dict[str, Any]:
-    """Content of a study's card (Any: JSON values).
-
-    Raises:
-        FleetError: it holds no study.
-    """
-    try:
-        card = json.loads((out / CARD).read_text(encoding="utf-8"))
-        if isinstance(card, dict):
-            return card
-        what = f"has a damaged {CARD}, which holds no object"
-    except ValueError as error:
-        what = f"has a damaged {CARD} ({error})"
-    except OSError:
-        what = "holds no study of `thermofleet compare --out`" if out.is_dir() else "is no folder"
-    raise FleetError(f"'{out}' {what}; give the folder of such a command.")
-
-
 BASELINE = "wsept"
 """Policy that differences refer to, with the scores of `SOURCE`; without it the last of the board."""
 SOURCE = "oracle"

@@ -6,8 +6,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
@@ -18,7 +18,8 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.env.lookahead import CellSimulator
 from fleet.env.validation import actions_of
-from fleet.env.vector import BatchEnv, Library
+from fleet.env.vector import BatchEnv, Library, Obs
+from fleet.observation import Observation
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.fleet import Fleet
@@ -119,13 +120,13 @@ def play(
     )
     obs, _ = env.reset()
     heat = HeatUse(env.temp_c, fleet.scenario.people.burn_c)
-    reward, running = np.zeros(len(seeds)), np.ones(len(seeds), dtype=bool)
+    running = np.ones(len(seeds), dtype=bool)
     results: dict[int, Played] = {}
     policies: dict[int, Policy] = {}
-    limit, dt_s = DecisionLimit(limit_s), library.tables.dt_s
+    limit, dt_s, tick = DecisionLimit(limit_s), library.tables.dt_s, 0
 
     @contextmanager
-    def guarded(e: int, time_s: float) -> Iterator[None]:
+    def guarded(e: int) -> Iterator[None]:
         """End the shift of an env whose policy fails."""
         try:
             with limit.decision():
@@ -133,52 +134,99 @@ def play(
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # whatever the policy raises
-            results[e], running[e] = Played(None, 0, error, time_s), False
+            results[e], running[e] = Played(None, 0, error, tick * dt_s), False
+
+    def after_step(reward: Array, ended: Array) -> None:
+        """Keep the figures of the shifts that have ended."""
+        nonlocal tick
+        tick += 1
+        heat.add(env.temp_c, dt_s)
+        if not ended.any():
+            return
+        state = env.state
+        for e in np.flatnonzero(ended).tolist():
+            shift = library.draw(np.random.SeedSequence(int(seeds[e])))
+            value = library.tables.value[shift.fleet, shift.kind]
+            found = Outcome(
+                **common_figures(state, e, value, shift.due_s, dt_s),
+                reward=float(reward[e]),
+                peak_c=float(state.peak_c[e].max()),
+                insulation_ppb=float(heat.insulation_ppb[e].max()),
+                tool_drift_mm=float(heat.tool_drift_mm[e].max()),
+                hot_surface_min=float(heat.hot_surface_min[e].sum()),
+            )
+            results[e] = Played(found, int(state.illegal[e].sum()))
 
     with limit.watching():
         for e, seed in enumerate(seeds):
-            with guarded(e, 0.0):
+            with guarded(e):
                 policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
         for e, each in policies.items():
             if isinstance(each, Planner):
                 cell = env.lookahead(_simulator(fleet), e)  # may compile, which is no time of the policy
-                with guarded(e, 0.0):
+                with guarded(e):
                     each.plan_in(cell)
-        only_when_asked = bool(policies) and only_choices(next(iter(policies.values())))
-        tick = 0
-        while running.any():
-            vectors, mask = obs["observation"], obs["action_mask"]
-            asked = running & mask[..., 1:-1].any(axis=(1, 2)) if only_when_asked else running
-            actions = np.full(mask.shape[:2], WAIT)
-            for e in np.flatnonzero(asked).tolist():
-                known = env.layout.read_each(env.agents, vectors[e], mask[e])
-                with guarded(e, tick * dt_s):
-                    actions[e] = actions_of(env.agents, policies[e].act(known))
-            obs, earned, finished, cut, _ = env.step(actions)
-            tick += 1
-            reward += earned
-            heat.add(env.temp_c, dt_s)
-            over = finished | cut
-            if not over.any():
-                continue
-            state = env.state
-            for e in np.flatnonzero(over & running).tolist():
-                shift = library.draw(np.random.SeedSequence(int(seeds[e])))
-                value = library.tables.value[shift.fleet, shift.kind]
-                found = Outcome(
-                    **common_figures(state, e, value, shift.due_s, dt_s),
-                    reward=float(reward[e]),
-                    peak_c=float(state.peak_c[e].max()),
-                    insulation_ppb=float(heat.insulation_ppb[e].max()),
-                    tool_drift_mm=float(heat.tool_drift_mm[e].max()),
-                    hot_surface_min=float(heat.hot_surface_min[e].sum()),
-                )
-                results[e] = Played(found, int(state.illegal[e].sum()))
-            running &= ~over
-            if running.any():
-                obs, _ = env.reset(rows=over)  # the policy is not called for these envs any more
+        rollout(env, obs, acts_of(env, policies, guarded), running=running, after_step=after_step)
     policies.clear()  # the traceback of an error keeps this frame, and a policy may have an open connection
     return [results[e] for e in range(len(seeds))]
+
+
+Act = Callable[[Obs, Array], Array]
+"""Actions, int [env, arm], of what the arms know and of the envs whose shift goes on, bool [env]."""
+AfterStep = Callable[[Array, Array], None]
+"""What is done after a step, with the reward so far [env] and the envs whose shift ended in it, bool [env]."""
+
+
+def rollout(
+    env: BatchEnv, obs: Obs, act: Act, *, running: Array | None = None, after_step: AfterStep | None = None
+) -> Array:
+    """Total reward of a shift of each env, [env].
+
+    Args:
+        obs: Of the reset that began the shifts.
+        running: Envs whose shift is played, bool [env]; one that `act` makes False in it ends early. Default: all.
+    """
+    reward, running = np.zeros(env.num_envs), np.ones(env.num_envs, dtype=bool) if running is None else running
+    while running.any():
+        obs, earned, terminated, truncated, _ = env.step(act(obs, running))
+        over = terminated | truncated
+        reward += np.where(running, earned, 0.0)
+        if after_step:
+            after_step(reward, over & running)
+        running &= ~over
+        if over.any() and running.any() and not env.autoreset:
+            obs, _ = env.reset(rows=over)
+    return reward
+
+
+def acts_of(
+    env: BatchEnv,
+    policies: Mapping[int, Policy],
+    guarded: Callable[[int], AbstractContextManager[None]] = lambda e: nullcontext(),
+) -> Act:
+    """The actions of one policy of a kind for each env; those that want to choose only are asked if there is a choice.
+
+    Args:
+        policies: By env, each at the beginning of its shift.
+        guarded: Context of the decision of an env.
+    """
+    only_when_asked = bool(policies) and only_choices(next(iter(policies.values())))
+
+    def act(obs: Obs, running: Array) -> Array:
+        mask = obs["action_mask"]
+        asked = running & mask[..., 1:-1].any(axis=(1, 2)) if only_when_asked else running
+        actions = np.full(mask.shape[:2], WAIT)
+        for e in np.flatnonzero(asked).tolist():
+            with guarded(e):
+                actions[e] = actions_of(env.agents, policies[e].act(known_in(env, e, obs)))
+        return actions
+
+    return act
+
+
+def known_in(env: BatchEnv, e: int, obs: Obs) -> dict[str, Observation]:
+    """What each arm of one env knows."""
+    return env.layout.read_each(env.agents, obs["observation"][e], obs["action_mask"][e])
 
 
 @lru_cache(maxsize=1)

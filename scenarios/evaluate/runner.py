@@ -19,7 +19,8 @@ from fleet.files import cache_folder
 from scenarios.evaluate import rollout
 from scenarios.evaluate.rollout import Outcome, Played, play
 from scenarios.evaluate.sources import Fleets, is_trained, plan_content
-from scenarios.evaluate.study import Key, Row, Study, Unit, policy_hash
+from scenarios.evaluate.store import opened
+from scenarios.evaluate.study import SHIFTS, Key, Row, Study, Unit, policy_hash
 from scenarios.extras import require_extra
 from scenarios.policy_loader import error_text, is_built_in
 from scenarios.prepare.fleet import Fleet, RiskName
@@ -246,9 +247,7 @@ def _opened(study: Study, out: Path | None) -> AbstractContextManager[Rows]:
     if out is None:
         return nullcontext(Memory())
     require_extra("report")
-    from scenarios.evaluate.store import opened
-
-    return opened(out, study.card)
+    return opened(out, SHIFTS, study.card)
 
 
 def _run(

@@ -2,11 +2,11 @@
 
 import hashlib
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from fleet.errors import FleetError, nearest
 from fleet.seeding import child
 from scenarios.evaluate.rollout import DECISION_LIMIT_S, FIGURES, DecisionLimit, Outcome, TooSlow
 from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, plan_content
+from scenarios.evaluate.store import RowKind
 from scenarios.load import INSTANCE, SPLITS, library, load
 from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.fleet import RISK, RiskName
@@ -323,6 +324,32 @@ def columns(row: Row) -> dict[str, object]:
     """A row as columns: key, figures, illegal, error, trace."""
     figures = dict.fromkeys(FIGURES) if row.outcome is None else asdict(row.outcome)
     return {**row.key._asdict(), **figures, "illegal": row.illegal, "error": row.error, "trace": row.trace}
+
+
+def row_of(found: Mapping[str, Any]) -> Row:
+    """The row of its columns."""
+    failed = found["error"] is not None
+    outcome = None if failed else Outcome(**{figure: found[figure] for figure in FIGURES})
+    return Row(Key(*(found[name] for name in Key._fields)), outcome, found["illegal"], found["error"], found["trace"])
+
+
+SHIFTS: RowKind[Key, Row] = RowKind(
+    work="study",
+    command="thermofleet compare --out",
+    card=CARD,
+    columns={
+        **Key.__annotations__,
+        **dict.fromkeys(FIGURES, float),
+        "illegal": int,
+        "error": str,
+        "trace": str,
+    },
+    key=lambda row: row.key,
+    values=columns,
+    row=row_of,
+    named={"instances": "instance", "policies": "policy"},
+)
+"""How a folder holds the rows of a study."""
 
 
 MOST_NAMES = 3

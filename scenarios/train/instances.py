@@ -1,6 +1,6 @@
 """Shifts of a split of the suite as batches, for a learner of scores of pairs: one batched environment per instance."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from agents.pair_scores import scores
 from agents.policy import WAIT
 from fleet.engine.reward import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs
+from scenarios.evaluate.rollout import rollout
 from scenarios.fault_price import weights_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
@@ -108,9 +109,9 @@ def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
     """
     env = BatchEnv(ground.library, len(seeds), weights=ground.weights, decisions="events")
 
-    def act(obs: Obs, over: Array) -> Array:
+    def act(obs: Obs, running: Array) -> Array:
         actions = np.full((len(seeds), ground.arms), WAIT)
-        asked = np.flatnonzero(~over & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
+        asked = np.flatnonzero(running & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
         if len(asked):
             seen = env.layout.read(obs["observation"][asked], obs["action_mask"][asked])
             score = scores(seen, parameters[asked])
@@ -119,20 +120,4 @@ def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
                     actions[asked[k], arm] = 1 + option
         return actions
 
-    return returns(env, act, seeds)
-
-
-Act = Callable[[Obs, Array], Array]
-"""Actions, int [env, arm], of what the arms know and of the envs whose shift is over, bool [env]: there they do not
-count."""
-
-
-def returns(env: BatchEnv, act: Act, seeds: Sequence[int]) -> Array:
-    """Total reward of the shift of each seed, [env]."""
-    obs, _ = env.reset(seed=list(seeds))
-    total, over = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
-    while not over.all():
-        obs, reward, terminated, truncated, _ = env.step(act(obs, over))
-        total += np.where(over, 0.0, reward)
-        over |= terminated | truncated
-    return total
+    return rollout(env, env.reset(seed=list(seeds))[0], act)

@@ -13,11 +13,12 @@ from agents.learned.imitation import imitate
 from agents.learned.policy import save_policy
 from agents.learned.ppo import PpoConfig, Trainer
 from agents.learned.training_log import CURVE, TrainingLength, TrainingLog, read_log
-from agents.policy import WAIT, Policy, only_choices
 from fleet.engine.reward import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
-from fleet.env.vector import BatchEnv, Library, Obs
+from fleet.env.validation import actions_of
+from fleet.env.vector import BatchEnv, Library
 from fleet.files import atomic_path
+from scenarios.evaluate.rollout import Act, acts_of, known_in, rollout
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
@@ -27,7 +28,7 @@ from scenarios.run.batch import library_of
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 from scenarios.train.folder import NETWORK_STATE, check_folder, holds_training, skip_complete, write_card
-from scenarios.train.instances import Act, Ground, returns
+from scenarios.train.instances import Ground
 
 Array = np.ndarray
 
@@ -142,7 +143,7 @@ class Judge:
 
     def reward(self, act: Act) -> float:
         """Mean reward of a shift, in its unit."""
-        return float((returns(self.env, act, self.seeds) / self.units).mean())
+        return float((rollout(self.env, self.env.reset(seed=list(self.seeds))[0], act) / self.units).mean())
 
 
 def _train(
@@ -254,33 +255,16 @@ def _demonstrations(env: BatchEnv, rule: str, count: int, progress: Progress) ->
         progress(f"imitating {rule}", Count(number, count))
         rows: list[tuple[Array, Array, Array]] = []
         for _ in range(STEPS):
-            actions = np.array([_actions_of(policy, env, obs, e) for e, policy in enumerate(policies)])
+            actions = np.array([actions_of(env.agents, p.act(known_in(env, e, obs))) for e, p in enumerate(policies)])
             rows.append((obs["observation"], obs["action_mask"], actions))
             obs, *_ = env.step(actions)
         vectors, masks, actions = (np.concatenate(part) for part in zip(*rows, strict=True))
         yield vectors.reshape(-1, vectors.shape[-1]), masks.reshape(-1, masks.shape[-1]), actions.reshape(-1)
 
 
-def _actions_of(policy: Policy, env: BatchEnv, obs: Obs, e: int) -> list[int]:
-    """Actions of a policy in one env, int [arm]."""
-    vectors, masks, read = obs["observation"][e], obs["action_mask"][e], env.layout.read
-    actions = policy.act({arm: read(vectors[a], masks[a]) for a, arm in enumerate(env.agents)})
-    return [actions[arm] for arm in env.agents]
-
-
 def rule_actions(rule: str, env: BatchEnv, seeds: Sequence[int]) -> Act:
     """Actions of a rule, one instance for each env, [env, arm]."""
-    policies = [policy_at(rule, seed) for seed in seeds]
-    when_asked = only_choices(policies[0])
-
-    def act(obs: Obs, over: Array) -> Array:
-        actions = np.full(obs["action_mask"].shape[:2], WAIT)
-        for e, policy in enumerate(policies):
-            if not over[e] and (not when_asked or obs["action_mask"][e, :, 1:-1].any()):
-                actions[e] = _actions_of(policy, env, obs, e)
-        return actions
-
-    return act
+    return acts_of(env, {e: policy_at(rule, seed) for e, seed in enumerate(seeds)})
 
 
 def draw_curves(folder: Path) -> None:

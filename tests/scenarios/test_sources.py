@@ -14,6 +14,7 @@ from scenarios.evaluate import runner
 from scenarios.evaluate.rollout import FIGURES
 from scenarios.evaluate.sources import _Inverted, _Random
 from scenarios.evaluate.store import read_rows
+from scenarios.evaluate.study import SHIFTS
 
 
 def plan(profile: np.ndarray) -> SimpleNamespace:
@@ -112,7 +113,7 @@ def rewards(thermofleet, file: Path, out: Path, names: Iterable[str]) -> dict[st
     done = thermofleet("compare", file, "--policies", ",".join(names), *how)
     assert done.code == 0, done.err
     found: dict[str, list[float]] = {}
-    for row in read_rows(out):
+    for row in read_rows(out, SHIFTS):
         assert row.outcome is not None
         found.setdefault(f"{row.key.policy}@{row.key.difficulty}", []).append(row.outcome.reward)
     return found
@@ -137,7 +138,7 @@ def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monk
     assert done.code == 0, done.err
     for name in ("wspt@blind", "wspt@random", "wspt@constant", "wspt@oracle", "round_robin@blind"):
         assert done.out.count(f"  {name} ") == 1 + len(FIGURES)  # its scope, and each figure
-    assert len(read_rows(out)) == 2 * 2 * (1 + 2 + 1 + 1 + 1)  # random numbers have two trainings
+    assert len(read_rows(out, SHIFTS)) == 2 * 2 * (1 + 2 + 1 + 1 + 1)  # random numbers have two trainings
     again = thermofleet(*call, "--seeds", 2, "--json")
     alone = thermofleet("compare", small_toml, "--policies", "round_robin", "--difficulty", "blind", *how, "--seeds", 2,
                         "--json")  # fmt: skip

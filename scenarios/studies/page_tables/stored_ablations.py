@@ -73,8 +73,9 @@ def stored(folder: Path) -> StoredAblation:
 
 def _of_study(folder: Path) -> StoredAblation:
     from scenarios.evaluate.store import read_rows
+    from scenarios.evaluate.study import SHIFTS
 
-    rows = read_rows(folder)
+    rows = read_rows(folder, SHIFTS)
     policies = {row.key.policy for row in rows}
     shifts = _by_name(
         (
