@@ -3,6 +3,9 @@
 import json
 import math
 
+from scenarios.evaluate.rollout import FIGURES, Outcome
+from scenarios.evaluate.store import opened
+from scenarios.evaluate.study import SHIFTS, Key, Row
 from scenarios.studies.page_tables.ablations import ablation_tables
 from scenarios.studies.page_tables.cells import difference
 from scenarios.studies.page_tables.cooling import cooling_tables
@@ -44,6 +47,22 @@ def test_an_ablation_has_means_and_differences_to_the_first_source(tmp_path) -> 
     assert value[4].startswith("+2.0")
     assert value[2:4] == ["–", "–"]  # sources that were not measured
     assert reward[1] == "7.0"
+    assert "`heat_wave`: 2 fleets × 2 seeds" in text
+
+
+def test_a_folder_of_compare_is_read_like_one_of_an_ablation(tmp_path) -> None:
+    folder = tmp_path / "ablations" / "mpc_heat_wave"
+    blank = dict.fromkeys(FIGURES, 0.0)
+    with opened(folder, SHIFTS, {"instances": {}, "policies": {}}) as store:
+        for policy, source, more in (("mpc", "rc", 2.0), ("wsept", "rc", 0.0)):
+            for fleet, seed in ((0, 5), (0, 6), (1, 5), (1, 6)):
+                outcome = Outcome(**blank | {"value": 10.0 * fleet + seed + more})
+                store.add([Row(Key(policy, "heat_wave", fleet, 0, source, seed), outcome)])
+    text = ablation_tables(tmp_path)["mpc_parts"]()
+    _, value, *_ = cells(text)
+    assert value[1] == "12.5"  # of 7, 8, 17 and 18
+    assert value[7].startswith("−2.0")
+    assert value[2:7] == ["–"] * 5
     assert "`heat_wave`: 2 fleets × 2 seeds" in text
 
 

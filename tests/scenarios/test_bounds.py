@@ -15,7 +15,7 @@ from fleet.env.random_actions import random_legal
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.evaluate import references as stored
-from scenarios.evaluate.hindsight import Budget, Replay, Schedules, ShiftSimulator, hindsight, optimum, without_scores
+from scenarios.evaluate.hindsight import Budget, Replay, Schedules, ShiftSimulator, hindsight, without_scores
 from scenarios.evaluate.references import Task, load_references, reference, reference_table, references
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.scores import split_file
@@ -25,6 +25,7 @@ from scenarios.load import SPLITS, parse_scenario
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare
 from scenarios.suite.splits import instance, manifest
+from tests.exhaustive import optimum
 
 HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
 DEAR = RewardWeights(tardiness=-0.5, above_warning=-2.0, faults=-1.5, energy=-0.05)
