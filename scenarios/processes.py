@@ -150,7 +150,7 @@ def run_all(
     """Every piece of work with its result, in the order in which they end.
 
     Args:
-        workers: Closed after an error or an interruption; else they have nothing left to do.
+        workers: The caller closes them.
         tell: Called with a sentence about each process that dies.
 
     Raises:
@@ -159,37 +159,32 @@ def run_all(
     """
     idle, groups = list(workers), {}
     running: dict[Future[Result], tuple[Worker, Work[Result]]] = {}
-    try:
-        while queue or running:
-            while queue and idle:
-                worker = idle.pop(0)
-                work = queue.take(groups.get(id(worker)))
-                groups[id(worker)] = work.group
-                running[worker.submit(work)] = worker, work
-            if not running:
-                raise FleetError("No process is left to run the shifts: all of them died.")
-            ended, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in ended:
-                worker, work = running.pop(future)
-                error = future.exception()
-                if error is None:
+    while queue or running:
+        while queue and idle:
+            worker = idle.pop(0)
+            work = queue.take(groups.get(id(worker)))
+            groups[id(worker)] = work.group
+            running[worker.submit(work)] = worker, work
+        if not running:
+            raise FleetError("No process is left to run the shifts: all of them died.")
+        ended, _ = wait(running, return_when=FIRST_COMPLETED)
+        for future in ended:
+            worker, work = running.pop(future)
+            error = future.exception()
+            if error is None:
+                idle.append(worker)
+                yield work, future.result()
+            elif not worker.died(error):
+                raise getattr(error, "cause", None) or error
+            else:
+                if worker.renew():
                     idle.append(worker)
-                    yield work, future.result()
-                elif not worker.died(error):
-                    raise getattr(error, "cause", None) or error
+                again = work.deaths + 1 < MOST_DEATHS
+                tell(f"A process died that ran {work.name}: {'run again' if again else 'given up'}.")
+                if again:
+                    queue.put_back(work.after_death())
                 else:
-                    if worker.renew():
-                        idle.append(worker)
-                    again = work.deaths + 1 < MOST_DEATHS
-                    tell(f"A process died that ran {work.name}: {'run again' if again else 'given up'}.")
-                    if again:
-                        queue.put_back(work.after_death())
-                    else:
-                        yield work, work.given_up()
-    except BaseException:  # an interruption, or a caller that wants no more
-        for worker in workers:
-            worker.close()
-        raise
+                    yield work, work.given_up()
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +245,12 @@ def worker_processes(count: int, *, in_order: bool = False) -> Iterator[Callable
         kept = _kept.setdefault(threads, [])
         workers = [kept.pop() if kept else LocalWorker(threads) for _ in range(min(count, len(works)))]
         results = run_all(Queue(works), workers)
-        yield from _in_order(results) if in_order else (result for _, result in results)
+        try:
+            yield from _in_order(results) if in_order else (result for _, result in results)
+        except BaseException:  # an interruption, or a caller that wants no more
+            for worker in workers:
+                worker.close()
+            raise
         kept.extend(workers)
 
     yield pool
