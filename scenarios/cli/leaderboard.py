@@ -35,8 +35,8 @@ def leaderboard_command(
     """
     from scenarios.evaluate.leaderboard import best_text, board_of, board_text, read_all, remark_text
     from scenarios.evaluate.scores import score_tables
+    from scenarios.evaluate.tables import LEGEND
     from scenarios.load import SplitName
-    from scenarios.statistics.tables import LEGEND
 
     split = choose("split", split, SplitName)
     if not folder.is_dir():

@@ -25,13 +25,13 @@ from scenarios.evaluate.scores import (
 )
 from scenarios.evaluate.statistics import fewest, unit
 from scenarios.evaluate.study import Row, Study, suite_label
+from scenarios.evaluate.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
 from scenarios.policy_loader import has_trainings, label, scope_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
 from scenarios.report.page import table
 from scenarios.schema import Scenario
-from scenarios.statistics.tables import LEGEND, Figure, add_block, empty_table, figures_of, remarks
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.evaluate.references import Reference

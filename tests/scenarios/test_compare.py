@@ -12,9 +12,9 @@ from rich.console import Console
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.evaluate.comparison import FIGURES, HEADINGS, Comparison, compare, comparison_table
+from scenarios.evaluate.tables import Figure
 from scenarios.load import load
 from scenarios.schema import Scenario
-from scenarios.statistics.tables import Figure
 
 POLICIES = ("random", "round_robin")
 

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from scenarios.evaluate.statistics import holm, interval, paired
-from scenarios.statistics.tables import EQUAL, add_block, empty_table, figures_of, remarks
+from scenarios.evaluate.tables import EQUAL, add_block, empty_table, figures_of, remarks
 
 
 @pytest.fixture

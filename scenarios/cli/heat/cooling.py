@@ -132,7 +132,7 @@ def _limit_table() -> Table:
 
 
 def _fleet_table(rows: "Sequence[FleetRow]", title: str) -> Table:
-    from scenarios.statistics.tables import LEGEND
+    from scenarios.evaluate.tables import LEGEND
 
     table = plain_table(
         "",

@@ -9,11 +9,11 @@ from fleet.robot import Cooling
 from fleet.thermal import gen3_network, housing, in_series, winding
 from scenarios.evaluate.comparison import figures_of_shifts
 from scenarios.evaluate.rollout import Outcome, outcomes
+from scenarios.evaluate.tables import Figure
 from scenarios.motion.hold import hold
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
 from scenarios.schema import Scenario
-from scenarios.statistics.tables import Figure
 
 STRATEGIES: tuple[Cooling, ...] = ("still_air", "heat_sink", "heat_spreader", "forced_air", "liquid", "immersion")
 """Ways of cooling on Earth, the first of which the others are compared with; two passive, three active."""

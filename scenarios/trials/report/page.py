@@ -12,9 +12,9 @@ from scenarios.evaluate.comparison import HEADINGS, LEAST_DIGITS, Comparison
 from scenarios.evaluate.rollout import FIGURES
 from scenarios.evaluate.scores import HEADS, Normalised, Scores, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import LEVEL, Interval, profile
+from scenarios.evaluate.tables import EQUAL, LEGEND, Figure, remarks
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.report.page import escape, html_page, paragraph, table
-from scenarios.statistics.tables import EQUAL, LEGEND, Figure, remarks
 from scenarios.trials.report.charts import Range, lines, points, spans
 
 Array = np.ndarray
