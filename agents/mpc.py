@@ -31,8 +31,8 @@ BEHIND_S = 1.0
 class Mpc:
     """Model predictive control with a simulator of the cell; see the module. Scope central: it plans for all arms.
 
-    It plans only where there is a simulator of its cell, which `plan_in` gives it: in `run`, `compare`, `ablate` and
-    `bounds`, not in a live fleet.
+    It plans only where there is a simulator of its cell, which `plan_in` gives it: in `run`, `compare` and `bounds`,
+    not in a live fleet.
     """
 
     scope: ClassVar = "central"

@@ -113,8 +113,8 @@ class Planner(Protocol):
 def no_simulator(name: str) -> FleetError:
     """The error of a policy that plans, where there is no simulator of its cell."""
     return FleetError(
-        f"The policy '{name}' plans in a simulator of its cell, and there is none here: it works in `run`, `compare`, "
-        "`ablate` and `bounds`. Choose another, for example wsept_learned."
+        f"The policy '{name}' plans in a simulator of its cell, and there is none here: it works in `run`, `compare` "
+        "and `bounds`. Choose another, for example wsept_learned."
     )
 
 

@@ -30,7 +30,7 @@ from agents.registry import RULES
 from agents.rolling_horizon import RollingHorizon
 from fleet.env.lookahead import Lookahead
 from fleet.observation import Layout, Observation
-from scenarios.bounds.schedule import ShiftSimulator
+from scenarios.evaluate.hindsight import ShiftSimulator
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, scope_of
 from scenarios.prepare.fleet import ShiftFactory, prepare

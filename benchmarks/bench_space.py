@@ -22,11 +22,11 @@ from fleet.physics.contacts import ContactFinder
 from fleet.physics.models import build_cell
 from fleet.planning.space import space_table
 from fleet.robot import Mount, Robot
+from scenarios.evaluate.rollout import outcomes
+from scenarios.evaluate.statistics import interval
 from scenarios.load import library, load
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.evaluate import outcomes
 from scenarios.run.shift import RunSpec, run
-from scenarios.statistics.means import interval
 
 SIXTEEN = 4
 """Cells of four arms that stand beside each other, for the larger table."""

@@ -20,11 +20,10 @@ from statistics import median
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from scenarios.trials import run_unit
-from scenarios.trials.cases import suite_of
-from scenarios.trials.contest import run_study
-from scenarios.trials.fleets import Fleets
-from scenarios.trials.plan import Study
+from scenarios.evaluate import runner
+from scenarios.evaluate.runner import run_study
+from scenarios.evaluate.sources import Fleets
+from scenarios.evaluate.study import Study, suite_of
 
 LOOP = "import numpy as np\na = np.ones((64, 64))\nfor _ in range({n}):\n    a = a @ a / 64.0; sum(range(400))"
 LOOPS = 300_000
@@ -72,7 +71,7 @@ def main() -> None:
     loads: list[float] = []
     for _ in range(arguments.repeats):
         for workers, name in ((1, "one"), (2, "two")):
-            run_unit.fleets = Fleets()  # as in a new process
+            runner.fleets = Fleets()  # as in a new process
             with ray_cluster(workers) if arguments.ray else nullcontext() as where:
                 began_s = time.perf_counter()
                 rows = run_study(study, workers=workers, ray=where)

@@ -1,4 +1,4 @@
-"""Variants of `mpc` without discount, search or heat, for `thermofleet ablate`; docs/policies.md has the command."""
+"""Variants of `mpc` without discount, search or heat, for `thermofleet compare`; docs/policies.md has the command."""
 
 from agents.mpc import Mpc
 from agents.policy import Lookahead

@@ -21,7 +21,7 @@ from result_tables import SAME
 
 from scenarios.suite.splits import instance, manifest
 
-COMPARE = [sys.executable, "-m", "scenarios", "compare", "--difficulty", "oracle", "--jobs", "1"]
+COMPARE = [sys.executable, "-m", "scenarios", "compare", "--difficulty", "oracle", "--workers", "1"]
 OLDER = {
     "NUMBA_CPU_NAME": "nehalem",
     "NUMBA_CPU_FEATURES": "",

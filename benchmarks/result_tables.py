@@ -8,10 +8,9 @@ from typing import Any  # values of JSON
 
 import numpy as np
 
-from scenarios.show.table import markdown_table as table
+from scenarios.evaluate.statistics import Interval, interval, paired, paired_counts
 from scenarios.json_rows import Row, Rows
-from scenarios.statistics.counts import paired_counts
-from scenarios.statistics.means import Interval, interval, paired
+from scenarios.show.table import markdown_table as table
 
 
 def difference(mean: float, low: float | None, high: float | None, digits: int = 1) -> str:

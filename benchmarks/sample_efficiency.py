@@ -36,14 +36,14 @@ from result_tables import course, trainings
 
 from fleet.engine.reward import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs, random_legal
+from scenarios.evaluate.rollout import Act, rollout
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Rows
 from scenarios.load import load
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.batch import library_of
 from scenarios.run.provenance import code_hash
-from scenarios.run.suite_batches import Act, returns
-from scenarios.run.train_policy import rule_actions
+from scenarios.train.networks import rule_actions
 
 Array = np.ndarray
 Training = tuple[list[dict[str, float]], dict[str, Any]]
@@ -86,7 +86,7 @@ class Curve:
     def add(self, env_steps: int, hours: float, act: Act) -> None:
         """Evaluate the policy after a number of env steps and simulated hours."""
         self._cpu_s += process_time() - self._since_s
-        reward = float(returns(self.env, act, SHIFTS).mean())
+        reward = float(rollout(self.env, self.env.reset(seed=list(SHIFTS))[0], act).mean())
         point = {"env_steps": env_steps, "hours": hours, "cpu_s": self._cpu_s, "reward": reward}
         self.points.append({name: round(value, 3) for name, value in point.items()})
         print(self.points[-1], flush=True)
@@ -104,7 +104,7 @@ def train_here(algorithm: Any, seed: int, warm_start: str = "") -> Training:
     """PPO of `agents.learned`; 30 envs and 20 steps instead of 32 and 16, so that `EVERY` is a whole number of
     iterations."""
     from agents.learned.ppo import PpoConfig
-    from scenarios.run.train_policy import DEMONSTRATIONS, STEPS, TEACHERS, imitate_rule, trainer_of
+    from scenarios.train.networks import DEMONSTRATIONS, STEPS, TEACHERS, imitate_rule, trainer_of
 
     config = PpoConfig(algorithm=algorithm, envs=30, steps=20, warm_start=warm_start, seed=seed)
     cells, curve, hours = [cell()[1:]], Curve(), 0.0

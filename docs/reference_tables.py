@@ -10,10 +10,10 @@ from agents.registry import RULES, WRAPPERS
 from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol import messages
 from fleet.bus.protocol.auction import MOST_JOBS, ArmEvent
+from fleet.bus.protocol.contract import Schema, descriptions, schemas
 from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.protocol.registry import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, Channel, MessageType
-from fleet.bus.protocol.contract import Schema, descriptions, schemas
 from fleet.engine.reward import RewardWeights
 from fleet.events import MEANINGS
 from fleet.job import BOUNDS, LONGEST_GRASP_S, LONGEST_JOB_S
@@ -24,8 +24,8 @@ from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 from scenarios.cli.main import COMMANDS, load_command
-from scenarios.show.table import markdown_table as table
 from scenarios.schema import RewardSpec
+from scenarios.show.table import markdown_table as table
 
 
 def _key_table() -> str:

@@ -8,7 +8,6 @@ arguments from the code or from files in `docs/results` to Markdown; `TABLES` ha
 """
 
 import argparse
-import csv
 import json
 import re
 import sys
@@ -21,11 +20,11 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "docs")) if path not in sys.path]
 
-from reference_tables import TABLES as REFERENCE  # noqa: E402  beside this file
+from reference_tables import TABLES as REFERENCE
 
-from agents.learned.training_log import read_log  # noqa: E402
-from benchmarks.paper.__main__ import study  # noqa: E402
-from benchmarks.result_tables import (  # noqa: E402
+from agents.learned.training_log import read_log
+from benchmarks.paper.__main__ import study
+from benchmarks.result_tables import (
     bold_if,
     channel_table,
     difference,
@@ -38,22 +37,22 @@ from benchmarks.result_tables import (  # noqa: E402
     steps_table,
     trainings,
 )
-from fleet.bus.protocol.contract import asyncapi  # noqa: E402
-from fleet.bus.protocol.contract import schema_document  # noqa: E402
-from fleet.errors import FleetError  # noqa: E402
-from scenarios.show.table import markdown_table as table  # noqa: E402
-from scenarios.json_rows import Rows  # noqa: E402
-from scenarios.leaderboard.board import BASELINE, SOURCE, benchmark_tables, read_all  # noqa: E402
-from scenarios.leaderboard.submission import Submission, split_references  # noqa: E402
-from scenarios.policy_loader import trainings_of  # noqa: E402
-from scenarios.run.compare import HEADINGS  # noqa: E402
-from scenarios.run.evaluate import COUNTS, POSSIBLE  # noqa: E402
-from scenarios.statistics.means import Interval, unit  # noqa: E402
-from scenarios.statistics.scores import Normalised, Scores, ranked, scores_of  # noqa: E402
-from scenarios.statistics.tables import figures_of  # noqa: E402
-from scenarios.suite.cells import CELLS  # noqa: E402
-from scenarios.suite.splits import instance  # noqa: E402
-from scenarios.trials.scores import normalised  # noqa: E402
+from benchmarks.stored_ablations import FIGURES as ABLATION_FIGURES
+from benchmarks.stored_ablations import stored
+from fleet.bus.protocol.contract import (
+    asyncapi,
+    schema_document,
+)
+from fleet.errors import FleetError
+from scenarios.evaluate.comparison import HEADINGS
+from scenarios.evaluate.leaderboard import BASELINE, SOURCE, Submission, benchmark_tables, read_all, split_references
+from scenarios.evaluate.scores import Normalised, Scores, normalised, ranked, scores_of
+from scenarios.evaluate.statistics import Interval, unit
+from scenarios.json_rows import Rows
+from scenarios.policy_loader import trainings_of
+from scenarios.show.table import markdown_table as table
+from scenarios.suite.cells import CELLS
+from scenarios.suite.splits import instance
 
 Array = np.ndarray
 Tables = Mapping[str, Callable[[], str]]
@@ -121,7 +120,7 @@ def decisions(measured: dict[str, Any]) -> str:
 
 
 ABLATED = ("heat_wave", "active_waiting")
-ABLATION_FIGURES = ("faults", "value", "reward")
+
 WRAPPED = {"wspt": "wspt@blind", "wsept": "wsept@rc", "least_difficulty": "least_difficulty@blind"}
 """Policies of the table of wrappers, with their sources."""
 DIGITS = {"faults": 2}
@@ -157,31 +156,9 @@ def ablated(folder: str, results: Path) -> dict[str, Path]:
     return {name: path for name in ABLATED if (path := results / folder.format(name)).is_dir()}
 
 
-def ablated_values(folder: Path) -> tuple[dict[str, dict[str, Array]], tuple[int, int, int]]:
-    """Figures [source][figure] of a stored ablation, each [fleet, training, seed], and the shape.
-
-    A source without trainings has the same values for each.
-    """
-    plan = read_json(folder / "ablation.json")["plan"]
-    shape, first_seed = (plan["fleets"], plan["trainings"], plan["seeds"]), plan["first_seed"]
-    found: dict[str, dict[tuple[int, int, int], dict[str, str]]] = {}
-    with (folder / "ablation.csv").open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            shift = int(row["fleet"]), int(row["training"]), int(row["seed"]) - first_seed
-            found.setdefault(row["scores"], {})[shift] = row
-    values: dict[str, dict[str, Array]] = {}
-    for name in plan["scores"]:
-        own = {training for _, training, _ in found[name]}
-        rows = [found[name][f, t if t in own else 0, s] for f, t, s in np.ndindex(shape)]
-        values[name] = {key: np.array([float(row[key]) for row in rows]).reshape(shape) for key in ABLATION_FIGURES}
-    return values, shape
-
-
 def ablation_rows(folder: Path, names: tuple[str, ...]) -> Iterator[tuple[str, list[str]]]:
     """Heading and cells of every figure: the mean of the first source and differences to it."""
-    values, _ = ablated_values(folder)
-    values = {names[0]: values[names[0]], **values}
-    effects = figures_of(values, names[0], counts=COUNTS, possible=POSSIBLE)
+    effects = stored(folder).effects(names[0])
     for key in ABLATION_FIGURES:
         digits = DIGITS.get(key, 1)
         cells = [f"{effects[names[0]][key].mean:.{digits}f}"]
@@ -193,7 +170,7 @@ def ablation_rows(folder: Path, names: tuple[str, ...]) -> Iterator[tuple[str, l
 
 def sizes_text(folders: Mapping[str, Path]) -> str:
     """A line on the numbers of fleets, trainings and seeds."""
-    return "\n\n" + "; ".join(f"`{name}`: {unit(ablated_values(each)[1])}" for name, each in folders.items()) + "."
+    return "\n\n" + "; ".join(f"`{name}`: {unit(stored(each).shape)}" for name, each in folders.items()) + "."
 
 
 def wrappers_table(folders: Mapping[str, Path]) -> str:

@@ -1,18 +1,278 @@
-"""Processes for independent pieces of work, which end soon after the one that began them, also when that is killed."""
+"""Processes for independent work, here or on a Ray cluster; the work of a process that dies is run again.
+
+The processes end soon after the one that began them, also when that is killed.
+"""
 
 import os
 import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, Protocol, TypeVar
 
-from joblib import Parallel
+from joblib import cpu_count
+from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky.backend import get_context
+from joblib.externals.loky.process_executor import BrokenProcessPool
+
+from fleet.errors import FleetError
 
 PARENT_CHECK_S = 1.0
 """Time between two checks of a process that its parent still runs."""
+MOST_DEATHS = 3
+"""Processes that may exit during a piece of work before it is given up."""
+IDLE_S = 120.0
+"""A process without work ends after this time."""
+Result = TypeVar("Result", covariant=True)  # of protocols and of frozen values
 
 
-def worker_processes(count: int, *, in_order: bool = False) -> Parallel:
-    """This many processes, or this one itself; results come as they are made, or in the order of the tasks."""
-    how = "generator" if in_order else "generator_unordered"
-    return Parallel(n_jobs=count, return_as=how, initializer=end_with, initargs=(os.getpid(),))
+class Work(Protocol[Result]):
+    """What one process does at a time."""
+
+    @property
+    def name(self) -> str:
+        """What it does, in a sentence about a process that died."""
+        ...
+
+    @property
+    def group(self) -> object:
+        """Work of one group shares what a process keeps, such as a prepared fleet."""
+        ...
+
+    @property
+    def deaths(self) -> int:
+        """How many processes died while they did it."""
+        ...
+
+    def __call__(self) -> Result:
+        """Do it, in whichever process this is."""
+        ...
+
+    def after_death(self) -> "Sequence[Work[Result]]":
+        """The same work, perhaps in smaller parts, each with one death more."""
+        ...
+
+    def given_up(self) -> Result:
+        """Its result after `MOST_DEATHS`."""
+        ...
+
+
+class Worker(Protocol):
+    """One process that does a piece of work at a time."""
+
+    def submit(self, work: Work[Result]) -> "Future[Result]":
+        """Begin a piece of work."""
+        ...
+
+    def died(self, error: BaseException) -> bool:
+        """Whether an error of its work says that the process died."""
+        ...
+
+    def renew(self) -> bool:
+        """Replace a process that died; False if there is no place for another."""
+        ...
+
+    def close(self) -> None:
+        """End the process."""
+        ...
+
+
+class LocalWorker:
+    """A process of this machine.
+
+    Args:
+        threads: Of the numerical libraries in it.
+    """
+
+    def __init__(self, threads: int = 1) -> None:
+        self._threads = threads
+        self._pool = self._new()
+
+    def _new(self) -> ProcessPoolExecutor:
+        how = {"context": get_context("loky"), "env": {"OMP_NUM_THREADS": str(self._threads)}, "timeout": IDLE_S}
+        return ProcessPoolExecutor(1, initializer=_begin, initargs=(os.getpid(),), **how)
+
+    def submit(self, work: Work[Result]) -> "Future[Result]":
+        """Begin a piece of work."""
+        return self._pool.submit(work)
+
+    def died(self, error: BaseException) -> bool:
+        """Whether an error of its work says that the process died."""
+        return isinstance(error, BrokenProcessPool)
+
+    def renew(self) -> bool:
+        """Replace a process that died."""
+        self.close()
+        self._pool = self._new()
+        return True
+
+    def close(self) -> None:
+        """End the process."""
+        self._pool.shutdown(wait=True, kill_workers=True)
+
+
+class Queue(Generic[Result]):
+    """Work that waits, in its groups: a worker stays with its group while there is work in it."""
+
+    def __init__(self, works: Iterable[Work[Result]]) -> None:
+        self._groups: dict[object, deque[Work[Result]]] = {}
+        for work in works:
+            self._groups.setdefault(work.group, deque()).append(work)
+        self._untouched = deque(self._groups)
+
+    def __bool__(self) -> bool:
+        return bool(self._groups)
+
+    def take(self, group: object = None) -> Work[Result]:
+        """The next work for a worker that has what this group shares: of this group, of one that no worker has begun,
+        or of the one with most left."""
+        if group not in self._groups:
+            group = next((each for each in self._untouched if each in self._groups), None)
+            group = group or max(self._groups, key=lambda each: len(self._groups[each]))
+        if group in self._untouched:
+            self._untouched.remove(group)
+        work = self._groups[group].popleft()
+        if not self._groups[group]:
+            del self._groups[group]
+        return work
+
+    def put_back(self, works: Sequence[Work[Result]]) -> None:
+        """Do these next."""
+        for work in reversed(works):
+            self._groups.setdefault(work.group, deque()).appendleft(work)
+
+
+def run_all(
+    queue: Queue[Result], workers: Sequence[Worker], tell: Callable[[str], None] = lambda sentence: None
+) -> Iterator[tuple[Work[Result], Result]]:
+    """Every piece of work with its result, in the order in which they end.
+
+    Args:
+        workers: The caller closes them.
+        tell: Called with a sentence about each process that dies.
+
+    Raises:
+        FleetError: no worker is left.
+        Exception: whatever the work raises.
+    """
+    idle, groups = list(workers), {}
+    running: dict[Future[Result], tuple[Worker, Work[Result]]] = {}
+    while queue or running:
+        while queue and idle:
+            worker = idle.pop(0)
+            work = queue.take(groups.get(id(worker)))
+            groups[id(worker)] = work.group
+            running[worker.submit(work)] = worker, work
+        if not running:
+            raise FleetError("No process is left to run the shifts: all of them died.")
+        ended, _ = wait(running, return_when=FIRST_COMPLETED)
+        for future in ended:
+            worker, work = running.pop(future)
+            error = future.exception()
+            if error is None:
+                idle.append(worker)
+                yield work, future.result()
+            elif not worker.died(error):
+                raise getattr(error, "cause", None) or error
+            else:
+                if worker.renew():
+                    idle.append(worker)
+                again = work.deaths + 1 < MOST_DEATHS
+                tell(f"A process died that ran {work.name}: {'run again' if again else 'given up'}.")
+                if again:
+                    queue.put_back(work.after_death())
+                else:
+                    yield work, work.given_up()
+
+
+@dataclass(frozen=True, eq=False)
+class Call(Generic[Result]):
+    """A call of a function as a piece of work."""
+
+    number: int
+    """Its place among the calls."""
+    function: Callable[..., Result]
+    arguments: Sequence[Any]
+    options: dict[str, Any] = field(default_factory=dict)
+    deaths: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the function."""
+        return getattr(self.function, "__qualname__", repr(self.function))
+
+    @property
+    def group(self) -> object:
+        """One for all calls, so that they begin in their order."""
+        return "calls"
+
+    def __call__(self) -> Result:
+        """Call it."""
+        return self.function(*self.arguments, **self.options)
+
+    def after_death(self) -> "list[Call[Result]]":
+        """The same call."""
+        return [replace(self, deaths=self.deaths + 1)]
+
+    def given_up(self) -> Result:
+        """Raise a FleetError."""
+        raise FleetError(f"The process that ran {self.name} died {MOST_DEATHS} times.")
+
+
+Delayed = tuple[Callable[..., Any], Sequence[Any], dict[str, Any]]
+"""A call to come, as `joblib.delayed(function)(…)` gives it (Any: of any signature)."""
+_kept: dict[int, list[LocalWorker]] = {}
+"""Processes that wait for the next calls, by their threads."""
+_is_worker = False
+
+
+@contextmanager
+def worker_processes(count: int, *, in_order: bool = False) -> Iterator[Callable[[Iterable[Delayed]], Iterator[Any]]]:
+    """What makes calls on this many processes, or in this one; results come as they are made, or in their order.
+
+    Processes wait some time for the next use. In a process of another one's work, calls are made in that process.
+    """
+
+    def pool(calls: Iterable[Delayed]) -> Iterator[Any]:
+        if count == 1 or _is_worker:
+            for function, arguments, options in calls:
+                yield function(*arguments, **options)
+            return
+        works = [Call(n, *each) for n, each in enumerate(calls)]
+        threads = max(1, cpu_count() // count)
+        kept = _kept.setdefault(threads, [])
+        workers = [kept.pop() if kept else LocalWorker(threads) for _ in range(min(count, len(works)))]
+        results = run_all(Queue(works), workers)
+        try:
+            yield from _in_order(results) if in_order else (result for _, result in results)
+        except BaseException:  # an interruption, or a caller that wants no more
+            for worker in workers:
+                worker.close()
+            raise
+        kept.extend(workers)
+
+    yield pool
+
+
+def _in_order(results: Iterator[tuple[Work[Any], Any]]) -> Iterator[Any]:
+    """Results of calls, in the order of their numbers."""
+    ready: dict[int, Any] = {}
+    coming = 0
+    for call, result in results:
+        assert isinstance(call, Call)
+        ready[call.number] = result
+        while coming in ready:
+            yield ready.pop(coming)
+            coming += 1
+
+
+def _begin(parent: int) -> None:
+    """Make this process one of another's work, which ends with it."""
+    global _is_worker
+    _is_worker = True
+    end_with(parent)
 
 
 def end_with(parent: int) -> None:

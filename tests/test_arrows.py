@@ -115,7 +115,7 @@ def library_allowed(importer: str, library: str) -> bool:
     if library in NEIGHBOURS:
         return importer == NEIGHBOURS[library]
     if library in TRAINERS:
-        return below(importer, "fleet.env.adapters") or (importer, library) == ("scenarios.trials.ray_workers", "ray")
+        return below(importer, "fleet.env.adapters") or (importer, library) == ("scenarios.evaluate.ray_workers", "ray")
     if library in TENSORS:
         return below(importer, "agents.learned", "fleet.env.adapters") or (
             library == "torch" and below(importer, "twin")

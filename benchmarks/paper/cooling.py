@@ -31,11 +31,11 @@ from benchmarks.result_tables import difference
 from fleet.motor import thermal_data
 from fleet.robot import COOLING, JOINTS, Cooling, ThermalLimits
 from fleet.thermal import ThermalModel, gen3_network, housing, in_series, modal_model, winding
+from scenarios.evaluate.comparison import figures_of_shifts
+from scenarios.evaluate.rollout import Outcome, outcomes
 from scenarios.json_rows import Row
 from scenarios.motion.hold import hold
 from scenarios.prepare.fleet import DifficultyName, prepare
-from scenarios.run.compare import figures_of_shifts
-from scenarios.run.evaluate import Outcome, outcomes
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
 

@@ -26,11 +26,11 @@ from fleet.motion import Plan
 from fleet.motor import Motors
 from fleet.seeding import child
 from fleet.thermal import ThermalModel, thermal_model
+from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.prepare.cool_motion import cold_peaks, records
 from scenarios.prepare.planned_arm import ArmHardware
 from scenarios.prepare.simulated_logs import own_logs
-from scenarios.statistics.means import interval
 from twin.thermal.identify import identify
 from twin.thermal.parameters import HeatModel
 from twin.vae.config import TwinConfig

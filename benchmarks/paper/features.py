@@ -37,10 +37,10 @@ from fleet.motor import Motors
 from fleet.physics.models import ArmModel
 from fleet.planning.random_motions import light_jobs
 from fleet.seeding import child
+from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.motion.generate import MOST_DRAWS, GenerationError, Verification, propose
 from scenarios.prepare.cool_motion import cold_peaks, records
-from scenarios.statistics.means import interval
 from twin.baselines.reconstruction import untrained_config
 from twin.vae.config import TwinConfig
 from twin.vae.train import train

@@ -39,11 +39,11 @@ from benchmarks.paper.subjects import ALARM_RATE, SCENARIOS, Sample, Study, arm_
 from fleet.errors import FleetError
 from fleet.motion import Plan
 from fleet.physics.models import ArmModel
+from scenarios.evaluate.statistics import Interval, mean_by_group
 from scenarios.json_rows import Row
 from scenarios.motion.generate import Rejected, planned
 from scenarios.prepare.cool_motion import cold_peaks
 from scenarios.schema import Scenario
-from scenarios.statistics.means import Interval, mean_by_group
 from twin.conformal import largest_p_value, p_value
 from twin.saturation.reliability import wilson
 from twin.vae.config import TwinConfig

@@ -29,11 +29,10 @@ from fleet.files import cache_folder
 from fleet.motion import CHANNELS
 from fleet.robot import JOINTS
 from fleet.thermal import HOUSING, WINDING
+from scenarios.evaluate.statistics import Interval, percentile_interval
 from scenarios.json_rows import Row
 from scenarios.prepare.train_twins import train_or_load
 from scenarios.prepare.twin_folder import LOG_INPUT
-from scenarios.statistics.means import Interval
-from scenarios.statistics.suites import percentile_interval
 from twin.logs.heat_log import heat_logs
 from twin.logs.reader import read_folder
 from twin.logs.recording import READINGS, Recording

@@ -34,6 +34,7 @@ from fleet.engine.shift import StepRecord
 from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.thermal import WINDING
+from scenarios.evaluate.sources import drawn
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import RISK, Fleet, RiskName, env_of, prepare
@@ -42,7 +43,6 @@ from scenarios.prepare.simulated_history import PastJobs, experience, past_jobs
 from scenarios.prepare.simulated_logs import LOGS, identify_from_work
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
-from scenarios.trials.cells import drawn
 from twin.saturation.fit import Experience, fit_saturation
 from twin.saturation.model import EVIDENCE, METHODS
 from twin.saturation.reliability import brier, reliability

@@ -47,9 +47,9 @@ from benchmarks.paper.subjects import (
 )  # fmt: skip
 from fleet.errors import FleetError, nearest
 from fleet.motion import RATE_HZ, Plan
+from scenarios.evaluate.statistics import Interval, mean_by_group
 from scenarios.json_rows import Row
 from scenarios.prepare.cool_motion import records
-from scenarios.statistics.means import Interval, mean_by_group
 from twin.vae.config import TwinConfig
 from twin.vae.model import one_thread
 from twin.vae.train import Motion, train, train_all

@@ -47,10 +47,10 @@ from benchmarks.paper.subjects import (
 from fleet.errors import FleetError
 from fleet.robot import Mount, Robot
 from fleet.seeding import child
+from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.prepare.cool_motion import records
 from scenarios.prepare.simulated_logs import own_logs
-from scenarios.statistics.means import interval
 from twin.logs.recording import Recording
 from twin.logs.resampling import stretches
 from twin.training_data import cool_stretches

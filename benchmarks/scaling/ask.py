@@ -10,12 +10,12 @@ from agents.policy import WAIT, plans_of
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.observation import Observation
+from scenarios.evaluate.statistics import interval
 from scenarios.fault_price import weights_of
 from scenarios.load import load
 from scenarios.prepare.fleet import DifficultyName, prepare
 from scenarios.run.batch import Randomisation, library_of
 from scenarios.run.outcome import common_figures
-from scenarios.statistics.means import interval
 
 Array = np.ndarray
 ASKED = (1, 2, 3, 4, 6, 8)

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from scenarios.statistics.means import mean_bounds
-from scenarios.statistics.suites import aggregates, by_group
+from scenarios.evaluate.statistics import aggregates, by_group, mean_bounds
 
 Array = np.ndarray
 Law = tuple[Callable[[np.random.Generator, tuple[int, ...]], Array], float]

@@ -1,4 +1,4 @@
-"""`thermofleet compare` and `thermofleet ablate`."""
+"""`thermofleet compare`."""
 
 import json
 from itertools import chain
@@ -11,7 +11,6 @@ from agents.registry import RULES, WRAPPERS_HELP
 from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.terminal import KEPT, out_console, print_json, progress_bar, say
-from scenarios.load import load
 from scenarios.result_folder import disk_errors
 from scenarios.schema_errors import choose
 
@@ -30,7 +29,8 @@ def compare_command(
         str,
         typer.Option(
             help="Policies, separated by commas: names, FILE.py:CLASS, bus:NAME in another process, or folders of "
-            "`thermofleet train` ('FOLDER-*': one policy with several trainings); "
+            "`thermofleet train` ('FOLDER-*': one policy with several trainings); POLICY@SOURCE for a policy with one "
+            "source of predictions; "
             f"{WRAPPERS_HELP}. Default: {', '.join(RULES)}.",
             show_default=False,
         ),
@@ -54,7 +54,7 @@ def compare_command(
     fleets: Annotated[
         int, options.number("Number of fleets: draws of the arms' deviations (spread.seed).", 1, 100)
     ] = 1,
-    trainings: Annotated[int, options.number("Number of trainings of the twins of each fleet.", 1, 20)] = 1,
+    trainings: Annotated[int, options.number("Number of trainings of each fleet's twins.", 1, 20)] = 1,
     baseline: Annotated[
         str | None,
         typer.Option(
@@ -65,8 +65,9 @@ def compare_command(
     difficulty: Annotated[
         str,
         typer.Option(
-            help="Sources of the difficulty scores, separated by commas: twin, oracle (simulator) or blind (none). "
-            "With several, POLICY@SOURCE names a policy."
+            help="Sources of predictions, separated by commas: twin, oracle (simulator), blind (none), or models to "
+            "compare: trained, untrained, unweighted, torque, weighted-torque, rc-nominal, rc, random, inverted, "
+            "constant. With several, POLICY@SOURCE names a policy."
         ),
     ] = "twin",
     risk: options.RiskOption = "rc",
@@ -89,7 +90,7 @@ def compare_command(
             show_default=False,
         ),
     ] = None,
-    jobs: Annotated[
+    workers: Annotated[
         int | None, options.number("Number of processes; default: one per core.", 1, 1024, show_default=False)
     ] = None,
     ray: Annotated[
@@ -114,26 +115,19 @@ def compare_command(
     The first failure of a policy is reported with instance, seed and traceback;
     the other policies and shifts continue.
     """
-    from scenarios.prepare.fleet import DifficultyName, RiskName
-    from scenarios.run.evaluate import FIGURES
+    from scenarios.evaluate.comparison import check_baseline, comparisons, rows_without_failures, scores_over_all
+    from scenarios.evaluate.marl_eval import to_marl_eval
+    from scenarios.evaluate.rollout import FIGURES
+    from scenarios.evaluate.runner import run_study
+    from scenarios.evaluate.scores import references_of
+    from scenarios.evaluate.study import Study, cases_of, columns, suite_label, suite_of
+    from scenarios.prepare.fleet import RiskName
     from scenarios.show.comparison_page import Judged, comparison_page, result_text, verdict
-    from scenarios.statistics.marl_eval import to_marl_eval
-    from scenarios.trials.cases import cases_of, suite_label, suite_of
-    from scenarios.trials.contest import run_study
-    from scenarios.trials.plan import Study, columns
-    from scenarios.trials.scores import references_of
-    from scenarios.trials.summary import (
-        check_baseline,
-        comparisons,
-        competitors,
-        rows_without_failures,
-        scores_over_all,
-    )
 
     if bool(scenario) == bool(suite):
         raise FleetError("Give either scenarios or --suite.")
-    if jobs is not None and ray is not None:
-        raise FleetError("Give either --jobs or --ray.")
+    if workers is not None and ray is not None:
+        raise FleetError("Give either --workers or --ray.")
     if marl_eval and out is None:
         raise FleetError("--marl-eval needs --out, the folder that it writes to.")
     if references is not None and not references.is_file():
@@ -155,18 +149,18 @@ def compare_command(
         cases=cases,
         fleets=fleets,
         trainings=trainings,
-        difficulties=[choose("difficulty", name, DifficultyName) for name in options.split_names(difficulty)],
+        difficulties=options.split_names(difficulty),
         risk=choose("risk", risk, RiskName),
         randomise=varied,
         channel=channels[0],  # the same of all; each scenario has the arms that it names
         decision_limit_s=decision_limit,
     )
-    names = competitors(study)
-    base = baseline or names.get(("round_robin", study.difficulties[0]), next(iter(names.values())))
+    names = study.competitors
+    base = baseline or names.get(("round_robin", study.sources[0]), next(iter(names.values())))
     check_baseline(study, base)
     known = references_of(cases, references)
     with progress_bar(kept="Finished shifts are" if out else KEPT, file=out) as progress:
-        rows = run_study(study, out=out, workers=jobs or -1, ray=ray, progress=progress, tell=say)
+        rows = run_study(study, out=out, workers=workers or -1, ray=ray, progress=progress, tell=say)
     results = comparisons(study, rows, base, suite, known)
     values = scores_over_all(study, rows, known)
     title = f"Comparison of {len(names)} policies on {suite_label(suite or ','.join(case.name for case in cases))}"
@@ -186,57 +180,3 @@ def compare_command(
     out_console.print("", *verdict(judged), sep="\n")
     if out:
         say(f"Written to {out}; open {out / PAGE}.")
-
-
-def ablate_command(
-    scenario: options.ScenarioArg,
-    policy: Annotated[
-        str,
-        typer.Option(
-            help="Policy that runs with each source: a name, FILE.py:CLASS, or a folder of `thermofleet train`."
-        ),
-    ] = "least_difficulty",
-    sources: Annotated[
-        str | None,
-        typer.Option(
-            help="Sources, separated by commas: trained, unweighted, untrained, torque, weighted-torque, rc-nominal, "
-            "rc, random, inverted, constant, blind, oracle; or POLICY@SOURCE for another policy. Differences refer to "
-            "the first one. Default: all sources.",
-            show_default=False,
-        ),
-    ] = None,
-    fleets: Annotated[
-        int, options.number("Number of fleets, 2 or more: draws of the arms' deviations (spread.seed).", 2, 100)
-    ] = 3,
-    trainings: Annotated[int, options.number("Number of trainings of the twins of each fleet.", 1, 20)] = 2,
-    seeds: Annotated[int, options.number("Number of seeds, 2 or more.", 2, 10_000)] = 20,
-    first_seed: Annotated[int, options.number("First seed.", 0, options.MAX_SEED)] = 10_000,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the results; default: runs/ablate-SCENARIO-POLICY.", show_default=False),
-    ] = None,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Compare the results of one policy with predictions from different sources.
-
-    Predictions are difficulty, P(saturation) and predicted peak. Every shift is written
-    to ablation.csv, the intervals to ablation.json. The same command resumes an
-    interrupted comparison. A training takes up to a minute per arm.
-    """
-    from scenarios.extras import require_extra
-
-    require_extra("twin")
-    from scenarios.policy_loader import label
-    from scenarios.studies.ablation import AblationPlan, ablate, ablation_table
-
-    chosen = load(scenario)
-    given = {} if sources is None else {"scores": tuple(options.split_names(sources))}
-    plan = AblationPlan(policy=policy, fleets=fleets, trainings=trainings, seeds=seeds, first_seed=first_seed, **given)
-    folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy).replace(':', '-')}")
-    with progress_bar(kept="Finished shifts are", file=folder) as progress:
-        result = ablate(chosen, plan, folder, progress=progress)
-    if as_json:
-        print_json(result)
-    else:
-        out_console.print(ablation_table(result))
-        say(f"Written to {folder}.")

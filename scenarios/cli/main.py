@@ -52,14 +52,9 @@ COMMANDS = {
     "view": LazyCommand(_LOOK, "view:view_command", "Play a shift in MuJoCo's viewer."),
     "trace": LazyCommand(_LOOK, "scenarios.cli.trace:trace_command", "Follow an event to its causes."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
-    "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of predictions under one policy."),
-    "bounds": LazyCommand(_POLICIES, "scenarios.bounds.command:bounds_command", "Bound the reward of shifts."),
-    "leaderboard": LazyCommand(
-        _POLICIES, "scenarios.leaderboard.command:leaderboard_command", "Print the leaderboard of a split."
-    ),
-    "submit-result": LazyCommand(
-        _POLICIES, "scenarios.leaderboard.command:submit_command", "Check a result and write the file to send."
-    ),
+    "bounds": LazyCommand(_POLICIES, "bounds:bounds_command", "Bound the reward of shifts."),
+    "leaderboard": LazyCommand(_POLICIES, "leaderboard:leaderboard_command", "Print the leaderboard of a split."),
+    "submit-result": LazyCommand(_POLICIES, "leaderboard:submit_command", "Check a result and write the file to send."),
     "train": LazyCommand(_POLICIES, "train:train_command", "Train a policy by reinforcement learning."),
     "up": LazyCommand(_LIVE, "live.up:up_command", "Start a whole fleet, one process per participant."),
     "router": LazyCommand(_LIVE, "router:router_command", "Run the Zenoh router of a fleet."),

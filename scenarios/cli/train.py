@@ -118,7 +118,7 @@ def train_command(
     from agents.learned.training_log import CURVE
     from fleet.env.validation import Decisions
     from scenarios.prepare.fleet import DifficultyName, RiskName
-    from scenarios.run.training_folder import holds_training
+    from scenarios.train.folder import holds_training
 
     models: Any = {
         "difficulty": choose("difficulty", difficulty, DifficultyName),
@@ -137,18 +137,18 @@ def train_command(
     grounds, judging, card = [], [], {"suite": suite, **models}
     if algorithm != "pairs":
         require_extra("learn")
-        from scenarios.run.train_policy import TrainingPlan
+        from scenarios.train.networks import TrainingPlan
 
         length = TrainingPlan(**length)
     else:
-        from scenarios.run.train_pairs import PairPlan
+        from scenarios.train.pairs import PairPlan
 
         length = PairPlan(**length)
     if suite is not None:
-        from scenarios.run.suite_batches import grounds_of
+        from scenarios.evaluate.scores import references_of
+        from scenarios.evaluate.study import suite_of
         from scenarios.suite.splits import split
-        from scenarios.trials.cases import suite_of
-        from scenarios.trials.scores import references_of
+        from scenarios.train.instances import grounds_of
 
         usual = (36, 60) if algorithm == "pairs" else (12, 24)
         train = split(suite)[: instances or usual[0]]
@@ -163,13 +163,13 @@ def train_command(
         goes_on = resume and (seeds == 1 or holds_training(where))
         if algorithm == "pairs":
             from agents.learned.evolution import EvolutionConfig
-            from scenarios.run.train_pairs import train_pairs
+            from scenarios.train.pairs import train_pairs
 
             search = EvolutionConfig(seed=seed + k, learning_rate=0.08 if lr is None else lr)
             done = train_pairs(grounds, judging, search, where, length, card=card, resume=goes_on, tell=say)
         else:
             from agents.learned.ppo import PpoConfig, use_threads
-            from scenarios.run.train_policy import train, train_on_split
+            from scenarios.train.networks import train, train_on_split
 
             use_threads(threads)
             try:

@@ -12,15 +12,14 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from fleet.bus.exchange.channel import PERFECT
+from scenarios.evaluate.comparison import HEADINGS, LEAST_DIGITS, Comparison, Failed
+from scenarios.evaluate.rollout import FIGURES
+from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
+from scenarios.evaluate.statistics import LEVEL, Interval, profile
+from scenarios.evaluate.tables import HEAD, LEGEND, figure_rows, remarks
 from scenarios.policy_loader import is_on_bus, label
-from scenarios.run.compare import HEADINGS, LEAST_DIGITS, Comparison, Failed
-from scenarios.run.evaluate import FIGURES
 from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, plain
 from scenarios.show.table import Column, Table
-from scenarios.statistics.means import LEVEL, Interval
-from scenarios.statistics.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
-from scenarios.statistics.suites import profile
-from scenarios.statistics.tables import HEAD, LEGEND, figure_rows, remarks
 
 Array = np.ndarray
 Range = tuple[float, float, float]

@@ -9,9 +9,9 @@ from threading import Thread
 import pytest
 
 from fleet.errors import FleetError
+from scenarios.evaluate.runner import run_study
+from scenarios.evaluate.study import Case, Row, Study
 from scenarios.load import load
-from scenarios.trials.contest import run_study
-from scenarios.trials.plan import Case, Row, Study
 from tests.own_policies import IDLE
 from tests.waiting import wait_until
 
@@ -89,7 +89,7 @@ def test_what_an_actor_ran_that_died_is_run_again(cluster, study, tmp_path):
 
 
 def test_other_files_of_a_policy_are_refused(cluster, study, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.trials.run_unit.policy_hash", lambda policy: "another")
+    monkeypatch.setattr("scenarios.evaluate.runner.policy_hash", lambda policy: "another")
     with pytest.raises(FleetError, match=r"has other files of the policy 'random': copy the same to every machine\."):
         run_study(study, ray=cluster.address)
 

@@ -18,11 +18,11 @@ from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.errors import FleetError
 from fleet.observation import Layout
 from fleet.robot import ThermalLimits
-from scenarios.bounds.exhaustive import optimum
-from scenarios.bounds.schedule import ShiftSimulator
+from scenarios.evaluate.hindsight import ShiftSimulator
 from scenarios.live.allocation import central_allocation
 from scenarios.load import load
 from scenarios.policy_loader import policy_of, without_simulator
+from tests.exhaustive import optimum
 
 HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
 WEIGHTS = RewardWeights(tardiness=-0.5, faults=-10.0)

@@ -15,12 +15,11 @@ from docs.tables import fill_tables, main
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import auction as trade
 from fleet.bus.protocol import keys, messages
-from fleet.bus.protocol.contract import asyncapi
 from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.contract import asyncapi, descriptions, schema_document
 from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage
 from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
-from fleet.bus.protocol.contract import descriptions, schema_document
 from fleet.events import EVENT_KINDS, MEANINGS
 from fleet.live.arm.simulated_body import _REPORTED
 

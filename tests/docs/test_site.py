@@ -25,7 +25,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_pages_are_made_from_readme_docstrings_and_notebooks(site: Path) -> None:
     for page, content in (
         ("index.html", "Two commands"),
-        ("api/scenarios.html", "scenarios.run.compare.Comparison"),
+        ("api/scenarios.html", "scenarios.evaluate.comparison.Comparison"),
         ("notebooks/quick_look.html", "data:image/png"),
         ("examples/own_policy.html", "HEADROOM_K"),
         ("cli.html", "thermofleet twin train"),

@@ -8,8 +8,8 @@ import pytest
 
 from fleet.env import allocation_v1
 from fleet.errors import ScenarioError
-from scenarios import make_batch, make_env
-from scenarios.run.batch import Randomisation
+from scenarios.prepare.fleet import make_env
+from scenarios.run.batch import Randomisation, make_batch
 
 NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array([1, 2]), np.array(3.0))
 

@@ -9,8 +9,9 @@ import pytest
 from docs.tables import fill_tables, main
 from fleet.engine.reward import TERMS
 from fleet.observation import FIELDS, Layout
-from scenarios import make_batch, make_env
 from scenarios.load import override
+from scenarios.prepare.fleet import make_env
+from scenarios.run.batch import make_batch
 from scenarios.schema import RewardSpec
 
 PAGE = Path(__file__).parents[2] / "docs" / "env.md"

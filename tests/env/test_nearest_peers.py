@@ -5,9 +5,10 @@ import pytest
 from scipy.spatial import KDTree
 
 from fleet.errors import ScenarioError
-from scenarios import make_batch, make_env
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.load import load
+from scenarios.prepare.fleet import make_env
+from scenarios.run.batch import make_batch
 
 
 @pytest.mark.parametrize("name", ["quickstart", "heat_wave"])

@@ -14,11 +14,10 @@ from fleet.engine.tables import stack_tables, tables_of
 from fleet.engine.world import Space
 from fleet.env.vector import BatchEnv, Library
 from fleet.motion import Plan
-from scenarios import make_batch, make_env
+from scenarios.evaluate.rollout import outcomes
 from scenarios.job_stream import draw_jobs
-from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.batch import Randomisation, library_of
-from scenarios.run.evaluate import outcomes
+from scenarios.prepare.fleet import Fleet, make_env, prepare
+from scenarios.run.batch import Randomisation, library_of, make_batch
 from scenarios.run.shift import RunSpec, run
 
 SEED = 30

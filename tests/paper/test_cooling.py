@@ -26,9 +26,9 @@ from benchmarks.paper.cooling import (
 from fleet.motor import thermal_data
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.thermal import HOUSING, WINDING, gen3_network, housing, node_heat, thermal_model
+from scenarios.evaluate.rollout import outcomes
 from scenarios.load import load, override
 from scenarios.prepare.fleet import prepare
-from scenarios.run.evaluate import outcomes
 
 ALPHA = 0.00393
 FROM_STILL_AIR = {"no_interface": 1.0, "forced_air": 2.5, "forced_water": 6.0, "immersion": 6.0}

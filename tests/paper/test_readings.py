@@ -8,7 +8,7 @@ import pytest
 from benchmarks.paper.readings import JOINTS, MEASURES, TOTALS, Errors, reading_cells, share_of
 from benchmarks.paper.real_logs import QUESTIONS, Windows, answers, judged_windows
 from fleet.errors import FleetError
-from scenarios.statistics.means import interval
+from scenarios.evaluate.statistics import interval
 from twin.logs.recording import Recording
 from twin.vae.config import TwinConfig
 from twin.vae.measures import PARTS, Calibration, Features, moments

@@ -14,22 +14,18 @@ from fleet.engine.reward import RewardWeights
 from fleet.env.random_actions import random_legal
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
-from scenarios.bounds import references as stored
-from scenarios.bounds.command import markdown
-from scenarios.bounds.exhaustive import optimum
-from scenarios.bounds.heat_budget import HeatBudget
-from scenarios.bounds.hindsight import Budget, hindsight
-from scenarios.bounds.references import Task, load_references, reference, references
-from scenarios.bounds.relaxation import Relaxation
-from scenarios.bounds.schedule import Replay, Schedules, ShiftSimulator, without_scores
-from scenarios.bounds.upper import upper_bound
+from scenarios.evaluate import references as stored
+from scenarios.evaluate.hindsight import Budget, Replay, Schedules, ShiftSimulator, hindsight, without_scores
+from scenarios.evaluate.references import Task, load_references, reference, reference_table, references
+from scenarios.evaluate.rollout import outcomes
+from scenarios.evaluate.scores import split_file
+from scenarios.evaluate.upper_bound import HeatBudget, Relaxation, upper_bound
 from scenarios.fault_price import weights_of
 from scenarios.load import SPLITS, parse_scenario
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare
-from scenarios.run.evaluate import outcomes
 from scenarios.suite.splits import instance, manifest
-from scenarios.trials.scores import split_file
+from tests.exhaustive import optimum
 
 HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
 DEAR = RewardWeights(tardiness=-0.5, above_warning=-2.0, faults=-1.5, energy=-0.05)
@@ -237,8 +233,8 @@ def test_a_budget_of_evaluations_gives_the_same_file_in_any_order(fleet: Fleet, 
         references([task], tmp_path / "twice.jsonl", budget, difficulty="blind", cache=plans)
     assert (tmp_path / "once.jsonl").read_bytes() == (tmp_path / "twice.jsonl").read_bytes()
     assert [each.instance for each in once] == ["three/2", "three/10"]
-    assert "CPU s" not in markdown(once)  # times would depend on other load, so they are unknown
-    assert "CPU s" in markdown([replace(once[0], seconds=1.0)])
+    assert "CPU s" not in reference_table(once)  # times would depend on other load, so they are unknown
+    assert "CPU s" in reference_table([replace(once[0], seconds=1.0)])
 
 
 def test_rewards_do_not_depend_on_predictions_that_only_policies_read(small):

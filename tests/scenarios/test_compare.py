@@ -11,10 +11,10 @@ from rich.console import Console
 
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
+from scenarios.evaluate.comparison import FIGURES, HEADINGS, Comparison, compare
+from scenarios.evaluate.tables import Figure
 from scenarios.load import load
-from scenarios.run.compare import FIGURES, HEADINGS, Comparison, compare
 from scenarios.schema import Scenario
-from scenarios.statistics.tables import Figure
 
 POLICIES = ("random", "round_robin")
 
@@ -33,14 +33,14 @@ def compared(scenario: Scenario, plans: Path, workers: int, **changes) -> Compar
 def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, monkeypatch, channel):
     how = {"seeds": range(6), "channel": channel}
     alone = compared(scenario, plans, workers=1, **how)
-    monkeypatch.setattr("scenarios.trials.plan.TOGETHER", 4)
+    monkeypatch.setattr("scenarios.evaluate.study.TOGETHER", 4)
     assert compared(scenario, plans, workers=1, **how) == alone
-    monkeypatch.setattr("scenarios.trials.contest.HERE_S", 0.0)
+    monkeypatch.setattr("scenarios.evaluate.runner.HERE_S", 0.0)
     assert compared(scenario, plans, workers=2, **how) == alone
 
 
 def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
-    monkeypatch.setattr("scenarios.trials.contest.LocalWorker", None)
+    monkeypatch.setattr("scenarios.evaluate.runner.LocalWorker", None)
     told: list[tuple[str, float]] = []
     compared(scenario, plans, workers=2, progress=lambda stage, share: told.append((stage, share)))
     assert [share for stage, share in told if stage == "comparing"] == [0.5, 1.0]

@@ -16,13 +16,13 @@ from plotly.offline import get_plotlyjs
 from rich.console import Console
 
 from scenarios.cli import options
+from scenarios.evaluate.comparison import comparisons, scores_over_all
+from scenarios.evaluate.rollout import FIGURES, Outcome
+from scenarios.evaluate.scores import Shift
+from scenarios.evaluate.study import Case, Key, Row, Study
 from scenarios.load import load
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
-from scenarios.trials.plan import Case, Key, Row, Study
-from scenarios.trials.scores import Shift
-from scenarios.trials.summary import comparisons, scores_over_all
 
 REWARD = {"wspt": 10.0, "wsept": 14.0, "fifo": 6.0}
 

@@ -10,10 +10,10 @@ import pytest
 from agents.policy import WAIT
 from agents.registry import RULES
 from fleet.bus.exchange.channel import PERFECT, Channel
+from scenarios.evaluate.rollout import FIGURES, Outcome, outcomes
 from scenarios.load import load, parse_scenario
 from scenarios.policy_loader import PolicyFailed, policy_of
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.evaluate import FIGURES, Outcome, outcomes
 from scenarios.run.shift import RunSpec, run
 
 SEEDS = (0, 3, 12)

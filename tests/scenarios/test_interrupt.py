@@ -111,7 +111,7 @@ def test_the_processes_of_a_killed_comparison_end_with_it(small_toml, tmp_path, 
                     threading.Event().wait(600)
         """)
     )
-    command = [sys.executable, "-m", "scenarios", "compare", str(small_toml), "--difficulty", "blind", "--jobs", "2"]
+    command = [sys.executable, "-m", "scenarios", "compare", str(small_toml), "--difficulty", "blind", "--workers", "2"]
     command += ["--policies", f"{policy}:Killer,round_robin", "--seeds", "2", "--out", str(tmp_path / "out")]
     env = {**os.environ, "THERMOFLEET_CACHE": str(plans)}
     # Returns when no process has its output open.

@@ -10,18 +10,27 @@ import msgspec
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.bounds.references import Reference
 from scenarios.cli.main import main
-from scenarios.leaderboard import board, submission
-from scenarios.leaderboard.board import board_of, board_text, read_all
-from scenarios.leaderboard.repeat import check_repeated
-from scenarios.leaderboard.submission import MOST_BYTES, Card, Played, Submission, check, read, write
+from scenarios.evaluate import leaderboard
+from scenarios.evaluate.leaderboard import (
+    MOST_BYTES,
+    Card,
+    Played,
+    Submission,
+    board_of,
+    board_text,
+    check,
+    check_repeated,
+    read,
+    read_all,
+    write,
+)
+from scenarios.evaluate.references import Reference
+from scenarios.evaluate.rollout import FIGURES, Outcome
+from scenarios.evaluate.store import opened
+from scenarios.evaluate.study import SHIFTS, Row, Study, suite_of
 from scenarios.policy_loader import policy_of, scope_of
-from scenarios.run.evaluate import FIGURES, Outcome
 from scenarios.suite.splits import manifest
-from scenarios.trials.cases import suite_of
-from scenarios.trials.plan import Row, Study
-from scenarios.trials.store import opened
 
 REWARD = FIGURES.index("reward")
 BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0) | {"value": 50.0})
@@ -48,8 +57,7 @@ def reference(line) -> Reference:
 def known(monkeypatch: pytest.MonkeyPatch):
     """References of the test split."""
     found = {(line.name, line.seed): reference(line) for line in manifest("test")}
-    for module in (submission, board):
-        monkeypatch.setattr(module, "split_references", lambda split: found if split == "test" else {})
+    monkeypatch.setattr(leaderboard, "split_references", lambda split: found if split == "test" else {})
     return found
 
 
@@ -62,7 +70,7 @@ def finished(study: Study, out: Path, rewards: dict[str, float], failed: int = 0
     """The folder of a study without running it; wsept fails in the first shifts."""
     keys = [key for unit in study.units(set()) for key in unit.keys]
     rows = [Row(key, replace(BLANK, reward=rewards[key.policy])) for key in keys]
-    with opened(out, study.card) as store:
+    with opened(out, SHIFTS, study.card) as store:
         for n, row in enumerate(row for row in rows if row.key.policy == "wsept"):
             if n < failed:
                 rows[rows.index(row)] = Row(row.key, None, 0, "Oops: x", "line 1")
@@ -159,10 +167,10 @@ FORGED = {
 def good(study: Study) -> Submission:
     scenarios = study.card["instances"]
     assert isinstance(scenarios, dict)
-    versions: dict[str, str | None] = {name: "1" for name in submission.NEEDED}
+    versions: dict[str, str | None] = {name: "1" for name in leaderboard.NEEDED}
     card = Card(
         format=1, policy="mine", difficulty="oracle", split="test", scope="arm", trainings=1, author="Ann", about="",
-        manifest=submission.manifest_hash("test"), code_hash="a" * 16, policy_hash="c" * 16, risk="rc",
+        manifest=leaderboard.manifest_hash("test"), code_hash="a" * 16, policy_hash="c" * 16, risk="rc",
         versions=versions,
     )  # fmt: skip
     figures = [12.0 if name == "reward" else 50.0 if name == "value" else 0.0 for name in FIGURES]
@@ -226,7 +234,7 @@ def test_studies_of_other_settings_are_refused(study: Study, tmp_path: Path):
         ({"instances": {"quickstart": "0" * 16}}, "no instance of a split"),
     ):
         with pytest.raises(FleetError, match=said):
-            submission.submissions_of(card | change, [], "Ann", "")
+            leaderboard.submissions_of(card | change, [], "Ann", "")
 
 
 def test_a_repetition_finds_other_figures(good: Submission, monkeypatch: pytest.MonkeyPatch):
@@ -236,7 +244,7 @@ def test_a_repetition_finds_other_figures(good: Submission, monkeypatch: pytest.
         outcome = Outcome(**dict(zip(FIGURES, truth, strict=True)))
         return [Row(key, outcome) for unit in study.units(set()) for key in unit.keys]
 
-    monkeypatch.setattr("scenarios.leaderboard.repeat.run_study", ran)
+    monkeypatch.setattr("scenarios.evaluate.leaderboard.run_study", ran)
     of_code = changed(None, policy="wspt", policy_hash="")(good)
     assert check_repeated(of_code, 3) == "test-wspt-oracle: 3 shifts repeated, with equal figures."
     truth[REWARD] += 0.01

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from fleet.errors import FleetError
+from scenarios.evaluate.study import check_policy
 from scenarios.policy_loader import PolicyFailed, failure
-from scenarios.trials.plan import check_policy
 
 POLICY = """
 class Bad:
@@ -63,12 +63,11 @@ def file(tmp_path: Path) -> Path:
         ("Misplans", "ValueError: no plan (FILE, line 29)"),
     ],
 )
-@pytest.mark.parametrize("command", ["run", "ablate", "bounds"])
+@pytest.mark.parametrize("command", ["run", "bounds"])
 def test_it_is_one_sentence(thermofleet, small_toml, tmp_path, file, command, policy, expected) -> None:
     name = f"{file}:{policy}"
     words = {
         "run": (small_toml, "--policy", name, "--difficulty", "blind", "--bus", "memory"),
-        "ablate": (small_toml, "--policy", name, "--sources", "blind,oracle", "--fleets", 2, "--seeds", 2),
         "bounds": (small_toml, "--starts", name, "--evaluations", 2, "--nodes", 0, "--difficulty", "blind"),
     }
     result = thermofleet(command, *words[command], "--out", tmp_path / "out")

@@ -20,13 +20,13 @@ from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol.messages import encoding
 from fleet.bus.protocol.policy import ActRequest
 from fleet.errors import BusError, FleetError
+from scenarios.evaluate import runner
+from scenarios.evaluate.rollout import outcomes, play
+from scenarios.evaluate.study import Case, Study, policy_hash
 from scenarios.load import load
 from scenarios.policy_loader import is_built_in, is_on_bus, label, policy_of, scope_of, source_of
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.evaluate import outcomes, play
 from scenarios.run.shift import RunSpec, run
-from scenarios.trials import contest
-from scenarios.trials.plan import Case, Study, policy_hash
 from tests.bus.test_policy_client import KEY, seen
 from tests.examples.programs import COMMAND, ROOT, running, started
 from tests.waiting import PATIENCE_S
@@ -85,18 +85,18 @@ def test_the_process_does_what_the_same_rule_does_in_python(fleet, served, same_
 def test_rows_are_the_same_on_one_and_two_processes_and_after_an_interruption(
     small_toml, plans, served, same_rule, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(contest, "HERE_S", 0.0)
+    monkeypatch.setattr(runner, "HERE_S", 0.0)
     on_bus, _ = served
     case = Case(name="heat", scenario=load(small_toml), seeds=tuple(range(18)))  # two units
     study = Study(policies=[on_bus, same_rule], cases=[case], difficulties=["blind"])
-    rows = contest.run_study(study, cache_dir=plans, workers=1)
-    assert rows == contest.run_study(study, cache_dir=plans, workers=2)
+    rows = runner.run_study(study, cache_dir=plans, workers=1)
+    assert rows == runner.run_study(study, cache_dir=plans, workers=2)
     assert [row.outcome for row in rows[:18]] == [row.outcome for row in rows[18:]]
     assert not any(row.error or row.illegal for row in rows)
     out = tmp_path / "out"
     first = replace(study, cases=[replace(case, seeds=case.seeds[:3])])
-    contest.run_study(first, out=out, cache_dir=plans, workers=1)
-    assert contest.run_study(study, out=out, cache_dir=plans, workers=1) == rows
+    runner.run_study(first, out=out, cache_dir=plans, workers=1)
+    assert runner.run_study(study, out=out, cache_dir=plans, workers=1) == rows
     assert json.loads((out / "study.json").read_text(encoding="utf-8"))["policies"][on_bus] == ""
 
 

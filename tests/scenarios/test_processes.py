@@ -1,13 +1,16 @@
 """Processes that do independent work, and what becomes of them when the one that began them is killed."""
 
+import os
 import signal
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 from joblib import delayed
 
+from fleet.errors import FleetError
 from scenarios.processes import worker_processes
 
 
@@ -43,3 +46,19 @@ def test_processes_end_with_the_one_that_began_them(tmp_path):
     # Returns when no process has its output open.
     killed = subprocess.run([sys.executable, str(script)], capture_output=True, timeout=60, check=False)
     assert killed.returncode == -signal.SIGKILL
+
+
+def die_once(marker: Path) -> str:
+    """Ends its process the first time."""
+    if not marker.exists():
+        marker.touch()
+        os._exit(1)
+    return "done"
+
+
+def test_work_of_a_process_that_died_is_done_again(tmp_path):
+    with worker_processes(2, in_order=True) as pool:
+        calls = [delayed(die_once)(tmp_path / "died"), delayed(abs)(-1), delayed(abs)(-2)]
+        assert list(pool(calls)) == ["done", 1, 2]
+        with pytest.raises(FleetError, match=r"The process that ran _exit died 3 times\."):
+            list(pool([delayed(os._exit)(1), delayed(abs)(-1)]))

@@ -7,16 +7,16 @@ import pytest
 
 from fleet.errors import FleetError, ScenarioError
 from scenarios.cli.options import parse_randomisation
+from scenarios.evaluate import runner
+from scenarios.evaluate.rollout import outcomes
+from scenarios.evaluate.store import read_rows
+from scenarios.evaluate.study import SHIFTS, Case, Study
 from scenarios.load import load, override
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.run.evaluate import outcomes
-from scenarios.trials import contest
-from scenarios.trials.plan import Case, Study
-from scenarios.trials.store import read_rows
 
 VARIED = Randomisation(ambient_k=(-5.0, 15.0), arrivals=(0.5, 2.0), variants=[{"spread": {"scale": 2.0, "seed": 9}}])
-BLIND = ("--policies", "random,round_robin", "--difficulty", "blind", "--seeds", 2, "--jobs", 1)
+BLIND = ("--policies", "random,round_robin", "--difficulty", "blind", "--seeds", 2, "--workers", 1)
 
 
 def study_of(*scenarios, randomise: Randomisation | None = VARIED) -> Study:
@@ -34,7 +34,9 @@ def test_a_constant_offset_equals_a_scenario_with_a_warmer_cell(thermofleet, sma
         ("cool", small_toml, ()),
     ):
         assert thermofleet("compare", file, *BLIND, "--out", tmp_path / name, *more).code == 0
-    offset, warm, cool = ([row.outcome for row in read_rows(tmp_path / name)] for name in ("offset", "warm", "cool"))
+    offset, warm, cool = (
+        [row.outcome for row in read_rows(tmp_path / name, SHIFTS)] for name in ("offset", "warm", "cool")
+    )
     for one, other, without in zip(offset, warm, cool, strict=True):
         assert one is not None
         assert other is not None
@@ -48,13 +50,13 @@ def test_a_constant_offset_equals_a_scenario_with_a_warmer_cell(thermofleet, sma
 def test_rows_do_not_depend_on_the_number_of_workers(small_toml, plans, monkeypatch):
     scenario = load(small_toml)
     study = study_of(scenario)
-    monkeypatch.setattr("scenarios.trials.plan.TOGETHER", 2)
-    alone = contest.run_study(study, cache_dir=plans, workers=1)
-    monkeypatch.setattr(contest, "HERE_S", 0.0)
-    assert contest.run_study(study, cache_dir=plans, workers=2) == alone
+    monkeypatch.setattr("scenarios.evaluate.study.TOGETHER", 2)
+    alone = runner.run_study(study, cache_dir=plans, workers=1)
+    monkeypatch.setattr(runner, "HERE_S", 0.0)
+    assert runner.run_study(study, cache_dir=plans, workers=2) == alone
     fleet = prepare(scenario, difficulty="blind", randomise=VARIED, cache=plans)
     assert [row.outcome for row in alone[:4]] == outcomes(fleet, "random", range(4))
-    plain = contest.run_study(study_of(scenario, randomise=None), cache_dir=plans, workers=1)
+    plain = runner.run_study(study_of(scenario, randomise=None), cache_dir=plans, workers=1)
     assert all(one.outcome != other.outcome for one, other in zip(alone, plain, strict=True))
 
 
@@ -62,7 +64,7 @@ def test_instances_of_one_cell_keep_their_own_jobs_in_variants(small_toml, plans
     scenario = load(small_toml)
     hold, sort = scenario.jobs
     worth = replace(scenario, name="worth", jobs=(hold, replace(sort, value=3.0, repetitions=(2, 4))))
-    rows = contest.run_study(study_of(scenario, worth), cache_dir=plans, workers=1)
+    rows = runner.run_study(study_of(scenario, worth), cache_dir=plans, workers=1)
     fleet = prepare(worth, difficulty="blind", randomise=VARIED, cache=plans)
     alone = [each for policy in ("random", "round_robin") for each in outcomes(fleet, policy, range(4))]
     assert [row.outcome for row in rows if row.key.instance == "worth"] == alone

@@ -6,18 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scenarios.evaluate.rollout import FIGURES, Outcome
+from scenarios.evaluate.scores import normalised, references_of, scores_of
+from scenarios.evaluate.statistics import interval
+from scenarios.evaluate.study import Case, Key, Row
 from scenarios.load import load
-from scenarios.run.evaluate import FIGURES, Outcome
-from scenarios.statistics.means import interval
-from scenarios.statistics.scores import scores_of
-from scenarios.trials.plan import Case, Key, Row
-from scenarios.trials.scores import normalised, references_of
 
 SHIFTS = [("test/0000", 7), ("test/0001", 8), ("test/0002", 9)]
 
 
 class Known:
-    """A reference as `scenarios.bounds.references` stores it, with what scores read."""
+    """A reference as `scenarios.evaluate.references` stores it, with what scores read."""
 
     def __init__(self, instance: str, random: float, hindsight: float, upper: float) -> None:
         self.instance, self.random, self.hindsight, self.upper = instance, random, hindsight, upper

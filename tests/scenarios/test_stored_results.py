@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.leaderboard.board import read_all
-from scenarios.trials.cases import suite_of
-from scenarios.trials.contest import run_study
-from scenarios.trials.plan import Study
+from scenarios.evaluate.leaderboard import read_all
+from scenarios.evaluate.runner import run_study
+from scenarios.evaluate.study import Study, suite_of
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results" / "leaderboard"
 

@@ -11,8 +11,8 @@ from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.load import load, override
 from scenarios.policy_loader import label, policy_of
-from scenarios.run.train_policy import CURVE, VALIDATION_SEED, TrainingPlan, train
-from scenarios.run.training_folder import NETWORK_STATE
+from scenarios.train.folder import NETWORK_STATE
+from scenarios.train.networks import CURVE, VALIDATION_SEED, TrainingPlan, train
 
 SMALL = {"horizon_s": 300.0}
 

@@ -14,17 +14,17 @@ from agents.pair_scores import PAIRS_CARD, PARAMETERS, first_parameters
 from agents.pairs import Worth
 from fleet.errors import FleetError
 from scenarios.cli.main import main
+from scenarios.evaluate.rollout import outcomes
 from scenarios.load import load, override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
-from scenarios.run import suite_batches
-from scenarios.run import train_pairs as pairs
-from scenarios.run.evaluate import outcomes
-from scenarios.run.suite_batches import ground_of, rewards
-from scenarios.run.train_pairs import CURVE, PairPlan, train_pairs, validation
-from scenarios.run.train_policy import Judge, TrainingPlan, train_on_split
-from scenarios.run.training_folder import PAIRS_STATE, TRAINING, holds_training
 from scenarios.suite.splits import Instance, instance
+from scenarios.train import instances as suite_batches
+from scenarios.train import pairs
+from scenarios.train.folder import PAIRS_STATE, TRAINING, holds_training
+from scenarios.train.instances import ground_of, rewards
+from scenarios.train.networks import Judge, TrainingPlan, train_on_split
+from scenarios.train.pairs import CURVE, PairPlan, train_pairs, validation
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +160,7 @@ def test_ctrl_c_before_the_first_state_of_ppo_leaves_no_training(tmp_path, groun
         config = PpoConfig(envs=2, steps=8, epochs=1, warm_start="wspt")
         return train_on_split([ground], [ground], config, out, plan, card={}, resume=resume)
 
-    monkeypatch.setattr("scenarios.run.train_policy.imitate_rule", lambda *args: None)
+    monkeypatch.setattr("scenarios.train.networks.imitate_rule", lambda *args: None)
     with monkeypatch.context() as patch:
         rewards_of = iter([0.5])  # of the teacher, and then an interruption
         patch.setattr(Judge, "reward", lambda *args: next(rewards_of, None) or interrupt())
@@ -170,7 +170,7 @@ def test_ctrl_c_before_the_first_state_of_ppo_leaves_no_training(tmp_path, groun
     with pytest.raises(FleetError, match="holds no training to resume"):
         trained(resume=True)
     with monkeypatch.context() as patch:
-        patch.setattr("scenarios.run.train_policy.Trainer.iterate", interrupt)
+        patch.setattr("scenarios.train.networks.Trainer.iterate", interrupt)
         done = trained()
     assert (done.iterations, done.interrupted) == (0, True)
     assert trained(resume=True).iterations == 1
@@ -187,7 +187,7 @@ def test_time_of_a_session_or_in_total() -> None:
 def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(suite_batches, "grounds_of", lambda *args, **options: [ground])
-    monkeypatch.setattr("scenarios.trials.scores.references_of", lambda cases: {})
+    monkeypatch.setattr("scenarios.evaluate.scores.references_of", lambda cases: {})
     words = ["--suite", "train", "--difficulty", "oracle", "--instances", "1", "--validation-instances", "1"]
 
     def trained(*more: str) -> tuple[list[int], int]:

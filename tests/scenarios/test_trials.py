@@ -12,17 +12,18 @@ import pytest
 
 from agents.pair_scores import PARAMETERS, save_pairs
 from fleet.errors import FleetError
+from scenarios.evaluate import runner, sources
+from scenarios.evaluate.comparison import comparison_of, comparisons
+from scenarios.evaluate.rollout import FIGURES, outcomes
+from scenarios.evaluate.store import RESULTS, opened, read_rows
+from scenarios.evaluate.study import SHIFTS, Case, Key, Row, Study, Unit, policy_hash, seeds_of_instance
 from scenarios.load import load, override
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.planned_arm import plan_arms
-from scenarios.run.evaluate import FIGURES, outcomes
+from scenarios.processes import Queue
 from scenarios.schema import Scenario
 from scenarios.show.comparison_page import result_text
-from scenarios.trials import contest, fleets, run_unit
-from scenarios.trials.plan import Case, Key, Row, Study, Unit, policy_hash, seeds_of_instance
-from scenarios.trials.store import RESULTS, opened, read_rows
-from scenarios.trials.summary import comparison_of, comparisons
 from tests.own_policies import IDLE
 
 BAD = (
@@ -76,7 +77,7 @@ def study_of(scenario: Scenario, *policies: str, seeds: int = 3, **more) -> Stud
 
 def test_rows_do_not_depend_on_processes_folders_and_blocks(scenario, plans, tmp_path, monkeypatch):
     study = study_of(scenario, seeds=5, fleets=2)
-    alone = contest.run_study(study, cache_dir=plans, workers=1)
+    alone = runner.run_study(study, cache_dir=plans, workers=1)
     assert [row.key for row in alone] == [
         Key(policy, "heat", fleet, 0, "blind", seed)
         for fleet in range(2)
@@ -86,10 +87,10 @@ def test_rows_do_not_depend_on_processes_folders_and_blocks(scenario, plans, tmp
     fleet = prepare(replace(scenario, spread=replace(scenario.spread, seed=1)), difficulty="blind", cache=plans)
     assert [row.outcome for row in alone[10:15]] == outcomes(fleet, "random", range(5))
     assert alone[0].outcome != alone[10].outcome
-    assert contest.run_study(study, out=tmp_path / "one", cache_dir=plans, workers=1) == alone
-    monkeypatch.setattr("scenarios.trials.plan.TOGETHER", 2)
-    monkeypatch.setattr(contest, "HERE_S", 0.0)
-    assert contest.run_study(study, out=tmp_path / "two", cache_dir=plans, workers=2) == alone
+    assert runner.run_study(study, out=tmp_path / "one", cache_dir=plans, workers=1) == alone
+    monkeypatch.setattr("scenarios.evaluate.study.TOGETHER", 2)
+    monkeypatch.setattr(runner, "HERE_S", 0.0)
+    assert runner.run_study(study, out=tmp_path / "two", cache_dir=plans, workers=2) == alone
     one, two = ((tmp_path / name / RESULTS).read_bytes() for name in ("one", "two"))
     assert one == two
     columns = ["policy", "instance", "fleet", "training", "difficulty", "seed", *FIGURES, "illegal", "error", "trace"]
@@ -97,45 +98,45 @@ def test_rows_do_not_depend_on_processes_folders_and_blocks(scenario, plans, tmp
 
 
 def test_an_interrupted_study_goes_on_where_it_was(scenario, plans, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.trials.plan.TOGETHER", 2)
+    monkeypatch.setattr("scenarios.evaluate.study.TOGETHER", 2)
     study = study_of(scenario, seeds=5)
-    whole = contest.run_study(study, out=tmp_path / "whole", cache_dir=plans, workers=1)
-    out, ran = tmp_path / "out", []
+    whole = runner.run_study(study, out=tmp_path / "whole", cache_dir=plans, workers=1)
+    out, ran, run_unit = tmp_path / "out", [], runner.run_unit
 
     def stop_at(count: int):
         def run(unit, settings):
             if len(ran) == count:
                 raise KeyboardInterrupt
             ran.append(unit)
-            return run_unit.run_unit(unit, settings)
+            return run_unit(unit, settings)
 
         return run
 
     for most in (1, 1, 4, 5, 6):
-        monkeypatch.setattr(contest, "run_unit", stop_at(most))
+        monkeypatch.setattr(runner, "run_unit", stop_at(most))
         if most < 6:
             with pytest.raises(KeyboardInterrupt):
-                contest.run_study(study, out=out, cache_dir=plans, workers=1)
+                runner.run_study(study, out=out, cache_dir=plans, workers=1)
             (out / "parts" / ".draft.parquet").write_bytes(b"PAR1")  # as a killed process may leave
-            assert len(read_rows(out)) == sum(len(unit.case.seeds) for unit in ran)
+            assert len(read_rows(out, SHIFTS)) == sum(len(unit.case.seeds) for unit in ran)
         else:
             (out / "parts" / ".draft.parquet").unlink()
-            assert contest.run_study(study, out=out, cache_dir=plans, workers=1) == whole
+            assert runner.run_study(study, out=out, cache_dir=plans, workers=1) == whole
     assert len(ran) == 6
     assert (out / RESULTS).read_bytes() == (tmp_path / "whole" / RESULTS).read_bytes()
-    assert contest.run_study(study, out=out, cache_dir=plans, workers=1) == whole  # nothing runs: it would stop
+    assert runner.run_study(study, out=out, cache_dir=plans, workers=1) == whole  # nothing runs: it would stop
     more = study_of(scenario, "random", "wspt", seeds=5)
-    monkeypatch.setattr(contest, "run_unit", run_unit.run_unit)
-    added = contest.run_study(more, out=out, cache_dir=plans, workers=1)
-    assert added == contest.run_study(more, cache_dir=plans, workers=1)
-    assert {row.key.policy for row in read_rows(out)} == {"random", "round_robin", "wspt"}
+    monkeypatch.setattr(runner, "run_unit", run_unit)
+    added = runner.run_study(more, out=out, cache_dir=plans, workers=1)
+    assert added == runner.run_study(more, cache_dir=plans, workers=1)
+    assert {row.key.policy for row in read_rows(out, SHIFTS)} == {"random", "round_robin", "wspt"}
 
 
 def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
     out = tmp_path / "out"
     own = f"{bad}:Idle"
     study = study_of(scenario, own, "random")
-    contest.run_study(study, out=out, cache_dir=plans, workers=1)
+    runner.run_study(study, out=out, cache_dir=plans, workers=1)
     hot = override(scenario, horizon_s=120.0)
     cases = [
         (study_of(hot, own, "random"), "holds a study in which instance 'heat' was another one"),
@@ -143,23 +144,23 @@ def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
     ]
     for other, said in cases:
         with pytest.raises(FleetError, match=said):
-            contest.run_study(other, out=out, cache_dir=plans, workers=1)
+            runner.run_study(other, out=out, cache_dir=plans, workers=1)
     bad.write_text(bad.read_text() + "\n", encoding="utf-8")
     study = replace(study)  # begun now
     with pytest.raises(FleetError, match=f"in which policy '{own}' was another one"):
-        contest.run_study(study, out=out, cache_dir=plans, workers=1)
-    with opened(tmp_path / "busy", study.card), pytest.raises(FleetError, match="Another process writes to"):
-        contest.run_study(study, out=tmp_path / "busy", cache_dir=plans, workers=1)
+        runner.run_study(study, out=out, cache_dir=plans, workers=1)
+    with opened(tmp_path / "busy", SHIFTS, study.card), pytest.raises(FleetError, match="Another process writes to"):
+        runner.run_study(study, out=tmp_path / "busy", cache_dir=plans, workers=1)
     with pytest.raises(FleetError, match="holds other files"):
-        contest.run_study(study, out=tmp_path, cache_dir=plans, workers=1)
+        runner.run_study(study, out=tmp_path, cache_dir=plans, workers=1)
 
 
 def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, tmp_path):
     names = {name: f"{bad}:{name}" for name in ("Raises", "Nonsense", "Needs", "Stuck", "Illegal", "Idle")}
     study = study_of(scenario, "round_robin", *names.values(), seeds=2, decision_limit_s=0.2)
-    rows = contest.run_study(study, out=tmp_path / "out", cache_dir=plans, workers=1)
+    rows = runner.run_study(study, out=tmp_path / "out", cache_dir=plans, workers=1)
     by_policy = {policy: [row for row in rows if row.key.policy == policy] for policy in study.policies}
-    alone = contest.run_study(study_of(scenario, "round_robin", seeds=2), cache_dir=plans, workers=1)
+    alone = runner.run_study(study_of(scenario, "round_robin", seeds=2), cache_dir=plans, workers=1)
     assert by_policy["round_robin"] == alone
     said = {
         "Raises": ("KeyError: 'nobody' (at 30 s of the shift)", 'return seen["nobody"]'),
@@ -177,7 +178,7 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     assert [row.outcome for row in idle] == [row.outcome for row in illegal]  # what is illegal is a wait
     assert [row.illegal for row in idle] == [0, 0]
     assert [row.illegal for row in illegal] == [36, 36]  # two arms, 18 decisions
-    assert read_rows(tmp_path / "out") == sorted(rows, key=lambda row: row.key)
+    assert read_rows(tmp_path / "out", SHIFTS) == sorted(rows, key=lambda row: row.key)
 
     result = comparison_of(study, rows, "round_robin")
     assert set(result.figures) == {"round_robin", names["Illegal"], names["Idle"]}
@@ -189,7 +190,7 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
 
 def test_a_policy_that_catches_every_alarm_ends_with_its_process():
     code = """
-from scenarios.run import decision_limit
+from scenarios.evaluate import rollout as decision_limit
 decision_limit.AGAIN_S, limit = 0.05, decision_limit.DecisionLimit(0.05)
 def turn():
     while True: pass
@@ -206,10 +207,10 @@ with limit.watching(), limit.decision():
 
 
 def test_shifts_of_a_process_that_dies_are_run_again(scenario, plans, bad, monkeypatch):
-    monkeypatch.setattr(contest, "HERE_S", 0.0)
+    monkeypatch.setattr(runner, "HERE_S", 0.0)
     told: list[str] = []
     study = study_of(scenario, f"{bad}:DiesOnce", f"{bad}:DiesInOne", f"{bad}:Idle")
-    rows = contest.run_study(study, cache_dir=plans, workers=2, tell=told.append)
+    rows = runner.run_study(study, cache_dir=plans, workers=2, tell=told.append)
     once, one, idle = ([row.outcome for row in rows[i : i + 3]] for i in (0, 3, 6))
     assert once == idle
     assert one == [idle[0], None, idle[2]]
@@ -239,9 +240,8 @@ def test_instances_of_one_cell_share_a_prepared_fleet(scenario, plans, monkeypat
         planned.append(scenario.name)
         return plan_arms(scenario, *rest)
 
-    monkeypatch.setattr(fleets, "prepare", counted)
-    monkeypatch.setattr(run_unit, "fleets", fleets.Fleets())
-    monkeypatch.setattr(contest.here, "fleets", run_unit.fleets)
+    monkeypatch.setattr(sources, "prepare", counted)
+    monkeypatch.setattr(runner, "fleets", sources.Fleets())
     cases = [Case(name=each.name, scenario=each, seeds=(7,)) for each in scenarios]
     for difficulty in ("blind", "oracle"):
         made.clear()
@@ -249,7 +249,7 @@ def test_instances_of_one_cell_share_a_prepared_fleet(scenario, plans, monkeypat
         study = Study(policies=["round_robin"], cases=cases, difficulties=[difficulty])
         with monkeypatch.context() as patched:
             patched.setattr(preparing, "plan_arms", plans_counted)
-            rows = contest.run_study(study, cache_dir=plans, workers=1)
+            rows = runner.run_study(study, cache_dir=plans, workers=1)
         assert made == ["heat", "wide", "warm"]
         assert planned == ["heat", "wide"]
         assert [row.key.instance for row in rows] == [case.name for case in cases]
@@ -261,7 +261,7 @@ def test_several_instances_are_told_apart_or_together(scenario, plans):
     warm = replace(scenario, name="warm", ambient=replace(scenario.ambient, points=((0.0, 45.0),)))
     cases = [Case(name=each.name, scenario=each, seeds=(0, 1)) for each in (scenario, warm)]
     study = Study(policies=["random", "round_robin"], cases=cases, difficulties=["blind", "oracle"])
-    rows = contest.run_study(study, cache_dir=plans, workers=1)
+    rows = runner.run_study(study, cache_dir=plans, workers=1)
     apart = comparisons(study, rows, "random@oracle")
     assert [each.scenario for each in apart] == ["heat", "warm"]
     (together,) = comparisons(study, rows, "random@oracle", "both")
@@ -278,10 +278,10 @@ def test_folders_of_trainings_are_one_policy(scenario, plans, tmp_path):
     for k in (0, 1, 10):
         save_pairs(np.eye(1, PARAMETERS)[0] * -9.0 * k, tmp_path / f"pairs-{k}")  # refuses warm jobs, then all
     every = str(tmp_path / "pairs-*")
-    rows = contest.run_study(study_of(scenario, "wsept", every), cache_dir=plans, workers=1)
+    rows = runner.run_study(study_of(scenario, "wsept", every), cache_dir=plans, workers=1)
     assert [(row.key.policy, row.key.training) for row in rows[::3]] == [("wsept", 0), *((every, k) for k in range(3))]
     apart = study_of(scenario, *(str(tmp_path / f"pairs-{k}") for k in (0, 1, 10)))
-    alone = contest.run_study(apart, cache_dir=plans, workers=1)
+    alone = runner.run_study(apart, cache_dir=plans, workers=1)
     assert [row.outcome for row in rows[3:]] == [row.outcome for row in alone]
     assert rows[3].outcome != rows[6].outcome
     assert len({policy_hash(each) for each in (every, *apart.policies)}) == 4
@@ -303,50 +303,52 @@ def test_seeds_of_instances_are_their_own():
 
 
 def test_a_worker_stays_with_its_group_and_helps_others_at_the_end(scenario):
-    from scenarios.trials.workers import Queue
+    settings = runner.Settings.of(study_of(scenario), None)
 
-    def units(name: str, count: int) -> list[Unit]:
-        return [Unit(str(i), Case(name=name, scenario=scenario, seeds=(0,)), 0, 0, "blind") for i in range(count)]
+    def works(name: str, count: int) -> list[runner.UnitWork]:
+        case = Case(name=name, scenario=scenario, seeds=(0,))
+        return [runner.UnitWork(Unit(str(i), case, 0, 0, "blind"), settings) for i in range(count)]
 
-    queue = Queue([*units("a", 4), *units("b", 2)])
+    queue = Queue([*works("a", 4), *works("b", 2)])
     first, second = queue.take(), queue.take()
-    assert (first.case.name, second.case.name) == ("a", "b")
+    assert (first.unit.case.name, second.unit.case.name) == ("a", "b")
     assert queue.take(second.group).group == second.group
     assert queue.take(second.group).group == first.group
-    queue.put_back(replace(first, case=replace(first.case, seeds=(5, 6))))
-    assert [queue.take(first.group).case.seeds for _ in range(4)] == [(5,), (6,), (0,), (0,)]
+    unit = replace(first.unit, case=replace(first.unit.case, seeds=(5, 6)))
+    queue.put_back(replace(first, unit=unit).after_death())
+    left = [queue.take(first.group) for _ in range(4)]
+    assert [(work.unit.case.seeds, work.deaths) for work in left] == [((5,), 1), ((6,), 1), ((0,), 0), ((0,), 0)]
     assert not queue
 
 
 def test_a_row_without_outcome_has_a_sentence():
     row = Row(Key("p", "i", 0, 0, "blind", 1), None, error="It died.")
-    from scenarios.trials.plan import columns
-    from scenarios.trials.store import row_of
+    from scenarios.evaluate.study import columns, row_of
 
     assert row_of(columns(row)) == row
 
 
 def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet, small_toml, bad, tmp_path):
     out = tmp_path / "study"
-    how = ("--difficulty", "blind", "--seeds", "2", "--jobs", "1", "--out", out)
+    how = ("--difficulty", "blind", "--seeds", "2", "--workers", "1", "--out", out)
     said = thermofleet("compare", small_toml, "--policies", f"round_robin,{bad}:Raises,{bad}:Illegal", *how)
     assert said.code == 0
     assert "Raises: KeyError: 'nobody' (at 30 s of the shift)" in said.out
     assert "Illegal actions, which count as waits: Illegal 72." in said.out
-    assert len(read_rows(out)) == 6
+    assert len(read_rows(out, SHIFTS)) == 6
     page = (out / "index.html").read_text(encoding="utf-8")
     assert f"thermofleet compare {small_toml} --policies round_robin,{bad}:Raises" in page
     assert "KeyError: &#39;nobody&#39; (at 30 s of the shift)" in page
     told = thermofleet("compare", "--suite", small_toml, "--policies", "wspt,random", *how, "--fleets", "2", "--json",
                        "--marl-eval")  # fmt: skip
     assert msgspec.json.decode(told.out)["scenario"] == str(small_toml)
-    assert len(read_rows(out)) == 14
+    assert len(read_rows(out, SHIFTS)) == 14
     raw = msgspec.json.decode((out / "marl_eval.json").read_bytes())
     assert len(raw["thermofleet"]["heat"]["wspt"]) == 4  # two fleets, two seeds
     for wrong, sentence in (
         ((), "Give either scenarios or --suite."),
         ((small_toml, "--suite", "test"), "Give either scenarios or --suite."),
-        ((small_toml, "--jobs", "2", "--ray", "auto"), "Give either --jobs or --ray."),
+        ((small_toml, "--workers", "2", "--ray", "auto"), "Give either --workers or --ray."),
         ((small_toml, "--marl-eval"), "--marl-eval needs --out"),
         ((small_toml, "--references", "none.jsonl"), "There is no file of references 'none.jsonl'"),
         ((small_toml, "--difficulty", "blind,oracel"), "No difficulty 'oracel'; did you mean 'oracle'?"),

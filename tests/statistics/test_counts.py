@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scenarios.statistics.counts import count_interval, paired_counts, rate_bounds, share_bounds
-from scenarios.statistics.means import interval, paired
+from scenarios.evaluate.statistics import count_interval, interval, paired, paired_counts, rate_bounds, share_bounds
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 10), (3, 10), (10, 10), (1, 1)])

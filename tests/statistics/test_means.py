@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from scenarios.statistics.holm import holm
-from scenarios.statistics.means import FARTHEST, SKEW_BIAS, interval, mean_bounds, mean_by_group, paired, unit
+from scenarios.evaluate.statistics import FARTHEST, SKEW_BIAS, holm, interval, mean_bounds, mean_by_group, paired, unit
 
 SYMMETRIC = np.array([-4.0, -1.0, 0.0, 1.0, 4.0]) + 2.0
 

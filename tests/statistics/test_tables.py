@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from scenarios.statistics.holm import holm
-from scenarios.statistics.means import interval, paired
-from scenarios.statistics.tables import EQUAL, figure_rows, figures_of, remarks
+from scenarios.evaluate.statistics import holm, interval, paired
+from scenarios.evaluate.tables import EQUAL, figure_rows, figures_of, remarks
 
 
 @pytest.fixture

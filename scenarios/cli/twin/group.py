@@ -185,8 +185,8 @@ def report_command(
     """
     check_source(scenario, log, arm)
     from fleet.files import cache_folder
-    from scenarios.show import twin_report
     from scenarios.result_folder import check_free, new_folder
+    from scenarios.show import twin_report
 
     check_free(out, twin_report.REPORT, overwrite=overwrite)
     bar = progress_bar(kept="Twins already trained are")

@@ -1,0 +1,1 @@
+"""Policies judged: studies over fleets, trainings and seeds, their statistics, bounds, and the leaderboard."""

@@ -1,0 +1,277 @@
+"""Hindsight: the best schedule that a clairvoyant search finds in the true simulator, a lower bound of the optimum; and
+the simulator, which plays schedules and policies in one shift many times side by side."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+
+from agents.policy import WAIT, Planner, Policy, only_choices
+from agents.schedules import LEAST_GAIN, Changes, Schedules, stack
+from fleet.engine.batch import Engine, shifts_of
+from fleet.engine.reward import RewardWeights
+from fleet.engine.state import World
+from fleet.engine.tables import tables_of
+from fleet.env.lookahead import CellSimulator, Lookahead
+from fleet.env.validation import actions_of
+from fleet.observation import Layout, Observation
+from scenarios.evaluate.rollout import UNLIMITED, DecisionLimit
+
+Array = np.ndarray
+
+
+Claim = tuple[int, int, int]
+"""Decision interval, arm (its index) and action."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """What came of schedules or of a policy."""
+
+    reward: Array
+    """[schedule]."""
+    start_s: Array
+    """When each job was last awarded, inf if never, [schedule, job]."""
+    arm: Array
+    """To which arm, int [schedule, job]."""
+    option: Array
+    """With which plan, int [schedule, job]."""
+    claims: list[list[Claim]]
+    """The claims of each schedule that were won, and jobs given back, in the order of time."""
+
+    def and_(self, other: "Simulated") -> "Simulated":
+        """These and other results of the same shift."""
+        names = ("reward", "start_s", "arm", "option")
+        arrays = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
+        return Simulated(*arrays, claims=[*self.claims, *other.claims])
+
+
+class ShiftSimulator:
+    """Simulates one shift many times side by side.
+
+    Args:
+        world: Its env 0.
+        rows: Number of simulations at a time.
+        noise_key: Of the sensors, which only policies notice.
+        simulator: Makes that of the same shift for a policy that plans.
+        compiled: As in `Engine`.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        weights: RewardWeights,
+        rows: int,
+        *,
+        noise_key: int = 0,
+        simulator: Callable[[], CellSimulator] | None = None,
+        compiled: bool | None = None,
+    ) -> None:
+        tables, drawn = tables_of(world)
+        self.world, self.rows, self._simulator = world, rows, simulator
+        self.jobs = int(world.jobs.exists[0].sum())
+        self.evaluations = 0
+        """Shifts simulated so far."""
+        self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+        self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
+        self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled)
+        self._vectors = np.zeros((rows, self._layout.arms, self._layout.size), np.float32)
+
+    def changes(self, rng: np.random.Generator) -> Changes:
+        """Changes of its schedules."""
+        tables, jobs = self._engine.tables, self.jobs
+        can = tables.work["plan"][0, :, :jobs] >= 0
+        return Changes(
+            can, tables.stations[0, :jobs], self.world.jobs.release_s[0, :jobs], self.world.horizon_s,
+            self.world.dt_s, rng,
+        )  # fmt: skip
+
+    def run(self, schedules: Schedules) -> Simulated:
+        """The results of at most `rows` schedules."""
+        given = len(schedules.arm)
+        self._engine.reset(np.arange(given), self._shifts[:given])
+        played = self._engine.play(schedules, np.ones(self.world.ticks))
+        self.evaluations += given
+        lists = [
+            [(tick, a, action) for tick, a, action in played.claims[e, : played.won[e]].tolist()] for e in range(given)
+        ]
+        return Simulated(played.reward, played.start_s, schedules.arm, schedules.option, lists)
+
+    def follow(self, policies: Sequence[Policy], limit: DecisionLimit = UNLIMITED) -> Simulated:
+        """The results of at most `rows` policies, each at the beginning of its shift.
+
+        Args:
+            limit: Of the time of a decision.
+        """
+        engine, world, given = self._engine, self.world, len(policies)
+        skips = all(only_choices(policy) for policy in policies)
+        engine.reset(np.arange(self.rows), self._shifts)
+        engine.observe(np.arange(self.rows), self._vectors)
+        for e, policy in enumerate(policies):
+            if isinstance(policy, Planner) and self._simulator:
+                policy.plan_in(Lookahead(self._simulator(), engine, e))
+        reward, running = np.zeros(self.rows), np.ones(self.rows, bool)
+        running[given:] = False
+        start_s = np.full((self.rows, self.jobs), np.inf)
+        arm_of, option_of = np.full((self.rows, self.jobs), -1), np.full((self.rows, self.jobs), -1)
+        claims: list[list[Claim]] = [[] for _ in range(self.rows)]
+        until = np.full(self.rows, world.ticks, np.int64) if skips else None
+        give_back, options = self._layout.actions - 1, self._layout.plans
+        while running.any():
+            asked = running & engine.mask[..., 1:-1].any(axis=(1, 2)) if skips else running
+            actions = self._actions(policies, asked, limit)
+            tick, slot_job = engine.state.tick.copy(), engine.offers.slot_job.copy()
+            legal = np.take_along_axis(engine.mask, np.clip(actions, 0, give_back)[..., None], axis=2)[..., 0] > 0
+            _, earned, finished = engine.step(actions, self._vectors, until)
+            reward += np.where(running, earned, 0.0)
+            for e, a in np.argwhere((actions > 0) & legal & running[:, None]).tolist():
+                action = int(actions[e, a])
+                if action < give_back and engine.state.last_award[e, a] != 1:
+                    continue
+                claims[e].append((int(tick[e]), a, action))
+                if action < give_back:
+                    slot, option = divmod(action - 1, options)
+                    job = slot_job[e, slot]
+                    start_s[e, job], arm_of[e, job], option_of[e, job] = tick[e] * world.dt_s, a, option
+            running &= ~finished & (engine.state.tick < world.ticks)
+        self.evaluations += given
+        return Simulated(reward[:given], start_s[:given], arm_of[:given], option_of[:given], claims[:given])
+
+    def _actions(self, policies: Sequence[Policy], asked: Array, limit: DecisionLimit) -> Array:
+        """The actions of the policies that are asked, int64 [row, arm]; the others wait."""
+        names, mask = self.world.arms, self._engine.mask
+        actions = np.full((self.rows, len(names)), WAIT, np.int64)
+        for e in np.flatnonzero(asked).tolist():
+            known = self._layout.read_each(names, self._vectors[e], mask[e])
+            with limit.decision():
+                actions[e] = actions_of(names, policies[e].act(known))
+        return actions
+
+
+def without_scores(world: World) -> World:
+    """The same world without predictions, which only policies read; awards do not change."""
+    unknown = np.full_like(world.offers.risk, -1)
+    offers = replace(world.offers, risk=unknown, peak=unknown, forecasts=None)
+    return replace(world, offers=offers)
+
+
+@dataclass
+class Replay:
+    """A policy that repeats the claims of a schedule; in the shift that it was made for, it has the same result."""
+
+    claims: Sequence[Claim]
+    scope: ClassVar = "central"
+    _interval: int = field(default=0, init=False)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin the shift."""
+        self._interval = 0
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of this decision interval; to be called once in each."""
+        arms = list(observations)
+        actions = dict.fromkeys(arms, WAIT) | {
+            arms[a]: action for tick, a, action in self.claims if tick == self._interval
+        }
+        self._interval += 1
+        return actions
+
+
+SIDE_BY_SIDE = 32
+"""Schedules that are simulated at a time."""
+TOLERANCE = 0.004
+"""At the beginning the search goes on from a schedule that is worse by at most this share of the value on offer."""
+RESTART = 30
+"""Rounds without a better schedule after which the search goes on near the best one."""
+KICKS = 6
+"""It is changed fewer times than this before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hindsight:
+    """The best schedule found."""
+
+    reward: float
+    start: float
+    """Reward of the best start."""
+    claims: list[Claim]
+    """For `Replay`."""
+    evaluations: int
+    seconds: float
+    """CPU time of the search after its first simulation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """When the search ends, at the first of both, and the proof of the upper bound.
+
+    Without a limit of seconds the result depends on nothing but the instance, the code and its libraries.
+    """
+
+    seconds: float = 30.0
+    """CPU time after the first simulation, which may compile the simulator; inf for no limit."""
+    evaluations: int = 1_000_000
+    """Simulated shifts."""
+    nodes: int = 2000
+    """Most nodes of the branch and bound of the upper bound, which has proved something by then; 0: none."""
+
+
+def hindsight(
+    simulator: ShiftSimulator,
+    starts: Simulated,
+    seed: np.random.SeedSequence,
+    budget: Budget | None = None,
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Hindsight:
+    """The best schedule found by large neighbourhood search, never worse than the starts.
+
+    Each round changes the present schedule in many ways, simulates all of them, and goes on from the best, which may be
+    slightly worse (record-to-record travel: Dueck, Journal of Computational Physics 104, 1993). The next round also
+    tries all changes that were improvements at once.
+
+    Args:
+        starts: Results in the same shift of policies, for example.
+        seed: Of the changes.
+    """
+    budget, rng, first = budget or Budget(), np.random.default_rng(seed), int(starts.reward.argmax())
+    best, best_claims = float(starts.reward[first]), starts.claims[first]
+    changes = simulator.changes(rng)
+    if changes.none:
+        return Hindsight(best, best, best_claims, 0, 0.0)
+    chosen = np.argsort(-starts.reward)[: simulator.rows // 4]
+    present = changes.of_awards(starts.start_s[chosen], starts.arm[chosen], starts.option[chosen])
+    value = float(simulator.world.jobs.value[0][simulator.world.jobs.exists[0]].sum())
+    tried = stack([present, changes.freed(present)])
+    result = simulator.run(tried)
+    began_s = time.process_time()  # that run may have compiled the simulator, for a minute
+    at = int(result.reward.argmax())
+    current, score = changes.in_order(tried, result.start_s, at), float(result.reward[at])
+    record, since, begun = current, 0, simulator.evaluations
+    if score > best:
+        best, best_claims = score, result.claims[at]
+    joint: list[Schedules] = []
+    while not stopped():
+        spent_s, spent = time.process_time() - began_s, simulator.evaluations - begun
+        used = max(spent_s / budget.seconds, spent / budget.evaluations)
+        if used >= 1.0:
+            break
+        tried = changes.neighbours(current, joint, simulator.rows)
+        result = simulator.run(tried)
+        at, since = int(result.reward.argmax()), since + 1
+        top, joint = float(result.reward[at]), changes.joined(current, score, tried, result.reward)
+        if top > best + LEAST_GAIN:
+            best, best_claims, since = top, result.claims[at], 0
+            record = changes.in_order(tried, result.start_s, at)
+        if top > min(best - TOLERANCE * value * (1.0 - used), score) - LEAST_GAIN:
+            current, score = changes.in_order(tried, result.start_s, at), top
+        if since >= RESTART:
+            kicked = record
+            for _ in range(int(rng.integers(KICKS))):
+                kicked = changes.changed(kicked)
+            result = simulator.run(kicked)
+            current, score, since, joint = changes.in_order(kicked, result.start_s, 0), float(result.reward[0]), 0, []
+    seconds = time.process_time() - began_s
+    return Hindsight(best, float(starts.reward[first]), best_claims, simulator.evaluations - begun, seconds)

@@ -1,0 +1,539 @@
+"""The leaderboard: results of policies on a whole split, one file each, their check, repetition and table."""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from math import isclose
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+
+from fleet.bus.exchange.channel import PERFECT
+from fleet.engine.observe import PEAK_HIGH_C, PEAK_LOW_C
+from fleet.errors import FleetError, printable
+from fleet.files import atomic_path
+from scenarios.evaluate.references import Reference, load_references, reference_table
+from scenarios.evaluate.rollout import COUNTS, DECISION_LIMIT_S, FIGURES, Outcome
+from scenarios.evaluate.runner import run_study
+from scenarios.evaluate.scores import Scores, Shift, normalised, ranked, references_of, score_cells, scores_of
+from scenarios.evaluate.study import CARD, Case, Key, Row, Study, suite_of
+from scenarios.load import SPLITS, SplitName
+from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
+from scenarios.prepare.fleet import RiskName
+from scenarios.prepare.randomisation import Randomisation
+from scenarios.progress import Progress, quiet
+from scenarios.result_folder import disk_errors
+from scenarios.show.table import markdown_table as table
+from scenarios.suite.cells import JUDGED
+from scenarios.suite.splits import Row as Line
+from scenarios.suite.splits import cell_of_instance, instance, line_of, manifest
+
+FORMAT = 1
+DIGITS = 10
+"""Significant digits of figures in a file."""
+MOST_BYTES = 1_000_000
+MOST_TRAININGS = 20
+SLACK = 1e-6
+"""By which a reward may exceed an upper bound, as a share, for rounding."""
+NEEDED = ("python", "thermofleet", "numpy", "numba", "scipy")
+"""Versions that a result must state."""
+MOST_FIGURE = 1e9
+MOST_LOSS = 100.0
+"""Least possible reward: this many times the way from random to the upper bound, below random."""
+SHOWN = 3
+"""Problems that an error names."""
+Text = Annotated[str, msgspec.Meta(max_length=200)]
+PLAIN = r"^[^\x00-\x1f\x7f-\x9f|<>`\u2028\u2029\ud800-\udfff]*$"
+"""Text of a table: no control characters, and no | < > `."""
+Name = Annotated[str, msgspec.Meta(max_length=200, pattern=PLAIN)]
+Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
+
+
+class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The first line of a file."""
+
+    format: Literal[1]
+    policy: Annotated[str, msgspec.Meta(min_length=1, max_length=80, pattern=PLAIN)]
+    difficulty: Literal["twin", "oracle", "blind"]
+    split: SplitName
+    scope: Literal["arm", "central"]
+    trainings: Annotated[int, msgspec.Meta(ge=1, le=MOST_TRAININGS)]
+    """Trainings of the policy, or else of the twins; each has a row for every instance."""
+    author: Annotated[str, msgspec.Meta(min_length=1, max_length=200, pattern=PLAIN)]
+    about: Name
+    """What the policy is, and where it can be had."""
+    manifest: Hash
+    """Of the split."""
+    code_hash: Hash
+    policy_hash: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{16})?$")]
+    """Of the policy's files; "" if it belongs to the code, or ran in another process."""
+    risk: RiskName
+    versions: dict[str, str | None]
+
+
+class Played(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The other lines: one shift each."""
+
+    instance: str
+    scenario: Hash
+    """As in the manifest."""
+    seed: int
+    training: Annotated[int, msgspec.Meta(ge=0, lt=MOST_TRAININGS)]
+    figures: list[float] | None
+    """In the order of `FIGURES`; None if the policy failed, which counts as the mean of random."""
+    illegal: Annotated[int, msgspec.Meta(ge=0)]
+    error: Text | None = None
+
+
+class Submission(msgspec.Struct, frozen=True, kw_only=True):
+    """A result file."""
+
+    card: Card
+    rows: tuple[Played, ...]
+
+    @property
+    def name(self) -> str:
+        """Of its file, without the ending."""
+        plain = re.sub(r"[^A-Za-z0-9_.-]+", "-", self.card.policy).strip("-.")
+        return f"{self.card.split}-{plain}-{self.card.difficulty}"
+
+    @property
+    def title(self) -> str:
+        """Its policy in a table, as Markdown."""
+        more = f", {self.card.trainings} trainings" if self.card.trainings > 1 else ""
+        return f"`{self.card.policy}`{more}"
+
+    @property
+    def failures(self) -> int:
+        """Shifts in which the policy failed."""
+        return sum(row.figures is None for row in self.rows)
+
+    def mean(self, figure: str) -> float:
+        """Mean of a figure over the shifts that did not fail."""
+        place = FIGURES.index(figure)
+        return sum(row.figures[place] for row in self.rows if row.figures) / max(1, len(self.rows) - self.failures)
+
+    def study_rows(self) -> list[Row]:
+        """As a study has them."""
+        return [
+            Row(
+                Key(self.card.policy, row.instance, 0, row.training, self.card.difficulty, row.seed),
+                None if row.figures is None else Outcome(**dict(zip(FIGURES, row.figures, strict=True))),
+                row.illegal,
+                row.error,
+            )
+            for row in self.rows
+        ]
+
+
+def manifest_hash(split: str) -> str:
+    """Hash of all lines of a split's manifest."""
+    return hashlib.sha256("\n".join(map(line_of, manifest(split))).encode()).hexdigest()[:16]
+
+
+def split_references(split: str) -> dict[Shift, Reference]:
+    """The references of a split that come with the package."""
+    return references_of(suite_of(split, 1))
+
+
+def played_of(row: Row, scenario: str) -> Played:
+    """The line of a row of a study."""
+    figures = None
+    if row.outcome is not None:
+        figures = [float(f"{value:.{DIGITS}g}") for value in asdict(row.outcome).values()]
+    key = row.key
+    return Played(
+        instance=key.instance,
+        scenario=scenario,
+        seed=key.seed,
+        training=key.training,
+        figures=figures,
+        illegal=row.illegal,
+        error=row.error and row.error[:200],
+    )
+
+
+def problems(submission: Submission, references: Mapping[Shift, Reference]) -> Iterator[str]:
+    """What is wrong with a result, in sentences; nothing if it can be accepted.
+
+    Args:
+        references: Of its split: no reward exceeds an upper bound.
+    """
+    card, rows = submission.card, submission.rows
+    lines = {line.name: line for line in manifest(card.split)}
+    if (is_built_in(card.policy) or is_on_bus(card.policy)) == bool(card.policy_hash):
+        yield (
+            f"its policy '{card.policy}' must be built-in and have no hash, or have another name and one "
+            "(bus:NAME has none)"
+        )
+    if card.manifest != manifest_hash(card.split):
+        yield f"its manifest of the split {card.split} is another one (hash {card.manifest})"
+    missing = [name for name in NEEDED if not card.versions.get(name)]
+    if missing:
+        yield f"it does not state the versions of {', '.join(missing)}"
+    found = {(row.instance, row.training) for row in rows}
+    wanted = {(name, training) for name in lines for training in range(card.trainings)}
+    if len(found) < len(rows):
+        yield f"{len(rows) - len(found)} shifts are given twice"
+    if wanted - found:
+        name, training = min(wanted - found)
+        yield f"{len(wanted - found)} of {len(wanted)} shifts are missing, the first {name}, training {training}"
+    if found - wanted:
+        yield f"{len(found - wanted)} shifts are not of the split {card.split}, the first {min(found - wanted)[0]}"
+    for row in rows:
+        line = lines.get(row.instance)
+        if line:
+            yield from (f"{row.instance} {what}" for what in _of_shift(row, line, references))
+
+
+def _of_shift(row: Played, line: Line, references: Mapping[Shift, Reference]) -> Iterator[str]:
+    if row.scenario != line.scenario:
+        yield f"was another scenario (hash {row.scenario}, in the manifest {line.scenario})"
+    if row.seed != line.seed:
+        yield f"has seed {line.seed} (got {row.seed})"
+    if (row.figures is None) != (row.error is not None):
+        yield "needs either figures or an error"
+    if row.figures is None:
+        return
+    if len(row.figures) != len(FIGURES) or not all(abs(value) <= MOST_FIGURE for value in row.figures):
+        yield f"needs {len(FIGURES)} figures of at most {MOST_FIGURE:g}"
+        return
+    own = dict(zip(FIGURES, row.figures, strict=True))
+    if not 0 <= own["on_time"] <= own["finished"] <= line.count:
+        yield f"has {own['finished']:g} finished jobs, {own['on_time']:g} on time, of {line.count}"
+    if min(value for name, value in own.items() if name not in ("reward", "peak_c")) < 0 or own["availability"] > 1:
+        yield "has a figure below 0, or an availability above 1"
+    if any(own[name] % 1 for name in COUNTS):
+        yield f"has counts that are no whole numbers ({', '.join(COUNTS)})"
+    cell = cell_of_instance(line)
+    longest_min = 60.0 * cell.hours * cell.arms
+    if max(own["above_warning_min"], own["hot_surface_min"]) > longest_min + SLACK:
+        yield f"has more minutes above a limit than its arms work ({longest_min:g})"
+    if not PEAK_LOW_C <= own["peak_c"] <= PEAK_HIGH_C:
+        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {PEAK_LOW_C:g} to {PEAK_HIGH_C:g}"
+    if own["reward"] > own["value"] + SLACK * (1 + own["value"]):
+        yield f"has a reward of {own['reward']:.4g}, above the finished value {own['value']:.4g}: all else is a cost"
+    known = references.get((row.instance, line.seed))
+    if known and own["reward"] < (least := known.random - MOST_LOSS * (known.upper - known.random)):
+        yield f"has a reward of {own['reward']:.4g}, below what the worst policy could lose ({least:.4g})"
+    if known and own["reward"] > known.upper + SLACK * (1 + abs(known.upper)):
+        yield f"has a reward of {own['reward']:.4g}, above the upper bound {known.upper:.4g}, which no policy exceeds"
+
+
+def check(submission: Submission, references: Mapping[Shift, Reference]) -> None:
+    """Check a result.
+
+    Raises:
+        FleetError: what is wrong.
+    """
+    wrong = list(problems(submission, references))
+    if wrong:
+        more = f"; and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        raise FleetError(f"The result '{submission.name}' is refused: {'; '.join(wrong[:SHOWN])}{more}.")
+
+
+def write(submission: Submission, folder: Path) -> Path:
+    """Write the file of a result, and return its path.
+
+    Raises:
+        FleetError: it is too large, cannot be written, or would replace the result of another author.
+    """
+    lines = [msgspec.json.encode(each).decode() for each in (submission.card, *submission.rows)]
+    content = "\n".join(lines) + "\n"
+    if len(content.encode()) > MOST_BYTES:
+        raise FleetError(f"The file of '{submission.name}' would be larger than {MOST_BYTES} bytes: fewer trainings.")
+    path = folder / f"{submission.name}.jsonl"
+    if path.exists() and (other := read(path).card.author) != submission.card.author:
+        raise FleetError(f"'{path}' has a result of {other}; give another --out, or your policy another name.")
+    with disk_errors(path):
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as draft:
+            draft.write_text(content, encoding="utf-8")
+    return path
+
+
+def read(path: Path) -> Submission:
+    """A result file; `check` tells whether it is one that counts.
+
+    Raises:
+        FleetError: it is too large, or has a line that is none of ours.
+    """
+    number = 1
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise FleetError(f"'{path}': a result has at most {MOST_BYTES} bytes.")
+        first, *rest = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
+        card, rows = msgspec.json.decode(first, type=Card), list[Played]()
+        for line in rest:
+            number += 1
+            rows.append(msgspec.json.decode(line, type=Played))
+    except OSError as error:
+        raise FleetError(f"Cannot read '{path}': {error.strerror}.") from error
+    except (ValueError, msgspec.DecodeError) as error:
+        why = f"line {number}: {printable(str(error))}"
+        raise FleetError(f"'{path}' is no result of `thermofleet submit-result`: {why}.") from error
+    return Submission(card=card, rows=tuple(rows))
+
+
+def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, about: str) -> list[Submission]:
+    """A result for each policy and source of scores in the folder of a study; not yet checked.
+
+    Shifts of other fleets, of other instances and with other seeds than the split's are left out.
+
+    Args:
+        card: Content of study.json (Any: JSON values).
+
+    Raises:
+        FleetError: the study is not finished, of other settings than the leaderboard's, or of no split.
+    """
+    if card.get("status") != "finished":
+        raise FleetError("The study is not finished; run the same command of `thermofleet compare` again.")
+    usual = json.loads(json.dumps({"channel": PERFECT.described(), "randomise": asdict(Randomisation())}))
+    if any(card[name] != value for name, value in usual.items()):
+        raise FleetError("Results of the leaderboard have no randomisation, and the bus of each instance.")
+    if card["decision_limit_s"] is None or card["decision_limit_s"] > DECISION_LIMIT_S:
+        raise FleetError(f"Results of the leaderboard have a decision limit of at most {DECISION_LIMIT_S:g} s.")
+    splits = sorted({name.partition("/")[0] for name in card["instances"] if "/" in name} & set[str](JUDGED))
+    if not splits:
+        raise FleetError("The study has no instance of a split that policies are judged on; compare with --suite test.")
+    made: list[Submission] = []
+    for split in splits:
+        seeds = {line.name: line.seed for line in manifest(split)}
+        by_policy: dict[tuple[str, str], list[Row]] = {}
+        for row in rows:
+            if row.key.fleet == 0 and seeds.get(row.key.instance) == row.key.seed:
+                by_policy.setdefault((row.key.policy, row.key.difficulty), []).append(row)
+        for (policy, difficulty), own in sorted(by_policy.items()):
+            header = {
+                "format": FORMAT, "policy": label(policy), "difficulty": difficulty, "split": split,
+                "scope": scope_of(policy), "trainings": 1 + max(row.key.training for row in own), "author": author,
+                "about": about, "manifest": manifest_hash(split), "code_hash": card["code_hash"],
+                "policy_hash": card["policies"][policy], "risk": card["risk"], "versions": card["versions"],
+            }  # fmt: skip
+            try:
+                head = msgspec.convert(header, Card)
+            except msgspec.ValidationError as error:
+                raise FleetError(f"The result of '{policy}' cannot be written: {error}.") from error
+            lines = tuple(played_of(row, card["instances"][row.key.instance]) for row in own)
+            made.append(Submission(card=head, rows=lines))
+    return made
+
+
+BASELINE = "wsept"
+"""Policy that differences refer to, with the scores of `SOURCE`; without it the last of the board."""
+SOURCE = "oracle"
+HEADS = ("", "policy", "predictions", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound")
+MORE = ("faults", "failed", "by", "code")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """The results on one split, the best first."""
+
+    split: str
+    scores: Scores
+    """By name of the submission."""
+    entries: Mapping[str, Submission]
+    instances: int
+    """Of the split."""
+
+    @property
+    def order(self) -> list[str]:
+        """Names of the submissions, the best first."""
+        return ranked(self.scores)
+
+    def best(self, scope: str) -> Submission | None:
+        """The best of a scope."""
+        return next((self.entries[name] for name in self.order if self.entries[name].card.scope == scope), None)
+
+
+def read_all(folder: Path, split: str) -> list[Submission]:
+    """The checked results of a split in a folder, by the names of their files.
+
+    Raises:
+        FleetError: a file is no result, or one that is refused, or has the name of another, or of no split.
+    """
+    if (folder / CARD).exists():
+        raise FleetError(
+            f"'{folder}' is a folder of `thermofleet compare`; run `thermofleet submit-result` with it first."
+        )
+    references, found = split_references(split), list[Submission]()
+    for path in sorted(folder.glob("*.jsonl")):
+        if (named := path.stem.partition("-")[0]) not in JUDGED:
+            raise FleetError(
+                f"'{path}' must have the name that `thermofleet submit-result` gives, SPLIT-POLICY-PREDICTIONS.jsonl "
+                f"with SPLIT {', '.join(JUDGED)}."
+            )
+        if named != split:
+            continue
+        submission = read(path)
+        if path.stem != submission.name:
+            raise FleetError(f"'{path}' must have the name of its policy and split, {submission.name}.jsonl.")
+        check(submission, references)
+        found.append(submission)
+    return found
+
+
+def board_of(
+    split: str, submissions: Sequence[Submission], references: Mapping[Shift, Reference] | None = None
+) -> Board | None:
+    """The board of a split; None without results or without references.
+
+    A failed shift counts as the mean of random.
+    """
+    entries = {each.name: each for each in submissions}
+    rows = {name: each.study_rows() for name, each in entries.items()}
+    values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
+    if values is None:
+        return None
+    base = next((name for name, each in entries.items() if _is_baseline(each)), None)
+    last = min(entries, key=lambda name: values.score[name].mean())
+    return Board(split=split, scores=scores_of(values, base or last), entries=entries, instances=len(manifest(split)))
+
+
+def _is_baseline(each: Submission) -> bool:
+    card = each.card
+    return (card.policy, card.difficulty, card.policy_hash) == (BASELINE, SOURCE, "")
+
+
+def board_text(board: Board | None, split: str) -> str:
+    """The board as Markdown: what is best of each scope, the table, and what must be known."""
+    if board is None:
+        return f"No results on the split {split}."
+    scores = board.scores
+    parts = [best_text(board)]
+    rows = [(str(place), *_cells(scores, name, board.entries[name])) for place, name in enumerate(board.order, start=1)]
+    parts.append(table((*HEADS, *MORE), rows))
+    return "\n\n".join([*parts, remark_text(board)])
+
+
+def best_text(board: Board) -> str:
+    """The policy with the highest mean score of each scope, in a sentence."""
+    best = [
+        f"{scope} `{each.card.policy}` ({board.scores.policies[each.name].mean.text()})"
+        for scope in ("central", "arm")
+        for each in [board.best(scope)]
+        if each
+    ]
+    return f"Highest mean score of scope {', of scope '.join(best)}."
+
+
+def remark_text(board: Board) -> str:
+    """What a reader must know of the results."""
+    scores = board.scores
+    base = board.entries[scores.baseline].card
+    missing = board.instances - scores.instances - len(scores.flat)
+    remark = f"{scores.instances} of {board.instances} instances; differences to `{base.policy}` ({base.difficulty})."
+    if missing:
+        remark += f" {missing} have no reference yet and are not scored."
+    if scores.flat:
+        remark += f" {scores.flat_remark}"
+    if len({each.card.code_hash for each in board.entries.values()}) > 1:
+        remark += " Results are of several versions of the code; `--verify` repeats some shifts of each with this one."
+    return remark
+
+
+def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
+    mean, difference, stars, *rest = score_cells(scores, name)
+    card = entry.card
+    own = (
+        entry.title,
+        card.difficulty,
+        card.scope,
+        mean,
+        f"{difference} {stars}".strip().replace("*", "\\*"),
+    )
+    return (
+        *own,
+        *rest,
+        f"{entry.mean('faults'):.2f}",
+        str(entry.failures or ""),
+        card.author,
+        f"`{card.code_hash[:8]}`",
+    )
+
+
+def references_text() -> str:
+    """A line for each split: how its references were found, and how far their two bounds are apart, as Markdown."""
+    rows: list[tuple[str, ...]] = []
+    for split in SPLITS:
+        found = list(split_references(split).values())
+        rows.append(
+            (
+                split,
+                f"{len(found)} of {len(manifest(split))}",
+                _span([each.evaluations for each in found]),
+                _span([each.nodes for each in found]),
+                f"{median(each.gap for each in found):.2f}",
+                f"{median(each.normalised(each.best_rule) for each in found):.2f}",
+            )
+        )
+    heads = (
+        "split",
+        "instances",
+        "shifts of the last search",
+        "nodes",
+        "gap, median",
+        "score of the best starting policy, median",
+    )
+    return table(heads, rows)
+
+
+def _span(numbers: Sequence[int]) -> str:
+    least, most = min(numbers), max(numbers)
+    return f"{least}" if least == most else f"{least} to {most}"
+
+
+def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
+    """Text of each table of docs/leaderboard.md and docs/bounds.md by the name in its mark.
+
+    Args:
+        results: docs/results.
+    """
+
+    def board(split: str) -> str:
+        return board_text(board_of(split, read_all(results / "leaderboard", split)), split)
+
+    return {
+        "bounds": lambda: reference_table(load_references(results / "bounds_library.jsonl")),
+        "references": references_text,
+        **{f"leaderboard_{split}": partial(board, split) for split in JUDGED},
+    }
+
+
+CLOSE = 1e-6
+"""Relative difference of figures on other machines: libraries round differently."""
+
+
+def check_repeated(submission: Submission, count: int, progress: Progress = quiet) -> str:
+    """Run some shifts of a result again, always the same ones; returns what was done.
+
+    Raises:
+        FleetError: a figure came out otherwise.
+    """
+    card = submission.card
+    if card.policy_hash:
+        return f"{submission.name}: not repeated, as its policy is a file of its author."
+    rng = np.random.default_rng(np.random.SeedSequence([len(submission.rows), count]))
+    rows = [row for row in submission.rows if row.training == 0]
+    chosen = [rows[i] for i in sorted(rng.permutation(len(rows))[:count].tolist())]
+    cases = [Case(name=row.instance, scenario=instance(row.instance).scenario, seeds=(row.seed,)) for row in chosen]
+    study = Study(policies=[card.policy], cases=cases, difficulties=[card.difficulty], risk=card.risk)  # pyright: ignore[reportArgumentType]  # as it was written
+    for row, again in zip(chosen, run_study(study, workers=1, progress=progress), strict=True):
+        figures = None if again.outcome is None else list(asdict(again.outcome).values())
+        same = figures is not None and row.figures is not None
+        close = same and all(
+            isclose(a, b, rel_tol=CLOSE, abs_tol=CLOSE) for a, b in zip(figures or (), row.figures or (), strict=True)
+        )
+        if not close and (figures is not None or row.figures is not None):
+            raise FleetError(
+                f"The result '{submission.name}' does not repeat: {row.instance} has the figures {figures} with this "
+                f"code, not {row.figures}."
+            )
+    return f"{submission.name}: {len(chosen)} shifts repeated, with equal figures."

@@ -1,0 +1,350 @@
+"""Stored references of instances, a scenario and a seed each: random, hindsight and upper bound; normalised scores."""
+
+import re
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial, reduce
+from math import isfinite
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from joblib import delayed
+
+from agents.registry import RULES
+from fleet.errors import FleetError, ScenarioError
+from fleet.files import cache_folder
+from fleet.seeding import child
+from scenarios.evaluate.hindsight import (
+    SIDE_BY_SIDE,
+    Budget,
+    Claim,
+    Replay,
+    ShiftSimulator,
+    Simulated,
+    hindsight,
+    without_scores,
+)
+from scenarios.evaluate.rollout import DECISION_LIMIT_S, DecisionLimit
+from scenarios.evaluate.sources import Fleets, plan_content
+from scenarios.evaluate.study import suite_of
+from scenarios.evaluate.upper_bound import Relaxation, upper_bound
+from scenarios.fault_price import weights_of
+from scenarios.json_rows import Row, Rows
+from scenarios.policy_loader import blaming, policy_at, policy_of
+from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
+from scenarios.prepare.known_cell import simulator_of_shift
+from scenarios.processes import worker_processes
+from scenarios.progress import Count, Progress, quiet
+from scenarios.run.provenance import code_hash
+from scenarios.scenario_hash import scenario_hash
+from scenarios.schema import Scenario
+
+RANDOM_SHIFTS = 20
+"""Draws of the policy `random` that its reward is the mean of."""
+STARTS = tuple(name for name in RULES if name != "random")
+"""Policies that the search starts from by default."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """What the reward of one instance is measured against."""
+
+    instance: str
+    """As `heat_wave/100`, or the name of an instance of a split."""
+    scenario_hash: str
+    """Of what is no default in the scenario: `scenarios.scenario_hash`."""
+    seed: int
+    difficulty: str
+    """Source of the scores of the policies that the search starts from."""
+    random: float
+    """Mean reward of the policy `random`."""
+    random_se: float
+    """Standard error of that mean."""
+    rule: str
+    """The best policy that the search starts from."""
+    best_rule: float
+    """Its reward."""
+    hindsight: float
+    upper: float
+    linear: float
+    """Upper bound before whole jobs and heat budgets."""
+    evaluations: int
+    """Shifts that the search simulated."""
+    nodes: int
+    """Most nodes of the branch and bound of the upper bound."""
+    search_s: float | None
+    """CPU time of the search; this and the other times are None if the budget counts evaluations only."""
+    upper_s: float | None
+    """CPU time of the upper bound."""
+    seconds: float | None
+    """CPU time of everything but the planning of the fleet."""
+    code: str
+    """Hash of the code."""
+    claims: tuple[Claim, ...]
+    """The schedule of the hindsight: decision interval, arm and action of every claim."""
+
+    def normalised(self, reward: float) -> float:
+        """0 for random, 1 for hindsight; NaN where the search found nothing better than random."""
+        span = self.hindsight - self.random
+        return (reward - self.random) / span if span > 0 else float("nan")
+
+    @property
+    def gap(self) -> float:
+        """Share by which the hindsight could at most be below the optimum, of the span from random to upper bound."""
+        span = self.upper - self.random
+        return (self.upper - self.hindsight) / span if span > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """One instance to bound."""
+
+    instance: str
+    scenario: Scenario
+    seed: int
+
+
+def reference(
+    fleet: Fleet,
+    task: Task,
+    budget: Budget,
+    *,
+    difficulty: str = "oracle",
+    bound: bool = True,
+    known: Sequence[Claim] = (),
+    policies: Sequence[str] = STARTS,
+) -> Reference:
+    """The reference of one instance of a prepared fleet.
+
+    Args:
+        difficulty: With which the fleet was prepared.
+        bound: Compute the upper bound; else it is infinite.
+        known: A schedule of an earlier search, which this one also starts from.
+        policies: Those that the search starts from.
+    """
+    began_s = time.process_time()
+    entropy = np.random.SeedSequence(task.seed)
+    episode, weights = ShiftFactory(fleet)(entropy), weights_of(fleet.scenario)
+    world = episode.world
+    simulator = partial(simulator_of_shift, fleet, task.seed)
+    rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key, simulator=simulator)
+    # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
+    each = [_followed(rules, name, task) for name in policies]
+    starts = reduce(Simulated.and_, each)
+    best = int(starts.reward.argmax())
+    rule, best_rule = policies[best], float(starts.reward[best])
+    bare = without_scores(world)
+    if known:
+        starts = starts.and_(ShiftSimulator(bare, weights, 1).follow([Replay(known)]))
+    drawn = [policy_of("random") for _ in range(RANDOM_SHIFTS)]
+    for n, policy in enumerate(drawn):
+        policy.reset(np.random.default_rng(child(np.random.SeedSequence([task.seed, 2]), n)))
+    random = ShiftSimulator(bare, weights, RANDOM_SHIFTS).follow(drawn).reward
+    search = ShiftSimulator(bare, weights, SIDE_BY_SIDE)
+    found = hindsight(search, starts, np.random.SeedSequence([task.seed, 3]), budget)
+    bounded_s = time.process_time()
+    upper = upper_bound(Relaxation(world, weights), nodes=budget.nodes) if bound else None
+    ended_s, timed = time.process_time(), isfinite(budget.seconds)
+    return Reference(
+        instance=task.instance,
+        scenario_hash=scenario_hash(task.scenario),
+        seed=task.seed,
+        difficulty=difficulty,
+        random=float(random.mean()),
+        random_se=float(random.std(ddof=1) / np.sqrt(len(random))),
+        rule=rule,
+        best_rule=best_rule,
+        hindsight=found.reward,
+        upper=upper.reward if upper else float("inf"),
+        linear=upper.linear if upper else float("inf"),
+        evaluations=found.evaluations,
+        nodes=budget.nodes if bound else 0,
+        search_s=found.seconds if timed else None,
+        upper_s=ended_s - bounded_s if timed else None,
+        seconds=ended_s - began_s if timed else None,
+        code=code_hash(),
+        claims=tuple(found.claims),
+    )
+
+
+def _followed(simulator: ShiftSimulator, name: str, task: Task) -> Simulated:
+    """The shift of a task under a policy.
+
+    Raises:
+        PolicyFailed: the policy is one of one's own, and raised something, was too slow or returned no action.
+    """
+    limit = DecisionLimit(DECISION_LIMIT_S)
+    with blaming(name, task.instance), limit.watching():
+        with limit.decision():
+            policy = policy_at(name, task.seed)
+        return simulator.follow([policy], limit)
+
+
+def references(
+    tasks: Sequence[Task],
+    path: Path,
+    budget: Budget,
+    *,
+    difficulty: DifficultyName = "oracle",
+    cache: Path | None = None,
+    workers: int = 1,
+    policies: Sequence[str] = STARTS,
+    progress: Progress = quiet,
+) -> list[Reference]:
+    """The references of instances, kept in a file of JSON lines; those in it are not computed again.
+
+    A row counts if instance, content of the scenario, seed and source of scores are the same. With a larger budget the
+    search is repeated, and starts from the known schedule too. At the end the rows are in the order of the instances'
+    names, whatever was computed first.
+
+    Args:
+        workers: Processes.
+        policies: Those that the searches start from.
+
+    Raises:
+        ScenarioError: the weights of the reward allow no bound.
+        FleetError: the file has other rows.
+    """
+    rows, folder = Rows(path), cache or cache_folder()
+    rows.check_writable()
+    keys = [key_of(task, difficulty) for task in tasks]
+    known = {(each.instance, each.seed): each for each in _references_in(rows, keys)}
+    left = [task for task in tasks if not _enough(known.get((task.instance, task.seed)), budget)]
+    first: dict[object, Task] = {}
+    cells = [first.setdefault(plan_content(task.scenario), task) for task in left]
+    order = [task for cell in first.values() for task, own in zip(left, cells, strict=True) if own is cell]
+    if workers > 1:
+        for task in first.values():
+            _fleet_of(task, difficulty, folder, progress)  # so that no two processes plan the same motions
+    work = (
+        delayed(_bounded)(task, budget, difficulty, known.get((task.instance, task.seed)), folder, policies)
+        for task in order
+    )
+    done = len(tasks) - len(left)
+    progress("bounding", Count(done, max(1, len(tasks))))
+    with worker_processes(max(1, min(workers, len(left)))) as pool:
+        for new in pool(work):
+            assert isinstance(new, Reference)
+            rows.append(_key(new.instance, new.scenario_hash, new.seed, difficulty), asdict(new))
+            done += 1
+            progress("bounding", Count(done, len(tasks)))
+    rows.sort(_place)
+    return _references_in(rows, keys)
+
+
+_fleets = Fleets()
+
+
+def _fleet_of(task: Task, difficulty: DifficultyName, folder: Path, progress: Progress = quiet) -> Fleet:
+    """The prepared fleet of an instance; instances of one cell share it."""
+    return _fleets.of(task.scenario, difficulty, RISK, folder, progress)
+
+
+def _bounded(
+    task: Task,
+    budget: Budget,
+    difficulty: DifficultyName,
+    known: Reference | None,
+    folder: Path,
+    policies: Sequence[str],
+) -> Reference:
+    """The reference of a task, in whichever process this is."""
+    fleet = _fleet_of(task, difficulty, folder)
+    try:
+        found = reference(
+            fleet, task, budget, difficulty=difficulty, known=known.claims if known else (), policies=policies
+        )
+        if known and known.code == found.code:
+            found = replace(found, upper=min(found.upper, known.upper))
+        return found
+    except ValueError as error:
+        raise ScenarioError(f"{task.instance}: {error}") from error
+
+
+def _enough(known: Reference | None, budget: Budget) -> bool:
+    """Whether a reference is of at least this budget."""
+    if known is None or known.nodes < budget.nodes:
+        return False
+    if isfinite(budget.seconds):
+        return (known.search_s or 0.0) >= 0.9 * budget.seconds
+    return known.evaluations >= budget.evaluations
+
+
+def _place(row: Row) -> list[object]:
+    """Sorts names of instances by their numbers."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", row["instance"])]
+
+
+def key_of(task: Task, difficulty: str) -> str:
+    """What a row of a file of references is found by."""
+    return _key(task.instance, scenario_hash(task.scenario), task.seed, difficulty)
+
+
+def _key(instance: str, scenario: str, seed: int, difficulty: str) -> str:
+    return f"{instance} {scenario} {seed} {difficulty}"
+
+
+def load_references(path: Path, keys: Iterable[str] | None = None) -> list[Reference]:
+    """The references in a file: all, or those of some keys.
+
+    Raises:
+        FleetError: the file has other rows, or damaged ones.
+    """
+    rows = Rows(path)
+    return _references_in(rows, rows.by_key if keys is None else keys)
+
+
+def _references_in(rows: Rows, keys: Iterable[str]) -> list[Reference]:
+    with rows.readable():
+        return msgspec.convert(rows.some(keys), list[Reference])
+
+
+def tasks_of(names: str, seeds: int, first_seed: int) -> list[Task]:
+    """What is to be bounded: a split, or names separated by commas. An instance has one seed."""
+    tasks: list[Task] = []
+    for case in suite_of(names, seeds, first_seed):
+        if "/" in case.name:
+            tasks.append(Task(case.name, case.scenario, case.seeds[0]))
+        else:
+            tasks += [Task(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
+    for i, task in enumerate(tasks):
+        if task.instance in {other.instance for other in tasks[:i]}:
+            raise FleetError(f"The instance '{task.instance}' is given twice.")
+    return tasks
+
+
+HEADS = ("instance", "random", "best start", "reward", "hindsight", "upper bound", "its score", "gap", "CPU s")
+
+
+def heads_of(references: Sequence[Reference]) -> tuple[str, ...]:
+    """Heads of the table of these references; that of times, the last one, only if times are known."""
+    return HEADS if any(each.seconds is not None for each in references) else HEADS[:-1]
+
+
+def cells(each: Reference) -> tuple[str, ...]:
+    """One line of the table."""
+    rewards = [f"{value:.1f}" for value in (each.best_rule, each.hindsight, each.upper)]
+    score = f"{each.normalised(each.best_rule):.3f}"
+    seconds = "" if each.seconds is None else f"{each.seconds:.0f}"
+    return each.instance, f"{each.random:.1f}", each.rule, *rewards, score, f"{each.gap:.3f}", seconds
+
+
+def reference_table(references: Sequence[Reference]) -> str:
+    """The table for a page, as Markdown: every instance, and the mean of each scenario."""
+    from scenarios.show.table import markdown_table as table  # loads the live fleet
+
+    lines: list[tuple[str, ...]] = []
+    for scenario in dict.fromkeys(each.instance.rpartition("/")[0] for each in references):
+        own = [each for each in references if each.instance.rpartition("/")[0] == scenario]
+        lines += [cells(each) for each in own]
+        figures = ("random", "best_rule", "hindsight", "upper")
+        random, *rewards = (f"**{sum(getattr(each, name) for each in own) / len(own):.1f}**" for name in figures)
+        score = sum(each.normalised(each.best_rule) for each in own) / len(own)
+        gap = sum(each.gap for each in own) / len(own)
+        times = [each.seconds for each in own if each.seconds is not None]
+        seconds = f"{sum(times) / len(times):.0f}" if times else ""
+        lines.append((f"**{scenario}**, mean", random, "", *rewards, f"**{score:.3f}**", f"**{gap:.3f}**", seconds))
+    heads = heads_of(references)
+    return table(heads, [line[: len(heads)] for line in lines])

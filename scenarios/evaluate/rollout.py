@@ -1,0 +1,309 @@
+"""A policy on several seeds, the figures of each of its shifts, and a limit on the time of its decisions."""
+
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, fields
+from functools import lru_cache
+
+import numpy as np
+
+from agents.policy import WAIT, Planner, Policy, only_choices
+from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.env.lookahead import CellSimulator
+from fleet.env.validation import actions_of
+from fleet.env.vector import BatchEnv, Library, Obs
+from fleet.observation import Observation
+from scenarios.fault_price import weights_of
+from scenarios.policy_loader import OnBus, failure, policy_at
+from scenarios.prepare.fleet import Fleet
+from scenarios.prepare.known_cell import as_known, simulator_of
+from scenarios.run.batch import library_of
+from scenarios.run.heat_use import HeatUse
+from scenarios.run.outcome import common_figures
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Figures of a shift that are compared; see `scenarios.run.metrics.Metrics`."""
+
+    reward: float
+    """Summed over the shift."""
+    value: float
+    finished: float
+    on_time: float
+    faults: float
+    above_warning_min: float
+    peak_c: float
+    """Temperature of the hottest motor of the fleet."""
+    availability: float
+    insulation_ppb: float
+    """Billionths of the rated life that the most aged winding of the fleet used."""
+    tool_drift_mm: float
+    """Of the arm whose tool point drifted most."""
+    hot_surface_min: float
+
+
+FIGURES = tuple(field.name for field in fields(Outcome))
+"""Names of the compared figures."""
+COUNTS = ("finished", "on_time", "faults")
+"""Figures that count events."""
+POSSIBLE = {name: (0.0, math.inf) for name in FIGURES if name not in ("reward", "peak_c")} | {
+    "availability": (0.0, 1.0)
+}
+"""Smallest and largest possible value of a figure."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """One shift under a policy."""
+
+    outcome: Outcome | None
+    """None after an error."""
+    illegal: int
+    """Illegal actions of all arms; 0 after an error."""
+    error: BaseException | None = None
+    """What the policy raised, or why its actions could not be taken."""
+    time_s: float = 0.0
+    """Time of the error in the shift."""
+
+
+def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel = PERFECT) -> list[Outcome]:
+    """The figures of a policy on each seed, independent of the other seeds. A decision takes at most
+    `DECISION_LIMIT_S`.
+
+    Raises:
+        PolicyFailed: the policy is one of one's own, and raised something, was too slow or returned no action.
+        Exception: whatever a built-in policy raises.
+    """
+    results: list[Outcome] = []
+    for seed, played in zip(seeds, play(fleet, policy, seeds, channel, DECISION_LIMIT_S), strict=True):
+        if played.error is not None:
+            where = f"{fleet.scenario.name}/{seed}, at {played.time_s:g} s of the shift"
+            raise failure(policy, played.error, where) from played.error
+        assert played.outcome is not None
+        results.append(played.outcome)
+    return results
+
+
+def play(
+    fleet: Fleet,
+    policy: str,
+    seeds: Sequence[int],
+    channel: Channel = PERFECT,
+    limit_s: float | None = None,
+) -> list[Played]:
+    """The shift of each seed under a policy; an error of the policy ends its shift alone.
+
+    The shifts are one batch, with an env, an exchange and a policy for each seed.
+
+    Args:
+        limit_s: Most time for a decision, s of real time.
+    """
+    library, channel = _library(fleet), fleet.scenario.channel(channel)
+    exchanges = None if channel.perfect else [MemoryExchange(library.arms, channel) for _ in seeds]
+    env = BatchEnv(
+        library,
+        len(seeds),
+        seed=list(seeds),
+        weights=weights_of(fleet.scenario),
+        autoreset=False,
+        exchanges=exchanges,
+    )
+    obs, _ = env.reset()
+    heat = HeatUse(env.temp_c, fleet.scenario.people.burn_c)
+    running = np.ones(len(seeds), dtype=bool)
+    results: dict[int, Played] = {}
+    policies: dict[int, Policy] = {}
+    limit, dt_s, tick = DecisionLimit(limit_s), library.tables.dt_s, 0
+
+    @contextmanager
+    def guarded(e: int) -> Iterator[None]:
+        """End the shift of an env whose policy fails."""
+        try:
+            with limit.decision():
+                yield
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # whatever the policy raises
+            results[e], running[e] = Played(None, 0, error, tick * dt_s), False
+
+    def after_step(reward: Array, ended: Array) -> None:
+        """Keep the figures of the shifts that have ended."""
+        nonlocal tick
+        tick += 1
+        heat.add(env.temp_c, dt_s)
+        if not ended.any():
+            return
+        state = env.state
+        for e in np.flatnonzero(ended).tolist():
+            shift = library.draw(np.random.SeedSequence(int(seeds[e])))
+            value = library.tables.value[shift.fleet, shift.kind]
+            found = Outcome(
+                **common_figures(state, e, value, shift.due_s, dt_s),
+                reward=float(reward[e]),
+                peak_c=float(state.peak_c[e].max()),
+                insulation_ppb=float(heat.insulation_ppb[e].max()),
+                tool_drift_mm=float(heat.tool_drift_mm[e].max()),
+                hot_surface_min=float(heat.hot_surface_min[e].sum()),
+            )
+            results[e] = Played(found, int(state.illegal[e].sum()))
+
+    with limit.watching():
+        for e, seed in enumerate(seeds):
+            with guarded(e):
+                policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
+        for e, each in policies.items():
+            if isinstance(each, Planner):
+                cell = env.lookahead(_simulator(fleet), e)  # may compile, which is no time of the policy
+                with guarded(e):
+                    each.plan_in(cell)
+        rollout(env, obs, acts_of(env, policies, guarded), running=running, after_step=after_step)
+    policies.clear()  # the traceback of an error keeps this frame, and a policy may have an open connection
+    return [results[e] for e in range(len(seeds))]
+
+
+Act = Callable[[Obs, Array], Array]
+"""Actions, int [env, arm], of what the arms know and of the envs whose shift goes on, bool [env]."""
+AfterStep = Callable[[Array, Array], None]
+"""What is done after a step, with the reward so far [env] and the envs whose shift ended in it, bool [env]."""
+
+
+def rollout(
+    env: BatchEnv, obs: Obs, act: Act, *, running: Array | None = None, after_step: AfterStep | None = None
+) -> Array:
+    """Total reward of a shift of each env, [env].
+
+    Args:
+        obs: Of the reset that began the shifts.
+        running: Envs whose shift is played, bool [env]; one that `act` makes False in it ends early. Default: all.
+    """
+    reward, running = np.zeros(env.num_envs), np.ones(env.num_envs, dtype=bool) if running is None else running
+    while running.any():
+        obs, earned, terminated, truncated, _ = env.step(act(obs, running))
+        over = terminated | truncated
+        reward += np.where(running, earned, 0.0)
+        if after_step:
+            after_step(reward, over & running)
+        running &= ~over
+        if over.any() and running.any() and not env.autoreset:
+            obs, _ = env.reset(rows=over)
+    return reward
+
+
+def acts_of(
+    env: BatchEnv,
+    policies: Mapping[int, Policy],
+    guarded: Callable[[int], AbstractContextManager[None]] = lambda e: nullcontext(),
+) -> Act:
+    """The actions of one policy of a kind for each env; those that want to choose only are asked if there is a choice.
+
+    Args:
+        policies: By env, each at the beginning of its shift.
+        guarded: Context of the decision of an env.
+    """
+    only_when_asked = bool(policies) and only_choices(next(iter(policies.values())))
+
+    def act(obs: Obs, running: Array) -> Array:
+        mask = obs["action_mask"]
+        asked = running & mask[..., 1:-1].any(axis=(1, 2)) if only_when_asked else running
+        actions = np.full(mask.shape[:2], WAIT)
+        for e in np.flatnonzero(asked).tolist():
+            with guarded(e):
+                actions[e] = actions_of(env.agents, policies[e].act(known_in(env, e, obs)))
+        return actions
+
+    return act
+
+
+def known_in(env: BatchEnv, e: int, obs: Obs) -> dict[str, Observation]:
+    """What each arm of one env knows."""
+    return env.layout.read_each(env.agents, obs["observation"][e], obs["action_mask"][e])
+
+
+@lru_cache(maxsize=1)
+def _library(fleet: Fleet) -> Library:
+    return library_of(fleet)
+
+
+@lru_cache(maxsize=1)
+def _simulator(fleet: Fleet) -> CellSimulator:
+    return simulator_of(fleet, library_of(as_known(fleet)).tables)
+
+
+DECISION_LIMIT_S = 60.0
+"""Longest time of a decision by default."""
+AGAIN_S = 1.0
+"""An alarm is repeated, in case the policy catches the first one."""
+MOST_CAUGHT = 5
+"""Alarms of one decision that a policy may catch; at the next one the process ends."""
+
+
+class TooSlow(BaseException):
+    """A decision took too long; no `Exception`, so that a policy does not catch it by accident."""
+
+
+class DecisionLimit:
+    """Ends decisions that take longer than `limit_s`, s of real time; None for no limit.
+
+    In the main thread of a process an alarm interrupts Python code. Elsewhere, and in libraries that do not return, a
+    decision is only found too slow when it ends. A policy that catches every alarm can be ended only with its process.
+    """
+
+    def __init__(self, limit_s: float | None) -> None:
+        self.limit_s = limit_s
+        self._rung = 0
+        self._alarm = limit_s is not None and hasattr(signal, "setitimer")
+        self._alarm = self._alarm and threading.current_thread() is threading.main_thread()
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Take the alarm of the process until the end of the block."""
+        if not self._alarm:
+            yield
+            return
+        before = signal.signal(signal.SIGALRM, self._ring)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGALRM, before)
+
+    @contextmanager
+    def decision(self) -> Iterator[None]:
+        """Limit the block.
+
+        Raises:
+            TooSlow: it took too long.
+        """
+        if self.limit_s is None:
+            yield
+            return
+        began_s, self._rung = time.monotonic(), 0
+        if self._alarm:
+            signal.setitimer(signal.ITIMER_REAL, self.limit_s, AGAIN_S)
+        try:
+            yield
+        finally:
+            if self._alarm:
+                signal.setitimer(signal.ITIMER_REAL, 0.0)
+        if time.monotonic() - began_s > self.limit_s:
+            self._ring()
+
+    def _ring(self, *_: object) -> None:
+        self._rung += 1
+        if self._rung > MOST_CAUGHT:
+            text = f"A decision took longer than {self.limit_s:g} s, and the policy catches what should end it; "
+            os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"{text}its process ends.\n".encode())
+            os._exit(1)
+        raise TooSlow(f"a decision took longer than {self.limit_s:g} s (--decision-limit)")
+
+
+UNLIMITED = DecisionLimit(None)

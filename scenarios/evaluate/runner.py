@@ -1,0 +1,281 @@
+"""Run a study: here in the first seconds, then on many processes, with its rows in memory or in a folder."""
+
+import os
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from traceback import format_tb
+from typing import Protocol
+
+from joblib import cpu_count
+
+from fleet.bus.exchange.channel import Channel
+from fleet.errors import FleetError
+from fleet.files import cache_folder
+from scenarios.evaluate import rollout
+from scenarios.evaluate.rollout import Outcome, Played, play
+from scenarios.evaluate.sources import Fleets, is_trained, plan_content
+from scenarios.evaluate.store import opened
+from scenarios.evaluate.study import SHIFTS, Key, Row, Study, Unit, policy_hash
+from scenarios.extras import require_extra
+from scenarios.policy_loader import error_text, is_built_in
+from scenarios.prepare.fleet import Fleet, RiskName
+from scenarios.prepare.randomisation import Randomisation
+from scenarios.processes import MOST_DEATHS, LocalWorker, Queue, Worker, run_all
+from scenarios.progress import Count, Progress, quiet
+from scenarios.run.provenance import code_hash
+
+HERE_S = 5.0
+"""About the time that a worker process takes to start. This process does work that takes no longer, but runs no code of
+users, which might end it."""
+
+
+MOST_TRACE = 4
+"""Frames of a traceback that are kept, the last ones."""
+MOST_TEXT = 2000
+"""Characters of a message that are kept."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all units of a study share."""
+
+    risk: RiskName
+    randomise: Randomisation | None
+    channel: Channel
+    decision_limit_s: float | None
+    folder: Path | None
+    """Cache of plans and twins; None for that of the process."""
+    code_hash: str
+    policies: dict[str, str] = field(hash=False)
+    """Hashes of the policies' files."""
+
+    @classmethod
+    def of(cls, study: Study, folder: Path | None) -> "Settings":
+        """The settings of a study that this process starts."""
+        return cls(
+            study.risk, study.randomise, study.channel, study.decision_limit_s, folder, code_hash(), study.policy_hashes
+        )
+
+
+fleets = Fleets()
+
+
+def fleet_of(
+    unit: Unit, risk: RiskName, randomise: Randomisation | None, folder: Path, progress: Progress = quiet
+) -> Fleet:
+    """The prepared fleet of a unit."""
+    return fleets.of(unit.scenario, unit.difficulty, risk, folder, progress, training=unit.twins, randomise=randomise)
+
+
+def run_unit(unit: Unit, settings: Settings) -> list[Row]:
+    """The rows of a unit; what a policy raises is in them.
+
+    Raises:
+        FleetError: the fleet cannot be prepared, or this machine has other code or another policy.
+    """
+    _check(unit.policy, settings)
+    fleet = fleet_of(unit, settings.risk, settings.randomise, settings.folder or cache_folder())
+    with _one_thread(), _contained():  # one thread, so that sums have one order
+        played = play(fleet, unit.played, unit.case.seeds, settings.channel, settings.decision_limit_s)
+    _check(unit.policy, settings)  # its files may have been changed meanwhile
+    return [row_of(unit, i, each) for i, each in enumerate(played)]
+
+
+def row_of(unit: Unit, index: int, played: Played) -> Row:
+    """The row of the unit's i-th shift."""
+    key = unit.keys[index]
+    if played.outcome is not None:
+        figures = {name: float(value) for name, value in asdict(played.outcome).items()}  # as a file gives them
+        return Row(key, Outcome(**figures), played.illegal)
+    assert played.error is not None
+    error = error_text(played.error)[:MOST_TEXT]
+    frames = [text for text in format_tb(played.error.__traceback__) if f'"{rollout.__file__}"' not in text]
+    trace = "".join(frames[-MOST_TRACE:])
+    return Row(key, None, 0, f"{error} (at {played.time_s:g} s of the shift)", trace[-MOST_TEXT:])
+
+
+@dataclass(frozen=True)
+class UnitWork:
+    """A unit as a piece of work for a process."""
+
+    unit: Unit
+    settings: Settings
+    deaths: int = 0
+
+    @property
+    def name(self) -> str:
+        """Policy, instance and first seed."""
+        return f"'{self.unit.policy}' on {self.unit.case.name}, seed {self.unit.case.seeds[0]}"
+
+    @property
+    def group(self) -> object:
+        """What shares plans and twins."""
+        return self.unit.group
+
+    def __call__(self) -> list[Row]:
+        """Run it."""
+        return run_unit(self.unit, self.settings)
+
+    def after_death(self) -> "list[UnitWork]":
+        """Each shift alone, because the process may have died of one shift only."""
+        case = self.unit.case
+        parts = [replace(self.unit, case=replace(case, seeds=(seed,))) for seed in case.seeds]
+        return [UnitWork(part, self.settings, self.deaths + 1) for part in parts]
+
+    def given_up(self) -> list[Row]:
+        """Rows of failed shifts."""
+        error = f"The process that ran it died {MOST_DEATHS} times."
+        return [Row(key, None, 0, error, "") for key in self.unit.keys]
+
+
+def _check(policy: str, settings: Settings) -> None:
+    here = f"process {os.getpid()} on {socket.gethostname()}"
+    if code_hash() != settings.code_hash:
+        raise FleetError(
+            f"The {here} runs other code of thermofleet than this command began with: install the same on every "
+            "machine, and change no code while it runs."
+        )
+    try:
+        found = policy_hash(policy)
+    except OSError as error:
+        raise FleetError(f"The {here} cannot read the policy '{policy}': {error.strerror}.") from error
+    if found != settings.policies[policy]:
+        raise FleetError(
+            f"The {here} has other files of the policy '{policy}' than this command began with: copy the same to every "
+            "machine, and change none while it runs."
+        )
+
+
+@contextmanager
+def _contained() -> Iterator[None]:
+    """Keep what a policy prints off standard output, and undo what it does to the process; end a fork of it."""
+    process, folder, streams = os.getpid(), Path.cwd(), (sys.stdout, sys.stderr)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        if os.getpid() != process:
+            os._exit(0)
+        sys.stdout, sys.stderr = streams
+        os.chdir(folder)
+
+
+def _one_thread() -> AbstractContextManager[None]:
+    if "torch" not in sys.modules:
+        return nullcontext()
+    from twin.vae.model import one_thread
+
+    return one_thread()
+
+
+class Rows(Protocol):
+    """Where rows go."""
+
+    rows: dict[Key, Row]
+
+    def add(self, rows: list[Row]) -> None:
+        """Take the rows of a unit."""
+        ...
+
+
+class Memory:
+    """Rows in memory."""
+
+    def __init__(self) -> None:
+        self.rows: dict[Key, Row] = {}
+
+    def add(self, rows: list[Row]) -> None:
+        """Take the rows of a unit."""
+        self.rows |= {row.key: row for row in rows}
+
+
+def run_study(
+    study: Study,
+    *,
+    out: Path | None = None,
+    cache_dir: Path | None = None,
+    workers: int = -1,
+    ray: str | None = None,
+    progress: Progress = quiet,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> list[Row]:
+    """The rows of a study, in the order of its keys.
+
+    Args:
+        out: Folder of the rows; those that are in it are not run again.
+        workers: Processes, if there is work for more than some seconds; -1 for one per core. The rows do not depend
+            on it.
+        ray: Address of a Ray cluster to run on instead.
+        tell: Called with a sentence about each process that dies.
+
+    Raises:
+        FleetError: a fleet cannot be prepared, the folder holds something else, or the cluster cannot be reached.
+        MissingExtra: a library is not installed.
+    """
+    wanted = [key for unit in study.units(set()) for key in unit.keys]
+    with _opened(study, out) as store:
+        # The largest first, so that processes end together; what shares plans follows.
+        units = sorted(study.units(set(store.rows)), key=lambda unit: (-unit.size, unit.cell))
+        folder = cache_dir or cache_folder()  # here: a worker may have started with another one
+        if ray is None or any(map(is_trained, study.sources)):  # other machines may have caches of their own
+            _warm(units, study, folder, progress)
+        settings = Settings.of(study, cache_dir if ray else folder)
+        done = len(wanted) - sum(len(unit.case.seeds) for unit in units)
+        for rows in _run(units, settings, workers, ray, tell):
+            store.add(rows)
+            done += len(rows)
+            progress("comparing", Count(done, len(wanted)))
+        return [store.rows[key] for key in wanted]
+
+
+def _warm(units: list[Unit], study: Study, folder: Path, progress: Progress) -> None:
+    """Make the plans and twins that units share, so that no two processes make the same; all land in the cache."""
+    seen: set[object] = set()
+    for unit in units:
+        cell = (plan_content(unit.scenario), unit.twins, unit.difficulty)
+        if cell not in seen:
+            seen.add(cell)
+            fleet_of(unit, study.risk, study.randomise, folder, progress)
+
+
+def _opened(study: Study, out: Path | None) -> AbstractContextManager[Rows]:
+    if out is None:
+        return nullcontext(Memory())
+    require_extra("report")
+    return opened(out, SHIFTS, study.card)
+
+
+def _run(
+    units: list[Unit], settings: Settings, workers: int, ray: str | None, tell: Callable[[str], None]
+) -> Iterator[list[Row]]:
+    """The rows of each unit."""
+    began_s, todo, left_s = time.monotonic(), list(units), 0.0
+    whole = left = sum(unit.size for unit in units)
+    while todo and not ray and is_built_in(todo[0].played) and (workers == 1 or left_s < HERE_S):
+        unit = todo.pop(0)
+        yield run_unit(unit, settings)
+        left -= unit.size
+        left_s = (time.monotonic() - began_s) * left / (whole - left)
+    if todo:
+        queue = Queue(UnitWork(unit, settings) for unit in todo)
+        several = _workers(workers, ray, len(todo))
+        try:
+            for _, rows in run_all(queue, several, tell):
+                yield rows
+        finally:
+            for each in several:
+                each.close()  # a policy may have left something in it
+
+
+def _workers(count: int, ray: str | None, most: int) -> list[Worker]:
+    if ray is None:
+        return [LocalWorker() for _ in range(min(count if count > 0 else cpu_count(), most))]
+    require_extra("ray")
+    from scenarios.evaluate.ray_workers import ray_workers
+
+    return list(ray_workers(ray))

@@ -1,0 +1,278 @@
+"""Normalised scores of policies over instances: from rewards and references to means, differences and tables."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scenarios.evaluate.statistics import Interval, aggregates, by_group, holm, improvement, interval, paired
+from scenarios.evaluate.study import Case, Row
+from scenarios.policy_loader import has_trainings
+from scenarios.scenario_hash import scenario_hash
+from scenarios.suite.splits import cell_name
+
+if TYPE_CHECKING:  # slow to import
+    from scenarios.evaluate.references import Reference
+
+Array = np.ndarray
+
+
+FEWEST = 2
+"""Instances that intervals over instances need."""
+FEWEST_CELLS = 3
+"""Cells that intervals over cells need; fewer are given, not a sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class Normalised:
+    """Scores of the same instances under several policies; 0 is the mean of random, 1 the hindsight."""
+
+    instances: tuple[str, ...]
+    """A scenario and a seed each."""
+    cells: tuple[str, ...]
+    """Cell of each instance; instances of one cell have the same arms, stations and tasks."""
+    score: Mapping[str, Array]
+    """By policy, [training of the policy, instance]; a single training counts as given, not as a sample."""
+    to_bound: Mapping[str, Array]
+    """(upper bound − reward) / (upper bound − random), in the same shape."""
+    missing: int = 0
+    """Shifts of each policy that have no reference."""
+    flat: tuple[str, ...] = ()
+    """Instances left out because their hindsight is not better than random."""
+
+    def only(self, chosen: Array) -> "Normalised":
+        """Some of the instances, bool [instance]."""
+        names, cells = (tuple(np.array(each)[chosen].tolist()) for each in (self.instances, self.cells))
+        score, to_bound = ({name: x[:, chosen] for name, x in each.items()} for each in (self.score, self.to_bound))
+        return replace(self, instances=names, cells=cells, score=score, to_bound=to_bound)
+
+    @cached_property
+    def groups(self) -> Array | None:
+        """Number of the cell of each instance; None if cells are no sample or each has one instance."""
+        names, groups = np.unique(self.cells, return_inverse=True)
+        return groups if FEWEST_CELLS <= len(names) < len(self.cells) else None
+
+    @property
+    def unit(self) -> str:
+        """What intervals are about, as `200 instances of 9 cells`."""
+        cells, count = len(set(self.cells)), f"{len(self.instances)} instances"
+        if self.groups is not None:
+            return f"{count} of {cells} cells"
+        if cells == len(self.cells):
+            return count
+        return f"{count}, {f'these {cells} cells' if cells > 1 else 'this cell'} only"
+
+    def interval(self, values: Array) -> Interval:
+        """The interval of the mean of values [training, instance] over the sample."""
+        return interval(self._sample(values))
+
+    def difference(self, policy: str, other: str) -> Interval:
+        """Of the mean scores of two policies, paired by instance, and by training if both have several."""
+        return paired(self._sample(self.score[policy]), self._sample(self.score[other]))
+
+    def _sample(self, values: Array) -> Array:
+        """As `means.interval` takes them."""
+        return values[:, None] if self.groups is None else by_group(values, self.groups)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """The normalised score of one policy; intervals are over cells and instances, and over trainings if there are
+    several."""
+
+    mean: Interval
+    difference: Interval
+    """Of means, paired, to the baseline."""
+    p_holm: float
+    """Of no difference, adjusted for all policies."""
+    iqm: Interval
+    optimality_gap: Interval
+    """By how much scores are below 1 in the mean; those above count as 1."""
+    improvement: Interval
+    """Probability of a better score than the baseline's on an instance; an equal score counts one half."""
+    bound_gap: Interval
+    """Distance to the upper bound as a share of that from random to the bound, in the mean."""
+
+    @property
+    def stars(self) -> str:
+        """As `tables.LEGEND` says."""
+        return self.difference.stars(self.p_holm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """Normalised scores of several policies."""
+
+    baseline: str
+    instances: int
+    unit: str
+    """As of `Normalised`."""
+    missing: int
+    flat: tuple[str, ...]
+    trainings: int = 1
+    """Most trainings of a policy."""
+    policies: dict[str, Score]
+
+    @property
+    def flat_remark(self) -> str:
+        """Which instances were left out; "" if none."""
+        names = ", ".join(self.flat)
+        return f"Not scored, as hindsight is no better than random there: {names}." if names else ""
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a reader must know of the instances."""
+        remarks = [
+            f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = "
+            "hindsight, the best schedule that a clairvoyant search found."
+        ]
+        if self.missing:
+            remarks.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
+        if self.flat:
+            remarks.append(self.flat_remark)
+        return remarks
+
+
+def scores_of(values: Normalised, baseline: str) -> Scores:
+    """The figures of every policy; baseline is one of them.
+
+    Raises:
+        ValueError: fewer than two instances.
+    """
+    if len(values.instances) < FEWEST:
+        raise ValueError(f"Scores need {FEWEST} instances or more (got {len(values.instances)}).")
+    base, names = values.score[baseline], list(values.score)
+    groups = values.groups
+    suite = aggregates(values.score, "both", groups=groups)
+    differences = [Interval(0.0, 0.0, 0.0) if name == baseline else values.difference(name, baseline) for name in names]
+    adjusted = holm([each.p for each in differences]).tolist()
+    return Scores(
+        baseline=baseline,
+        instances=len(values.instances),
+        unit=values.unit,
+        missing=values.missing,
+        flat=values.flat,
+        trainings=max(map(len, values.score.values())),
+        policies={
+            name: Score(
+                mean=values.interval(values.score[name]),
+                difference=difference,
+                p_holm=p_holm,
+                iqm=suite[name].iqm,
+                optimality_gap=suite[name].optimality_gap,
+                improvement=improvement(values.score[name], base, "both", groups=groups),
+                bound_gap=values.interval(values.to_bound[name]),
+            )
+            for name, difference, p_holm in zip(names, differences, adjusted, strict=True)
+        },
+    )
+
+
+def and_trainings(count: int) -> str:
+    """What a unit says of the trainings of policies."""
+    return f" × {count} trainings of a policy" if count > 1 else ""
+
+
+def ranked(scores: Scores) -> list[str]:
+    """The policies, the best mean first."""
+    return sorted(scores.policies, key=lambda name: -scores.policies[name].mean.mean)
+
+
+HEADS = ("policy", "mean", "difference", "", "IQM", "short of 1", "better in", "to bound")
+
+
+def score_cells(scores: Scores, name: str, digits: int = 2) -> tuple[str, ...]:
+    """A row of `HEADS` but for the name."""
+    each, base = scores.policies[name], name == scores.baseline
+    return (
+        each.mean.text(digits),
+        "" if base else each.difference.text(digits),
+        "" if base else each.stars,
+        each.iqm.text(digits),
+        each.optimality_gap.text(digits),
+        "" if base else each.improvement.text(digits),
+        f"{each.bound_gap.mean:.{digits}f}",
+    )
+
+
+Shift = tuple[str, int]
+"""Instance and seed."""
+FOLDER = "suite/references"
+"""Of the references that come with the package, a file for each split."""
+
+
+def split_file(split: str) -> Path:
+    """File of the references of a split; there may be none."""
+    return Path(str(resources.files("scenarios").joinpath(FOLDER, f"{split}.jsonl")))
+
+
+def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shift, Reference]":
+    """The references of those shifts that have one.
+
+    Args:
+        file: Rows of `thermofleet bounds`; without it those of the splits that come with the package.
+
+    Raises:
+        FleetError: the file is no such file.
+    """
+    from scenarios.evaluate.references import load_references
+
+    splits = dict.fromkeys(case.name.partition("/")[0] for case in cases if "/" in case.name)
+    files = [file] if file else [path for path in map(split_file, splits) if path.is_file()]
+    rows = {(each.instance, each.seed): each for path in files for each in load_references(path)}
+    found: dict[Shift, Reference] = {}
+    for case in cases:
+        content = scenario_hash(case.scenario)
+        for seed in case.seeds:
+            own = rows.get((case.name if "/" in case.name else f"{case.name}/{seed}", seed))
+            if own and own.scenario_hash == content:
+                found[case.name, seed] = own
+    return found
+
+
+def normalised(
+    by_policy: Mapping[str, Sequence[Row]], references: "Mapping[Shift, Reference]", *, failed_as_random: bool = False
+) -> Normalised | None:
+    """The scores of policies on the shifts that have a reference; None if there are fewer than `FEWEST`.
+
+    An instance is a scenario and a seed, with the mean reward over trainings of its twins; trainings of a policy, which
+    do all instances, are kept apart. References are of the first fleet.
+
+    Args:
+        by_policy: Rows of each policy, of the same shifts.
+        failed_as_random: Count a failed shift as the mean of random; otherwise no row may have failed.
+    """
+    first = next(iter(by_policy.values()), ())
+    shifts = list(dict.fromkeys((row.key.instance, row.key.seed) for row in first if row.key.fleet == 0))
+    scored = [shift for shift in shifts if shift in references]
+    spread = [shift for shift in scored if references[shift].hindsight > references[shift].random]
+    if len(spread) < FEWEST:
+        return None
+    known = [references[shift] for shift in spread]
+    random, best, upper = (
+        np.array([getattr(each, name) for each in known]) for name in ("random", "hindsight", "upper")
+    )
+    score, to_bound = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    for policy, rows in by_policy.items():
+        rewards: dict[int, dict[Shift, list[float]]] = {}
+        for row in rows:
+            shift = row.key.instance, row.key.seed
+            if row.key.fleet == 0 and shift in references:
+                assert row.outcome is not None or failed_as_random
+                own = rewards.setdefault(row.key.training if has_trainings(row.key.policy) else 0, {})
+                own.setdefault(shift, []).append(row.outcome.reward if row.outcome else references[shift].random)
+        reward = np.array([[np.mean(own[shift]) for shift in spread] for own in rewards.values()])
+        score[policy] = (reward - random) / (best - random)
+        to_bound[policy] = (upper - reward) / (upper - random)
+    return Normalised(
+        instances=tuple(each.instance for each in known),
+        cells=tuple(cell_name(each.instance) for each in known),
+        score=score,
+        to_bound=to_bound,
+        missing=len({(row.key.fleet, row.key.instance, row.key.seed) for row in first}) - len(scored),
+        flat=tuple(references[shift].instance for shift in scored if shift not in set(spread)),
+    )

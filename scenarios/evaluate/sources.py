@@ -1,0 +1,378 @@
+"""Sources of predictions by name, from the trained twin to random numbers, and the prepared fleets of a study.
+
+A source gives the arms of a fleet their difficulty models: difficulty, P(saturation) and predicted peak. Those besides
+`twin` and `oracle` do not mix two methods: d and P of a VAE come from its reconstruction errors alone, and only thermal
+networks predict peak temperatures.
+"""
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+
+from fleet.difficulty import Difficulty, DifficultyModel, difficulty_of_error, heat_weights
+from fleet.errors import FleetError, nearest
+from fleet.motion import Plan
+from fleet.robot import JOINTS
+from scenarios.extras import require_extra
+from scenarios.job_stream import all_works, rehearsal_works, works_of
+from scenarios.prepare.fleet import DifficultyName, Fleet, RiskName, prepare
+from scenarios.prepare.planned_arm import PlannedArm, plan_arms
+from scenarios.prepare.randomisation import Randomisation, randomisation_of
+from scenarios.progress import Progress, quiet
+from scenarios.schema import Scenario
+
+if TYPE_CHECKING:  # need the extra `twin`
+    from twin.baselines.torque import TorqueRms
+    from twin.thermal.calibrated import CalibratedTwin
+
+Array = np.ndarray
+
+PREPARED: tuple[DifficultyName, ...] = get_args(DifficultyName)
+"""Sources of `scenarios.prepare.fleet.prepare`, which `run` and the environment have too."""
+BELOW_ONE = 1.0 - 1e-9
+MOST_FLEETS = 4
+"""Prepared fleets that a process keeps; one has some 10 MB per arm."""
+_UNREAD = ("name", "description", "jobs", "reward", "people", "slots", "decisions", "telemetry_interval_s", "bus")
+"""Fields of a scenario that `prepare` does not read, and its jobs."""
+_WEATHER = ("horizon_s", "decision_interval_s", "ambient", "start", "limits")
+"""Fields that plans and trained networks do not depend on; what does is quickly made."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedFleet:
+    """A scenario's arms with their plans, without predictions."""
+
+    scenario: Scenario
+    folder: Path
+    """Cache."""
+    progress: Progress = quiet
+
+    @cached_property
+    def blind(self) -> Fleet:
+        """The fleet without predictions."""
+        return prepare(self.scenario, difficulty="blind", cache=self.folder, progress=self.progress)
+
+    @cached_property
+    def arms(self) -> list[PlannedArm]:
+        """The arms with their plans for all motion of the scenario, light loads included."""
+        every = range(len(self.scenario.arms))
+        return plan_arms(self.scenario, every, rehearsal_works(self.scenario), self.folder, self.progress)
+
+    def calibrated(
+        self, training: int, risk: RiskName, *, trained: bool = True, changes: Mapping[str, int] | None = None
+    ) -> "list[CalibratedTwin]":
+        """The arms' twins of a training, with P(saturation) of a kind; or the same networks before training.
+
+        Args:
+            changes: Fields of the configuration with other values.
+        """
+        from scenarios.prepare.calibrate_twins import calibrate_twins
+        from scenarios.prepare.train_twins import train_twins, training_seed
+        from twin.baselines.reconstruction import untrained_config
+        from twin.vae.config import TwinConfig
+
+        spec = self.scenario.twin
+        config = (TwinConfig.quick() if spec.size == "quick" else TwinConfig()).changed(**changes or {})
+        seed = training_seed(self.scenario, training)
+        twins = train_twins(
+            self.scenario,
+            self.arms,
+            self.folder,
+            self.progress,
+            config=config if trained else untrained_config(config),
+            seed=seed,
+        )
+        return calibrate_twins(self.scenario, self.arms, twins, self.folder, self.progress, risk=risk)
+
+    def scored(self, models: Sequence[DifficultyModel]) -> Fleet:
+        """The fleet with these difficulty models."""
+        arms = [replace(arm, model=model) for arm, model in zip(self.blind.arms, models, strict=True)]
+        return replace(self.blind, arms=tuple(arms))
+
+
+@dataclass(frozen=True)
+class _WithoutPeak:
+    """The difficulty and P(saturation) of a model, without its predicted peak."""
+
+    model: DifficultyModel
+
+    @property
+    def version(self) -> str:
+        return f"{self.model.version}, no peak"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
+        score = self.model.score(plan, repetitions)
+        return score and replace(score, peak=None)
+
+
+@dataclass(frozen=True)
+class _Unweighted:
+    """The scores of a model with d = Σ_k d_k, as in the paper."""
+
+    model: DifficultyModel
+
+    @property
+    def version(self) -> str:
+        return f"{self.model.version}, unweighted"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
+        score = self.model.score(plan, repetitions)
+        return score and replace(score, weight=None)
+
+
+@dataclass(frozen=True)
+class _Inverted:
+    """The opposite of a model: d_k and P of hard work are those of easy work."""
+
+    model: DifficultyModel
+
+    @property
+    def version(self) -> str:
+        return f"inverted {self.model.version}"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
+        score = self.model.score(plan, repetitions)
+        if score is None:
+            return None
+        assert score.risk is None or score.risk.offset.shape[-1] == 1, "the opposite of a maximum is not one"
+        risk = score.risk and replace(score.risk, offset=-score.risk.offset, weight=-score.risk.weight)
+        return Difficulty(np.minimum(1.0 - score.per_joint, BELOW_ONE), risk=risk, weight=score.weight)
+
+
+@dataclass(frozen=True)
+class _Torque:
+    """d_k from the RMS torque over that of the training motion; P from a regression on the mean squared torque."""
+
+    torque: "TorqueRms"
+    risk: DifficultyModel
+    version: str = "torque"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
+        per_joint = difficulty_of_error(self.torque.scores([plan], [repetitions]).per_joint[0])
+        score = self.risk.score(plan, repetitions)
+        weight = heat_weights(self.torque.nominal_nm**2)
+        return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk, weight=weight)
+
+
+@dataclass(frozen=True)
+class _Random:
+    """Uniform d_k and P for each plan and number of repetitions, the same whenever they are asked for."""
+
+    seed: int
+    version: str = "random"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        motion = hashlib.sha256(np.ascontiguousarray(plan.cycle.profile).tobytes()).digest()
+        entropy = [self.seed, repetitions, int.from_bytes(motion[:8], "little"), *plan.arm.encode()]
+        drawn = np.random.default_rng(np.random.SeedSequence(entropy)).random(JOINTS + 1)
+        return Difficulty(drawn[:JOINTS], p_saturation=float(drawn[JOINTS]))
+
+
+@dataclass(frozen=True)
+class _Constant:
+    """The same score for everything."""
+
+    version: str = "constant"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        return Difficulty(np.full(JOINTS, 0.5), p_saturation=0.5)
+
+
+@dataclass(frozen=True)
+class Source:
+    """One source of predictions besides those of `PREPARED`."""
+
+    make: Callable[[PlannedFleet, int], Fleet]
+    """The fleet with its predictions, of a training, from 0."""
+    trained: bool = True
+    """Whether it depends on the training; else one training stands for all."""
+
+
+def _vae(
+    planned: PlannedFleet, training: int, *, trained: bool = True, changes: Mapping[str, int] | None = None
+) -> Fleet:
+    models = planned.calibrated(training, "excess", trained=trained, changes=changes)
+    return planned.scored([_WithoutPeak(model) for model in models])
+
+
+def _unweighted(planned: PlannedFleet, fleet: Fleet) -> Fleet:
+    return planned.scored([_Unweighted(arm.model) for arm in fleet.arms])
+
+
+def _torque(planned: PlannedFleet) -> Fleet:
+    from scenarios.prepare.cool_motion import records, require_cool_plans
+    from scenarios.prepare.train_twins import exploration_records
+    from twin.baselines.torque import torque_over_known
+
+    scenario, twins = planned.scenario, planned.calibrated(0, "torque")
+
+    def training_records(arm: PlannedArm) -> list[Array]:
+        cool = require_cool_plans(arm.all_plans, arm.hardware, scenario)
+        return [*records(cool), *exploration_records(scenario, arm)]
+
+    rules = [torque_over_known(training_records(arm)) for arm in planned.arms]
+    return planned.scored([_Torque(rule, twin) for rule, twin in zip(rules, twins, strict=True)])
+
+
+def _network(planned: PlannedFleet, risk: RiskName) -> Fleet:
+    from scenarios.prepare.calibrate_twins import calibrate_networks
+
+    heats = calibrate_networks(planned.scenario, planned.arms, planned.folder, planned.progress, risk=risk)
+    fleet = planned.scored(heats)
+    if risk == "rc-nominal":
+        return fleet
+    arms = [replace(arm, known=(heat.thermal, heat.motors)) for arm, heat in zip(fleet.arms, heats, strict=True)]
+    return replace(fleet, arms=tuple(arms))
+
+
+def _random(planned: PlannedFleet, training: int) -> Fleet:
+    from scenarios.prepare.train_twins import training_seed
+
+    return planned.scored([_Random(training_seed(planned.scenario, training))] * len(planned.arms))
+
+
+def _inverted(planned: PlannedFleet, training: int) -> Fleet:
+    return planned.scored([_Inverted(model) for model in planned.calibrated(training, "excess")])
+
+
+def _sized(**changes: int) -> Source:
+    """The VAE alone, with another configuration."""
+    return Source(lambda planned, training: _vae(planned, training, changes=changes))
+
+
+SOURCES: dict[str, Source] = {
+    # d and P of the VAE alone; `twin` has P and peak of the identified thermal network besides.
+    "trained": Source(_vae),
+    "untrained": Source(lambda planned, training: _vae(planned, training, trained=False)),
+    "unweighted": Source(lambda planned, training: _unweighted(planned, _vae(planned, training))),
+    # RMS torque over that of the training motion.
+    "torque": Source(lambda planned, _: _unweighted(planned, _torque(planned)), trained=False),
+    "weighted-torque": Source(lambda planned, _: _torque(planned), trained=False),
+    # Thermal networks alone: of a nominal arm, and as identified.
+    "rc-nominal": Source(lambda planned, _: _network(planned, "rc-nominal"), trained=False),
+    "rc": Source(lambda planned, _: _network(planned, "rc"), trained=False),
+    "random": Source(_random),
+    "inverted": Source(_inverted),
+    "constant": Source(lambda planned, _: planned.scored([_Constant()] * len(planned.arms)), trained=False),
+    # The VAE with other windows and sizes.
+    "trained-1s-16": _sized(window=12, hidden=16),
+    "trained-1s-32": _sized(window=12, hidden=32),
+    "trained-4s-32": _sized(window=50, hidden=32),
+}
+"""Sources besides those of `PREPARED`, by name."""
+ALL_SOURCES = (*PREPARED, *SOURCES)
+"""Names, as `--difficulty` of `thermofleet compare` takes them."""
+
+
+def check_source(name: str) -> None:
+    """Check that there is such a source of predictions.
+
+    Raises:
+        FleetError: there is none.
+    """
+    if name not in ALL_SOURCES:
+        raise FleetError(f"No difficulty '{name}'{nearest(name, ALL_SOURCES)}")
+
+
+def is_trained(source: str) -> bool:
+    """Whether a source has several trainings."""
+    return source == "twin" if source in PREPARED else SOURCES[source].trained
+
+
+def drawn(scenario: Scenario, fleet: int) -> Scenario:
+    """The scenario with the k-th draw of its arms."""
+    return replace(scenario, spread=replace(scenario.spread, seed=scenario.spread.seed + fleet))
+
+
+def prepared_content(scenario: Scenario, source: str) -> tuple[object, ...]:
+    """What the preparation of a fleet reads of a scenario: two with the same content have the same prepared fleet.
+
+    Past jobs of a twin are drawn from the scenario's streams, so these are kept whole, but for `blind` and `oracle`.
+    """
+    without_past = source in ("blind", "oracle")
+    jobs = tuple(works_of(scenario, stream) for stream in scenario.jobs) if without_past else scenario.jobs
+    return (jobs, *(getattr(scenario, field.name) for field in fields(scenario) if field.name not in _UNREAD))
+
+
+def plan_content(scenario: Scenario) -> tuple[object, ...]:
+    """What takes long to make of a scenario, plans and trained twins, depends on this."""
+    kept = (field.name for field in fields(scenario) if field.name not in (*_UNREAD, *_WEATHER))
+    return (all_works(scenario), *(getattr(scenario, name) for name in kept))
+
+
+class Fleets:
+    """Prepared fleets, the last few of them kept: one for all scenarios that share a cell."""
+
+    def __init__(self) -> None:
+        self._cells: OrderedDict[object, tuple[object, Fleet]] = OrderedDict()
+        """With what the plans of each depend on."""
+        self._last: tuple[object, Fleet] | None = None
+        self._planned: PlannedFleet | None = None
+
+    def of(
+        self,
+        scenario: Scenario,
+        source: str,
+        risk: RiskName,
+        folder: Path,
+        progress: Progress = quiet,
+        *,
+        training: int = 0,
+        randomise: Randomisation | None = None,
+    ) -> Fleet:
+        """The fleet of a scenario with predictions from a source; the same object for calls that follow each other.
+
+        Args:
+            training: Of the twins, from 0.
+            risk: Model of P(saturation) of the source `twin`.
+            folder: Cache of plans and twins.
+
+        Raises:
+            FleetError: it cannot be prepared.
+            MissingExtra: the source needs libraries that are not installed.
+        """
+        asked = (scenario, training, source, risk, randomise, folder)
+        if self._last and self._last[0] == asked:
+            return self._last[1]
+        cell = (prepared_content(scenario, source), *asked[1:])
+        if cell not in self._cells:
+            plans = (plan_content(scenario), source, risk, randomise, folder)
+            like = next((fleet for key, fleet in self._cells.values() if key == plans), None)
+            randomise_ = randomisation_of(randomise)
+            made = (
+                prepare(
+                    scenario, difficulty=source, risk=risk, randomise=randomise, training=training, cache=folder,
+                    progress=progress, like=like,
+                )
+                if source in PREPARED
+                else self._scored(scenario, source, training, randomise_, folder, progress)
+            )  # fmt: skip
+            self._cells[cell] = plans, made
+            while len(self._cells) > MOST_FLEETS:
+                self._cells.popitem(last=False)
+        self._cells.move_to_end(cell)
+        fleet = self._cells[cell][1]
+        _, *specs = (randomise or Randomisation()).scenarios_of(scenario)
+        variants = [replace(each, scenario=spec) for each, spec in zip(fleet.variants, specs, strict=True)]
+        found = replace(fleet, scenario=scenario, variants=tuple(variants))
+        self._last = asked, found
+        return found
+
+    def _scored(
+        self, scenario: Scenario, source: str, training: int, randomise: Randomisation, folder: Path, progress: Progress
+    ) -> Fleet:
+        """A fleet with its variants, and predictions from one of `SOURCES`."""
+        require_extra("twin")
+        fleets: list[Fleet] = []
+        for spec in randomise.scenarios_of(scenario):
+            last = self._planned
+            if last is None or (last.scenario, last.folder) != (spec, folder):
+                self._planned = last = PlannedFleet(spec, folder, progress)
+            fleets.append(SOURCES[source].make(last, training))
+        return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))

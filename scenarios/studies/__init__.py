@@ -1,1 +1,0 @@
-"""Research studies of the twin; nothing else depends on them."""

@@ -1,0 +1,123 @@
+"""Shifts of a split of the suite as batches, for a learner of scores of pairs: one batched environment per instance."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from agents.assignment import matched_options
+from agents.pair_scores import scores
+from agents.policy import WAIT
+from fleet.engine.reward import RewardWeights
+from fleet.env.vector import BatchEnv, Library, Obs
+from scenarios.evaluate.rollout import rollout
+from scenarios.fault_price import weights_of
+from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
+from scenarios.progress import Count, Progress, quiet
+from scenarios.run.batch import library_of
+from scenarios.suite.splits import Instance
+
+Array = np.ndarray
+
+SHIFTS = 4
+"""Shifts of a validation instance: that of its own seed, and others."""
+
+
+Known = Mapping[tuple[str, int], tuple[float, float]]
+"""Rewards of random and of the hindsight in the shift of an instance and its seed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """One instance, ready for batches of its shifts."""
+
+    name: str
+    seed: int
+    """Of the instance itself."""
+    library: Library
+    weights: RewardWeights
+    random: float = 0.0
+    """Mean reward of the policy `random` in the shift of its own seed; 0 without a reference."""
+    span: float | None = None
+    """Reward of the hindsight of that shift less `random`; None without a reference."""
+
+    @property
+    def shifts(self) -> list[int]:
+        """Seeds of its shifts in validation: its own, and the next ones."""
+        return [*range(self.seed, self.seed + SHIFTS)]
+
+    @property
+    def arms(self) -> int:
+        """Number of arms."""
+        return len(self.library.arms)
+
+    def value(self, seed: int) -> float:
+        """Value of all jobs that arrive in the shift of a seed: the unit of a fitness, so that instances are alike."""
+        shift = self.library.draw(np.random.SeedSequence(seed))
+        return max(float(self.library.tables.value[shift.fleet, shift.kind].sum()), 1.0)
+
+    @property
+    def unit(self) -> float:
+        """What rewards of its shifts are divided by: the span, or the value of all jobs without a reference."""
+        return self.value(self.seed) if self.span is None else self.span
+
+
+def ground_of(
+    instance: Instance,
+    *,
+    difficulty: DifficultyName = "oracle",
+    risk: RiskName = RISK,
+    cache: Path | None = None,
+    known: Known | None = None,
+) -> Ground:
+    """Prepare an instance; its cell is planned once."""
+    fleet = prepare(instance.scenario, difficulty=difficulty, risk=risk, cache=cache)
+    random, hindsight = (known or {}).get((instance.name, instance.seed), (0.0, None))
+    span = None if hindsight is None else hindsight - random
+    return Ground(instance.name, instance.seed, library_of(fleet), weights_of(instance.scenario), random, span)
+
+
+def grounds_of(
+    instances: Sequence[Instance],
+    *,
+    difficulty: DifficultyName = "oracle",
+    risk: RiskName = RISK,
+    cache: Path | None = None,
+    known: Known | None = None,
+    progress: Progress = quiet,
+) -> list[Ground]:
+    """Prepare instances.
+
+    Args:
+        known: References of those instances that have one.
+    """
+    grounds: list[Ground] = []
+    for instance in instances:
+        progress(f"preparing {instance.name}", Count(len(grounds), len(instances)))
+        grounds.append(ground_of(instance, difficulty=difficulty, risk=risk, cache=cache, known=known))
+    return grounds
+
+
+def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
+    """Reward of one shift for each row of parameters and its seed, [row].
+
+    Perfect and immediate messages; decisions are asked for by events, which changes no result of a central policy.
+
+    Args:
+        parameters: [row, parameter] of `agents.pair_scores`.
+    """
+    env = BatchEnv(ground.library, len(seeds), weights=ground.weights, decisions="events")
+
+    def act(obs: Obs, running: Array) -> Array:
+        actions = np.full((len(seeds), ground.arms), WAIT)
+        asked = np.flatnonzero(running & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
+        if len(asked):
+            seen = env.layout.read(obs["observation"][asked], obs["action_mask"][asked])
+            score = scores(seen, parameters[asked])
+            for k in np.flatnonzero(np.isfinite(score).any(axis=(1, 2))).tolist():
+                for arm, option in matched_options(-score[k], env.layout.plans):
+                    actions[asked[k], arm] = 1 + option
+        return actions
+
+    return rollout(env, env.reset(seed=list(seeds))[0], act)
