@@ -114,8 +114,8 @@ def _computed(missing: Sequence[tuple[Unit, list[str]]], workers: int) -> KeyedR
             yield from unit.compute(keys)
         return
     with worker_processes(workers) as pool:
-        for some in pool(delayed(_listed)(unit, keys) for unit, keys in missing) or ():
-            yield from some
+        for some in pool(delayed(_listed)(unit, keys) for unit, keys in missing):
+            yield from some or ()
 
 
 def _listed(unit: Unit, keys: list[str]) -> list[tuple[str, Mapping[str, Any]]]:
