@@ -17,6 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from fleet.errors import FleetError, JournalFull, NoRouter, printable, visible
 from fleet.live.supervisor import SUPERVISED, WAITS
+from scenarios.cli.from_fields import with_fields
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, echo, err_console, say
 from scenarios.extras import missing_extra
 
@@ -125,7 +126,7 @@ def load_command(name: str) -> Any:
     target = target_of(name)
     if not isinstance(target, typer.Typer):
         alone = typer.Typer(add_completion=False)
-        alone.command(name)(target)
+        alone.command(name)(with_fields(target))
         target = alone
     command = typer.main.get_command(target)
     command.name = name
