@@ -2,9 +2,9 @@
 
     python examples/own_allocator.py 7447 my_fleet
 
-It replaces `thermofleet auction`: jobs are submitted at jobs/submit, every arm quotes the waiting jobs, and each job
-goes to the arm with the lowest difficulty. It follows the rules by which no job is done twice, as long as it runs. It
-has no disk, so a restart loses all jobs; a real allocator writes every reply to disk before it sends it.
+It replaces `thermofleet bus auctioneer`: jobs are submitted at jobs/submit, every arm quotes the waiting jobs, and each
+job goes to the arm with the lowest difficulty. It follows the rules by which no job is done twice, as long as it runs.
+It has no disk, so a restart loses all jobs; a real allocator writes every reply to disk before it sends it.
 """
 
 import json

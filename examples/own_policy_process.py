@@ -1,6 +1,6 @@
 """Example of your own policy in another process, with `eclipse-zenoh` and `json` only, by the rules of docs/bus.md.
 
-    thermofleet router                                                   # in one terminal
+    thermofleet bus router                                                   # in one terminal
     python examples/own_policy_process.py 7447 mine                      # in another one
     thermofleet compare quickstart --policies wsept,bus:mine --seeds 5   # in a third one
 

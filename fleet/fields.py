@@ -5,9 +5,11 @@ from dataclasses import dataclass, field, fields
 from math import inf
 from typing import Any
 
-from fleet.errors import nearest
+from fleet.errors import NAME_RULE, is_name, nearest, printable
 
 MAX_SEED = 2**32 - 1
+MIN_SPEED, MAX_SPEED = 0.001, 10_000.0
+"""Of a fleet, in fleet seconds per real second."""
 _KEY = "option"
 
 
@@ -23,6 +25,8 @@ class Option:
     """Whether the value must be more than `low`, not equal to it."""
     choices: tuple[str, ...] = ()
     """Allowed names."""
+    is_name: bool = False
+    """Whether a text must follow the rule for names, which become parts of keys and files; "" is none."""
     flag: str = ""
     """Name on the command line; "" for that of the field."""
     panel: str = ""
@@ -49,7 +53,9 @@ class Option:
             name: What the sentence calls the value, as `--seed` or `RunSpec.seed`.
         """
         if self.choices and isinstance(value, str) and value not in self.choices:
-            return f"No {name.rpartition('.')[2].removeprefix('--')} '{value}'{nearest(value, self.choices)}"
+            return f"No {name.rpartition('.')[2].removeprefix('--')} '{printable(value)}'{nearest(value, self.choices)}"
+        if self.is_name and isinstance(value, str) and value and not is_name(value):
+            return f"{name} must have {NAME_RULE} (got '{printable(value)}')."
         if isinstance(value, int | float) and not self._within(value):
             return f"{name} must be {self.limits} (got {value:g})."
         return ""

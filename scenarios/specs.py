@@ -4,11 +4,13 @@ Nothing here is slow to import, so that the help of a command is fast.
 """
 
 from dataclasses import dataclass
+from math import inf
+from pathlib import Path
 from typing import Literal, get_args
 
-from agents.registry import NAMES_HELP
+from agents.registry import NAMES_HELP, WRAPPERS_HELP, names_of
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.fields import MAX_SEED, check, option
+from fleet.fields import MAX_SEED, MAX_SPEED, MIN_SPEED, check, option
 
 DifficultyName = Literal["twin", "blind", "oracle"]
 RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
@@ -49,6 +51,51 @@ class RunSpec:
     risk: RiskName = option(RISK_HELP, RISK, choices=get_args(RiskName))
     channel: Channel = PERFECT
     """Topology, delay and loss of the arms' messages."""
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+LiveModel = Literal["twin", "blind"]
+JobSource = Literal["scenario", "none"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveSpec:
+    """How a live fleet works; each of its processes gets what concerns it."""
+
+    policy: str = option(
+        f"Allocation policy. Run by the auctioneer: {names_of('central')}. Run by each arm, without an auctioneer: "
+        f"{names_of('arm')}, or a folder of `thermofleet train`. Your own as FILE.py:CLASS, run according to its "
+        f"scope, or bus:NAME in another process. {WRAPPERS_HELP}.",
+        "matching",
+    )
+    speed: float = option("Fleet seconds per real second.", 1.0, low=MIN_SPEED, high=MAX_SPEED)
+    difficulty: LiveModel = option("Difficulty model.", "twin", choices=get_args(LiveModel))
+    risk: RiskName = option(RISK_HELP, RISK, choices=get_args(RiskName))
+    jobs: JobSource = option(
+        "scenario: the scenario's job stream; none: submitted jobs only.", "scenario", choices=get_args(JobSource)
+    )
+    seed: int = option("Random seed of the scenario's jobs, the sensor noise and the policy.", 0, low=0, high=MAX_SEED)
+    fleet: str = option("Name of the fleet. Default: the scenario's name.", "", is_name=True)
+    journal: Path | None = option("Folder of the journals; an existing journal is continued.", None)
+    new_epoch: bool = option("Begin with empty journals although other participants know older ones.", False)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """What to film and how."""
+
+    speed: float = option("Shift seconds per second of the film.", 120.0, low=0.1, high=3600)
+    fps: int = option("Pictures per second.", 30, low=1, high=60)
+    width: int = 1280
+    height: int = 720
+    begin_s: float = option("First second of the shift.", 0.0, low=0, high=1e9, flag="--begin")
+    end_s: float = option("Last second of the shift; by default its end.", inf, low=0, flag="--end", shown="")
+    meshes: bool = option("Kinova's shells; needs the extra `meshes`.", False)
 
     def __post_init__(self) -> None:
         check(self)

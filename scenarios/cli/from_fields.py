@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import typer
 
-from fleet.errors import FleetError, printable
+from fleet.errors import FleetError
 from fleet.fields import Option, options_of
 
 _GIVEN = ("COMMANDLINE", "ENVIRONMENT")
 """Names of typer's sources of a value that is not a default; their class is private."""
 Given = dict[str, Any]
-"""Values of fields that the command line gives, by the name of the field; the others keep their defaults."""
+"""Values of fields that the command line gives, by field; the others keep the default of the dataclass."""
 
 
 class From:
@@ -24,17 +24,27 @@ class From:
     Args:
         kind: A dataclass whose fields are declared with `fleet.fields.option`.
         names: The fields; all of them if there are none.
+        defaults: Of fields whose default is another one in this command.
     """
 
-    def __init__(self, kind: type, *names: str) -> None:
+    def __init__(self, kind: type, *names: str, **defaults: Any) -> None:
         known = options_of(kind)
-        self.kind = kind
+        self.kind, self.defaults = kind, defaults
         self.options = {name: known[name] for name in names or known}
         self.fields: dict[str, Field[Any]] = {each.name: each for each in fields(kind) if each.name in self.options}
 
     def parameters(self) -> list[inspect.Parameter]:
         """One keyword parameter for each field."""
-        return [_parameter(self.kind, self.fields[name], option) for name, option in self.options.items()]
+        return [self._parameter(self.fields[name], option) for name, option in self.options.items()]
+
+    def _parameter(self, known: "Field[Any]", option: Option) -> inspect.Parameter:
+        plain = list[str] | None if option.parse else _plain(known.type, option)
+        default = None if option.shown is not None or known.default in (MISSING, ()) else known.default
+        default = self.defaults.get(known.name, default)
+        if default is None:
+            plain = plain | None
+        annotation = Annotated[plain, declared(self.kind, known.name)]
+        return inspect.Parameter(known.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
     def take(self, values: dict[str, Any], ctx: typer.Context) -> Given:
         """Remove the own values from those of all parameters, and return the given ones.
@@ -43,11 +53,8 @@ class From:
             FleetError: a text has another form.
         """
         own = {name: values.pop(name) for name in self.options}
-        given = {
-            name: value
-            for name, value in own.items()
-            if getattr(ctx.get_parameter_source(name), "name", None) in _GIVEN
-        }
+        sources = {name: getattr(ctx.get_parameter_source(name), "name", "") for name in own}
+        given = {name: value for name, value in own.items() if sources[name] in _GIVEN or name in self.defaults}
         for name, value in given.items():
             if parse := self.options[name].parse:
                 try:
@@ -90,7 +97,7 @@ def declared(kind: type, name: str) -> Any:
     flag = option.flag or f"--{name.replace('_', '-')}"
 
     def check(_: typer.CallbackParam, value: object) -> object:
-        if problem := option.problem(flag, printable(value) if isinstance(value, str) else value):
+        if problem := option.problem(flag, value):
             raise FleetError(problem)
         return value
 
@@ -98,22 +105,12 @@ def declared(kind: type, name: str) -> Any:
         flag,
         help=option.help,
         callback=check,
-        show_default=True if option.shown is None else option.shown,
+        show_default=True if option.shown is None else option.shown or False,
         rich_help_panel=option.panel or None,
         metavar=option.metavar,
         envvar=option.env,
         autocompletion=(lambda: list(option.choices)) if option.choices else None,
     )
-
-
-def _parameter(kind: type, known: "Field[Any]", option: Option) -> inspect.Parameter:
-    """The keyword parameter of a field."""
-    plain = list[str] | None if option.parse else _plain(known.type, option)
-    default = None if option.shown is not None or known.default in (MISSING, ()) else known.default
-    if default is None:
-        plain = plain | None
-    annotation = Annotated[plain, declared(kind, known.name)]
-    return inspect.Parameter(known.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 def _plain(kind: Any, option: Option) -> Any:
@@ -123,3 +120,15 @@ def _plain(kind: Any, option: Option) -> Any:
     if get_origin(kind) in (Union, UnionType):
         kind = next(each for each in get_args(kind) if each is not NoneType)
     return kind
+
+
+def flags_of(value: object, *names: str) -> tuple[str, ...]:
+    """Words of a command line that give these fields of a dataclass; those that are empty or False are left out."""
+    words: list[str] = []
+    for name in names:
+        given, flag = getattr(value, name), options_of(type(value))[name].flag or f"--{name.replace('_', '-')}"
+        if given is True:
+            words.append(flag)
+        elif given not in (None, False, ""):
+            words += [flag, str(given)]
+    return tuple(words)

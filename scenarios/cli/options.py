@@ -72,7 +72,7 @@ def command_line(ctx: typer.Context) -> str:
 ScenarioArg = Annotated[
     str,
     typer.Argument(
-        help="A library name (see `thermofleet list`), a .toml file, or an instance of the suite, as test/0017."
+        help="A library name (see `thermofleet show`), a .toml file, or an instance of the suite, as test/0017."
     ),
 ]
 SeedOption = Annotated[int, number("Random seed of jobs, sensor noise and policy.", 0, MAX_SEED)]
@@ -119,7 +119,7 @@ FleetOption = Annotated[
 
 # Twins.
 ScenarioOrLog = Annotated[
-    str | None, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file; or use --log.")
+    str | None, typer.Argument(help="A library name (see `thermofleet show`) or a .toml file; or use --log.")
 ]
 LogOption = Annotated[
     Path | None, typer.Option("--log", help="A log of a real arm, or a folder of logs: .csv, .csv.gz, .parquet.")

@@ -1,4 +1,4 @@
-"""`thermofleet leaderboard` and `thermofleet submit-result`."""
+"""`thermofleet leaderboard` and `thermofleet leaderboard --submit`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,7 +30,7 @@ def leaderboard_command(
 ) -> None:
     """Print the leaderboard: normalised scores of all results on a split.
 
-    Every file is checked as by `thermofleet submit-result`. A failed shift counts
+    Every file is checked as by `thermofleet leaderboard --submit`. A failed shift counts
     as the mean of random. With --verify, repeated shifts must give equal figures.
     """
     from scenarios.leaderboard.board import best_text, board_of, board_text, read_all, remark_text

@@ -1,10 +1,13 @@
 """The recorder on the bus: receives what arms and auctioneers publish, and writes it in turns."""
 
+import fcntl
 import logging
 import math
+import os
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
 
 from msgspec import structs
 
@@ -25,6 +28,10 @@ CELL_S, CELL_REPLY_S = 30.0, 5.0
 """Real seconds between two questions about the cell, until one is answered; in which a reply counts."""
 RETRY_S = 5.0
 """Real seconds until the next attempt to write a part to a disk that refused."""
+BACKLOG = 200_000
+"""Messages that may wait: joining a fleet of a hundred arms brings a hundred thousand at once."""
+CONNECT_S = 0.5
+"""Real seconds that the router has to accept the session that fetches missed messages."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -91,3 +98,47 @@ class RecorderNode:
     def close(self) -> None:
         """Close the client that fetches."""
         self._fetcher.close()
+
+
+def record(
+    link: BusClient, folder: Path, *, rotate_s: float, stopped: Callable[[], bool], connect: Callable[[], BusClient]
+) -> Recorder:
+    """Record until stopped; return the recorder, everything written.
+
+    Args:
+        rotate_s: Real seconds between two Parquet parts; rows are in the journal before.
+        connect: Makes another client of the fleet, which fetches missed messages.
+
+    Raises:
+        FleetError: the disk refuses at the beginning or at the end; in between it is tried again.
+    """
+    with (
+        lock_folder(folder),
+        closing(Recorder.open(folder, link.fleet)) as recorder,
+        closing(RecorderNode(link, recorder, connect, rotate_s=rotate_s)) as node,
+    ):
+        while not stopped():
+            node.serve()
+        node.end()
+    return recorder
+
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Create the folder if it is missing, and lock it until the end of the block or of the process.
+
+    Raises:
+        FleetError: another process has locked it, or it cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)  # the folder itself: no lock file is left in it
+    except OSError as error:
+        raise FleetError(f"Cannot write to '{folder}': {error.strerror}.") from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise FleetError(f"Another process records in '{folder}'. Stop it, or choose another --out.") from error
+    finally:
+        os.close(handle)

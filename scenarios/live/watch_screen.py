@@ -30,8 +30,8 @@ PLAIN = {
     "award": "begins {job}",
     "finish": "has finished {job}",
     "home": "is home again",
-    "warning": "motor {joint} is above the warning limit",
-    "fault": "has stopped: motor {joint} is above the error limit",
+    "warning": "joint {joint} is above the warning limit",
+    "fault": "has stopped: joint {joint} is above the error limit",
     "recover": "works again",
     "moved": "was moved home by a person",
     "torque_warning": "has a plan above the torque warning",
@@ -196,7 +196,7 @@ def heat_bar(arm: ArmSnapshot) -> Text:
 
 
 def plain_event(event: ArmEvent) -> str:
-    """An event in words, for example `motor 2 is above the warning limit (60.0 °C), crate_1`."""
+    """An event in words, for example `joint 2 is above the warning limit (60.0 °C), crate_1`."""
     words = PLAIN.get(event.kind, event.kind.replace("_", " "))
     text = words.format(job=event.job or "its job", joint=event.joint)
     if event.kind in ("warning", "fault") and event.value is not None:

@@ -193,7 +193,9 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
     with pytest.raises(FleetError, match=r"banana.jsonl' must have the name .* with SPLIT validation, test, sizes"):
         read_all(tmp_path, "test")
     (tmp_path / "study.json").touch()
-    with pytest.raises(FleetError, match="is a folder of `thermofleet compare`; run `thermofleet submit-result`"):
+    with pytest.raises(
+        FleetError, match="is a folder of `thermofleet compare`; run `thermofleet leaderboard --submit`"
+    ):
         read_all(tmp_path, "test")
     lines = (tmp_path / "test-other-oracle.jsonl").read_text(encoding="utf-8").splitlines()
     for bad in (
@@ -206,7 +208,7 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
         ),
     ):
         path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
-        with pytest.raises(FleetError, match="is no result of `thermofleet submit-result`"):
+        with pytest.raises(FleetError, match="is no result of `thermofleet leaderboard --submit`"):
             read(path)
     path.write_text("\n".join([*lines[:2], lines[2][:20], *lines[3:]]), encoding="utf-8")
     with pytest.raises(FleetError, match="line 3: "):

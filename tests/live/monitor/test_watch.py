@@ -26,8 +26,8 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent
 from fleet.events import EVENT_KINDS
 from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
-from scenarios.cli.live.up import free_port
-from scenarios.cli.live.watch import GONE_S, ShiftEnd
+from scenarios.live.fleet_processes import free_port
+from scenarios.live.watch import GONE_S, ShiftEnd
 from scenarios.live.watch_screen import (
     PLAIN,
     JobBars,
@@ -110,7 +110,7 @@ def test_every_event_of_an_arm_is_told_in_words():
     def words(kind, **more):
         return plain_event(ArmEvent(arm="a", number=0, time_s=1.0, kind=kind, **more))
 
-    assert words("warning", joint=2, value=60.04, job="j") == "motor 2 is above the warning limit (60.0 °C), j"
+    assert words("warning", joint=2, value=60.04, job="j") == "joint 2 is above the warning limit (60.0 °C), j"
     assert words("give_back", job="j", reason="paused") == "gives j back after a cycle: paused"
     assert words("later_kind") == "later kind"
     assert set(PLAIN) <= set(EVENT_KINDS)
@@ -186,7 +186,7 @@ def test_ages_and_times_are_short():
 
 
 def command(*arguments):
-    return [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "watch", *arguments]
+    return [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "bus", "watch", *arguments]
 
 
 def test_without_a_terminal_lines_are_printed_until_stopped(fleet):

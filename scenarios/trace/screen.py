@@ -1,12 +1,11 @@
-"""`thermofleet trace`: one event, and everything that led to it, on one screen."""
+"""One event, and everything that led to it, on one screen."""
 
 import re
 from bisect import bisect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any  # values of run.json
+from typing import Any  # values of run.json
 
-import typer
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
@@ -14,36 +13,12 @@ from rich.text import Text
 
 from fleet.errors import FleetError, visible
 from fleet.events import MEANINGS, Event
-from scenarios.cli.options import JsonOption
-from scenarios.cli.terminal import out_console, print_json
 from scenarios.report.gantt import clock
 from scenarios.shift_records import Offer
-from scenarios.trace.thread import NOT_RECORDED, Thread, thread_of
+from scenarios.trace.thread import NOT_RECORDED, Thread
 
 RUNS = Path("runs")
 MOST_OFFERS, MOST_HISTORY = 8, 8
-
-
-def trace_command(
-    event: Annotated[
-        str,
-        typer.Argument(
-            help="A row of the event log from 0; a kind such as fault, also with an arm or a job as fault@arm_1; or a "
-            "job, for its award. Of several events, the first one."
-        ),
-    ],
-    folder: Annotated[
-        Path | None,
-        typer.Option("--in", help="Folder of a run or a recording; default: the last of runs/.", show_default=False),
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Follow an event to its job, plan, offers, twin, training data, configuration and code."""
-    found = thread_of(folder or last_folder(RUNS), event)
-    if as_json:
-        print_json(found.as_json())
-    else:
-        out_console.print(thread_screen(found))
 
 
 def last_folder(runs: Path) -> Path:

@@ -1,17 +1,59 @@
-"""`thermofleet train`."""
+"""Commands that evaluate and train policies: suite, bounds, leaderboard and train; see `compare` too."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
 from fleet.errors import FleetError
-from scenarios.cli.options import MAX_SEED, DifficultyOption, RandomiseOption, RiskOption, number, parse_randomisation
-from scenarios.cli.terminal import out_console, progress_bar, say
-from scenarios.extras import require_extra
-from scenarios.load import INSTANCE, load
-from scenarios.policy_loader import policy_of, without_simulator
+from scenarios.cli.options import (
+    MAX_SEED,
+    DifficultyOption,
+    JsonOption,
+    RandomiseOption,
+    RiskOption,
+    number,
+    parse_randomisation,
+)
+from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
 from scenarios.schema_errors import choose
+
+
+def suite_command(
+    split: Annotated[
+        str | None,
+        typer.Option(help="List the instances of this split: train, validation, test or sizes.", show_default=False),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the cells of the benchmark suite, or the instances of one of its splits.
+
+    A cell is a group of arms with stations and tasks. An instance is a scenario
+    in a cell with a seed: `thermofleet show test/0000` describes it.
+    """
+    from scenarios.suite.cells import CELLS
+    from scenarios.suite.splits import manifest
+
+    if split is not None:
+        rows = manifest(split)
+        if as_json:
+            print_json([asdict(row) for row in rows])
+            return
+        table = plain_table("instance", "cell", "axes", "jobs", numbers=False)
+        for row in rows:
+            axes = ", ".join(f"{name} {value}" for name, value in asdict(row.axes).items())
+            table.add_row(row.name, row.cell, axes, str(row.count))
+        out_console.print(table)
+        return
+    if as_json:
+        print_json({cell.name: {**asdict(cell), "stations_per_arm": cell.stations_per_arm} for cell in CELLS})
+        return
+    table = plain_table("split", "cell", "arms are", "stations per arm", "hours", "instances", numbers=False)
+    for cell in CELLS:
+        numbers = (f"{cell.stations_per_arm:.2g}", f"{cell.hours:g}", str(cell.instances))
+        table.add_row(cell.split, cell.name, cell.unlike, *numbers)
+    out_console.print(table)
 
 
 def train_command(
@@ -104,6 +146,10 @@ def train_command(
 
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """
+    from scenarios.extras import require_extra
+    from scenarios.load import INSTANCE, load
+    from scenarios.policy_loader import policy_of, without_simulator
+
     if (scenario is None) == (suite is None):
         raise FleetError("Give either a scenario or --suite SPLIT.")
     if randomise and suite is not None:
