@@ -79,7 +79,7 @@ def run(*words: object) -> int:
 def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(study, tmp_path, capsys):
     out = finished(study, tmp_path / "study", {"wspt": 15.0, "wsept": 30.0}, failed=50)
     sent = tmp_path / "sent"
-    assert run("submit-result", out, "--author", "Ann", "--about", "rules", "--out", sent) == 0
+    assert run("leaderboard", "--submit", out, "--author", "Ann", "--about", "rules", "--out", sent) == 0
     assert sorted(path.name for path in sent.iterdir()) == ["test-wsept-oracle.jsonl", "test-wspt-oracle.jsonl"]
     assert all(path.stat().st_size < 200_000 for path in sent.iterdir())
     assert "50 failed shifts, which count as random" in capsys.readouterr().err
@@ -92,7 +92,7 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     assert scores["test-wspt-oracle"].improvement.mean == 0.25
     assert run("leaderboard", sent) == 0
     assert "of 200 instances; differences to `wsept` (oracle)." in capsys.readouterr().out
-    assert run("submit-result", out, "--author", "Bob", "--out", sent) == 2
+    assert run("leaderboard", "--submit", out, "--author", "Bob", "--out", sent) == 2
     assert "has a result of Ann" in capsys.readouterr().err
     assert run("leaderboard", sent, "--markdown") == 0
     text = capsys.readouterr().out

@@ -96,7 +96,7 @@ def heard_from(link, fleet, enough):
         (["left", "--source", "log"], "log with a FILE"),
         (["left", "some.csv"], "log with a FILE"),
         (["left", "--source", "video"], "'video' is not one of 'sim', 'log'"),
-        (["left", "--difficulty", "oracle"], "'oracle' is not one of 'twin', 'blind'"),
+        (["left", "--difficulty", "oracle"], "No difficulty 'oracle'. Allowed: blind, twin."),
         (["left", "--speed", "0"], "--speed must be 0.001 to 10000"),
         (["left", "--rate-hz", "1000"], "--rate-hz must be > 0 and at most 100 (got 1000)."),
         (["left", "--capacity", "0"], "--capacity must be 1 to 256 (got 0)."),
