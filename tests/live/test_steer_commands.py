@@ -51,6 +51,14 @@ def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
     assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles.\n")
     assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles. It is cancelled.\n")
     assert command("job", "change", "two", "--due", 900, "--value", 3) == (0, "two: waiting, 0 of 1 cycles.\n")
+    code, told = command("job", "list")
+    assert code == 0
+    assert [line.split()[:2] for line in told.splitlines()[1:]] == [
+        ["one", "cancelled"],
+        ["two", "waiting"],
+        ["three", "waiting"],
+    ]
+    assert [job["job"] for job in json.loads(command("job", "list", "--json")[1])] == ["one", "two", "three"]
     code, told = command("job", "settle", "two", "done")
     assert code == 2
     assert "only an unfinished job can be settled" in told

@@ -116,26 +116,26 @@ def test_a_job_message_has_all_fields():
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("auction", "quickstart", "--policy", "match"), "No policy 'match'; did you mean 'matching'?"),
+        (("bus", "auctioneer", "quickstart", "--policy", "match"), "No policy 'match'; did you mean 'matching'?"),
         (("up", "quickstart", "--policy", "sssi"), "did you mean 'ssi'?"),
         (
-            ("auction", "quickstart", "--policy", "consensus"),
+            ("bus", "auctioneer", "quickstart", "--policy", "consensus"),
             "'consensus' of scope arm runs without an auctioneer. Start",
         ),
         (
-            ("auction", "quickstart", "--policy", "random"),
+            ("bus", "auctioneer", "quickstart", "--policy", "random"),
             "'random' of scope arm runs without an auctioneer. Start",
         ),
         (
-            ("arm", "quickstart", "arm_0", "--policy", "wspt"),
+            ("arm", "run", "quickstart", "arm_0", "--policy", "wspt"),
             "'wspt' needs an auctioneer: start it with thermofleet bus auctioneer",
         ),
-        (("arm", "quickstart", "arm_9", "--policy", "random"), "No arm 'arm_9' in quickstart"),
+        (("arm", "run", "quickstart", "arm_9", "--policy", "random"), "No arm 'arm_9' in quickstart"),
         (
-            ("arm", "quickstart", "arm_0", "--policy", "ssi"),
+            ("arm", "run", "quickstart", "arm_0", "--policy", "ssi"),
             "'ssi' needs an auctioneer: start it with thermofleet bus auctioneer",
         ),
-        (("arm", "quickstart", "arm_0", "--jobs", "all"), "'all' is not one of 'scenario', 'none'"),
+        (("arm", "run", "quickstart", "arm_0", "--jobs", "all"), "No jobs 'all'. Allowed: none, scenario."),
     ],
 )
 def test_an_invalid_policy_is_one_sentence(thermofleet, words, complaint):
@@ -153,10 +153,18 @@ def test_an_invalid_policy_is_one_sentence(thermofleet, words, complaint):
             "the shift had an auctioneer",
         ),
         (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "belongs to a shift without an auctioneer"),
-        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "belongs to a shift without an auctioneer"),
-        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "belongs to a shift without an auctioneer"),
         (
-            ("arm", "quickstart", "arm_2", "--policy", "consensus", "--journal"),
+            ("bus", "auctioneer", "quickstart", "--journal"),
+            ["arm_2.grants"],
+            "belongs to a shift without an auctioneer",
+        ),
+        (
+            ("arm", "run", "quickstart", "arm_2", "--journal"),
+            ["arm_2.grants"],
+            "belongs to a shift without an auctioneer",
+        ),
+        (
+            ("arm", "run", "quickstart", "arm_2", "--policy", "consensus", "--journal"),
             ["arm_2.journal"],
             "has no 'arm_2.grants'",
         ),
