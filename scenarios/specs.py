@@ -56,6 +56,8 @@ class RunSpec:
         check(self)
 
 
+PORT, PAGE_PORT = 7447, 8080
+"""TCP ports of the router and of the gateway, unless they are taken."""
 LiveModel = Literal["twin", "blind"]
 JobSource = Literal["scenario", "none"]
 

@@ -84,7 +84,7 @@ def submit_command(
 
 
 def list_command(endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = "", as_json: JsonOption = False) -> None:
-    """List the jobs of a fleet: state, arm, cycles and reason."""
+    """List the jobs of a fleet by name: state, arm, cycles and reason."""
     import time
 
     from fleet.bus.client.client import BusClient
@@ -94,12 +94,12 @@ def list_command(endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = "", a
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         listener = FleetListener(link)
         listener.serve(time.monotonic() + LISTEN_S)
-        snapshot = listener.view.snapshot(time.monotonic())
+        jobs = sorted(listener.view.snapshot(time.monotonic()).jobs, key=lambda status: status.job)
     if as_json:
-        print_json(snapshot.jobs)
+        print_json(jobs)
         return
     table = plain_table("job", "state", "arm", "cycles", "reason", numbers=False)
-    for job in snapshot.jobs:
+    for job in jobs:
         table.add_row(job.job, job.state.replace("_", " "), job.arm, f"{job.cycles} of {job.repetitions}", job.reason)
     out_console.print(table)
 

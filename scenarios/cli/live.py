@@ -19,9 +19,8 @@ from scenarios.cli.options import (
     number,
 )
 from scenarios.cli.terminal import echo, out_console, say
-from scenarios.specs import LiveSpec
+from scenarios.specs import PAGE_PORT, PORT, LiveSpec
 
-PORT, PAGE_PORT = 7447, 8080
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
 _TLS, _LISTEN = "Mutual TLS", "ros2 listen"

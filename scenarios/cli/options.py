@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from agents.registry import WRAPPERS_HELP, names_of
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.bus.protocol.keys import ENDPOINT as ENDPOINT
 from fleet.errors import NAME_RULE, FleetError, LogError, is_name, nearest, printable
@@ -102,14 +101,6 @@ PartitionOption = Annotated[list[str] | None, declared(Channel, "partitions")]
 
 # Live fleets.
 EndpointOption = Annotated[str, typer.Option(envvar="THERMOFLEET_ENDPOINT", help="Endpoint of the fleet's router.")]
-PolicyOption = Annotated[
-    str,
-    typer.Option(
-        help=f"Allocation policy. Run by the auctioneer: {names_of('central')}. Run by each arm, without an "
-        f"auctioneer: {names_of('arm')}, or a folder of `thermofleet train`. Your own as FILE.py:CLASS, run "
-        f"according to its scope, or bus:NAME in another process. {WRAPPERS_HELP}."
-    ),
-]
 FleetOption = Annotated[
     str,
     typer.Option(

@@ -58,7 +58,8 @@ def run_command(
     from scenarios.run.shift import summary
 
     chosen = load(scenario)
-    spec = RunSpec(**{"seed": own_seed(scenario)} | given, channel=options.channel_of(chosen, **channel))
+    given = {"seed": own_seed(scenario), **given}
+    spec = RunSpec(**given, channel=options.channel_of(chosen, **channel))
     policy_of(spec.policy)
     if listen and spec.bus == "memory":
         raise FleetError(f"--listen needs --bus zenoh (got {listen} and {spec.bus}).")

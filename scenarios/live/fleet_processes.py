@@ -18,11 +18,11 @@ from scenarios.extras import require_extra
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.load import load
 from scenarios.policy_loader import plans, scope_of
-from scenarios.specs import LiveSpec
+from scenarios.specs import PAGE_PORT, PORT, LiveSpec
 
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""
-PORT, PAGE_PORT, PAGE_READY = 7447, 8080, "ready page "
+PAGE_READY = "ready page "
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 
 

@@ -55,10 +55,10 @@ def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
     assert code == 0
     assert [line.split()[:2] for line in told.splitlines()[1:]] == [
         ["one", "cancelled"],
-        ["two", "waiting"],
         ["three", "waiting"],
+        ["two", "waiting"],
     ]
-    assert [job["job"] for job in json.loads(command("job", "list", "--json")[1])] == ["one", "two", "three"]
+    assert [job["job"] for job in json.loads(command("job", "list", "--json")[1])] == ["one", "three", "two"]
     code, told = command("job", "settle", "two", "done")
     assert code == 2
     assert "only an unfinished job can be settled" in told

@@ -8,11 +8,15 @@ import typer
 from typer.testing import CliRunner
 
 from fleet.bus.exchange.channel import Channel
+from fleet.bus.protocol.keys import ENDPOINT
+from fleet.bus.protocol.registry import CHANNEL, STATE_HZ
 from fleet.errors import FleetError
 from fleet.fields import check, option, options_of
+from fleet.robot import ThermalLimits
 from scenarios.cli.from_fields import From, Given, flags_of, with_fields
 from scenarios.cli.main import COMMANDS, GROUPS, MOVED, load_command
-from scenarios.specs import LiveSpec, RunSpec, Shot
+from scenarios.live.http_access import ROLES
+from scenarios.specs import PORT, LiveSpec, RunSpec, Shot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,3 +110,16 @@ def test_an_earlier_name_of_a_command_names_a_present_one():
         assert {word for word in options if word.startswith("--")} <= flags, old
         assert old not in {name.split()[0] for name in COMMANDS}, old
     assert {name.split()[0] for name in COMMANDS if " " in name} == set(GROUPS)
+
+
+def test_defaults_that_the_help_states_are_those_of_the_modules_that_it_does_not_load():
+    def default(command, name):
+        return next(each.default for each in load_command(command).params if each.name == name)
+
+    assert default("arm run", "rate_hz") == STATE_HZ
+    assert default("bus router", "state_hz") == CHANNEL["arm", "state"].limit_hz
+    limits = ThermalLimits()
+    assert (default("bus ros2", "warning_c"), default("bus ros2", "error_c")) == (limits.warning_c, limits.error_c)
+    assert ENDPOINT == f"tcp/127.0.0.1:{PORT}" == default("bus watch", "endpoint")
+    tokens = next(each for each in load_command("bus gateway").params if each.name == "tokens")
+    assert ", ".join(ROLES) in tokens.help

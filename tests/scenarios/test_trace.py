@@ -18,7 +18,7 @@ from scenarios.prepare.fleet import prepare
 from scenarios.run.provenance import code_hash
 from scenarios.run.run_folder import write
 from scenarios.run.shift import RunSpec, run
-from scenarios.trace.command import last_folder, thread_screen
+from scenarios.trace.screen import last_folder, thread_screen
 from scenarios.trace.thread import NOT_RECORDED, rows_of, thread_of
 
 JOBS = ("a", "b")
