@@ -102,7 +102,7 @@ def arm_command(
         raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {words}).")
     from scenarios.live.arm import run_arm
 
-    spec = LiveSpec(**given, **({"policy": policy} if policy else {}))
+    spec = LiveSpec(**given | ({"policy": policy} if policy else {}))
     run_arm(
         chosen,
         name,
