@@ -25,6 +25,8 @@ class Option:
     """Whether the value must be more than `low`, not equal to it."""
     choices: tuple[str, ...] = ()
     """Allowed names."""
+    noun: str = ""
+    """What an error calls one of these names; "" for the name of the field."""
     is_name: bool = False
     """Whether a text must follow the rule for names, which become parts of keys and files; "" is none."""
     flag: str = ""
@@ -53,7 +55,8 @@ class Option:
             name: What the sentence calls the value, as `--seed` or `RunSpec.seed`.
         """
         if self.choices and isinstance(value, str) and value not in self.choices:
-            return f"No {name.rpartition('.')[2].removeprefix('--')} '{printable(value)}'{nearest(value, self.choices)}"
+            noun = self.noun or name.rpartition(".")[2].removeprefix("--")
+            return f"No {noun} '{printable(value)}'{nearest(value, self.choices)}"
         if self.is_name and isinstance(value, str) and value and not is_name(value):
             return f"{name} must have {NAME_RULE} (got '{printable(value)}')."
         if isinstance(value, int | float) and not self._within(value):

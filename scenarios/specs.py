@@ -4,7 +4,6 @@ Nothing here is slow to import, so that the help of a command is fast.
 """
 
 from dataclasses import dataclass
-from math import inf
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -76,7 +75,10 @@ class LiveSpec:
     difficulty: LiveModel = option("Difficulty model.", "twin", choices=get_args(LiveModel))
     risk: RiskName = option(RISK_HELP, RISK, choices=get_args(RiskName))
     jobs: JobSource = option(
-        "scenario: the scenario's job stream; none: submitted jobs only.", "scenario", choices=get_args(JobSource)
+        "scenario: the scenario's job stream; none: submitted jobs only.",
+        "scenario",
+        choices=get_args(JobSource),
+        noun="source of jobs",
     )
     seed: int = option("Random seed of the scenario's jobs, the sensor noise and the policy.", 0, low=0, high=MAX_SEED)
     fleet: str = option("Name of the fleet. Default: the scenario's name.", "", is_name=True)
@@ -96,7 +98,7 @@ class Shot:
     width: int = 1280
     height: int = 720
     begin_s: float = option("First second of the shift.", 0.0, low=0, high=1e9, flag="--begin")
-    end_s: float = option("Last second of the shift; by default its end.", inf, low=0, flag="--end", shown="")
+    end_s: float = option("Last second of the shift; by default its end.", 1e9, low=0, high=1e9, flag="--end", shown="")
     meshes: bool = option("Kinova's shells; needs the extra `meshes`.", False)
 
     def __post_init__(self) -> None:

@@ -52,6 +52,7 @@ class PpoConfig:
         "Length of a training step: events (until an arm has a choice) or interval.",
         "events",
         choices=get_args(Decisions),
+        noun="kind of step",
     )
     """See `fleet.env.allocation_v1`."""
     discount_s: float = 7200.0

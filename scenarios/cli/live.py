@@ -1,5 +1,6 @@
 """Commands that run a live fleet: up, `thermofleet arm run` and `thermofleet bus`."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -102,7 +103,8 @@ def arm_command(
         raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {words}).")
     from scenarios.live.arm import run_arm
 
-    spec = LiveSpec(**given | ({"policy": policy} if policy else {}))
+    spec = LiveSpec(**given)
+    spec = replace(spec, policy=policy) if policy else spec
     run_arm(
         chosen,
         name,

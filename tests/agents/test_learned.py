@@ -249,7 +249,7 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
         ({"learning_rate": 0.0}, "learning_rate must be > 0"),
         ({"discount_s": 0.5}, r"discount_s must be 1 to 1e\+07 \(got 0\.5\)"),
         ({"trace_s": float("nan")}, "trace_s must be 1 to"),
-        ({"decisions": "event"}, "No decisions 'event'; did you mean 'events'"),
+        ({"decisions": "event"}, "No kind of step 'event'; did you mean 'events'"),
     ],
 )
 def test_a_wrong_configuration_is_refused(changes, message) -> None:

@@ -135,7 +135,7 @@ def test_a_job_message_has_all_fields():
             ("arm", "run", "quickstart", "arm_0", "--policy", "ssi"),
             "'ssi' needs an auctioneer: start it with thermofleet bus auctioneer",
         ),
-        (("arm", "run", "quickstart", "arm_0", "--jobs", "all"), "No jobs 'all'. Allowed: none, scenario."),
+        (("arm", "run", "quickstart", "arm_0", "--jobs", "all"), "No source of jobs 'all'. Allowed: none, scenario."),
     ],
 )
 def test_an_invalid_policy_is_one_sentence(thermofleet, words, complaint):
