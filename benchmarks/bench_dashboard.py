@@ -3,9 +3,9 @@
     python benchmarks/bench_dashboard.py [--arms 16] [--rate 10] [--seconds 20] [--pages 1] [--chromium PROGRAM]
 
 A process publishes states of arms with all their quantities, --rate a second each (live arms: 10), and scores of 16
-jobs with every tenth, on a router of its own. `thermofleet dashboard` serves the page. Readers take its stream as the
-page does; with --chromium the page itself is opened too, drawn without a graphics card, and its processes are measured
-apart. Linux only.
+jobs with every tenth, on a router of its own. `thermofleet bus gateway --page` serves the page. Readers take its
+stream as the page does; with --chromium the page itself is opened too, drawn without a graphics card, and its processes
+are measured apart. Linux only.
 """
 
 import argparse
@@ -126,7 +126,16 @@ def main() -> None:
     options = parser.parse_args()
     context = multiprocessing.get_context("spawn")
     pipe, other = context.Pipe()
-    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "dashboard", "--fleet", FLEET]
+    command = [
+        sys.executable,
+        "-c",
+        "from scenarios.cli.main import main; main()",
+        "bus",
+        "gateway",
+        "--page",
+        "--fleet",
+        FLEET,
+    ]
     with Router() as router, tempfile.TemporaryFile("w+") as log:
         fleet = context.Process(target=publish, args=(router.endpoint, options.arms, options.rate, other))
         fleet.start()

@@ -2,7 +2,7 @@
 
     python benchmarks/bench_fleet.py [--arms 64] [--seconds 20] [--rate 10] [--speed 1]
 
-Every arm is `thermofleet arm`, a separate process, blind, in its own cell; all connect to one router. This process
+Every arm is `thermofleet arm run`, a separate process, blind, in its own cell; all connect to one router. This process
 deals: it awards each arm one long pick-and-place job and renews its lease, so that the arm moves and heats up. It also
 listens as a recorder does: every message is validated, gaps are filled from the arm's cache within `GRACE_S`, and the
 received ticks are compared with the published ones (`--plain`: without recovery of dropped messages). In the same run
@@ -42,7 +42,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import State, encode
 from fleet.live.supervisor import Part, Supervisor
-from scenarios.cli.live.up import PROGRAM, free_port
+from scenarios.live.fleet_processes import PROGRAM, free_port
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 
@@ -157,7 +157,7 @@ def arms_of(folder: Path, names: list[str], endpoint: str, options: argparse.Nam
     how = ("--difficulty", "blind", "--speed", f"{options.speed:g}", "--rate-hz", f"{options.rate:g}")
     where = ("--endpoint", endpoint, "--fleet", FLEET, "--journal", str(folder / "journals"))
     return [
-        Part(name=name, argv=(*PROGRAM, "arm", str(cell), name, *where, *how))
+        Part(name=name, argv=(*PROGRAM, "arm", "run", str(cell), name, *where, *how))
         for name, cell in zip(names, cells, strict=True)
     ]
 
@@ -194,7 +194,7 @@ def main() -> None:
         supervisor = stack.enter_context(Supervisor(folder / "logs"))
         port = free_port()
         endpoint = f"tcp/127.0.0.1:{port}"
-        supervisor.start(Part(name="router", argv=(*PROGRAM, "router", "--port", str(port)), ready=endpoint))
+        supervisor.start(Part(name="router", argv=(*PROGRAM, "bus", "router", "--port", str(port)), ready=endpoint))
         supervisor.await_ready("router", START_S)
         bare = (sys.executable, "-c", BARE, endpoint, str(size), str(options.rate))
         supervisor.start(Part(name="bare", argv=bare, ready="ready"), ready_s=START_S)

@@ -25,9 +25,10 @@ from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest, JobSpec, Submission, SubmissionReply
 from fleet.live.supervisor import Supervisor
-from scenarios.cli.live.up import free_port, parts_of
+from scenarios.live.fleet_processes import free_port, parts_of
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
+from scenarios.specs import LiveSpec
 
 SCENARIO, START_S, REPLY_S, EXPIRES_S = "quickstart", 60.0, 5.0, 2.0
 """Real seconds: to start a process, to wait for a reply, and until a job expires."""
@@ -78,14 +79,9 @@ def main() -> None:
         router, _, _, auction = parts_of(
             SCENARIO,
             tuple(arm.name for arm in load(SCENARIO).arms),
+            LiveSpec(fleet=SCENARIO, policy="quickest_matching", difficulty="blind", jobs="none"),
             port=free_port(),
-            fleet=SCENARIO,
             folder=folder,
-            speed=1.0,
-            policy="quickest_matching",
-            difficulty="blind",
-            jobs="none",
-            seed=0,
         )
         assert auction is not None
         supervisor = stack.enter_context(Supervisor(folder / "logs"))

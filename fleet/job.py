@@ -7,8 +7,6 @@ from functools import cached_property
 from math import inf, pi
 from typing import Literal, NamedTuple, get_args
 
-import networkx as nx
-
 from fleet.errors import check_coordinates
 
 Kind = Literal["pick_place", "hold", "press", "sort"]
@@ -244,6 +242,8 @@ def check_precedence(jobs: Sequence[Job]) -> None:
     for before, name in edges:
         if before not in names:
             raise ValueError(f"Job '{name}' waits for '{before}', which does not exist.")
+    import networkx as nx  # slow to import, and the bounds of numbers need it not
+
     graph = nx.DiGraph(edges)
     if edges and not nx.is_directed_acyclic_graph(graph):
         cycle = " → ".join(edge[0] for edge in nx.find_cycle(graph))

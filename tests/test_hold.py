@@ -7,7 +7,6 @@ from io import StringIO
 
 import numpy as np
 import pytest
-import typer
 from rich.console import Console
 from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
@@ -16,18 +15,15 @@ from fleet.errors import FleetError
 from fleet.motor import gen3_motors, reference_current
 from fleet.robot import JOINTS, POSTURES
 from fleet.thermal import NODES, drive_heat, gen3_network, thermal_model
-from scenarios.motion.hold import LIMITS_C, HoldError, as_json, as_table, courses, hold, hold_command
+from scenarios.cli.main import app
+from scenarios.motion.hold import LIMITS_C, HoldError, as_json, as_table, courses, hold
 from scenarios.motion.posture import PostureError
 
 J2, J4 = 1, 3
 
-app = typer.Typer()
-app.command("hold")(hold_command)
-app.callback()(lambda: None)  # Two levels, as in the real command line.
-
 
 def run(*arguments: str):
-    return CliRunner().invoke(app, ["hold", *arguments])
+    return CliRunner().invoke(app, ["show", *arguments])
 
 
 # Scenario check of the identification at 25 °C: torque of joints 2 and 4, current of joint 2, minutes to 60 and 75 °C
@@ -156,7 +152,7 @@ def test_a_posture_in_degrees_is_the_posture_by_name():
 
 
 def test_json_has_lists_of_seven_and_nulls():
-    printed = run("--payload", "3", "--posture", "outstretched", "--ambient", "25", "--json")
+    printed = run("--hold", "3", "--posture", "outstretched", "--ambient", "25", "--json")
     assert printed.exit_code == 0
     data = json.loads(printed.stdout)
     assert (data["payload"], data["posture"], data["ambient_c"]) == (3.0, "outstretched", 25.0)
@@ -171,7 +167,7 @@ def test_json_has_lists_of_seven_and_nulls():
 
 
 def test_table_names_every_joint_and_says_where_it_extrapolates():
-    printed = run("--payload", "4")
+    printed = run("--hold", "4")
     assert printed.exit_code == 0
     assert all(f" {j} " in printed.stdout for j in range(1, JOINTS + 1))
     text = " ".join(printed.stdout.split())
@@ -191,15 +187,15 @@ def test_table_fits_a_terminal():
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--posture", "outstreched"], "did you mean 'outstretched'?"),
-        (["--posture", ""], "Allowed: home"),
-        (["--posture", "1,2,3"], "7 comma-separated angles"),
-        (["--posture", "0,nan,0,0,0,0,0"], "7 comma-separated angles"),
-        (["--posture", "0,130,0,0,0,0,0"], "Joint 2 turns from"),
-        (["--payload", "9", "--tool-kg", "4"], "at most 104 N·m"),
-        (["--payload", "4.6"], "4.6 kg is beyond the rating of the Gen3: 4.5 kg for a short time, 1.1 kg continuously"),
-        (["--payload", "4", "--tool-kg", "1"], "add --beyond-rating"),
-        (["--cooling", "forced"], "did you mean 'forced_air'?"),
+        (["--hold", "0", "--posture", "outstreched"], "did you mean 'outstretched'?"),
+        (["--hold", "0", "--posture", ""], "Allowed: home"),
+        (["--hold", "0", "--posture", "1,2,3"], "7 comma-separated angles"),
+        (["--hold", "0", "--posture", "0,nan,0,0,0,0,0"], "7 comma-separated angles"),
+        (["--hold", "0", "--posture", "0,130,0,0,0,0,0"], "Joint 2 turns from"),
+        (["--hold", "9", "--tool-kg", "4"], "at most 104 N·m"),
+        (["--hold", "4.6"], "4.6 kg is beyond the rating of the Gen3: 4.5 kg for a short time, 1.1 kg continuously"),
+        (["--hold", "4", "--tool-kg", "1"], "add --beyond-rating"),
+        (["--hold", "0", "--cooling", "forced"], "did you mean 'forced_air'?"),
     ],
 )
 def test_a_hold_that_cannot_be_is_refused(arguments, says):
@@ -226,15 +222,15 @@ def test_a_value_out_of_range_is_refused(values, says):
 
 
 def test_a_load_beyond_the_rating_is_computed_on_request():
-    assert run("--payload", "4.6", "--beyond-rating").exit_code == 0
+    assert run("--hold", "4.6", "--beyond-rating").exit_code == 0
     assert "4.6 kg at 0.90 m reach is above the continuous rating of 1.1 kg" in hold(4.6, beyond_rating=True).note
     assert "rating" not in hold(1.0).note
 
 
 def test_a_word_for_a_number_is_refused():
-    answer = run("--payload", "heavy")
+    answer = run("--hold", "heavy")
     assert answer.exit_code == 2
-    assert "payload" in answer.stderr
+    assert "--hold" in answer.stderr
 
 
 def test_every_named_posture_can_be_held():

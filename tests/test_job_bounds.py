@@ -16,7 +16,7 @@ from fleet.bus.protocol.messages import decode
 from fleet.errors import FleetError, ScenarioError
 from fleet.job import Job, Place, Work
 from fleet.robot import Mount
-from scenarios.cli.live.submit import explain
+from scenarios.live.requests import explain
 from scenarios.load import load, parse_scenario
 from scenarios.schema import Scenario
 

@@ -231,7 +231,7 @@ print(steps)
     [
         ("from scenarios import make_env; make_env('quickstart')", "twin"),
         ("from scenarios.prepare.fleet import open_exchange; open_exchange('zenoh', ('a', 'b'), 'fleet')", "bus"),
-        ("sys.argv = ['thermofleet', 'list']; from scenarios.__main__ import main; main()", "cli"),
+        ("sys.argv = ['thermofleet', 'show']; from scenarios.__main__ import main; main()", "cli"),
     ],
 )
 def test_a_missing_extra_is_one_sentence(call, extra):

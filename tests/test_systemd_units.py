@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.cli.main import load_command
+from scenarios.cli.main import GROUPS, load_command
 
 PROGRAM = "/opt/thermofleet/bin/thermofleet"
 UNITS = {path.name: path.read_text() for path in (Path(__file__).parents[1] / "docs" / "systemd").glob("*.service")}
@@ -39,4 +39,6 @@ def test_the_command_line_accepts_the_commands_of_the_units(name):
     (line,) = re.findall(r"^ExecStart=(.*)$", UNITS[name], re.MULTILINE)
     program, command, *words = shlex.split(line)
     assert program == PROGRAM
+    if command in GROUPS:
+        command, *words = f"{command} {words[0]}", *words[1:]
     load_command(command).make_context(command, words)  # raises on an unknown option or a value out of range

@@ -5,31 +5,17 @@ So the logits are equivariant in the options, and invariant to the order and num
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
+from agents.learned.config import NetworkSize
 from agents.learned.features import OPTION, OWN, PAIR, PEER, sets_of
 from fleet.observation import Layout
 
 BIASES = (-3.0, -6.0)
 """Initial biases of the logits of waiting and giving back, so that an untrained actor claims jobs and ends them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class NetworkSize:
-    """Widths of the hidden layers."""
-
-    arm: int = 48
-    option: int = 48
-    pair: int = 16
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value < 1:
-                raise ValueError(f"NetworkSize.{name} must be >= 1 (got {value}).")
 
 
 class Actor(nn.Module):

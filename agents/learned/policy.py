@@ -11,8 +11,9 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
+from agents.learned.config import NetworkSize
 from agents.learned.features import has_choice
-from agents.learned.network import Actor, NetworkSize, masked
+from agents.learned.network import Actor, masked
 from agents.policy import WAIT, plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path

@@ -12,9 +12,9 @@ import pickle
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,82 +27,21 @@ from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from agents.learned.config import PpoConfig
 from agents.learned.features import has_choice
-from agents.learned.network import Actor, Critic, NetworkSize, masked
+from agents.learned.network import Actor, Critic, masked
 from agents.learned.policy import draw
 from agents.policy import WAIT
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Layout
 
-Algorithm = Literal["mappo", "ippo"]
-Decisions = Literal["interval", "events"]
-"""As in `fleet.env.validation`, which agents do not import."""
 SEEN, MASK, ACTION, LIKELIHOOD = ("arms", "observation"), ("arms", "action_mask"), ("arms", "action"), "log_prob"
 CERTAIN = 1e3
 """A logit beside zeros."""
-LONGEST_S = 1e7
-"""Longest horizon of a discount, 116 days."""
 _STATE = ("actor", "critic", "optimizer")
 EnvFactory = Callable[[int, int], EnvBase]
 """From a number of envs and a seed to a batched environment with the keys of `fleet.env.adapters.torchrl`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PpoConfig:
-    """Hyperparameters of a training."""
-
-    algorithm: Algorithm = "mappo"
-    size: NetworkSize = field(default_factory=NetworkSize)
-    envs: int = 32
-    steps: int | None = None
-    """Steps of every env in an iteration; by default 16 with events, 128 with intervals."""
-    epochs: int = 4
-    """Passes of the actor over an iteration's choices; the critic makes one over all steps."""
-    minibatch: int = 128
-    """Choices in one optimiser step of the actor."""
-    learning_rate: float = 3e-4
-    decisions: Decisions = "events"
-    """Length of a step; see `fleet.env.allocation_v1`."""
-    discount_s: float = 7200.0
-    """Horizon of the discount: gamma of a step is exp(-elapsed_s / discount_s)."""
-    trace_s: float = 900.0
-    """Horizon of the trace: lambda of a step is exp(-elapsed_s / trace_s). Longer than most jobs, so that the return of
-    a claim contains the reward of its job."""
-    clip: float = 0.2
-    entropy: float = 0.002
-    """Weight of the entropy bonus."""
-    max_gradient: float = 0.5
-    reward_scale: float = 0.1
-    warm_start: str = ""
-    """Policy that the actor imitates first; empty for none."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.algorithm not in get_args(Algorithm):
-            raise ValueError(f"algorithm must be one of {', '.join(get_args(Algorithm))} (got {self.algorithm!r}).")
-        if self.decisions not in get_args(Decisions):
-            raise ValueError(f"decisions must be one of 'interval', 'events' (got {self.decisions!r}).")
-        whole, positive = (
-            ("envs", "steps", "epochs", "minibatch"),
-            ("learning_rate", "clip", "max_gradient", "reward_scale"),
-        )
-        values = vars(self) | {"steps": self.length}
-        for names, allowed, valid in (
-            (whole, ">= 1", lambda value: value >= 1),
-            (positive, "> 0", lambda value: value > 0),
-            (("discount_s", "trace_s"), f"1 to {LONGEST_S:g}", lambda value: 1 <= value <= LONGEST_S),
-        ):
-            for name in names:
-                if not valid(values[name]):
-                    raise ValueError(f"{name} must be {allowed} (got {values[name]}).")
-
-    @property
-    def length(self) -> int:
-        """Steps of every env in an iteration."""
-        if self.steps is not None:
-            return self.steps
-        return 16 if self.decisions == "events" else 128
 
 
 @dataclass(frozen=True)

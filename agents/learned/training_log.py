@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.errors import FleetError
+from fleet.fields import check, option
 
 LOG, CURVE, BOARD = "progress.jsonl", "curve.png", "tensorboard"
 
@@ -20,18 +21,28 @@ class TrainingLength:
         FleetError: a number is not positive.
     """
 
-    minutes: float = 30.0
-    iterations: int | None = None
-    """Most iterations, those before a resume included."""
+    minutes: float = option(
+        "Training time excluding the twins, min. With --resume: additional time; with --resume and --seeds: total of "
+        "each training.",
+        30.0,
+        low=0,
+        high=100_000,
+        above=True,
+    )
+    iterations: int | None = option(
+        "Maximum number of iterations in total, those before a resume included.", None, low=1, high=1_000_000
+    )
     in_total: bool = False
     """Whether `minutes` include those before a resume, too, and a complete training is skipped."""
 
     def __post_init__(self) -> None:
-        if not self.minutes > 0:
-            raise FleetError(f"minutes must be > 0 (got {self.minutes}).")
+        try:
+            check(self)
+        except ValueError as error:
+            raise FleetError(str(error)) from error
         for field in fields(self):
             value = getattr(self, field.name)
-            if value is not None and field.name not in ("minutes", "in_total") and value < 1:
+            if value is not None and field.name not in ("minutes", "iterations", "in_total") and value < 1:
                 raise FleetError(f"{field.name} must be >= 1 (got {value}).")
 
     def share(self, iterations: int, seconds: float, before_s: float) -> float:

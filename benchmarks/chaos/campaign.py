@@ -21,8 +21,9 @@ from fleet.bus.security.certificates import HERE
 from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
 from fleet.live.supervisor import Supervisor
-from scenarios.cli.live.up import free_port, parts_of
+from scenarios.live.fleet_processes import free_port, parts_of
 from scenarios.load import load
+from scenarios.specs import LiveSpec
 
 START_S = 60.0
 LATE_REPORTS_S = 10.0
@@ -59,14 +60,15 @@ def start_fleet(fault: Fault, folder: Path, *, speed: float, namespaces: bool = 
         router, arm_parts, record, auction = parts_of(
             SCENARIO,
             arms,
+            LiveSpec(
+                fleet=SCENARIO,
+                speed=speed,
+                policy="consensus" if fault.no_auctioneer else "quickest_matching",
+                difficulty="blind",
+                jobs="none",
+            ),
             port=port,
-            fleet=SCENARIO,
             folder=folder,
-            speed=speed,
-            policy="consensus" if fault.no_auctioneer else "quickest_matching",
-            difficulty="blind",
-            jobs="none",
-            seed=0,
             tls=place,
         )
         if isinstance(cut, Namespaces):

@@ -34,7 +34,7 @@ from fleet.bus.security.certificates import HERE
 from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
 from fleet.live.supervisor import Backoff, Part, Supervisor
-from scenarios.cli.live.up import PROGRAM, free_port
+from scenarios.live.fleet_processes import PROGRAM, free_port
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 
@@ -56,7 +56,7 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
         place, at_a, at_b = folder / "keys", f"tls/127.0.0.1:{port_a}", f"tls/127.0.0.1:{port_b}"
         make(place, of_arms(FLEET, names, [Participant(FAR, "router")]), days=30, hosts=(*HERE, *hosts))
         beyond = ("--host", "0.0.0.0") if hosts else ()
-        router = (*PROGRAM, "router", "--tls", str(place))
+        router = (*PROGRAM, "bus", "router", "--tls", str(place))
         near = Part(name="router", argv=(*router, "--port", str(port_a), *beyond), ready=at_a)
         link = ("--port", str(port_b), "--name", FAR, "--connect", at_a)
         far = cable.through(Part(name=FAR, argv=(*router, *link), ready=at_b), "b")

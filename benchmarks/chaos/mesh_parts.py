@@ -3,7 +3,7 @@
     python benchmarks/chaos/mesh_parts.py auction|NUMBER,NUMBER,… ADDRESS KEYS JOURNALS ARMS SPEED
 
 Four arms are a cell with places of its own, so many arms can work at a time. Bodies, plans and journals are those of
-`thermofleet arm` without twins; the arms of a process take turns on one thread, and publish one state a second.
+`thermofleet arm run` without twins; the arms of a process take turns on one thread, and publish one state a second.
 """
 
 import sys
@@ -23,9 +23,9 @@ from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.round import Timing
 from fleet.live.journal import Journal
-from scenarios.cli.live.arm import PreparedArm, make_node, simulated_arm
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.live.allocation import CentralAllocation
+from scenarios.live.arm import PreparedArm, make_node, simulated_arm
 from scenarios.load import load
 from scenarios.policy_loader import policy_at
 from scenarios.progress import quiet

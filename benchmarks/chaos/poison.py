@@ -66,7 +66,7 @@ def poison(fleet: Fleet) -> float:
 
 
 def _ask(fleet: Fleet, *jobs: JobSpec) -> None:
-    """Request a dry run of every arm, as `thermofleet ask` does."""
+    """Request a dry run of every arm, as `thermofleet job submit --quote` does."""
     named = tuple(msgspec.structs.replace(job, name=f"poison {i}") for i, job in enumerate(jobs))
     body = encode(QuoteRequest("dry run", named, dry_run=True))
     key = keys.of_every_arm(fleet.client.fleet, "quote")

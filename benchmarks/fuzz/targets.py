@@ -24,8 +24,8 @@ from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
-from scenarios.cli.live.submit import read_jobs
 from scenarios.live.http_app import read_tokens
+from scenarios.live.requests import read_jobs
 from scenarios.load import library, parse_toml
 from twin.logs.formats import GEN3, PLAIN
 from twin.logs.reader import read

@@ -40,7 +40,7 @@ from fleet.live.journal import Journal
 from fleet.live.journal_upkeep import CompactingJournal
 from fleet.live.space import Excludes
 from fleet.live.supervisor import Part, Supervisor
-from scenarios.cli.live.arm import fleet_clock, restart_history
+from scenarios.live.arm import fleet_clock, restart_history
 
 AUCTIONEER, CLIENT = "auctioneer", "client"
 RETRY_S = 1.0

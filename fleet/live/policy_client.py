@@ -72,7 +72,8 @@ class PolicyClient:
             client = self._client.open()
         except NoRouter as error:
             raise BusError(
-                f"{error} The {self._whose} is reached there: start a router with thermofleet router, then its process."
+                f"{error} The {self._whose} is reached there: start a router with thermofleet bus router, then its "
+                "process."
             ) from error
         replies = client.query_and_wait(self._key, request, ActReply, timeout_s=self._limit_s, most=2)
         actions = dict(self._reply_in(replies, request).actions)

@@ -17,7 +17,7 @@ def bounds_command(
     scenarios: Annotated[
         str | None,
         typer.Argument(
-            help="Separated by commas: library names (see `thermofleet list`), .toml files, or instances of the suite, "
+            help="Separated by commas: library names (see `thermofleet show`), .toml files, or instances of the suite, "
             "as test/0017.",
             show_default=False,
         ),

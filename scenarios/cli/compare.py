@@ -22,7 +22,7 @@ def compare_command(
     scenario: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Library names (see `thermofleet list`) or .toml files; or use --suite.", show_default=False
+            help="Library names (see `thermofleet show`) or .toml files; or use --suite.", show_default=False
         ),
     ] = None,
     policies: Annotated[

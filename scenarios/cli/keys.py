@@ -1,4 +1,4 @@
-"""`thermofleet keys`: the certificate authority of a fleet, and a certificate for each participant."""
+"""`thermofleet bus keys`: the certificate authority of a fleet, and a certificate for each participant."""
 
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -12,7 +12,6 @@ from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, 
 from fleet.errors import FleetError, nearest
 from scenarios.cli.options import JsonOption, number
 from scenarios.cli.terminal import out_console, plain_table, print_json, say
-from scenarios.load import load
 
 DAYS, MAX_DAYS = 365, 3650
 
@@ -53,6 +52,8 @@ def keys_command(
     if extra and not scenario:
         raise FleetError("--extra is for new keys, so SCENARIO is needed; --add extends present ones.")
     if scenario:
+        from scenarios.load import load
+
         chosen = load(scenario)
         more = [participant_of(text) for text in extra or ()]
         try:

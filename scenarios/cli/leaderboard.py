@@ -1,4 +1,4 @@
-"""`thermofleet leaderboard` and `thermofleet submit-result`."""
+"""`thermofleet leaderboard`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,6 +13,7 @@ from scenarios.schema_errors import choose
 if TYPE_CHECKING:  # slow to import
     from scenarios.evaluate.leaderboard import Submission
 
+_SUBMIT = "Check a result and write the file to send"
 FOLDER = Path("docs/results/leaderboard")
 """Of the results in a checkout."""
 
@@ -27,12 +28,40 @@ def leaderboard_command(
         bool, typer.Option("--markdown", help="Print the table as docs/leaderboard.md has it.")
     ] = False,
     as_json: options.JsonOption = False,
+    submit: Annotated[
+        Path | None,
+        typer.Option(help="Folder of `thermofleet compare --suite test --out`.", rich_help_panel=_SUBMIT),
+    ] = None,
+    author: Annotated[
+        str, typer.Option(help="--submit: name of the person who sends the result.", rich_help_panel=_SUBMIT)
+    ] = "",
+    about: Annotated[
+        str,
+        typer.Option(help="--submit: what the policy is, and where to get it; one sentence.", rich_help_panel=_SUBMIT),
+    ] = "",
+    policies: Annotated[
+        str | None,
+        typer.Option(
+            help="--submit: policies of the folder, separated by commas; default: all.",
+            show_default=False,
+            rich_help_panel=_SUBMIT,
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="--submit: folder for the files.", rich_help_panel=_SUBMIT)] = Path(),
 ) -> None:
     """Print the leaderboard: normalised scores of all results on a split.
 
-    Every file is checked as by `thermofleet submit-result`. A failed shift counts
-    as the mean of random. With --verify, repeated shifts must give equal figures.
+    Every file is checked as by --submit. A failed shift counts as the mean of random.
+    With --verify, repeated shifts must give equal figures. With --submit the results
+    of a comparison on a whole split are checked, and one file per policy is written.
     """
+    if submit is not None:
+        if not author:
+            raise FleetError("--submit needs --author, the name of the person who sends the result.")
+        submit_results(submit, author, about, policies, out)
+        return
+    if author or about or policies is not None:
+        raise FleetError("--author, --about and --policies are for --submit: leave them out.")
     from scenarios.evaluate.leaderboard import best_text, board_of, board_text, read_all, remark_text
     from scenarios.evaluate.tables import LEGEND
     from scenarios.load import SplitName
@@ -67,15 +96,7 @@ def leaderboard_command(
         )
 
 
-def submit_command(
-    results: Annotated[Path, typer.Argument(help="Folder of `thermofleet compare --suite test --out`.")],
-    author: Annotated[str, typer.Option(help="Name of the person who sends the result.")],
-    about: Annotated[str, typer.Option(help="What the policy is, and where to get it; one sentence.")] = "",
-    policies: Annotated[
-        str | None, typer.Option(help="Policies of the folder, separated by commas; default: all.", show_default=False)
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path(),
-) -> None:
+def submit_results(results: Path, author: str, about: str, policies: str | None, out: Path) -> None:
     """Check results on a whole split, and write one file per policy for the leaderboard.
 
     Instances must have the hashes of the manifest, every shift must be there, and

@@ -7,7 +7,7 @@ import errno
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from itertools import zip_longest
 from typing import Annotated, Any, NamedTuple
@@ -17,6 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from fleet.errors import FleetError, JournalFull, NoRouter, printable, visible
 from fleet.live.supervisor import SUPERVISED, WAITS
+from scenarios.cli.from_fields import with_fields
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, echo, err_console, say
 from scenarios.extras import missing_extra
 
@@ -33,89 +34,141 @@ class LazyCommand(NamedTuple):
     """A command whose module is imported when it runs."""
 
     panel: str
-    """Its group in `thermofleet --help`."""
+    """Its part of `thermofleet --help`."""
     target: str
-    """MODULE:NAME of its function or `typer.Typer`, the module relative to this package."""
+    """MODULE:NAME of its function, the module relative to this package."""
     help: str
 
 
-_LOOK, _POLICIES, _LIVE = "Run and look", "Evaluate policies", "Run a live fleet"
-_TWIN = "Digital twin"
+_LOOK, _POLICIES, _LIVE, _TWIN = "Run and look", "Evaluate policies", "Run a live fleet", "Digital twin"
+GROUPS = {
+    "job": LazyCommand(_LIVE, "", "Submit, follow and steer jobs."),
+    "arm": LazyCommand(_LIVE, "", "Run and steer arms."),
+    "bus": LazyCommand(_LIVE, "", "Run, watch, record and connect the other processes of a fleet."),
+    "twin": LazyCommand(_TWIN, "", "Train, score and use the digital twin of an arm."),
+}
+"""Groups of commands, which have no function of their own."""
 COMMANDS = {
     "demo": LazyCommand(_LOOK, "run:demo_command", "Run the quickstart shift under two policies."),
     "run": LazyCommand(_LOOK, "run:run_command", "Run one shift of a scenario and record it."),
-    "list": LazyCommand(_LOOK, "library:list_command", "List the scenarios that come with thermofleet."),
-    "suite": LazyCommand(_LOOK, "library:suite_command", "List the benchmark's suite of instances."),
-    "show": LazyCommand(_LOOK, "library:show_command", "Show a scenario: arms, jobs, thermal load factor."),
-    "layout": LazyCommand(_LOOK, "library:layout_command", "Show reach, space and problems of a cell."),
-    "film": LazyCommand(_LOOK, "film:film_command", "Film a recorded shift."),
-    "view": LazyCommand(_LOOK, "view:view_command", "Play a shift in MuJoCo's viewer."),
-    "trace": LazyCommand(_LOOK, "scenarios.cli.trace:trace_command", "Follow an event to its causes."),
+    "show": LazyCommand(_LOOK, "look:show_command", "List the scenarios, or show one: arms, jobs, thermal load."),
+    "layout": LazyCommand(_LOOK, "look:layout_command", "Show reach, space and problems of a cell."),
+    "view": LazyCommand(_LOOK, "look:view_command", "Play a shift in MuJoCo's viewer."),
+    "film": LazyCommand(_LOOK, "look:film_command", "Film a recorded shift."),
+    "report": LazyCommand(_LOOK, "look:report_command", "Write the page of a run or of a recording."),
+    "trace": LazyCommand(_LOOK, "look:trace_command", "Follow an event to its causes."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
+    "suite": LazyCommand(_POLICIES, "evaluate:suite_command", "List the benchmark's suite of instances."),
     "bounds": LazyCommand(_POLICIES, "bounds:bounds_command", "Bound the reward of shifts."),
-    "leaderboard": LazyCommand(_POLICIES, "leaderboard:leaderboard_command", "Print the leaderboard of a split."),
-    "submit-result": LazyCommand(_POLICIES, "leaderboard:submit_command", "Check a result and write the file to send."),
-    "train": LazyCommand(_POLICIES, "train:train_command", "Train a policy by reinforcement learning."),
-    "up": LazyCommand(_LIVE, "live.up:up_command", "Start a whole fleet, one process per participant."),
-    "router": LazyCommand(_LIVE, "router:router_command", "Run the Zenoh router of a fleet."),
-    "arm": LazyCommand(_LIVE, "live.arm:arm_command", "Run one arm of a fleet."),
-    "auction": LazyCommand(_LIVE, "live.auction:auction_command", "Run the auctioneer of a fleet."),
-    "submit": LazyCommand(_LIVE, "live.submit:submit_command", "Submit jobs to a fleet."),
-    "ask": LazyCommand(_LIVE, "live.ask:ask_command", "Ask every arm for a quote."),
-    "clear": LazyCommand(_LIVE, "live.clear:clear_command", "Free the space of an absent arm."),
-    "cancel": LazyCommand(_LIVE, "live.control:cancel_command", "Cancel jobs."),
-    "settle": LazyCommand(_LIVE, "live.control:settle_command", "Say what became of an unfinished job."),
-    "change": LazyCommand(_LIVE, "live.control:change_command", "Change due date and value of a job."),
-    "pause": LazyCommand(_LIVE, "live.control:pause_command", "Give an arm, or all arms, no more jobs."),
-    "resume": LazyCommand(_LIVE, "live.control:resume_command", "End a pause."),
-    "reset": LazyCommand(_LIVE, "live.control:reset_command", "Clear the fault of an arm."),
-    "watch": LazyCommand(_LIVE, "live.watch:watch_command", "Watch a fleet in the terminal."),
-    "doctor": LazyCommand(_LIVE, "live.doctor:doctor_command", "Check the health of a fleet."),
-    "dashboard": LazyCommand(_LIVE, "live.gateway:dashboard_command", "Show a fleet live on a page."),
-    "gateway": LazyCommand(_LIVE, "live.gateway:gateway_command", "Serve a fleet over HTTP."),
-    "record": LazyCommand(_LIVE, "live.record:record_command", "Record a fleet to Parquet."),
-    "replay": LazyCommand(_LIVE, "live.record:replay_command", "Replay a run or a recording on the bus."),
-    "report": LazyCommand(_LIVE, "live.record:report_command", "Write the report of a recording."),
-    "ros2": LazyCommand(_LIVE, "ros2:ros2_app", "Connect a fleet and ROS 2."),
-    "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
-    "twin": LazyCommand(_TWIN, "twin.group:twin_app", "Train, score and use the digital twin of an arm."),
-    "hold": LazyCommand(_TWIN, "scenarios.motion.hold:hold_command", "Compute how long an arm can hold a payload."),
+    "leaderboard": LazyCommand(
+        _POLICIES, "leaderboard:leaderboard_command", "Print the leaderboard, or check a result."
+    ),
+    "train": LazyCommand(_POLICIES, "evaluate:train_command", "Train a policy by reinforcement learning."),
+    "up": LazyCommand(_LIVE, "live:up_command", "Start a whole fleet, one process per participant."),
+    "job submit": LazyCommand(_LIVE, "jobs:submit_command", "Submit jobs, or ask what they would cost."),
+    "job list": LazyCommand(_LIVE, "jobs:list_command", "List the jobs of a fleet."),
+    "job cancel": LazyCommand(_LIVE, "jobs:cancel_command", "Cancel jobs."),
+    "job change": LazyCommand(_LIVE, "jobs:change_command", "Change due date and value of a job."),
+    "job settle": LazyCommand(_LIVE, "jobs:settle_command", "Resolve a job with unknown outcome."),
+    "arm run": LazyCommand(_LIVE, "live:arm_command", "Run one arm of a fleet."),
+    "arm pause": LazyCommand(_LIVE, "jobs:pause_command", "Give an arm, or all arms, no more jobs."),
+    "arm resume": LazyCommand(_LIVE, "jobs:resume_command", "End a pause."),
+    "arm reset": LazyCommand(_LIVE, "jobs:reset_command", "Clear the fault of an arm."),
+    "arm clear": LazyCommand(_LIVE, "jobs:clear_command", "Free the space of an absent arm."),
+    "bus router": LazyCommand(_LIVE, "live:router_command", "Run the Zenoh router of a fleet."),
+    "bus auctioneer": LazyCommand(_LIVE, "live:auctioneer_command", "Run the auctioneer of a fleet."),
+    "bus watch": LazyCommand(_LIVE, "live:watch_command", "Watch a fleet in the terminal."),
+    "bus doctor": LazyCommand(_LIVE, "live:doctor_command", "Check the health of a fleet."),
+    "bus record": LazyCommand(_LIVE, "live:record_command", "Record a fleet to Parquet."),
+    "bus replay": LazyCommand(_LIVE, "live:replay_command", "Replay a run or a recording on the bus."),
+    "bus gateway": LazyCommand(_LIVE, "live:gateway_command", "Serve a fleet over HTTP, with a live page."),
+    "bus keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
+    "bus ros2": LazyCommand(_LIVE, "live:ros2_command", "Connect a fleet and ROS 2."),
+    "twin train": LazyCommand(_TWIN, "twin.group:train_command", "Train the twins of a scenario, or that of logs."),
+    "twin score": LazyCommand(_TWIN, "twin.group:score_command", "Score every job of a scenario, or a log."),
+    "twin verdict": LazyCommand(_TWIN, "twin.verdict:verdict_command", "Judge recordings as hot or cool."),
+    "twin identify": LazyCommand(_TWIN, "twin.motion:identify_command", "Identify an arm's thermal network."),
+    "twin generate": LazyCommand(_TWIN, "twin.motion:generate_command", "Generate new cool motion."),
+    "twin recover": LazyCommand(_TWIN, "twin.motion:recover_command", "Find a posture with less load for a warm arm."),
+    "twin export": LazyCommand(_TWIN, "twin.motion:export_command", "Export a twin as ONNX."),
+    "twin report": LazyCommand(_TWIN, "twin.group:report_command", "Write the paper's pictures as one page."),
 }
+MOVED = {
+    "list": "show",
+    "hold": "show --hold",
+    "ablate": "compare --difficulty",
+    "submit-result": "leaderboard --submit",
+    "submit": "job submit",
+    "ask": "job submit --quote",
+    "cancel": "job cancel",
+    "change": "job change",
+    "settle": "job settle",
+    "pause": "arm pause",
+    "resume": "arm resume",
+    "reset": "arm reset",
+    "clear": "arm clear",
+    "auction": "bus auctioneer",
+    "router": "bus router",
+    "watch": "bus watch",
+    "doctor": "bus doctor",
+    "dashboard": "bus gateway --page",
+    "gateway": "bus gateway",
+    "record": "bus record",
+    "replay": "bus replay",
+    "ros2": "bus ros2",
+    "keys": "bus keys",
+}
+"""Earlier names of commands."""
 
 
 class LazyGroup(TyperGroup):
-    """The commands of `COMMANDS`: listed by their entries, imported when they run."""
+    """The commands of `COMMANDS` under some words: listed by their entries, imported when they run."""
+
+    words: tuple[str, ...] = ()
+    """Before the name of each command."""
 
     def __init__(self, **attributes: Any) -> None:  # whatever typer passes on to its base class
         super().__init__(**attributes)
+        depth = len(self.words)
         for name, entry in COMMANDS.items():
-            self.add_command(TyperCommand(name, help=entry.help, rich_help_panel=entry.panel))
+            *before, word = name.split()[: depth + 1]
+            if tuple(before) == self.words and word not in self.commands:
+                listed = entry if depth else GROUPS.get(word, entry)
+                panel = None if depth else listed.panel
+                self.add_command(TyperCommand(word, help=listed.help, rich_help_panel=panel))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Import the command in place of its entry, for running it and for shell completion.
 
         Any: typer keeps the classes of contexts and commands private.
         """
+        if args and args[0] not in self.commands:
+            if not self.words and args[0] in MOVED and not ctx.resilient_parsing:
+                raise FleetError(f"`thermofleet {args[0]}` is now `thermofleet {MOVED[args[0]]}`.")
+            if self.words == ("arm",) and not args[0].startswith("-") and len(args) > 1 and not ctx.resilient_parsing:
+                raise FleetError("`thermofleet arm SCENARIO NAME` is now `thermofleet arm run SCENARIO NAME`.")
         name, listed, rest = super().resolve_command(ctx, args)
-        return name, listed and load_command(str(name)), rest
-
-
-def target_of(name: str) -> Callable[..., None] | typer.Typer:
-    """Import the function of a command, or its group of commands."""
-    module, _, attribute = COMMANDS[name].target.partition(":")
-    prefix = "" if module.startswith("scenarios.") else "scenarios.cli."
-    return getattr(import_module(prefix + module), attribute)
+        return name, listed and load_command(" ".join((*self.words, str(name)))), rest
 
 
 def load_command(name: str) -> Any:
-    """Import a command (Any: typer keeps the class of commands private)."""
-    target = target_of(name)
-    if not isinstance(target, typer.Typer):
+    """Import a command, or make a group of them (Any: typer keeps the class of commands private).
+
+    Args:
+        name: Its words, as `bus router`.
+    """
+    words = name.split()
+    if name in GROUPS:
+        kind = type("LazyGroup", (LazyGroup,), {"words": tuple(words)})
+        alone = typer.Typer(cls=kind, help=GROUPS[name].help, no_args_is_help=True, add_completion=False)
+        alone.callback()(lambda: None)
+    else:
+        module, _, attribute = COMMANDS[name].target.partition(":")
+        prefix = "" if module.startswith("scenarios.") else "scenarios.cli."
         alone = typer.Typer(add_completion=False)
-        alone.command(name)(target)
-        target = alone
-    command = typer.main.get_command(target)
-    command.name = name
+        alone.command(words[-1])(with_fields(getattr(import_module(prefix + module), attribute)))
+    command = typer.main.get_command(alone)
+    command.name = words[-1]
     return command
 
 

@@ -2,24 +2,26 @@
 
 import shlex
 import tomllib
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from agents.registry import WRAPPERS_HELP, names_of
+from fleet.bus.exchange.channel import Channel, Partition
 from fleet.bus.protocol.keys import ENDPOINT as ENDPOINT
 from fleet.errors import NAME_RULE, FleetError, LogError, is_name, nearest, printable
+from fleet.fields import MAX_SEED, Option
+from scenarios.cli.from_fields import declared
+from scenarios.specs import RunSpec
+
+Number = TypeVar("Number", int, float, None)
 
 if TYPE_CHECKING:  # slow to import
-    from fleet.bus.exchange.channel import Channel, Partition
     from scenarios.prepare.randomisation import Randomisation
     from scenarios.schema import Scenario
     from twin.logs.recording import Recording
-
-Number = TypeVar("Number", int, float, None)
-MAX_SEED = 2**32 - 1
 
 
 def number(text: str, low: float, high: float, *names: str, above: bool = False, **more: Any) -> Any:
@@ -27,13 +29,12 @@ def number(text: str, low: float, high: float, *names: str, above: bool = False,
 
     Any: typer keeps the class of options private, and `more` goes to `typer.Option`.
     """
-
-    limits = f"> {low:.10g} and at most {high:.10g}" if above else f"{low:.10g} to {high:.10g}"
+    known = Option(help=text, low=low, high=high, above=above)
 
     def check(option: typer.CallbackParam, value: Number) -> Number:
-        if value is None or ((low < value if above else low <= value) and value <= high):  # NaN fails
-            return value
-        raise FleetError(f"{option.opts[0]} must be {limits} (got {value:g}).")
+        if problem := known.problem(option.opts[0], value):
+            raise FleetError(problem)
+        return value
 
     return typer.Option(*names, help=text, callback=check, **more)
 
@@ -70,21 +71,12 @@ def command_line(ctx: typer.Context) -> str:
 ScenarioArg = Annotated[
     str,
     typer.Argument(
-        help="A library name (see `thermofleet list`), a .toml file, or an instance of the suite, as test/0017."
+        help="A library name (see `thermofleet show`), a .toml file, or an instance of the suite, as test/0017."
     ),
 ]
 SeedOption = Annotated[int, number("Random seed of jobs, sensor noise and policy.", 0, MAX_SEED)]
-DifficultyOption = Annotated[
-    str, typer.Option(help="Source of the difficulty scores: twin, oracle (simulator) or blind (none).")
-]
-RiskOption = Annotated[
-    str,
-    typer.Option(
-        help="With --difficulty twin, model of P(saturation): rc (peak predicted by the arm's own thermal network), "
-        "rc-nominal (peak predicted by that of a nominal arm), excess, load, errors (regression on errors of the "
-        "learned twin), or torque (regression on mean squared torque)."
-    ),
-]
+DifficultyOption = Annotated[str, declared(RunSpec, "difficulty")]
+RiskOption = Annotated[str, declared(RunSpec, "risk")]
 RandomiseOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -99,49 +91,16 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result in --out.")]
 
 # Communication between the arms of a simulated shift.
-_CHANNEL = "Communication between arms"
-MAX_DELAY_S = 86_400.0
-TopologyOption = Annotated[
-    str,
-    typer.Option(
-        help="Which arms receive each other's messages: complete, star, ring, line, random_geometric.",
-        rich_help_panel=_CHANNEL,
-    ),
-]
-RadiusOption = Annotated[
-    float, number("random_geometric: range of an arm in a unit square.", 0, 2, rich_help_panel=_CHANNEL)
-]
-TopologySeedOption = Annotated[
-    int, number("random_geometric: seed of the arms' positions.", 0, MAX_SEED, rich_help_panel=_CHANNEL)
-]
-DelayOption = Annotated[
-    float, number("Minimum delay of a message, s of simulated time.", 0, MAX_DELAY_S, rich_help_panel=_CHANNEL)
-]
-JitterOption = Annotated[
-    float,
-    number(
-        "Maximum additional delay per message and link, s of simulated time.", 0, MAX_DELAY_S, rich_help_panel=_CHANNEL
-    ),
-]
-LossOption = Annotated[float, number("Probability that a message is lost on a link.", 0, 1, rich_help_panel=_CHANNEL)]
-PartitionOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="FROM_S:TO_S:ARM,ARM|ARM,ARM: between these times messages stay inside each group. May be repeated.",
-        rich_help_panel=_CHANNEL,
-    ),
-]
+TopologyOption = Annotated[str, declared(Channel, "topology")]
+RadiusOption = Annotated[float, declared(Channel, "radius")]
+TopologySeedOption = Annotated[int, declared(Channel, "topology_seed")]
+DelayOption = Annotated[float, declared(Channel, "delay_s")]
+JitterOption = Annotated[float, declared(Channel, "jitter_s")]
+LossOption = Annotated[float, declared(Channel, "loss")]
+PartitionOption = Annotated[list[str] | None, declared(Channel, "partitions")]
 
 # Live fleets.
 EndpointOption = Annotated[str, typer.Option(envvar="THERMOFLEET_ENDPOINT", help="Endpoint of the fleet's router.")]
-PolicyOption = Annotated[
-    str,
-    typer.Option(
-        help=f"Allocation policy. Run by the auctioneer: {names_of('central')}. Run by each arm, without an "
-        f"auctioneer: {names_of('arm')}, or a folder of `thermofleet train`. Your own as FILE.py:CLASS, run "
-        f"according to its scope, or bus:NAME in another process. {WRAPPERS_HELP}."
-    ),
-]
 FleetOption = Annotated[
     str,
     typer.Option(
@@ -151,7 +110,7 @@ FleetOption = Annotated[
 
 # Twins.
 ScenarioOrLog = Annotated[
-    str | None, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file; or use --log.")
+    str | None, typer.Argument(help="A library name (see `thermofleet show`) or a .toml file; or use --log.")
 ]
 LogOption = Annotated[
     Path | None, typer.Option("--log", help="A log of a real arm, or a folder of logs: .csv, .csv.gz, .parquet.")
@@ -164,40 +123,20 @@ WhichOption = Annotated[
 ]
 
 
-def channel_of(scenario: "Scenario", partition: list[str] | None = None, **fields: Any) -> "Channel":
+def channel_of(scenario: "Scenario", partition: Sequence[str] | None = None, **fields: Any) -> Channel:
     """The channel that the command line describes; `fields` are those of `Channel`, which checks them (hence Any).
 
     Raises:
         FleetError: says what was given and what is allowed.
     """
-    from fleet.bus.exchange.channel import Channel
-
     try:
-        channel = Channel(partitions=tuple(parse_partition(text) for text in partition or ()), **fields)
+        if partition is not None:
+            fields["partitions"] = tuple(Partition.parse(text) for text in partition)
+        channel = Channel(**fields)
         channel.check([arm.name for arm in scenario.arms])
     except ValueError as error:
         raise FleetError(str(error)) from error
     return channel
-
-
-def parse_partition(text: str) -> "Partition":
-    """The partition of a text such as `600:1200:arm_0,arm_1|arm_2,arm_3`.
-
-    Raises:
-        ValueError: the text has another form.
-    """
-    from fleet.bus.exchange.channel import Partition
-
-    begin, _, rest = text.partition(":")
-    end, _, groups = rest.partition(":")
-    try:
-        from_s, to_s = float(begin), float(end)
-    except ValueError:
-        raise ValueError(
-            f"--partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM, as in 600:1200:arm_0,arm_1|arm_2 (got '{text}')."
-        ) from None
-    arms = (tuple(arm.strip() for arm in group.split(",") if arm.strip()) for group in groups.split("|"))
-    return Partition(from_s, to_s, tuple(arms))
 
 
 def parse_randomisation(texts: list[str] | None) -> "Randomisation | None":

@@ -11,23 +11,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from agents.registry import NAMES_HELP
-from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
 from scenarios.cli import options
+from scenarios.cli.from_fields import From, Given
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, plain_table, print_json, progress_bar, say
-from scenarios.load import load, own_seed
-from scenarios.policy_loader import label, policy_of
-from scenarios.progress import Progress
-from scenarios.result_folder import check_free, disk_errors, new_folder
-from scenarios.run.metrics import Metrics
-from scenarios.schema import Scenario
-from scenarios.schema_errors import choose
+from scenarios.specs import RunSpec
 
 if TYPE_CHECKING:  # slow to import
     from fleet.events import Event
     from scenarios.prepare.fleet import Fleet
-    from scenarios.run.shift import RunResult, RunSpec
+    from scenarios.progress import Progress
+    from scenarios.run.metrics import Metrics
+    from scenarios.run.shift import RunResult
+    from scenarios.schema import Scenario
 
 DEMO_POLICY = "wsept"
 """The policy that the demo compares with `round_robin`."""
@@ -37,27 +34,11 @@ PAIR = "index.html"
 
 def run_command(
     scenario: options.ScenarioArg,
-    policy: Annotated[str, typer.Option(help=NAMES_HELP)] = "least_difficulty",
-    seed: Annotated[
-        int | None,
-        options.number(
-            "Random seed of jobs, sensor noise and policy; default: 0, or of an instance of the suite its own.",
-            0,
-            options.MAX_SEED,
-        ),
-    ] = None,
+    given: Annotated[Given, From(RunSpec, "policy", "seed", "plant", "bus", "difficulty", "risk")],
+    channel: Annotated[Given, From(Channel)],
     out: Annotated[
         Path | None, typer.Option(help="Folder of the recording; default: runs/SCENARIO-POLICY-SEED.")
     ] = None,
-    plant: Annotated[
-        str,
-        typer.Option(help="profile (arms follow their plans exactly) or mujoco (all arms in closed loop in MuJoCo)."),
-    ] = "profile",
-    bus: Annotated[
-        str, typer.Option(help="Transport between the arms: zenoh (in-process router) or memory.")
-    ] = "zenoh",
-    difficulty: options.DifficultyOption = "twin",
-    risk: options.RiskOption = "rc",
     overwrite: options.OverwriteOption = False,
     listen: Annotated[
         int,
@@ -68,27 +49,21 @@ def run_command(
         ),
     ] = 0,
     as_json: options.JsonOption = False,
-    topology: options.TopologyOption = "complete",
-    radius: options.RadiusOption = 0.5,
-    topology_seed: options.TopologySeedOption = 0,
-    delay_s: options.DelayOption = 0.0,
-    jitter_s: options.JitterOption = 0.0,
-    loss: options.LossOption = 0.0,
-    partition: options.PartitionOption = None,
 ) -> None:
     """Run one shift of a scenario and record it."""
+    from scenarios.load import load, own_seed
+    from scenarios.policy_loader import label, policy_of
+    from scenarios.result_folder import check_free
     from scenarios.run.run_folder import RUN
     from scenarios.run.shift import summary
 
-    chosen, seed = load(scenario), own_seed(scenario) if seed is None else seed
-    channel = options.channel_of(
-        chosen, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
-        jitter_s=jitter_s, loss=loss,
-    )  # fmt: skip
-    spec = _spec(policy, seed, plant, bus, difficulty, risk, channel)
-    if listen and bus == "memory":
-        raise FleetError(f"--listen needs --bus zenoh (got {listen} and {bus}).")
-    where = out or Path("runs") / f"{chosen.name}-{label(policy).replace(':', '-')}-{seed}"
+    chosen = load(scenario)
+    given = {"seed": own_seed(scenario), **given}
+    spec = RunSpec(**given, channel=options.channel_of(chosen, **channel))
+    policy_of(spec.policy)
+    if listen and spec.bus == "memory":
+        raise FleetError(f"--listen needs --bus zenoh (got {listen} and {spec.bus}).")
+    where = out or Path("runs") / f"{chosen.name}-{label(spec.policy).replace(':', '-')}-{spec.seed}"
     check_free(where, RUN, overwrite=overwrite)
     with ExitStack() as open_until_end:
         endpoint = None
@@ -102,8 +77,8 @@ def run_command(
         run, keys = summary(result), ("status", "policy", "seed", "plant", "bus", "difficulty", "metrics")
         print_json({"out": str(where), **{key: run[key] for key in keys}})
     else:
-        say(f"{chosen.name}, seed {seed}", out_console)
-        out_console.print(metrics_table({label(policy): result.metrics}))
+        say(f"{chosen.name}, seed {spec.seed}", out_console)
+        out_console.print(metrics_table({label(spec.policy): result.metrics}))
         if result.metrics.illegal_actions:
             say(f"The policy chose {result.metrics.illegal_actions} illegal actions; each counted as a wait.")
         if result.finished:
@@ -123,6 +98,8 @@ def demo_command(
     seed: options.SeedOption = 20,
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
+    from scenarios.load import load
+    from scenarios.result_folder import disk_errors
     from scenarios.run.shift import summary
     from scenarios.show.run_page import Side, pair_page
 
@@ -131,8 +108,9 @@ def demo_command(
     fleet = None
     with progress_bar() as progress:
         for policy in ("round_robin", DEMO_POLICY):
-            spec = _spec(policy, seed, "profile", "zenoh", "twin", "rc", PERFECT)
-            fleet, result = _run_into(chosen, spec, out / policy, True, progress, fleet=fleet)
+            fleet, result = _run_into(
+                chosen, RunSpec(policy=policy, seed=seed), out / policy, True, progress, fleet=fleet
+            )
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result
@@ -163,34 +141,19 @@ def _named(faults: "list[Event]") -> str:
     return ", ".join(dict.fromkeys(f"{fault.arm} (joint {fault.joint})" for fault in faults))
 
 
-def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, risk: str, channel: Channel) -> "RunSpec":
-    from scenarios.prepare.fleet import BusName, DifficultyName, PlantName, RiskName
-    from scenarios.run.shift import RunSpec
-
-    policy_of(policy)
-    return RunSpec(
-        policy=policy,
-        seed=seed,
-        plant=choose("plant", plant, PlantName),
-        bus=choose("bus", bus, BusName),
-        difficulty=choose("difficulty", difficulty, DifficultyName),
-        risk=choose("risk", risk, RiskName),
-        channel=channel,
-    )
-
-
 def _run_into(
-    scenario: Scenario,
-    spec: "RunSpec",
+    scenario: "Scenario",
+    spec: RunSpec,
     out: Path,
     overwrite: bool,
-    progress: Progress,
+    progress: "Progress",
     *,
     endpoint: str | None = None,
     fleet: "Fleet | None" = None,
 ) -> tuple["Fleet", "RunResult"]:
     """Run a shift and write it to `out`; the fleet is prepared unless it is given."""
     from scenarios.prepare.fleet import prepare
+    from scenarios.result_folder import new_folder
     from scenarios.run.run_folder import RUN, write
     from scenarios.run.shift import run
 
@@ -224,7 +187,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def metrics_table(results: dict[str, Metrics]) -> Table:
+def metrics_table(results: "dict[str, Metrics]") -> Table:
     """Key figures, one column per policy."""
     table = plain_table("", *results)
     rows: list[tuple[str, Callable[[Metrics], str]]] = [

@@ -277,7 +277,7 @@ def read(path: Path) -> Submission:
         raise FleetError(f"Cannot read '{path}': {error.strerror}.") from error
     except (ValueError, msgspec.DecodeError) as error:
         why = f"line {number}: {printable(str(error))}"
-        raise FleetError(f"'{path}' is no result of `thermofleet submit-result`: {why}.") from error
+        raise FleetError(f"'{path}' is no result of `thermofleet leaderboard --submit`: {why}.") from error
     return Submission(card=card, rows=tuple(rows))
 
 

@@ -77,7 +77,7 @@ def central_allocation(
     if scope_of(policy) == "arm":
         raise FleetError(
             f"Policy '{policy}' of scope arm runs without an auctioneer. "
-            f"Start each arm with: thermofleet arm SCENARIO NAME --policy {policy}"
+            f"Start each arm with: thermofleet arm run SCENARIO NAME --policy {policy}"
         )
     made = without_simulator(policy, policy_at(policy, seed, bus))
     return CentralAllocation(made, live_fleet(scenario, ends=ends))

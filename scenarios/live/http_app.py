@@ -336,7 +336,13 @@ def application(
 
     table: list[tuple[str, str, Role, Endpoint, str]] = [
         ("GET", "/", "monitor", contents, "This list."),
-        ("GET", "/v4/fleet", "monitor", fleet, "State of every arm, jobs and messages, as `thermofleet watch --json`."),
+        (
+            "GET",
+            "/v4/fleet",
+            "monitor",
+            fleet,
+            "State of every arm, jobs and messages, as `thermofleet bus watch --json`.",
+        ),
         ("GET", "/v4/events", "monitor", events, "Every message as server-sent events."),
         ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
         ("POST", "/v4/jobs", "submitter", submit, "Submit jobs: a Submission."),

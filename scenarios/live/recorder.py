@@ -6,13 +6,14 @@ are dropped, missing ones are sought in the caches of the publishers (`GapFetche
 a row of `gaps`.
 """
 
+import fcntl
 import logging
 import math
 import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +73,10 @@ TURN_S, BATCH = 0.5, 1000
 """Real seconds, and messages, after which received messages are written to the disk."""
 CELL_S, CELL_REPLY_S = 30.0, 5.0
 """Real seconds between two questions about the cell, until one is answered; in which a reply counts."""
+BACKLOG = 200_000
+"""Maximum number of messages that wait: joining a fleet of a hundred arms brings a hundred thousand at once."""
+CONNECT_S = 0.5
+"""Real seconds that the router has to accept the session that fetches missed messages."""
 RETRY_S = 5.0
 """Real seconds until the next attempt to write a part to a disk that refused."""
 
@@ -443,3 +448,47 @@ class RecorderNode:
     def close(self) -> None:
         """Close the client that fetches."""
         self._fetcher.close()
+
+
+def record(
+    link: BusClient, folder: Path, *, rotate_s: float, stopped: Callable[[], bool], connect: Callable[[], BusClient]
+) -> Recorder:
+    """Record until stopped; return the recorder, everything written.
+
+    Args:
+        rotate_s: Real seconds between two Parquet parts; rows are in the journal before.
+        connect: Makes another client of the fleet, which fetches missed messages.
+
+    Raises:
+        FleetError: the disk refuses at the beginning or at the end; in between it is tried again.
+    """
+    with (
+        lock_folder(folder),
+        closing(Recorder.open(folder, link.fleet)) as recorder,
+        closing(RecorderNode(link, recorder, connect, rotate_s=rotate_s)) as node,
+    ):
+        while not stopped():
+            node.serve()
+        node.end()
+    return recorder
+
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Create the folder if it is missing, and lock it until the end of the block or of the process.
+
+    Raises:
+        FleetError: another process has locked it, or it cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)  # the folder itself: no lock file is left in it
+    except OSError as error:
+        raise FleetError(f"Cannot write to '{folder}': {error.strerror}.") from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise FleetError(f"Another process records in '{folder}'. Stop it, or choose another --out.") from error
+    finally:
+        os.close(handle)

@@ -4,21 +4,18 @@ Gravity torque comes from MuJoCo, temperatures from the thermal network. The arm
 temperature) or idle-warm (powered for hours without load).
 """
 
-import json
 from dataclasses import dataclass
-from typing import Annotated, cast, get_args
+from typing import cast, get_args
 
 import msgspec
 import numpy as np
-import typer
-from rich.console import Console
 from rich.table import Table
 
 from fleet.errors import FleetError, nearest
 from fleet.job import BOUNDS
 from fleet.motion import static_drive
 from fleet.motor import Motors, current, gen3_motors, thermal_data
-from fleet.robot import GEN3, JOINTS, POSTURES, RATING, Cooling, Robot, ThermalLimits
+from fleet.robot import GEN3, JOINTS, RATING, Cooling, Robot, ThermalLimits
 from fleet.thermal import (
     HOUSING,
     NODES,
@@ -31,7 +28,6 @@ from fleet.thermal import (
     steady_state,
     thermal_model,
 )
-from scenarios.cli.options import number
 from scenarios.motion.posture import parse_posture
 
 Array = np.ndarray
@@ -226,27 +222,6 @@ def as_table(result: HoldResult) -> Table:
             style=style,
         )
     return table
-
-
-def hold_command(
-    payload: Annotated[float, number("Payload at the flange, kg.", *BOUNDS["payload_kg"][:2])] = 0.0,
-    posture: Annotated[
-        str, typer.Option(help=f"{', '.join(POSTURES)}, or seven comma-separated angles in degrees.")
-    ] = "outstretched",
-    ambient: Annotated[float, number("Ambient temperature, °C.", *AMBIENT_RANGE_C)] = 25.0,
-    json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-    cooling: Annotated[str, typer.Option(help=f"Cooling of the arm: {', '.join(get_args(Cooling))}.")] = "still_air",
-    tool_kg: Annotated[float, number("Mass of the gripper at the flange, kg.", 0, RATING.temporary_kg)] = 0.0,
-    beyond_rating: Annotated[
-        bool, typer.Option("--beyond-rating", help="Accept a load beyond the rating of the arm.")
-    ] = False,
-) -> None:
-    """Compute how long an arm can hold a payload until its motors reach the warning and error limits."""
-    result = hold(payload, posture, ambient, cooling=cooling, tool_kg=tool_kg, beyond_rating=beyond_rating)
-    if json_:
-        typer.echo(json.dumps(as_json(result), indent=2, allow_nan=False, ensure_ascii=False))
-    else:
-        Console().print(as_table(result))
 
 
 def _check_torque(tau: Array, payload_kg: float, posture: str) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,18 +36,11 @@ from scenarios.prepare.randomisation import Randomisation, Variation, randomisat
 from scenarios.progress import Count, Progress, check_progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
+from scenarios.specs import RISK, BusName, DifficultyName, PlantName, RiskName
 
 if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
     from fleet.engine.shift import Episode, Plant
     from fleet.env.allocation_v1 import AllocationEnv, MaskPlace
-
-DifficultyName = Literal["twin", "blind", "oracle"]
-RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
-"""Model of P(saturation): from the peak predicted by the identified or by the nominal thermal network of the arm, or
-a regression on features of the learned twin (`twin.saturation.model.evidence_of`)."""
-RISK: RiskName = "rc"
-PlantName = Literal["profile", "mujoco"]
-BusName = Literal["zenoh", "memory"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from agents.policy import only_choices
-from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.bus.exchange.channel import PERFECT
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
 from fleet.env.allocation_v1 import VERSION, AllocationEnv
@@ -18,7 +18,7 @@ from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
 from scenarios.policy_loader import OnBus, blaming, policy_at
-from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
+from scenarios.prepare.fleet import Fleet, env_of
 from scenarios.prepare.known_cell import let_plan
 from scenarios.progress import Progress, quiet
 from scenarios.run.heat_use import HeatUse
@@ -28,26 +28,13 @@ from scenarios.run.provenance import code_hash, provenance
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
+from scenarios.specs import RunSpec
 
 RUN_FORMAT = 6
 """Raised when run.json or the columns of the recordings change so that an earlier version cannot be read."""
 AT_ONCE = 20_000
 """Readings of an arm that are computed at a time."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunSpec:
-    """What to run, without the fleet."""
-
-    policy: str
-    seed: int = 0
-    plant: PlantName = "profile"
-    bus: BusName = "zenoh"
-    difficulty: DifficultyName = "twin"
-    risk: RiskName = RISK
-    channel: Channel = PERFECT
-    """Topology, delay and loss of the arms' messages."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,6 @@
 """Films of a recorded shift: MuJoCo's renderer without a display, and ffmpeg's encoders through PyAV."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
@@ -16,6 +15,7 @@ from fleet.telemetry import FAULTED, MODES
 from scenarios.run.stored_run import StoredRun
 from scenarios.show.moments import motor_spheres
 from scenarios.show.words import clock
+from scenarios.specs import Shot
 
 Array = np.ndarray
 
@@ -30,20 +30,6 @@ TEXT_PX, SMALLEST_PX = 16, 11
 """Height of text in a picture of 1280 x 720 px, and in the smallest ones."""
 POSTURES = 64
 """Postures of the film that the camera must hold."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Shot:
-    """What to film and how."""
-
-    speed: float = 120.0
-    """Shift seconds per second of the film."""
-    fps: int = 30
-    width: int = 1280
-    height: int = 720
-    begin_s: float = 0.0
-    end_s: float = float("inf")
-    meshes: bool = False
 
 
 def times(run: StoredRun, shot: Shot) -> Array:

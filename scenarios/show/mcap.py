@@ -2,7 +2,7 @@
 
 Standard messages need no setting in Foxglove: transforms and markers go to its 3-D panel, temperatures to plots,
 `/rosout` to its log, `/diagnostics` to its diagnostics. Joint states and diagnostics have the topics and content of
-`thermofleet ros2 bridge`. After a jump in time a viewer has the last message of each topic only, so markers of one
+`thermofleet bus ros2 bridge`. After a jump in time a viewer has the last message of each topic only, so markers of one
 topic are always sent together.
 """
 
@@ -81,7 +81,7 @@ class _File:
         self.frames = [[f"{name}/link_{i}" for i in range(len(moments.model["links"]))] for name in names]
         """Of each link of each arm; the first is its base."""
         self.topics = [f"/{plain_name(run.scenario.name)}/{name}" for name in names]
-        """Beginnings of the arms' topics, as `thermofleet ros2 bridge` has them."""
+        """Beginnings of the arms' topics, as `thermofleet bus ros2 bridge` has them."""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         writer.start(profile="ros2", library="thermofleet")

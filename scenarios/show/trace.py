@@ -91,7 +91,7 @@ def thread_of(folder: Path, asked: str) -> Thread:
     elif (folder / CARD).exists():
         log = _of_recording(folder)
     else:
-        raise FleetError(f"'{folder}' is neither a folder of `thermofleet run` nor of `thermofleet record`.")
+        raise FleetError(f"'{folder}' is neither a folder of `thermofleet run` nor of `thermofleet bus record`.")
     rows = rows_of(log.events, asked)
     event = log.events[rows[0]]
     job = event.job or log.holder(event)

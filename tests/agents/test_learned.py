@@ -9,9 +9,10 @@ import pytest
 import torch
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
+from agents.learned.config import NetworkSize
 from agents.learned.features import sets_of
 from agents.learned.imitation import imitate
-from agents.learned.network import Actor, Critic, NetworkSize, masked
+from agents.learned.network import Actor, Critic, masked
 from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, draw, load_policy, save_policy
 from agents.learned.ppo import Chooser, PpoConfig, Trainer, advantages
 from fleet.engine.batch import Shift, shifts_of
@@ -244,11 +245,11 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
     ("changes", "message"),
     [
         ({"algorithm": "dqn"}, "algorithm must be one of mappo, ippo"),
-        ({"envs": 0}, "envs must be >= 1"),
+        ({"envs": 0}, "envs must be 1 to 65536"),
         ({"learning_rate": 0.0}, "learning_rate must be > 0"),
         ({"discount_s": 0.5}, r"discount_s must be 1 to 1e\+07 \(got 0\.5\)"),
         ({"trace_s": float("nan")}, "trace_s must be 1 to"),
-        ({"decisions": "event"}, "decisions must be one of 'interval', 'events'"),
+        ({"decisions": "event"}, "No kind of step 'event'; did you mean 'events'"),
     ],
 )
 def test_a_wrong_configuration_is_refused(changes, message) -> None:

@@ -246,7 +246,7 @@ def test_an_expired_authority_signs_nothing_and_vouches_for_nobody(tmp_path):
         ({"a.pem": b"-----BEGIN"}, r"a\.pem' is not a certificate"),
         ({"a.key": b""}, r"a\.key' is not a private key"),
         ({"ca.pem": b"\xff"}, r"ca\.pem' is not a certificate"),
-        ({"a.pem": None}, r"There is no '.*a\.pem'; thermofleet keys"),
+        ({"a.pem": None}, r"There is no '.*a\.pem'; thermofleet bus keys"),
         ({ROSTER: b"{"}, "is not a roster"),
         ({ROSTER: b'{"fleet":"f","participants":[{"name":"a","role":"king"}]}'}, "is not a roster: .*king"),
         ({ROSTER: b'{"fleet":"","participants":[]}'}, "is not a roster: .*must have 1 to 128"),

@@ -178,7 +178,9 @@ def test_a_link_needs_tls_and_a_certificate_that_may_connect(place, tmp_path, mo
     issue(older, Participant("router", "router"), days=20, now=datetime.now(UTC) - timedelta(days=1))
     monkeypatch.undo()
     Router(tls=Tls(older, "router")).open().close()  # it may still listen
-    with pytest.raises(BusError, match=r"permits listening only.*thermofleet keys .* --add router:router --overwrite"):
+    with pytest.raises(
+        BusError, match=r"permits listening only.*thermofleet bus keys .* --add router:router --overwrite"
+    ):
         Router(tls=Tls(older, "router"), connect=["tls/127.0.0.1:7447"]).open()
 
 

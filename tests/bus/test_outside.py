@@ -276,13 +276,13 @@ def test_a_fleet_without_an_auctioneer_is_as_the_contract_says(folder, port):
     channels = {*ARM, "arm_event", "arm_quote", *CONSENSUS, "jobs_submit", "jobs_status", "clock_now"}
     channels |= {"jobs_control", "jobs_cell"}
     with ExitStack() as stack:
-        stack.enter_context(started(folder, "router", "--port", port))
+        stack.enter_context(started(folder, "bus", "router", "--port", port))
         outsider = stack.enter_context(outside(port, "cell"))
         token = outsider.session.liveliness().declare_token(
             CHANNELS["arm_alive"][0].format(fleet=outsider.fleet, arm="spare")
         )
         for arm in ("left", "right"):
-            stack.enter_context(started(folder, "arm", folder / "cell.toml", arm, *at, *here))
+            stack.enter_context(started(folder, "arm", "run", folder / "cell.toml", arm, *at, *here))
         deadline_s = time.monotonic() + PATIENCE_S
         while outsider.missing(channels) and time.monotonic() < deadline_s:
             outsider.work()

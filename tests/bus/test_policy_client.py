@@ -186,7 +186,9 @@ def test_nobody_two_and_no_router_are_told_apart_at_once(router, served):
     with refused("Several processes reply as policy 'mine' at tcp/.*: stop all but one", 2.0):
         client(router).act(seen())
     nowhere = PolicyClient("mine", fleet="f", endpoint="tcp/127.0.0.1:1", limit_s=PATIENT_S)
-    with refused("No router answered at tcp/127.0.0.1:1 .* start a router with thermofleet router", CONNECT_S + 2.0):
+    with refused(
+        "No router answered at tcp/127.0.0.1:1 .* start a router with thermofleet bus router", CONNECT_S + 2.0
+    ):
         nowhere.act(seen())
 
 

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from types import ModuleType
 
-from scenarios.cli.live.up import free_port
+from scenarios.live.fleet_processes import free_port
 from tests.examples.programs import COMMAND, ROOT, program, started
 from tests.waiting import PATIENCE_S
 

@@ -44,11 +44,11 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
         keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status), history=True
     )
     at = ("--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}")
-    command = [*COMMAND, "auction", "quickstart", "--jobs", "none", *at, "--journal", str(tmp_path / "j")]
+    command = [*COMMAND, "bus", "auctioneer", "quickstart", "--jobs", "none", *at, "--journal", str(tmp_path / "j")]
     with started(command, stderr=subprocess.PIPE) as auction:
         assert auction.stdout.readline().startswith("ready")
         for arm in range(4):  # those of the scenario are not there; until then each may be anywhere
-            clear = [*COMMAND, "clear", f"arm_{arm}", *at]
+            clear = [*COMMAND, "arm", "clear", f"arm_{arm}", *at]
             cleared = subprocess.run(clear, capture_output=True, text=True, timeout=60, check=True)
             assert cleared.stdout == f"arm_{arm}: its space is free until the arm reports its space again.\n"
         with running("own_arm", port, "f", "a"), running("own_arm", port, "f", "b"):
@@ -72,7 +72,7 @@ def test_own_allocator_has_real_arms_do_the_jobs(bus, tmp_path):
     with running("own_allocator", port, "f") as allocator, ExitStack() as stack:
         for name in ("arm_0", "arm_1"):
             options = ["--difficulty", "blind", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"]
-            command = [*COMMAND, "arm", "quickstart", name, *options, "--journal", str(tmp_path / name)]
+            command = [*COMMAND, "arm", "run", "quickstart", name, *options, "--journal", str(tmp_path / name)]
             arm = stack.enter_context(started(command, stderr=subprocess.DEVNULL))
             assert arm.stdout.readline().startswith("ready")
         submit_jobs(port, timeout_s=150.0)

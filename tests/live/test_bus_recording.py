@@ -21,8 +21,7 @@ from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cancel, ControlRequest, Operation
 from fleet.errors import FleetError
-from scenarios.cli.live.record import lock_folder, record
-from scenarios.live.recorder import Recorder
+from scenarios.live.recorder import Recorder, lock_folder, record
 from scenarios.live.recording import CARD, JOURNAL, part_files, read_card, read_parts, states
 from scenarios.live.replayer import Replay
 

@@ -44,7 +44,7 @@ def test_an_absent_arm_that_keeps_its_space_is_a_warning():
     (finding,) = check_health(now, 101.505, [ASKED]).findings
     assert finding.level == "warning"
     assert "The space of b stays closed" in finding.what
-    assert "thermofleet clear b" in finding.what
+    assert "thermofleet arm clear b" in finding.what
     assert space_line(now).plain == "space closed by: a (away from home), b (not present, may be anywhere)"
 
 
@@ -191,7 +191,15 @@ def participants(endpoint, *, states=True, clocks=1):
 
 
 def doctor(endpoint, *options):
-    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "doctor", "--endpoint", endpoint]
+    command = [
+        sys.executable,
+        "-c",
+        "from scenarios.cli.main import main; main()",
+        "bus",
+        "doctor",
+        "--endpoint",
+        endpoint,
+    ]
     done = subprocess.run(
         [*command, "--seconds", "1", *options], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
@@ -247,7 +255,7 @@ def test_a_missing_router_gives_exit_code_2_and_the_command_to_start_one():
         port = probe.getsockname()[1]
     code, told = doctor(f"tcp/127.0.0.1:{port}")
     assert code == 2
-    assert f"thermofleet router --port {port}" in told
+    assert f"thermofleet bus router --port {port}" in told
 
 
 def test_another_server_at_the_port_is_recognised():

@@ -12,7 +12,7 @@ from fleet.live.consensus.participant import Membership
 from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from fleet.live.journal_records import Started
-from scenarios.cli.live.arm import restart_history
+from scenarios.live.arm import restart_history
 from tests.live.council.test_council_poison import Arm
 from tests.live.test_poison import Wire
 

@@ -36,8 +36,8 @@ from fleet.motor import gen3_motors
 from fleet.observation import FIELDS, Observation
 from fleet.planning.space import plan_key, space_name
 from fleet.robot import JOINTS, ThermalLimits
-from scenarios.cli.live.auction import job_spec
 from scenarios.live.allocation import CentralAllocation
+from scenarios.live.auctioneer import job_spec
 
 MAY_DIFFER = {
     "last_award": "a live fleet counts rounds, and there is a round only when a job can begin",

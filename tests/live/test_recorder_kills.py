@@ -47,8 +47,8 @@ def test_kills_cost_no_result(tmp_path, seed):
         port = free.getsockname()[1]
     endpoint, start_s = f"tcp/127.0.0.1:{port}", str(time.monotonic())
     commands = {
-        "router": (CLI, "router", "--port", str(port)),
-        "record": (CLI, "record", "f", "--out", str(tmp_path / "rec"), "--endpoint", endpoint),
+        "router": (CLI, "bus", "router", "--port", str(port)),
+        "record": (CLI, "bus", "record", "f", "--out", str(tmp_path / "rec"), "--endpoint", endpoint),
         "publisher": (PUBLISHER, endpoint, str(tmp_path / "journal"), start_s),
     }
     running = {}

@@ -19,7 +19,9 @@ def port(tmp_path):
     """The port of a router with the auctioneer of quickstart, whose arms are absent: every job waits."""
     with Router() as router:
         at = ("--fleet", "f", "--endpoint", router.endpoint, "--journal", str(tmp_path / "j"), "--jobs", "none")
-        auction = subprocess.Popen([*COMMAND, "auction", "quickstart", *at], stdout=subprocess.PIPE, text=True)
+        auction = subprocess.Popen(
+            [*COMMAND, "bus", "auctioneer", "quickstart", *at], stdout=subprocess.PIPE, text=True
+        )
         try:
             assert auction.stdout is not None
             assert auction.stdout.readline().startswith("ready")
@@ -42,14 +44,22 @@ def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
         return run(sys.executable, ROOT / "examples" / "steer_jobs.py", port, "f", *words)
 
     (tmp_path / "jobs.json").write_text(json.dumps(JOBS), encoding="utf-8")
-    code, told = command("submit", tmp_path / "jobs.json")
+    code, told = command("job", "submit", tmp_path / "jobs.json")
     assert (code, told.count("accepted")) == (0, 3)
-    assert command("pause", "--by", "ann") == (0, "Paused: all arms.\n")
-    assert command("resume", "arm_0")[0] == 2
-    assert command("cancel", "one") == (0, "one: cancelled, 0 of 1 cycles.\n")
-    assert command("cancel", "one") == (0, "one: cancelled, 0 of 1 cycles. It is cancelled.\n")
-    assert command("change", "two", "--due", 900, "--value", 3) == (0, "two: waiting, 0 of 1 cycles.\n")
-    code, told = command("settle", "two", "done")
+    assert command("arm", "pause", "--by", "ann") == (0, "Paused: all arms.\n")
+    assert command("arm", "resume", "arm_0")[0] == 2
+    assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles.\n")
+    assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles. It is cancelled.\n")
+    assert command("job", "change", "two", "--due", 900, "--value", 3) == (0, "two: waiting, 0 of 1 cycles.\n")
+    code, told = command("job", "list")
+    assert code == 0
+    assert [line.split()[:2] for line in told.splitlines()[1:]] == [
+        ["one", "cancelled"],
+        ["three", "waiting"],
+        ["two", "waiting"],
+    ]
+    assert [job["job"] for job in json.loads(command("job", "list", "--json")[1])] == ["one", "three", "two"]
+    code, told = command("job", "settle", "two", "done")
     assert code == 2
     assert "only an unfinished job can be settled" in told
     code, told = example("cancel", "two")
@@ -65,4 +75,4 @@ def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
     assert [arm["name"] for arm in cell["arms"]] == [f"arm_{i}" for i in range(4)]
     assert cell["limits"]["payload_kg"] == {"low": 0.0, "high": 10.0, "unit": "kg"}
     assert example("resume")[0] == 0
-    assert command("resume") == (0, "Paused: none. Nothing changed: it is so already.\n")
+    assert command("arm", "resume") == (0, "Paused: none. Nothing changed: it is so already.\n")

@@ -43,9 +43,9 @@ ARM = "arm 1+b"
 EXTRA = Participant("gateway", "submitter")
 TOKEN = "a token of this test"
 COMMANDS = {
-    "watch": ["watch", "--json"],
-    "doctor": ["doctor", "--seconds", "1"],
-    "gateway": ["gateway", "--port", "0", "--token", TOKEN],
+    "watch": ["bus", "watch", "--json"],
+    "doctor": ["bus", "doctor", "--seconds", "1"],
+    "gateway": ["bus", "gateway", "--port", "0", "--token", TOKEN],
 }
 
 
@@ -180,7 +180,7 @@ MINUTE = r"20\d\d-\d\d-\d\d \d\d:\d\d UTC"
 WRONG = {
     "none": r"^Endpoint '\S+' needs a certificate; name it, as tls/\S+#FOLDER/NAME\.$",
     "plain": r"^No router answered at tcp/\S+ within 5\.0 s \(the server expects TLS: .* are needed\)\.$",
-    "missing": r"^There is no '\S+/nobody\.pem'; thermofleet keys makes it\.$",
+    "missing": r"^There is no '\S+/nobody\.pem'; thermofleet bus keys makes it\.$",
     "wrong role": r"^'\S+/router\.pem' is the certificate of 'router:router'; only the router may use it\.$",
     "another authority": r"^No router answered .* is not valid: .*; are the keys in '\S+' those of another ",
     "expired": rf"^The certificate '/\S+/k/monitor\.pem' expired on {MINUTE}, and it is {MINUTE} now; issue a new ",

@@ -37,14 +37,20 @@ from scenarios.cli.main import app
 
 PATIENCE_S = 30.0
 COMMANDS = {
-    ("cancel", "j"): Cancel("j"),
-    ("settle", "j", "redo"): Settle("j", "redo"),
-    ("change", "j", "--value", "2"): Change("j", value=2.0),
-    ("pause",): Pause("*"),
-    ("pause", "a"): Pause("a"),
-    ("resume",): Resume("*"),
-    ("clear", "a"): ClearRequest("a", "ann"),
-    ("reset", "a"): ResetRequest("ann"),
+    ("job", "cancel", "j"): Cancel("j"),
+    ("job", "settle", "j", "redo"): Settle("j", "redo"),
+    ("job", "change", "j", "--value", "2"): Change("j", value=2.0),
+    (
+        "arm",
+        "pause",
+    ): Pause("*"),
+    ("arm", "pause", "a"): Pause("a"),
+    (
+        "arm",
+        "resume",
+    ): Resume("*"),
+    ("arm", "clear", "a"): ClearRequest("a", "ann"),
+    ("arm", "reset", "a"): ResetRequest("ann"),
 }
 OTHERS = ("monitor", "submitter", "recorder", "b")
 
@@ -123,7 +129,13 @@ def test_the_router_drops_what_a_client_sends_against_its_role(fleet, who):
             assert [reply for reply in replies if reply.ok is not None] == []
     finally:
         session.close()
-    test_an_operator_may(fleet, ("pause",))  # whatever came before would have been served by now
+    test_an_operator_may(
+        fleet,
+        (
+            "arm",
+            "pause",
+        ),
+    )  # whatever came before would have been served by now
     assert len(fleet.received) == 1
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.errors import FleetError
-from scenarios.cli.options import channel_of, parse_partition
+from scenarios.cli.options import channel_of
 from scenarios.load import load
 
 QUICK = ("--difficulty", "blind", "--policy", "least_difficulty")
@@ -14,14 +14,14 @@ HARD = ("--topology", "line", "--delay-s", 20, "--jitter-s", 5, "--loss", 0.2, "
 
 
 def test_a_partition_is_read_from_a_text():
-    assert parse_partition("600:1200:a, b|c") == Partition(600.0, 1200.0, (("a", "b"), ("c",)))
-    assert parse_partition("0:1e3:arm:1") == Partition(0.0, 1000.0, (("arm:1",),))
+    assert Partition.parse("600:1200:a, b|c") == Partition(600.0, 1200.0, (("a", "b"), ("c",)))
+    assert Partition.parse("0:1e3:arm:1") == Partition(0.0, 1000.0, (("arm:1",),))
 
 
 @pytest.mark.parametrize("text", ["", "600", "600:1200", "a:b:left", "1200:600:left|right", "0:10:left|", "0:10:a,a"])
 def test_a_text_that_is_no_partition_is_refused(text):
     with pytest.raises(ValueError, match=r"partition .*\(got|names 'a' twice"):
-        parse_partition(text)
+        Partition.parse(text)
 
 
 def test_options_make_a_channel(small_toml):

@@ -86,10 +86,10 @@ def test_a_finished_run_is_kept_until_told_otherwise(thermofleet, small_toml, tm
 
 
 def test_list_names_every_scenario_of_the_library(thermofleet):
-    said = thermofleet("list")
+    said = thermofleet("show")
     assert said.code == 0
     assert all(name in said.out for name in library())
-    assert set(json.loads(thermofleet("list", "--json").out)) == set(library())
+    assert set(json.loads(thermofleet("show", "--json").out)) == set(library())
 
 
 def test_show_fits_eighty_columns_and_cuts_no_word(thermofleet, small_toml):

@@ -89,9 +89,12 @@ def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(
         (["show", "quikstart"], "No scenario 'quikstart'; did you mean 'quickstart'? Allowed: "),
         (["run"], "Missing argument 'scenario'."),
         (["rnu"], "No such command 'rnu'. Did you mean 'run'?"),
+        (["submit", "jobs.json"], "`thermofleet submit` is now `thermofleet job submit`."),
+        (["arm", "quickstart", "arm_0"], "`thermofleet arm SCENARIO NAME` is now `thermofleet arm run SCENARIO NAME`."),
+        (["show", "quickstart", "--hold", "1"], "--hold needs no scenario; leave 'quickstart' out."),
         (["compare", "quickstart", "--policies", "random,rnd"], "No policy 'rnd'; did you mean 'random'?"),
         (["compare", "quickstart", "--baseline", "best"], "The baseline 'best' is not among the policies compared: "),
-        (["hold", "--posture", "hom"], "No posture 'hom'; did you mean 'home'?"),
+        (["show", "--hold", "1", "--posture", "hom"], "No posture 'hom'; did you mean 'home'?"),
     ],
 )
 def test_every_command_tells_what_is_wrong(thermofleet, arguments, sentence):

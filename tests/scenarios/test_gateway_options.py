@@ -1,12 +1,12 @@
-"""Addresses and tokens of `thermofleet gateway`."""
+"""Addresses and tokens of `thermofleet bus gateway`."""
 
 import re
 
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.cli.live.gateway import check
 from scenarios.live.http_app import check_token, read_tokens
+from scenarios.live.http_server import check
 
 PLAIN, SECURE = "tcp/127.0.0.1:7447", "tls/127.0.0.1:7447"
 

@@ -87,7 +87,7 @@ def run(*words: object) -> int:
 def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(study, tmp_path, capsys):
     out = finished(study, tmp_path / "study", {"wspt": 15.0, "wsept": 30.0}, failed=50)
     sent = tmp_path / "sent"
-    assert run("submit-result", out, "--author", "Ann", "--about", "rules", "--out", sent) == 0
+    assert run("leaderboard", "--submit", out, "--author", "Ann", "--about", "rules", "--out", sent) == 0
     assert sorted(path.name for path in sent.iterdir()) == ["test-wsept-oracle.jsonl", "test-wspt-oracle.jsonl"]
     assert all(path.stat().st_size < 200_000 for path in sent.iterdir())
     assert "50 failed shifts, which count as random" in capsys.readouterr().err
@@ -100,7 +100,7 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     assert scores["test-wspt-oracle"].improvement.mean == 0.25
     assert run("leaderboard", sent) == 0
     assert "of 200 instances; differences to `wsept` (oracle)." in capsys.readouterr().out
-    assert run("submit-result", out, "--author", "Bob", "--out", sent) == 2
+    assert run("leaderboard", "--submit", out, "--author", "Bob", "--out", sent) == 2
     assert "has a result of Ann" in capsys.readouterr().err
     assert run("leaderboard", sent, "--markdown") == 0
     text = capsys.readouterr().out
@@ -201,7 +201,9 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
     with pytest.raises(FleetError, match=r"banana.jsonl' must have the name .* with SPLIT validation, test, sizes"):
         read_all(tmp_path, "test")
     (tmp_path / "study.json").touch()
-    with pytest.raises(FleetError, match="is a folder of `thermofleet compare`; run `thermofleet submit-result`"):
+    with pytest.raises(
+        FleetError, match="is a folder of `thermofleet compare`; run `thermofleet leaderboard --submit`"
+    ):
         read_all(tmp_path, "test")
     lines = (tmp_path / "test-other-oracle.jsonl").read_text(encoding="utf-8").splitlines()
     for bad in (
@@ -214,7 +216,7 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, 
         ),
     ):
         path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
-        with pytest.raises(FleetError, match="is no result of `thermofleet submit-result`"):
+        with pytest.raises(FleetError, match="is no result of `thermofleet leaderboard --submit`"):
             read(path)
     path.write_text("\n".join([*lines[:2], lines[2][:20], *lines[3:]]), encoding="utf-8")
     with pytest.raises(FleetError, match="line 3: "):

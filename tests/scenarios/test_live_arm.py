@@ -1,4 +1,4 @@
-"""`thermofleet arm`: the arm of a run as its own process, and a replayed log."""
+"""`thermofleet arm run`: the arm of a run as its own process, and a replayed log."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ from fleet.bus.protocol.messages import Info, State
 from fleet.errors import BusError, FleetError, LogError
 from fleet.physics.models import ArmModel
 from fleet.planning.plan_cache import rest_torque
-from scenarios.cli.live.arm import ambient_of, replayed_arm, simulated_arm, wait_for_name
+from scenarios.live.arm import ambient_of, replayed_arm, simulated_arm, wait_for_name
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.progress import quiet
@@ -51,7 +51,7 @@ class Process:
     def __init__(self, *args, cache, cwd):
         program = "import sys; from scenarios.cli.main import main; main(sys.argv[1:])"
         self.process = subprocess.Popen(
-            [sys.executable, "-c", program, "arm", *map(str, args)],
+            [sys.executable, "-c", program, "arm", "run", *map(str, args)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -96,7 +96,7 @@ def heard_from(link, fleet, enough):
         (["left", "--source", "log"], "log with a FILE"),
         (["left", "some.csv"], "log with a FILE"),
         (["left", "--source", "video"], "'video' is not one of 'sim', 'log'"),
-        (["left", "--difficulty", "oracle"], "'oracle' is not one of 'twin', 'blind'"),
+        (["left", "--difficulty", "oracle"], "No difficulty 'oracle'. Allowed: blind, twin."),
         (["left", "--speed", "0"], "--speed must be 0.001 to 10000"),
         (["left", "--rate-hz", "1000"], "--rate-hz must be > 0 and at most 100 (got 1000)."),
         (["left", "--capacity", "0"], "--capacity must be 1 to 256 (got 0)."),
@@ -110,7 +110,7 @@ def test_an_error_of_the_arm_command_is_one_sentence(
     thermofleet, small_toml, tmp_path, monkeypatch, options, complaint
 ):
     monkeypatch.chdir(tmp_path)
-    said = thermofleet("arm", small_toml, *options)
+    said = thermofleet("arm", "run", small_toml, *options)
     assert said.code == 2
     assert complaint in said.err.replace("\n", " ")
 
@@ -246,7 +246,7 @@ def test_a_blind_arm_whose_plans_are_known_loads_no_physics(tmp_path):
 import sys
 from pathlib import Path
 from scenarios.progress import quiet
-from scenarios.cli.live.arm import simulated_arm
+from scenarios.live.arm import simulated_arm
 from scenarios.load import load
 made = simulated_arm(load("quickstart"), "arm_0", "blind", 0, quiet, Path({str(tmp_path)!r}))
 made.body(0.0, 0.1).advance(1.0)

@@ -1,4 +1,4 @@
-"""`thermofleet auction` and its parts."""
+"""`thermofleet bus auctioneer` and its parts."""
 
 import json
 import signal
@@ -18,9 +18,9 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.job import Job, Place, Work
-from scenarios.cli.live import auction as live_auction
-from scenarios.cli.live.auction import job_spec, own_jobs
-from scenarios.cli.live.journals import refuse_other_way
+from scenarios.live import auctioneer as live_auction
+from scenarios.live.auctioneer import job_spec, own_jobs
+from scenarios.live.journals import refuse_other_way
 from scenarios.load import load
 from scenarios.prepare.fleet import make_env
 
@@ -116,26 +116,26 @@ def test_a_job_message_has_all_fields():
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("auction", "quickstart", "--policy", "match"), "No policy 'match'; did you mean 'matching'?"),
+        (("bus", "auctioneer", "quickstart", "--policy", "match"), "No policy 'match'; did you mean 'matching'?"),
         (("up", "quickstart", "--policy", "sssi"), "did you mean 'ssi'?"),
         (
-            ("auction", "quickstart", "--policy", "consensus"),
+            ("bus", "auctioneer", "quickstart", "--policy", "consensus"),
             "'consensus' of scope arm runs without an auctioneer. Start",
         ),
         (
-            ("auction", "quickstart", "--policy", "random"),
+            ("bus", "auctioneer", "quickstart", "--policy", "random"),
             "'random' of scope arm runs without an auctioneer. Start",
         ),
         (
-            ("arm", "quickstart", "arm_0", "--policy", "wspt"),
-            "'wspt' needs an auctioneer: start it with thermofleet auction",
+            ("arm", "run", "quickstart", "arm_0", "--policy", "wspt"),
+            "'wspt' needs an auctioneer: start it with thermofleet bus auctioneer",
         ),
-        (("arm", "quickstart", "arm_9", "--policy", "random"), "No arm 'arm_9' in quickstart"),
+        (("arm", "run", "quickstart", "arm_9", "--policy", "random"), "No arm 'arm_9' in quickstart"),
         (
-            ("arm", "quickstart", "arm_0", "--policy", "ssi"),
-            "'ssi' needs an auctioneer: start it with thermofleet auction",
+            ("arm", "run", "quickstart", "arm_0", "--policy", "ssi"),
+            "'ssi' needs an auctioneer: start it with thermofleet bus auctioneer",
         ),
-        (("arm", "quickstart", "arm_0", "--jobs", "all"), "'all' is not one of 'scenario', 'none'"),
+        (("arm", "run", "quickstart", "arm_0", "--jobs", "all"), "No source of jobs 'all'. Allowed: none, scenario."),
     ],
 )
 def test_an_invalid_policy_is_one_sentence(thermofleet, words, complaint):
@@ -153,10 +153,18 @@ def test_an_invalid_policy_is_one_sentence(thermofleet, words, complaint):
             "the shift had an auctioneer",
         ),
         (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "belongs to a shift without an auctioneer"),
-        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "belongs to a shift without an auctioneer"),
-        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "belongs to a shift without an auctioneer"),
         (
-            ("arm", "quickstart", "arm_2", "--policy", "consensus", "--journal"),
+            ("bus", "auctioneer", "quickstart", "--journal"),
+            ["arm_2.grants"],
+            "belongs to a shift without an auctioneer",
+        ),
+        (
+            ("arm", "run", "quickstart", "arm_2", "--journal"),
+            ["arm_2.grants"],
+            "belongs to a shift without an auctioneer",
+        ),
+        (
+            ("arm", "run", "quickstart", "arm_2", "--policy", "consensus", "--journal"),
             ["arm_2.journal"],
             "has no 'arm_2.grants'",
         ),
@@ -187,7 +195,7 @@ def test_a_shift_is_continued_with_its_own_kind_of_allocation(tmp_path):
 @contextmanager
 def auctioneer(endpoint: str, folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
     """The command as a process that has said that it is ready."""
-    program = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "auction"]
+    program = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "bus", "auctioneer"]
     options = ["--endpoint", endpoint, "--journal", folder, *words]
     command = [*program, *map(str, options)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -205,21 +213,23 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
     file.write_text("\n".join(json.dumps(HOLD | {"name": n, "places": [p]}) for n, p in (("a", "belt"), ("b", "moon"))))
     at = ("--endpoint", endpoint, "--fleet", "quickstart")
     with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
-        code, out, _ = thermofleet("submit", file, *at)
+        code, out, _ = thermofleet("job", "submit", file, *at)
         assert code == 1
         assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
-        code, _, err = thermofleet("auction", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other")
+        code, _, err = thermofleet(
+            "bus", "auctioneer", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other"
+        )
         assert code == 2
         assert "Fleet 'quickstart' has an auctioneer 'auctioneer' already: its token is present." in err
         other = ("--name", "other", "--journal", tmp_path / "other")
-        code, _, err = thermofleet("auction", "quickstart", "--endpoint", endpoint, *other)
+        code, _, err = thermofleet("bus", "auctioneer", "quickstart", "--endpoint", endpoint, *other)
         assert code == 2
         assert "Fleet 'quickstart' has an auctioneer already: 'auctioneer'." in err
         process.send_signal(signal.SIGKILL)
         process.wait(PATIENT_S)
     with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
         file.write_text(json.dumps(HOLD | {"places": ["belt"]}))
-        assert thermofleet("submit", file, *at)[:2] == (0, "a: accepted\n")
+        assert thermofleet("job", "submit", file, *at)[:2] == (0, "a: accepted\n")
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=PATIENT_S)
         assert process.returncode == 0

@@ -1,4 +1,4 @@
-"""`thermofleet ros2`: an arm to ROS 2 and back, and errors in one sentence."""
+"""`thermofleet bus ros2`: an arm to ROS 2 and back, and errors in one sentence."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ def started(stack, *words):
     environment.pop("ROS_DOMAIN_ID", None)
     process = stack.enter_context(
         subprocess.Popen(
-            [sys.executable, "-c", "from scenarios.cli.main import main; main()", "ros2", *words],
+            [sys.executable, "-c", "from scenarios.cli.main import main; main()", "bus", "ros2", *words],
             cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )
     )  # fmt: skip
@@ -82,7 +82,7 @@ def test_an_arm_is_published_in_ros_and_followed_again():
 def test_an_error_of_the_ros2_command_is_one_sentence(words, sentence, capsys, monkeypatch):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     with pytest.raises(SystemExit) as end:
-        main(["ros2", *words])
+        main(["bus", "ros2", *words])
     assert end.value.code == 2
     told = " ".join(capsys.readouterr().err.split())
     assert told.startswith("Error: ")
@@ -92,6 +92,6 @@ def test_an_error_of_the_ros2_command_is_one_sentence(words, sentence, capsys, m
 def test_a_missing_extra_is_named(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(SystemExit) as end:
-        main(["ros2", "bridge", "--fleet", "f", "--domain", "0"])
+        main(["bus", "ros2", "bridge", "--fleet", "f", "--domain", "0"])
     assert end.value.code == 2
     assert "pip install -e '.[ros2]'" in capsys.readouterr().err

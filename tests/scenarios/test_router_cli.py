@@ -1,4 +1,4 @@
-"""`thermofleet keys` and `thermofleet router`, in this process and as processes."""
+"""`thermofleet bus keys` and `thermofleet bus router`, in this process and as processes."""
 
 import json
 import os
@@ -22,7 +22,8 @@ from fleet.bus.security.certificates import issue
 from fleet.bus.security.tls import Tls, identified
 from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
-from scenarios.cli.live.up import chosen_arms, free_port, parts_of
+from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
+from scenarios.specs import LiveSpec
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
@@ -32,7 +33,7 @@ PATIENT_S = 20.0
 @contextmanager
 def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The router as a process, and the line that it prints when it listens."""
-    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "router", *map(str, words)]
+    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "bus", "router", *map(str, words)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -44,7 +45,7 @@ def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
 @pytest.fixture
 def folder(tmp_path: Path, thermofleet: pytest.CaptureFixture[str]) -> Path:
     place = tmp_path / "keys"
-    assert thermofleet("keys", place, "quickstart", "--extra", "gateway:submitter")[0] == 0
+    assert thermofleet("bus", "keys", place, "quickstart", "--extra", "gateway:submitter")[0] == 0
     return place
 
 
@@ -97,7 +98,7 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
 def test_a_port_in_use_is_one_sentence(thermofleet):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        code, out, err = thermofleet("router", "--port", port)
+        code, out, err = thermofleet("bus", "router", "--port", port)
     assert (code, out) == (2, "")
     assert f"could not listen on port {port} of 127.0.0.1; is it in use?" in err
 
@@ -115,7 +116,7 @@ def test_a_port_in_use_is_one_sentence(thermofleet):
     ],
 )
 def test_an_error_of_the_router_command_is_one_sentence(thermofleet, folder, words, complaint):
-    code, out, err = thermofleet("router", *(word.format(keys=folder) for word in words))
+    code, out, err = thermofleet("bus", "router", *(word.format(keys=folder) for word in words))
     assert (code, out) == (2, "")
     assert complaint in " ".join(err.split())
     assert "Traceback" not in err
@@ -125,13 +126,13 @@ def test_an_arm_without_a_certificate_is_named_before_the_router_starts(thermofl
     told = json.loads((folder / "roster.json").read_text())
     told["participants"] = [one for one in told["participants"] if one["name"] != "arm_1"]
     (folder / "roster.json").write_text(json.dumps(told))
-    code, _, err = thermofleet("router", "--tls", folder, "--scenario", "quickstart")
+    code, _, err = thermofleet("bus", "router", "--tls", folder, "--scenario", "quickstart")
     assert code == 2
     assert "--add arm_1:arm." in " ".join(err.split())
 
 
 def test_keys_are_made_shown_and_extended(thermofleet, folder):
-    code, out, err = thermofleet("keys", folder, "--json")
+    code, out, err = thermofleet("bus", "keys", folder, "--json")
     assert (code, err) == (0, "")
     told = json.loads(out)
     assert told["fleet"] == "quickstart"
@@ -141,17 +142,17 @@ def test_keys_are_made_shown_and_extended(thermofleet, folder):
         **{f"arm_{i}": "arm" for i in range(4)},
         "gateway": "submitter",
     }
-    assert thermofleet("keys", folder, "--add", "a:b:monitor", "--days", 5)[0] == 0
-    code, out, _ = thermofleet("keys", folder)
+    assert thermofleet("bus", "keys", folder, "--add", "a:b:monitor", "--days", 5)[0] == 0
+    code, out, _ = thermofleet("bus", "keys", folder)
     assert "a:b" in out
     assert "expired" not in out
     assert "(authority)" in out
 
 
 def test_up_gives_every_process_its_own_certificate(folder):
-    options = {"port": 7447, "fleet": "quickstart", "folder": Path("run"), "speed": 60.0, "seed": 0, "jobs": "none"}
-    chosen = {"policy": "matching", "difficulty": "blind"}
-    router, arms, record, auction = parts_of("quickstart", ("arm_0", "arm_1"), tls=folder, **options, **chosen)
+    spec = LiveSpec(fleet="quickstart", speed=60.0, jobs="none", difficulty="blind")
+    options = {"port": 7447, "folder": Path("run"), "tls": folder}
+    router, arms, record, auction = parts_of("quickstart", ("arm_0", "arm_1"), spec, **options)
     assert router.argv[router.argv.index("--tls") + 1] == str(folder)
     assert router.ready == "tls/127.0.0.1:7447"
     who = [identified(part.argv[part.argv.index("--endpoint") + 1]) for part in (*arms, record, auction)]
@@ -163,17 +164,17 @@ def test_up_gives_every_process_its_own_certificate(folder):
 
 
 def test_a_part_of_a_fleet_connects_to_a_router_elsewhere(folder):
-    options = {"port": 7447, "fleet": "quickstart", "folder": Path("run"), "speed": 60.0, "seed": 0, "jobs": "none"}
-    options |= {"policy": "matching", "difficulty": "blind", "tls": folder}
+    spec = LiveSpec(fleet="quickstart", speed=60.0, jobs="none", difficulty="blind")
+    options = {"port": 7447, "folder": Path("run"), "tls": folder}
     names = chosen_arms("arm_3, arm_1", ("arm_0", "arm_1", "arm_2", "arm_3"))
     assert names == ("arm_1", "arm_3")
-    _, arms, *_ = parts_of("quickstart", names, at="tls/cell-1:7447", **options)
+    _, arms, *_ = parts_of("quickstart", names, spec, at="tls/cell-1:7447", **options)
     ends = [identified(part.argv[part.argv.index("--endpoint") + 1]) for part in arms]
     assert ends == [("tls/cell-1:7447", Tls(folder, name)) for name in names]
-    router, *_ = parts_of("quickstart", names, host="0.0.0.0", **options)
+    router, *_ = parts_of("quickstart", names, spec, host="0.0.0.0", **options)
     assert router.argv[router.argv.index("--host") + 1] == "0.0.0.0"
     assert router.ready == "tls/127.0.0.1:7447"
-    assert parts_of("quickstart", names, host="fd00::1", **options)[0].ready == "tls/[fd00::1]:7447"
+    assert parts_of("quickstart", names, spec, host="fd00::1", **options)[0].ready == "tls/[fd00::1]:7447"
 
 
 @pytest.mark.parametrize(
@@ -212,7 +213,7 @@ def test_wrong_options_for_several_machines_are_one_sentence(thermofleet, tmp_pa
 )
 def test_an_error_of_the_keys_command_is_one_sentence(thermofleet, folder, words, complaint):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    code, out, err = thermofleet("keys", folder, *words)
+    code, out, err = thermofleet("bus", "keys", folder, *words)
     assert (code, out) == (2, "")
     assert complaint in " ".join(err.split())
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
@@ -231,7 +232,9 @@ def reports(folder):
 def test_a_whole_fleet_works_with_tls_and_access_control(thermofleet, small_toml, plans, tmp_path, policy):
     """Processes of their own for router, arms, auctioneer and recorder: what they need of each other is allowed."""
     place, out = tmp_path / "keys", tmp_path / "live"
-    assert thermofleet("keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
+    assert (
+        thermofleet("bus", "keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
+    )
     words = ("up", small_toml, "--tls", place, "--speed", 20, "--difficulty", "blind", "--out", out, "--policy", policy)
     done = subprocess.run(
         [sys.executable, "-c", "from scenarios.cli.main import main; main()", *map(str, words)],
@@ -259,10 +262,10 @@ def test_a_whole_fleet_works_with_tls_and_access_control(thermofleet, small_toml
 
 def test_the_list_of_keys_shows_which_are_invalid_now(tmp_path, thermofleet):
     place, now = tmp_path / "keys", datetime.now(UTC)
-    assert thermofleet("keys", place, "quickstart")[0] == 0
+    assert thermofleet("bus", "keys", place, "quickstart")[0] == 0
     issue(place, Participant("arm_0", "arm"), days=1, now=now - timedelta(days=3))
     issue(place, Participant("arm_1", "arm"), days=1, now=now + timedelta(days=3))
-    rows = dict(line.split(maxsplit=1) for line in thermofleet("keys", place)[1].splitlines()[2:])
+    rows = dict(line.split(maxsplit=1) for line in thermofleet("bus", "keys", place)[1].splitlines()[2:])
     assert rows["arm_0"].rstrip().endswith(f"{now - timedelta(days=2):%Y-%m-%d %H:%M} UTC, expired")
     assert rows["arm_1"].rstrip().endswith(f"{now + timedelta(days=4):%Y-%m-%d %H:%M} UTC, not yet valid")
     assert rows["arm_2"].rstrip().endswith("UTC")

@@ -1,4 +1,4 @@
-"""`thermofleet submit` and `ask`, and the files of jobs that they read."""
+"""`thermofleet job submit` and `ask`, and the files of jobs that they read."""
 
 import json
 import threading
@@ -25,7 +25,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.errors import FleetError
 from fleet.live.job_client import batches
-from scenarios.cli.live.submit import read_jobs
+from scenarios.live.requests import read_jobs
 
 PATIENT_S = 20.0
 HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}
@@ -75,7 +75,7 @@ def test_jobs_in_several_messages_follow_those_they_wait_for():
 
 
 def test_a_missing_file_is_one_sentence(thermofleet):
-    code, _, err = thermofleet("submit", "no-such-file", "--fleet", "f")
+    code, _, err = thermofleet("job", "submit", "no-such-file", "--fleet", "f")
     assert code == 2
     assert "Cannot read 'no-such-file': No such file or directory." in err
 
@@ -83,7 +83,7 @@ def test_a_missing_file_is_one_sentence(thermofleet):
 def test_a_missing_auctioneer_is_one_sentence(endpoint, tmp_path, thermofleet):
     file = tmp_path / "jobs"
     file.write_text(json.dumps(HOLD))
-    code, _, err = thermofleet("submit", file, "--endpoint", endpoint, "--fleet", "f")
+    code, _, err = thermofleet("job", "submit", file, "--endpoint", endpoint, "--fleet", "f")
     assert code == 2
     assert "No auctioneer of fleet 'f' replied" in err
 
@@ -135,18 +135,18 @@ def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, thermofleet, end,
     file = tmp_path / "jobs"
     file.write_text(json.dumps(HOLD))
     with served(endpoint, declare):
-        said = thermofleet("submit", file, "--wait", "--endpoint", endpoint, "--fleet", "f")
+        said = thermofleet("job", "submit", file, "--wait", "--endpoint", endpoint, "--fleet", "f")
     assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} {link} arm_0\n")
 
 
 def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, thermofleet):
     job = ("--kind", "hold", "--place", "rack", "--payload", "2")
     with arm(endpoint) as asked:
-        code, out, _ = thermofleet("ask", *job, "--endpoint", endpoint, "--fleet", "f")
+        code, out, _ = thermofleet("job", "submit", "--quote", *job, "--endpoint", endpoint, "--fleet", "f")
         assert code == 0
         assert "hold  arm_0     0     52.3     +12.3  0.12  3.50         100          160" in out
         assert "1     49.5         –     –     –           –            –" in out
-        code, out, _ = thermofleet("ask", *job, "--endpoint", endpoint, "--fleet", "f", "--json")
+        code, out, _ = thermofleet("job", "submit", "--quote", *job, "--endpoint", endpoint, "--fleet", "f", "--json")
         assert json.loads(out)[0]["estimates"][0]["plans"][0]["difficulty"] == 3.5
     assert [request.dry_run for request in asked] == [True, True]
     assert asked[0].jobs[0].payload_kg == 2.0
@@ -155,20 +155,20 @@ def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, thermofleet):
 def test_ask_exits_with_1_where_no_arm_can_do_a_job(endpoint, thermofleet):
     with arm(endpoint, feasible=False):
         at = ("--endpoint", endpoint, "--fleet", "f")
-        code, out, _ = thermofleet("ask", "--kind", "hold", "--place", "rack", *at)
+        code, out, _ = thermofleet("job", "submit", "--quote", "--kind", "hold", "--place", "rack", *at)
         assert (code, "arm_0" in out) == (1, True)
-        assert thermofleet("ask", "--kind", "hold", "--place", "rack", "--json", *at)[0] == 1
+        assert thermofleet("job", "submit", "--quote", "--kind", "hold", "--place", "rack", "--json", *at)[0] == 1
 
 
 def test_ask_reports_missing_arguments(endpoint, thermofleet):
     at = ("--endpoint", endpoint, "--fleet", "f")
-    assert "either a FILE of jobs or one job" in thermofleet("ask", *at)[2]
-    assert r"must be UTF-8 text (got '\udcff')" in thermofleet("ask", "--kind", "\udcff", *at)[2]
-    heavy = thermofleet("ask", "--kind", "hold", "--place", "rack", "--payload", "11", *at)
+    assert "either a FILE of jobs or one job" in thermofleet("job", "submit", "--quote", *at)[2]
+    assert r"must be UTF-8 text (got '\udcff')" in thermofleet("job", "submit", "--quote", "--kind", "\udcff", *at)[2]
+    heavy = thermofleet("job", "submit", "--quote", "--kind", "hold", "--place", "rack", "--payload", "11", *at)
     assert "--payload must be 0 to 10 (got 11)" in heavy[2]
-    told = thermofleet("ask", "--kind", "pick_and_place", *at)[2]
+    told = thermofleet("job", "submit", "--quote", "--kind", "pick_and_place", *at)[2]
     told_kinds = "did you mean 'pick_place'? Allowed: hold, pick_place, press, sort (at kind)."
     assert f"Invalid job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())
-    code, _, err = thermofleet("ask", "--kind", "hold", "--place", "rack", *at)
+    code, _, err = thermofleet("job", "submit", "--quote", "--kind", "hold", "--place", "rack", *at)
     assert code == 2
     assert "No arm of fleet 'f' replied" in err

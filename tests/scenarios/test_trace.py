@@ -10,9 +10,9 @@ import pytest
 from fleet.bus.protocol.auction import ArmEvent, ArmOffer, JobStatus, PlanQuote, Result
 from fleet.errors import FleetError
 from fleet.events import Event
+from scenarios.cli.look import last_folder
 from scenarios.cli.main import main
 from scenarios.cli.terminal import out_console
-from scenarios.cli.trace import last_folder
 from scenarios.live.recorder import Recorder
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
@@ -116,7 +116,7 @@ def test_a_folder_without_a_run_is_said(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FleetError, match="There is no run in 'runs'; name the folder"):
         last_folder(Path("runs"))
-    with pytest.raises(FleetError, match="is neither a folder of `thermofleet run` nor of `thermofleet record`"):
+    with pytest.raises(FleetError, match="is neither a folder of `thermofleet run` nor of `thermofleet bus record`"):
         thread_of(tmp_path, "fault")
 
 

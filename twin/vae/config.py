@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
+from fleet.fields import check, option
 from fleet.motion import CHANNELS, RATE_HZ
 
 Scope = Literal["joint", "arm"]
@@ -17,6 +18,7 @@ Loss = Literal["sum", "mean"]
 Optimizer = Literal["adam", "sgd"]
 """Adam with a one-cycle schedule, or plain stochastic gradient descent at a constant learning rate."""
 
+_BY_SIZE = "by the size"
 LOGVAR_RANGE = (-8.0, 4.0)
 """Bounds of the posterior's log variance."""
 
@@ -25,68 +27,63 @@ LOGVAR_RANGE = (-8.0, 4.0)
 class TwinConfig:
     """Input, size and training of a twin."""
 
-    scope: Scope = "joint"
-    kind: Kind = "vae"
-    latent: int = 2
-    """Latent units of each network."""
-    hidden: int = 16
-    layers: int = 1
-    window: int = 12
-    """Samples per window: about a second. Longer ones rank jobs worse and take longer (docs/results/paper.md, the
+    scope: Scope = option(
+        "joint (one network per joint) or arm (one network of 21 channels).", "joint", choices=get_args(Scope)
+    )
+    kind: Kind = option("vae or ae (a plain autoencoder, as a baseline).", "vae", choices=get_args(Kind))
+    latent: int = option("Dimensions of the latent space of each network.", 2, low=1, high=64)
+    hidden: int = option("Units of each LSTM.", 16, low=1, high=1024)
+    layers: int = option("Layers of each LSTM.", 1, low=1, high=8)
+    window: int = option("Samples per window.", 12, low=2, high=10_000)
+    """About a second. Longer ones rank jobs worse and take longer (docs/results/paper.md, the
     sweep)."""
-    rate_hz: float = 12.5
-    """Samples per second inside a window."""
+    rate_hz: float = option("Samples per second inside a window.", 12.5, low=0, high=1000, above=True, flag="--rate")
     record_hz: float = RATE_HZ
     """Samples per second of the training records; plans always come at fleet.motion.RATE_HZ."""
     stride: int = 10
     """Samples from one training window to the next."""
     score_stride: int = 12
     """Samples from one scored window to the next; the last window ends at the end."""
-    max_windows: int = 1792
-    """Maximum number of training windows, sampled at random; 14 batches."""
-    beta: float = 1.0
-    """Weight of the KL term."""
+    max_windows: int = option("Maximum number of training windows.", 1792, low=1, high=1_000_000, shown=_BY_SIZE)
+    """Sampled at random; 14 batches."""
+    beta: float = option("Weight of the KL term.", 1.0, low=0, high=1000)
     loss: Loss = "sum"
     optimizer: Optimizer = "adam"
-    epochs: int = 60
+    epochs: int = option("Passes over the training windows.", 60, low=1, high=100_000, shown=_BY_SIZE)
     batch: int = 128
     learning_rate: float = 3e-3
     """Peak of the one-cycle schedule; with `sgd` the constant rate."""
     clip: float = 1.0
     """Largest gradient norm."""
-    restarts: int = 2
-    """Trainings per network from different weights: a small latent has local minima."""
+    restarts: int = option("Trainings per network; the best ELBO is kept.", 2, low=1, high=100, shown=_BY_SIZE)
+    """From different weights: a small latent has local minima."""
     trial: float = 0.6
     """Share of the epochs of every restart; then only the one with the best ELBO continues (`twin.vae.train`)."""
     noise: tuple[float, float, float] = (0.001, 0.005, 0.1)
     """Sensor noise added to the training windows, standard deviation in rad, rad/s, N·m, so that smooth plans and noisy
     measured motion score alike."""
-    allow_collapse: bool = False
-    """Keep a twin with a collapsed posterior, as a baseline, instead of raising CollapsedPosterior."""
+    allow_collapse: bool = option("Keep a twin whose latent space collapsed, as a baseline.", False)
+    """Instead of raising CollapsedPosterior."""
 
     def __post_init__(self) -> None:
-        choices = {"scope": Scope, "kind": Kind, "loss": Loss, "optimizer": Optimizer}
+        check(self)
+        choices = {"loss": Loss, "optimizer": Optimizer}
         for name, allowed in ((name, get_args(literal)) for name, literal in choices.items()):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"TwinConfig.{name} must be one of {allowed} (got {getattr(self, name)!r}).")
-        whole = ("latent", "hidden", "layers", "stride", "score_stride", "max_windows", "epochs", "batch", "restarts")
-        for name in whole:
+        for name in ("stride", "score_stride", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"TwinConfig.{name} must be >= 1 (got {getattr(self, name)}).")
-        for name in ("rate_hz", "record_hz", "learning_rate", "clip"):
+        for name in ("record_hz", "learning_rate", "clip"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"TwinConfig.{name} must be > 0 (got {getattr(self, name)}).")
         if not 0 < self.trial <= 1:
             raise ValueError(f"TwinConfig.trial must be in (0, 1] (got {self.trial}).")
-        if self.window < 2:
-            raise ValueError(f"TwinConfig.window must be >= 2 samples (got {self.window}).")
         if max(self.stride, self.score_stride) > self.window:
             raise ValueError(
                 f"TwinConfig.stride and score_stride must be <= window = {self.window}, or samples between windows "
                 f"are never seen (got {self.stride}, {self.score_stride})."
             )
-        if not self.beta >= 0:
-            raise ValueError(f"TwinConfig.beta must be >= 0 (got {self.beta}).")
         if len(self.noise) != len(CHANNELS) or not all(std >= 0 for std in self.noise):
             raise ValueError(f"TwinConfig.noise must be three standard deviations >= 0 (got {self.noise}).")
 

@@ -77,7 +77,7 @@ def loopback(endpoint: str) -> str:
         raise BusError(
             f"Endpoint '{endpoint}' is not on loopback. Plain TCP does not authenticate, so any process that reaches "
             "it could act as any arm. Allowed: 127.0.0.1, [::1], localhost; other hosts need tls/ and certificates "
-            "of thermofleet keys."
+            "of thermofleet bus keys."
         )
     return endpoint
 

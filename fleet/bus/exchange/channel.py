@@ -7,17 +7,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
-from typing import Any, Literal, get_args
-
-import networkx as nx
-import numpy as np
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from fleet.errors import nearest
+from fleet.fields import MAX_SEED, check, option
 
-Array = np.ndarray
+if TYPE_CHECKING:  # slow to import, and the help of commands needs neither
+    import networkx as nx
+    import numpy as np
+
+    Array = np.ndarray
 
 TopologyName = Literal["complete", "star", "ring", "line", "random_geometric"]
 TOPOLOGIES: tuple[TopologyName, ...] = get_args(TopologyName)
+MAX_DELAY_S = 86_400.0
+_PANEL = "Communication between arms"
 
 
 @dataclass(frozen=True)
@@ -40,12 +44,32 @@ class Partition:
             if named.count(arm) > 1:
                 raise ValueError(f"A partition names '{arm}' twice; every arm is in one group.")
 
-    def cuts(self, arms: Sequence[str]) -> Array:
+    @classmethod
+    def parse(cls, text: str) -> "Partition":
+        """The partition of a text such as `600:1200:arm_0,arm_1|arm_2,arm_3`.
+
+        Raises:
+            ValueError: the text has another form.
+        """
+        begin, _, rest = text.partition(":")
+        end, _, groups = rest.partition(":")
+        try:
+            from_s, to_s = float(begin), float(end)
+        except ValueError:
+            raise ValueError(
+                f"--partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM, as in 600:1200:arm_0,arm_1|arm_2 (got '{text}')."
+            ) from None
+        arms = (tuple(arm.strip() for arm in group.split(",") if arm.strip()) for group in groups.split("|"))
+        return cls(from_s, to_s, tuple(arms))
+
+    def cuts(self, arms: Sequence[str]) -> "Array":
         """Which links it cuts, bool, [receiver, sender].
 
         Raises:
             ValueError: a group names an unknown arm.
         """
+        import numpy as np
+
         group = np.full(len(arms), -1)
         for number, members in enumerate(self.groups):
             for arm in members:
@@ -59,36 +83,41 @@ class Partition:
 class Channel:
     """How broadcasts reach peers. The default is perfect: every arm receives every broadcast at once."""
 
-    topology: TopologyName | nx.Graph = "complete"
-    """Which arms receive from which; broadcasts are not forwarded. A star has the first arm in the middle; a ring and a
-    line have the fleet's order. A networkx graph has names of arms as nodes: an edge connects both ways, a directed one
-    from tail to head, and an arm without a node has no link."""
-    radius: float = 0.5
-    """For `random_geometric`: arms at random places in the unit square receive from those within this radius."""
-    topology_seed: int = 0
-    """For `random_geometric`: seed of the places."""
-    delay_s: float = 0.0
-    """Minimum delay of a broadcast, simulation seconds."""
-    jitter_s: float = 0.0
-    """Additional delay of each broadcast on each link, uniform from 0 to this."""
-    loss: float = 0.0
-    """Probability that a broadcast is lost on a link, independent for each."""
-    partitions: tuple[Partition, ...] = ()
+    topology: "TopologyName | nx.Graph" = option(
+        "Which arms receive each other's messages: complete, star, ring, line, random_geometric.",
+        "complete",
+        choices=TOPOLOGIES,
+        panel=_PANEL,
+    )
+    """Broadcasts are not forwarded. A star has the first arm in the middle; a ring and a line have the fleet's order. A
+    networkx graph has names of arms as nodes: an edge connects both ways, a directed one from tail to head, and an arm
+    without a node has no link."""
+    radius: float = option("random_geometric: range of an arm in a unit square.", 0.5, low=0, high=2, panel=_PANEL)
+    topology_seed: int = option("random_geometric: seed of the arms' positions.", 0, low=0, high=MAX_SEED, panel=_PANEL)
+    delay_s: float = option(
+        "Minimum delay of a message, s of simulated time.", 0.0, low=0, high=MAX_DELAY_S, panel=_PANEL
+    )
+    jitter_s: float = option(
+        "Maximum additional delay per message and link, uniform, s of simulated time.",
+        0.0,
+        low=0,
+        high=MAX_DELAY_S,
+        panel=_PANEL,
+    )
+    loss: float = option(
+        "Probability that a message is lost on a link, independent for each.", 0.0, low=0, high=1, panel=_PANEL
+    )
+    partitions: tuple[Partition, ...] = option(
+        "FROM_S:TO_S:ARM,ARM|ARM,ARM: between these times messages stay inside each group. May be repeated.",
+        (),
+        flag="--partition",
+        parse=Partition.parse,
+        panel=_PANEL,
+    )
     """A broadcast in transit on a link is lost when a partition cuts the link."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.topology, str) and self.topology not in TOPOLOGIES:
-            raise ValueError(f"No topology '{self.topology}'{nearest(self.topology, TOPOLOGIES)}")
-        if not 0 <= self.radius < math.inf:
-            raise ValueError(f"radius must be finite and >= 0 (got {self.radius}).")
-        if self.topology_seed < 0:
-            raise ValueError(f"topology_seed must be >= 0 (got {self.topology_seed}).")
-        for name in ("delay_s", "jitter_s"):
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} must be finite and >= 0 (got {value}).")
-        if not 0 <= self.loss <= 1:
-            raise ValueError(f"loss must be a probability, from 0 to 1 (got {self.loss}).")
+        check(self)
         object.__setattr__(self, "partitions", tuple(self.partitions))
 
     @property
@@ -101,12 +130,15 @@ class Channel:
         """Whether loss or delay is random."""
         return bool(self.loss or self.jitter_s)
 
-    def graph(self, arms: Sequence[str]) -> nx.Graph:
+    def graph(self, arms: Sequence[str]) -> "nx.Graph":
         """Which arms receive from which, as a graph of their names.
 
         Raises:
             ValueError: a node is no arm.
         """
+        import networkx as nx
+        import numpy as np
+
         if not isinstance(self.topology, str):
             for node in self.topology:
                 if node not in arms:
@@ -131,8 +163,10 @@ class Channel:
         graph.remove_edges_from(list(nx.selfloop_edges(graph)))
         return graph
 
-    def links(self, arms: Sequence[str]) -> Array:
+    def links(self, arms: Sequence[str]) -> "Array":
         """Which arms receive from which, bool, [receiver, sender], False on the diagonal; raises as `graph`."""
+        import numpy as np
+
         graph = self.graph(arms)
         links = np.array([[graph.has_edge(sender, receiver) for sender in arms] for receiver in arms])
         np.fill_diagonal(links, False)
@@ -176,7 +210,7 @@ class Channel:
         }
 
 
-def _edges(graph: nx.Graph) -> dict[str, Any]:
+def _edges(graph: "nx.Graph") -> dict[str, Any]:
     return {"directed": graph.is_directed(), "edges": sorted([str(tail), str(head)] for tail, head in graph.edges())}
 
 

@@ -20,12 +20,11 @@ import msgspec
 
 from fleet.bus.protocol.messages import Count, Name, Number, Person, Share, finite
 from fleet.errors import check_names
+from fleet.fields import MAX_SPEED, MIN_SPEED
 from fleet.job import BOUNDS, DWELL_S, Kind, check_bounds, check_duration, check_dwell, check_places
 from fleet.telemetry import Mode
 
 LeaseTime = Annotated[float, msgspec.Meta(gt=0, le=3600)]
-MIN_SPEED, MAX_SPEED = 0.001, 10_000.0
-"""Of a fleet, in fleet seconds per real second."""
 LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
 NOT_PLANNED = "not planned yet; ask again"

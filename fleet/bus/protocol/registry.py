@@ -50,7 +50,7 @@ class Channel:
     rate_hz: float | None = None
     """Messages a second from one sender, real time; None: when something changes."""
     limit_hz: float | None = None
-    """Messages a second that the router of `thermofleet router` forwards from one session; None: any number."""
+    """Messages a second that the router of `thermofleet bus router` forwards from one session; None: any number."""
     lease_s: float | None = None
     """Real seconds that the token, or the job that is granted, stays valid without renewal."""
     priority: Priority = "DATA"

@@ -117,7 +117,7 @@ def read_roster(folder: Path) -> Roster:
         return msgspec.json.decode(path.read_bytes(), type=Roster)
     except FileNotFoundError as error:
         raise BusError(
-            f"There is no '{path}': '{folder}' is not a folder of keys. thermofleet keys makes one."
+            f"There is no '{path}': '{folder}' is not a folder of keys. thermofleet bus keys makes one."
         ) from error
     except OSError as error:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error

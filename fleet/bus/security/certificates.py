@@ -133,7 +133,7 @@ def check_dates(certificate: x509.Certificate, file: Path, now: datetime) -> Non
     if now > expires:
         raise BusError(
             f"The certificate '{file}' expired on {format_time(expires)}, and it is {format_time(now)} now; issue a "
-            "new one with thermofleet keys."
+            "new one with thermofleet bus keys."
         )
     if now < begins:
         raise BusError(
@@ -194,7 +194,7 @@ def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
-        raise BusError(f"There is no '{path}'; thermofleet keys makes it.") from error
+        raise BusError(f"There is no '{path}'; thermofleet bus keys makes it.") from error
     except OSError as error:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
 

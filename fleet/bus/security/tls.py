@@ -55,7 +55,7 @@ class Tls:
         if links and not may_connect(certificate):
             raise BusError(
                 f"'{self.folder / self.file}.pem' is of an older version and permits listening only, so this router "
-                f"cannot connect to another one. Make a new one: thermofleet keys {self.folder} --add "
+                f"cannot connect to another one. Make a new one: thermofleet bus keys {self.folder} --add "
                 f"{self.name}:router --overwrite, with every --host."
             )
         key = self._path(f"{self.file}.key")
@@ -63,7 +63,7 @@ class Tls:
             raise BusError(f"Others on this machine may read the private key '{key}': chmod 600 it.")
         expires = certificate.not_valid_after_utc
         if expires - datetime.now(UTC) < REMIND:
-            renew = "thermofleet keys --add renews it"
+            renew = "thermofleet bus keys --add renews it"
             _LOG.warning("The certificate of '%s' ends on %s; %s.", owner, format_time(expires), renew)
 
     def link(self, *, serves: bool) -> dict[str, Any]:

@@ -122,7 +122,7 @@ def _objection_to_job(fleet: SteeredFleet, action: Cancel | Settle | Change) -> 
                 arm = at_work[action.job][0]
                 raise Refused(
                     f"'{arm}' may still do the last cycle of '{action.job}'. Stop it and free its space "
-                    f"(jobs/clear, or thermofleet clear {arm}) first."
+                    f"(jobs/clear, or thermofleet arm clear {arm}) first."
                 )
             return ""
         case Change():

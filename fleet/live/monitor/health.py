@@ -110,7 +110,7 @@ def check_health(
         Finding(
             "warning",
             f"The space of {arm} stays closed to other arms, as {arm} is not present. If you have seen that it is at "
-            f"home or removed, and is switched off: thermofleet clear {arm}",
+            f"home or removed, and is switched off: thermofleet arm clear {arm}",
         )
         for arm in sorted(fleet.space.keys() - present)
     ]

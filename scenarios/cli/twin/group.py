@@ -4,21 +4,20 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.table import Table
 
 from fleet.errors import FleetError
 from scenarios.cli import options
+from scenarios.cli.from_fields import From, Given
 from scenarios.cli.terminal import echo, out_console, plain_table, print_json, print_wide, progress_bar, say
 from scenarios.cli.twin.motion import export_command, generate_command, identify_command, recover_command
 from scenarios.cli.twin.verdict import verdict_command
 from scenarios.load import load
 from scenarios.schema_errors import choose
-
-if TYPE_CHECKING:  # slow to import
-    from twin.vae.config import TwinConfig
+from twin.vae.config import TwinConfig
 
 twin_app = typer.Typer(
     help="Train, score and use the digital twin of an arm: an LSTM variational autoencoder of its cool motion.",
@@ -29,36 +28,19 @@ twin_app = typer.Typer(
 
 @twin_app.command("train")
 def train_command(
+    given: Annotated[Given, From(TwinConfig)],
     scenario: options.ScenarioOrLog = None,
     log: options.LogOption = None,
     out: Annotated[Path, typer.Option(help="Folder of the twins.")] = Path("runs/twins"),
     arm: options.ArmOption = None,
     size: Annotated[str | None, typer.Option(help="quick or full; default: as the scenario says.")] = None,
-    scope: Annotated[
-        str | None, typer.Option(help="joint (one network per joint) or arm (one network of 21 channels).")
-    ] = None,
-    kind: Annotated[str | None, typer.Option(help="vae or ae (a plain autoencoder, as a baseline).")] = None,
-    latent: Annotated[int | None, options.number("Dimensions of the latent space.", 1, 64)] = None,
-    hidden: Annotated[int | None, options.number("Units of each LSTM.", 1, 1024)] = None,
-    layers: Annotated[int | None, options.number("Layers of each LSTM.", 1, 8)] = None,
-    window: Annotated[int | None, options.number("Samples per window.", 2, 10_000)] = None,
-    rate_hz: Annotated[
-        float | None, options.number("Samples per second inside a window.", 0, 1000, "--rate", above=True)
-    ] = None,
-    epochs: Annotated[int | None, options.number("Passes over the training windows.", 1, 100_000)] = None,
-    restarts: Annotated[int | None, options.number("Trainings per network; the best ELBO is kept.", 1, 100)] = None,
-    beta: Annotated[float | None, options.number("Weight of the KL term.", 0, 1000)] = None,
-    max_windows: Annotated[int | None, options.number("Largest number of training windows.", 1, 1_000_000)] = None,
     cool: Annotated[
         float,
-        options.number("--log: temperature limit of motors 1 to 4 for training data, °C.", 0, 200),
+        options.number("--log: temperature limit of joints 1 to 4 for training data, °C.", 0, 200),
     ] = 40.0,
     hold_out: Annotated[
         float, options.number("--log: share of the cool recordings held out to calibrate verdicts.", 0, 0.9)
     ] = 0.3,
-    allow_collapse: Annotated[
-        bool, typer.Option("--allow-collapse", help="Keep a twin whose latent space collapsed, as a baseline.")
-    ] = False,
     seed: Annotated[
         int | None,
         options.number("Seed of weights and training. Default: the scenario's, for logs 0.", 0, options.MAX_SEED),
@@ -75,11 +57,6 @@ def train_command(
     check_source(scenario, log, arm)
     if size is not None:
         choose("size", size, Literal["quick", "full"])
-    fields = dict(
-        scope=scope, kind=kind, latent=latent, hidden=hidden, layers=layers, window=window, rate_hz=rate_hz,
-        epochs=epochs, restarts=restarts, beta=beta, max_windows=max_windows, allow_collapse=allow_collapse or None,
-    )  # fmt: skip
-    given = {name: value for name, value in fields.items() if value is not None}
     from scenarios.prepare.twin_folder import TWINS, save_twins, train_arms, train_log
     from scenarios.result_folder import check_free, new_folder
 
@@ -214,10 +191,9 @@ def report_command(
         raise typer.Exit(1)
 
 
-def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> "TwinConfig":
+def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> TwinConfig:
     """The configuration of a size, with the options given on the command line (Any: one per field)."""
     from scenarios.prepare.twin_folder import LOG_INPUT
-    from twin.vae.config import TwinConfig
 
     base = TwinConfig.quick() if size == "quick" else TwinConfig()
     try:

@@ -33,7 +33,7 @@ from fleet.live.consensus.node import ConsensusNode, Membership
 from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from fleet.robot import ThermalLimits
-from scenarios.cli.live.consensus import refuse_auctioneer
+from scenarios.live.arm import refuse_auctioneer
 
 PATIENCE_S = 20.0
 SPEED = 120.0

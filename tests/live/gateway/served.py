@@ -16,8 +16,8 @@ from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.bus.protocol.operator import Controlled, ControlRequest
 from fleet.live.monitor.async_bridge import AsyncBridge
-from scenarios.cli.live.gateway import Server, listen
 from scenarios.live.http_app import Readers, application
+from scenarios.live.http_server import Server, listen
 from tests.waiting import PATIENCE_S
 
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}

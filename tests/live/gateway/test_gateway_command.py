@@ -1,4 +1,4 @@
-"""`thermofleet gateway` as a process, and the monitor in JavaScript."""
+"""`thermofleet bus gateway` as a process, and the monitor in JavaScript."""
 
 import http.client
 import os
@@ -22,7 +22,16 @@ ROOT = Path(__file__).parents[3]
 @contextmanager
 def process(endpoint, *options):
     """The command in a process of its own, from when it says that it is ready, and its address."""
-    command = [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "gateway", "--fleet", "f"]
+    command = [
+        sys.executable,
+        "-u",
+        "-c",
+        "from scenarios.cli.main import main; main()",
+        "bus",
+        "gateway",
+        "--fleet",
+        "f",
+    ]
     command += ["--endpoint", endpoint, "--port", "0", *options]
     started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
@@ -53,7 +62,16 @@ def test_the_command_waits_for_a_router():
         port = free.getsockname()[1]
     with Router(port):
         pass  # now the port is free, and was a router's
-    command = [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "gateway", "--fleet", "f"]
+    command = [
+        sys.executable,
+        "-u",
+        "-c",
+        "from scenarios.cli.main import main; main()",
+        "bus",
+        "gateway",
+        "--fleet",
+        "f",
+    ]
     command += ["--endpoint", f"tcp/127.0.0.1:{port}", "--port", "0"]
     started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

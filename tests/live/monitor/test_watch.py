@@ -26,18 +26,9 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent
 from fleet.events import EVENT_KINDS
 from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
-from scenarios.cli.live.up import free_port
-from scenarios.cli.live.watch import GONE_S, ShiftEnd
-from scenarios.show.watch import (
-    PLAIN,
-    JobBars,
-    arm_line,
-    format_age,
-    format_scores,
-    format_time,
-    plain_event,
-    screen,
-)
+from scenarios.live.fleet_processes import free_port
+from scenarios.live.watch import GONE_S, ShiftEnd
+from scenarios.show.watch import PLAIN, JobBars, arm_line, format_age, format_scores, format_time, plain_event, screen
 from tests.waiting import PATIENCE_S
 
 
@@ -186,7 +177,7 @@ def test_ages_and_times_are_short():
 
 
 def command(*arguments):
-    return [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "watch", *arguments]
+    return [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "bus", "watch", *arguments]
 
 
 def test_without_a_terminal_lines_are_printed_until_stopped(fleet):

@@ -1,20 +1,61 @@
-"""`thermofleet train`."""
+"""Commands that evaluate and train policies: suite, bounds, leaderboard and train; see `compare` too."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
+from agents.learned.config import PpoConfig
+from agents.learned.training_log import TrainingLength
 from fleet.errors import FleetError
-from scenarios.cli.options import MAX_SEED, DifficultyOption, RandomiseOption, RiskOption, number, parse_randomisation
-from scenarios.cli.terminal import out_console, progress_bar, say
-from scenarios.extras import require_extra
-from scenarios.load import INSTANCE, load
-from scenarios.policy_loader import policy_of, without_simulator
+from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import JsonOption, RandomiseOption, number, parse_randomisation
+from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
 from scenarios.schema_errors import choose
+from scenarios.specs import RunSpec
+
+
+def suite_command(
+    split: Annotated[
+        str | None,
+        typer.Option(help="List the instances of this split: train, validation, test or sizes.", show_default=False),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the cells of the benchmark suite, or the instances of one of its splits.
+
+    A cell is a group of arms with stations and tasks. An instance is a scenario
+    in a cell with a seed: `thermofleet show test/0000` describes it.
+    """
+    from scenarios.suite.cells import CELLS
+    from scenarios.suite.splits import manifest
+
+    if split is not None:
+        rows = manifest(split)
+        if as_json:
+            print_json([asdict(row) for row in rows])
+            return
+        table = plain_table("instance", "cell", "axes", "jobs", numbers=False)
+        for row in rows:
+            axes = ", ".join(f"{name} {value}" for name, value in asdict(row.axes).items())
+            table.add_row(row.name, row.cell, axes, str(row.count))
+        out_console.print(table)
+        return
+    if as_json:
+        print_json({cell.name: {**asdict(cell), "stations_per_arm": cell.stations_per_arm} for cell in CELLS})
+        return
+    table = plain_table("split", "cell", "arms are", "stations per arm", "hours", "instances", numbers=False)
+    for cell in CELLS:
+        numbers = (f"{cell.stations_per_arm:.2g}", f"{cell.hours:g}", str(cell.instances))
+        table.add_row(cell.split, cell.name, cell.unlike, *numbers)
+    out_console.print(table)
 
 
 def train_command(
+    given: Annotated[Given, From(PpoConfig, "warm_start", "envs", "decisions", "learning_rate", "entropy", "seed")],
+    length: Annotated[Given, From(TrainingLength, "minutes", "iterations")],
+    models: Annotated[Given, From(RunSpec, "difficulty", "risk")],
     scenario: Annotated[
         str | None, typer.Argument(help="A library name, a .toml file or an instance of the suite; or use --suite.")
     ] = None,
@@ -33,32 +74,9 @@ def train_command(
             show_default=False,
         ),
     ] = None,
-    minutes: Annotated[
-        float,
-        number(
-            "Training time excluding the twins, min. With --resume: additional time; with --resume and --seeds: total "
-            "of each training.",
-            0,
-            100_000,
-            above=True,
-        ),
-    ] = 30.0,
-    iterations: Annotated[int | None, number("Maximum number of iterations in total.", 1, 1_000_000)] = None,
-    warm_start: Annotated[
-        str, typer.Option(help="Rule that the network imitates first, for example wspt; default: none.")
-    ] = "",
-    envs: Annotated[int, number("Shifts simulated in parallel.", 1, 65_536)] = 32,
-    decisions: Annotated[
-        str, typer.Option(help="Length of a training step: events (until an arm has a choice) or interval.")
-    ] = "events",
     discount_hours: Annotated[
         float, number("Horizon of the discount: a reward this much later counts 1/e.", 0.01, 1000)
     ] = 2.0,
-    lr: Annotated[
-        float | None,
-        number("Learning rate; default: 0.0003, with --algo pairs 0.08.", 0, 10, above=True, show_default=False),
-    ] = None,
-    entropy: Annotated[float, number("Weight of the entropy bonus; not with --algo pairs.", 0, 10)] = 0.002,
     instances: Annotated[
         int | None,
         number(
@@ -75,7 +93,6 @@ def train_command(
             show_default=False,
         ),
     ] = None,
-    seed: Annotated[int, number("Seed for shifts, initialisation and minibatches.", 0, MAX_SEED)] = 0,
     seeds: Annotated[int, number("Number of trainings, one after another, with seeds from --seed on.", 1, 100)] = 1,
     out: Annotated[
         Path | None,
@@ -92,8 +109,6 @@ def train_command(
         ),
     ] = False,
     threads: Annotated[int, number("Threads of the network's computations.", 1, 1024)] = 1,
-    difficulty: DifficultyOption = "twin",
-    risk: RiskOption = "rc",
     randomise: RandomiseOption = None,
 ) -> None:
     """Train a policy by reinforcement learning or evolution, with checkpoints and learning curves.
@@ -104,6 +119,10 @@ def train_command(
 
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """
+    from scenarios.extras import require_extra
+    from scenarios.load import INSTANCE, load
+    from scenarios.policy_loader import policy_of, without_simulator
+
     if (scenario is None) == (suite is None):
         raise FleetError("Give either a scenario or --suite SPLIT.")
     if randomise and suite is not None:
@@ -116,34 +135,23 @@ def train_command(
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
         choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
     from agents.learned.training_log import CURVE
-    from fleet.env.validation import Decisions
-    from scenarios.prepare.fleet import DifficultyName, RiskName
     from scenarios.train.folder import holds_training
 
-    models: Any = {
-        "difficulty": choose("difficulty", difficulty, DifficultyName),
-        "risk": choose("risk", risk, RiskName),
-    }
+    spec, seed = RunSpec(**models), given.pop("seed", 0)
+    sources: Any = {"difficulty": spec.difficulty, "risk": spec.risk}
     algorithm = choose("algorithm", algo or ("mappo" if suite is None else "pairs"), Algorithm)
     if algorithm == "pairs" and suite is None:
         raise FleetError("--algo pairs trains over a split: give --suite, not a scenario.")
     chosen = load(scenario) if scenario is not None else None
-    if warm_start:
-        without_simulator(warm_start, policy_of(warm_start))
+    if teacher := given.get("warm_start"):
+        without_simulator(teacher, policy_of(teacher))
     places = [
         out or Path("runs") / f"{suite if chosen is None else chosen.name}-{algorithm}-{seed + k}" for k in range(seeds)
     ]
-    length: Any = {"minutes": minutes, "iterations": iterations, "in_total": seeds > 1}
-    grounds, judging, card = [], [], {"suite": suite, **models}
+    length["in_total"] = seeds > 1
+    grounds, judging, card = [], [], {"suite": suite, **sources}
     if algorithm != "pairs":
         require_extra("learn")
-        from scenarios.train.networks import TrainingPlan
-
-        length = TrainingPlan(**length)
-    else:
-        from scenarios.train.pairs import PairPlan
-
-        length = PairPlan(**length)
     if suite is not None:
         from scenarios.evaluate.scores import references_of
         from scenarios.evaluate.study import suite_of
@@ -156,41 +164,32 @@ def train_command(
         cases = [*suite_of(suite, 1)[: len(train)], *suite_of("validation", 1)[: len(validation)]]
         known = {shift: (each.random, each.hindsight) for shift, each in references_of(cases).items()}
         with progress_bar() as progress:
-            grounds = grounds_of(train, **models, known=known, progress=progress)
-            judging = grounds_of(validation, **models, known=known, progress=progress)
+            grounds = grounds_of(train, **sources, known=known, progress=progress)
+            judging = grounds_of(validation, **sources, known=known, progress=progress)
         card |= {"prepared": len(grounds), "judges": len(judging)}
     for k, where in enumerate(places):
         goes_on = resume and (seeds == 1 or holds_training(where))
         if algorithm == "pairs":
             from agents.learned.evolution import EvolutionConfig
-            from scenarios.train.pairs import train_pairs
+            from scenarios.train.pairs import PairPlan, train_pairs
 
-            search = EvolutionConfig(seed=seed + k, learning_rate=0.08 if lr is None else lr)
-            done = train_pairs(grounds, judging, search, where, length, card=card, resume=goes_on, tell=say)
+            rate = {name: value for name, value in given.items() if name == "learning_rate"}
+            search = EvolutionConfig(seed=seed + k, **rate)
+            plan = PairPlan(**length)
+            done = train_pairs(grounds, judging, search, where, plan, card=card, resume=goes_on, tell=say)
         else:
-            from agents.learned.ppo import PpoConfig, use_threads
-            from scenarios.train.networks import train, train_on_split
+            from agents.learned.ppo import use_threads
+            from scenarios.train.networks import TrainingPlan, train, train_on_split
 
             use_threads(threads)
-            try:
-                config = PpoConfig(
-                    algorithm=algorithm,
-                    envs=envs,
-                    decisions=choose("kind of step", decisions, Decisions),
-                    discount_s=3600.0 * discount_hours,
-                    learning_rate=3e-4 if lr is None else lr,
-                    entropy=entropy,
-                    seed=seed + k,
-                    warm_start=warm_start,
-                )
-            except ValueError as error:
-                raise FleetError(str(error)) from error
+            discount_s, plan = 3600.0 * discount_hours, TrainingPlan(**length)
+            config = PpoConfig(algorithm=algorithm, discount_s=discount_s, seed=seed + k, **given)
             with progress_bar() as progress:
                 common: Any = {"resume": goes_on, "progress": progress, "tell": say}
                 if chosen is not None:
-                    done = train(chosen, config, where, length, randomise=varied, **models, **common)
+                    done = train(chosen, config, where, plan, randomise=varied, **sources, **common)
                 else:
-                    done = train_on_split(grounds, judging, config, where, length, card=card, **common)
+                    done = train_on_split(grounds, judging, config, where, plan, card=card, **common)
         unit = "" if algorithm == "pairs" else " a shift" if chosen else " of the value of all jobs"
         say(
             f"{'Interrupted after' if done.interrupted else 'Trained'} {done.iterations} iterations, {done.seconds:.0f}"
@@ -198,7 +197,7 @@ def train_command(
             out_console,
         )
         target = scenario if suite is None else "--suite test"  # the split validation chose the best of the training
-        how = f"{target} --difficulty {difficulty} --policies random,{where}"
+        how = f"{target} --difficulty {spec.difficulty} --policies random,{where}"
         say(f"Curves: {where / CURVE}. Try it: thermofleet compare {how}", out_console)
         if done.interrupted:
             return

@@ -1,4 +1,4 @@
-"""`thermofleet gateway` and `dashboard`: the bus over HTTP and server-sent events, and a page for browsers."""
+"""The bus over HTTP and server-sent events, and a page for browsers, as a process."""
 
 import asyncio
 import ipaddress
@@ -9,9 +9,8 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 import uvicorn
 from starlette.applications import Starlette
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -20,69 +19,18 @@ from fleet.bus.client.client import BusClient
 from fleet.env.render.heat import heat_scale
 from fleet.errors import FleetError
 from fleet.live.monitor.async_bridge import AsyncBridge
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
+from scenarios.cli.options import the_fleet
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import Interrupted, echo
-from scenarios.live.http_app import MIN_TOKEN, ROLES, STUCK_S, Readers, Role, application, check_token, read_tokens
+from scenarios.live.http_app import MIN_TOKEN, STUCK_S, Readers, Role, application, check_token, read_tokens
 from scenarios.live.http_page import LivePage
-from scenarios.load import load
 from scenarios.schema import Scenario
-from scenarios.show.replay import three_js
 
 TOKEN = "THERMOFLEET_TOKEN"
-PORT = 8080
 MAX_CONNECTIONS, MAX_WAITING, HEADER_S = 1000, 128, 5.0
 """Connections at a time; those that have sent no complete request yet, of which one more ends the oldest; and real
 seconds after which such a connection ends."""
 _LOG = logging.getLogger(__name__)
-PortOption = Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)]
-HostOption = Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")]
-TokenOption = Annotated[
-    str,
-    typer.Option(
-        envvar=TOKEN, help="Bearer token for all requests. Prefer the variable: other users can read command lines."
-    ),
-]
-TokensOption = Annotated[
-    Path | None,
-    typer.Option(
-        help=f"File with ROLE TOKEN in each line, readable by you alone. Roles: {', '.join(ROLES)}; each may do "
-        "what the ones before it may."
-    ),
-]
-
-
-def gateway_command(
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    port: PortOption = PORT,
-    host: HostOption = "127.0.0.1",
-    token: TokenOption = "",
-    tokens: TokensOption = None,
-) -> None:
-    """Serve the fleet over HTTP until Ctrl-C or SIGTERM."""
-    run(endpoint, fleet, port, host, token, tokens)
-
-
-def dashboard_command(
-    scenario: Annotated[
-        str,
-        typer.Argument(help="Scenario of the cell, to draw its fixtures too. Default: as the auctioneer describes it."),
-    ] = "",
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    port: PortOption = PORT,
-    host: HostOption = "127.0.0.1",
-    token: TokenOption = "",
-    tokens: TokensOption = None,
-) -> None:
-    """Serve a live page for browsers, until Ctrl-C or SIGTERM.
-
-    It is a gateway with a page: arms in 3-D, temperatures, jobs, offers,
-    alerts, and what the role of a token may request.
-    """
-    three_js()  # if it is missing, say so at once
-    run(endpoint, fleet, port, host, token, tokens, LivePage(scene_of(load(scenario)) if scenario else None))
 
 
 def scene_of(scenario: Scenario) -> dict[str, Any]:  # values of JSON
@@ -94,10 +42,10 @@ def scene_of(scenario: Scenario) -> dict[str, Any]:  # values of JSON
     return {**cell_model(robots, scenario.places, scenario.fixtures), "heat": heat}
 
 
-def run(
+def run_gateway(
     endpoint: str, fleet: str, port: int, host: str, token: str, tokens: Path | None, page: LivePage | None = None
 ) -> None:
-    """Serve until a signal arrives; the arguments are the options of the commands."""
+    """Serve until a signal arrives; the arguments are the options of `thermofleet bus gateway`."""
     roles = read_tokens(tokens) if tokens else {}
     if token:
         roles[check_token(token)] = "operator"

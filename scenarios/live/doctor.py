@@ -1,13 +1,11 @@
-"""`thermofleet doctor`: check the health of a fleet."""
+"""The health of a live fleet, as a report on the terminal."""
 
 import re
 import socket
 import time
 from dataclasses import replace
-from typing import Annotated
 
 import msgspec
-import typer
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.discover import fleets_at, other_versions
@@ -18,37 +16,27 @@ from fleet.bus.security.tls import identified, why_not
 from fleet.errors import BusError
 from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number
 from scenarios.cli.terminal import echo, out_console, say
-from scenarios.load import load
 from scenarios.show.watch import arm_table, format_time, jobs_line, space_line
 
-UNHEALTHY = 1
-"""Exit code; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
 PROBE_EVERY_S, REPLY_S = 0.3, 1.0
 _COLORS = {"fault": "red", "warning": "yellow"}
 
 
-def doctor_command(
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    seconds: Annotated[float, number("Real seconds to listen.", 0, 600, above=True)] = 3.0,
-    auctioneer: Annotated[
-        bool, typer.Option(help="The fleet should have one; --no-auctioneer: it should have none.")
-    ] = True,
-    scenario: Annotated[
-        str,
-        typer.Option(
-            help="Every arm of this scenario should be present. Default: only the arms that are found are checked."
-        ),
-    ] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
-) -> None:
-    """Check the health of a fleet: whether its arms and its auctioneer are present, and their clocks agree.
+def diagnose(
+    endpoint: str, fleet: str, seconds: float, *, auctioneer: bool, expected: tuple[str, ...], as_json: bool
+) -> bool:
+    """Print the health of a fleet; return whether it is healthy.
 
-    Exit code 0: healthy; 1: a fault was found, or no fleet; 2: the router cannot be reached.
+    Args:
+        fleet: Its name; "" for the only one at the endpoint.
+        seconds: Real seconds to listen.
+        auctioneer: Whether it should have one.
+        expected: Arms that should be present.
+
+    Raises:
+        BusError: the router cannot be reached.
     """
-    expected = tuple(arm.name for arm in load(scenario).arms) if scenario else ()
     try:
         fleets = fleets_at(endpoint)
     except BusError as error:
@@ -57,7 +45,7 @@ def doctor_command(
         several = f"There are several fleets: {', '.join(fleets)}. Choose one with --fleet."
         none = "No fleet found: no arm or auctioneer has a liveliness token."
         say(f"The router at {endpoint} replies. {several if fleets else none}")
-        raise typer.Exit(UNHEALTHY)
+        return False
     snapshot, report = examine(endpoint, fleet or fleets[0], seconds, auctioneer=auctioneer, expected=expected)
     if as_json:
         fields = {"healthy": report.healthy, **msgspec.to_builtins(report)}
@@ -66,7 +54,7 @@ def doctor_command(
         show(endpoint, snapshot, report)
         if fleets and fleet and fleet not in fleets:
             say(f"Fleets at {endpoint}: {', '.join(fleets)}.", out_console)
-    raise typer.Exit(0 if report.healthy else UNHEALTHY)
+    return report.healthy
 
 
 def examine(
@@ -151,6 +139,6 @@ def why_unreachable(endpoint: str) -> str:
             known, _ = why_not(host, port, None)  # the error says it already
             return "" if known else f"Port {port} is open, but no thermofleet router listens on it."
     except ConnectionRefusedError:
-        return f"Nothing listens at port {port} of {host}; start it with: thermofleet router --port {port}"
+        return f"Nothing listens at port {port} of {host}; start it with: thermofleet bus router --port {port}"
     except OSError as error:
         return f"A plain connection fails too: {error.strerror or error}."

@@ -1,52 +1,32 @@
-"""`thermofleet ros2`: publish a fleet in ROS 2, and add a real arm with a ROS 2 driver to a fleet."""
+"""A fleet and ROS 2 over Zenoh (rmw_zenoh): processes that pass states, jobs and a real arm between them."""
 
 import os
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
+from fleet.bus.client.client import BusClient
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, number, split_names, the_fleet
+from scenarios.cli.options import split_names, the_fleet
+from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import echo
 from scenarios.extras import require_extra
 
 if TYPE_CHECKING:
     from fleet.ros2.node import Node
 
-ros2_app = typer.Typer(
-    help="Connect a fleet and ROS 2 over Zenoh (rmw_zenoh), in both directions; needs the extra ros2.",
-    no_args_is_help=True,
-    add_completion=False,
-)
 TURN_S = 0.25
 """Real seconds between two checks for a stop request."""
 DEFAULTS = ThermalLimits()
 
-DomainOption = Annotated[int, number("The ROS 2 domain.", 0, 232, envvar="ROS_DOMAIN_ID")]
-RouterOption = Annotated[
-    str, typer.Option(help="Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.")
-]
-WarningOption = Annotated[float, number("Motor temperature at which a warning begins, °C.", 0, 200)]
 
-
-@ros2_app.command("bridge")
-def bridge_command(
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    domain: DomainOption = 0,
-    router: RouterOption = "",
-    humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash.")] = False,
-    warning_c: WarningOption = DEFAULTS.warning_c,
-    error_c: Annotated[float, number("Motor temperature at which an error begins, °C.", 0, 200)] = DEFAULTS.error_c,
+def run_bridge(
+    endpoint: str, fleet: str, *, domain: int, router: str, humble: bool, warning_c: float, error_c: float
 ) -> None:
     """Publish every arm of a fleet as JointState and DiagnosticArray, until Ctrl-C or SIGTERM."""
     where = ros2_router(router, endpoint)
-    from fleet.bus.client.client import BusClient
     from fleet.ros2.bridge import Bridge
-    from scenarios.cli.signals import until_stopped
 
     limits = limits_of(warning_c, error_c)
     with (
@@ -61,35 +41,33 @@ def bridge_command(
         stop.leave("The bridge was interrupted.")
 
 
-@ros2_app.command("listen")
-def listen_command(
-    topic: Annotated[str, typer.Argument(help="Topic of the arm's sensor_msgs/JointState, as /joint_states.")],
-    arm: Annotated[str, typer.Option(help="Name of the arm in the fleet.", callback=check_name)] = "real",
-    temperatures: Annotated[
-        str, typer.Option(help="Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.")
-    ] = "",
-    hardware: Annotated[
-        str, typer.Option(help="Text before /JOINT in the hardware_id of these diagnostics; default: none.")
-    ] = "",
-    joints: Annotated[str, typer.Option(help="Names of its joints in ROS 2, from joint 1 on.")] = "",
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    domain: DomainOption = 0,
-    router: RouterOption = "",
-    rate_hz: Annotated[float, number("State messages per real second.", 0, 100, above=True)] = 10.0,
-    warning_c: WarningOption = DEFAULTS.warning_c,
+def run_listener(
+    topic: str,
+    endpoint: str,
+    fleet: str,
+    *,
+    arm: str,
+    temperatures: str,
+    hardware: str,
+    joints: str,
+    domain: int,
+    router: str,
+    rate_hz: float,
+    warning_c: float,
 ) -> None:
-    """Show a real arm with a ROS 2 driver as an arm of the fleet that takes no jobs, until Ctrl-C or SIGTERM."""
+    """Show a real arm with a ROS 2 driver as an arm of the fleet that takes no jobs, until Ctrl-C or SIGTERM.
+
+    Raises:
+        FleetError: the topic of its temperatures is missing, or joints or limits are not allowed.
+    """
     if not temperatures:
         raise FleetError(
             "A JointState has no motor temperatures, and a fleet needs them: name the topic of a DiagnosticArray that "
             "has them with --temperatures. docs/ros2.md describes its content."
         )
     names, where = names_of(joints), ros2_router(router, endpoint)
-    from fleet.bus.client.client import BusClient
     from fleet.live.clock import FleetClock
     from fleet.ros2.bridge import ArmReadings, Follower
-    from scenarios.cli.signals import until_stopped
 
     with (
         until_stopped() as stop,
@@ -106,16 +84,12 @@ def listen_command(
         stop.leave(f"Stopped listening to {topic}.")
 
 
-@ros2_app.command("jobs")
-def jobs_command(
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    domain: DomainOption = 0,
-) -> None:
-    """Serve the action thermofleet_msgs/action/DoJob: a goal is a job. Needs rclpy, with any middleware."""
-    from fleet.bus.client.client import BusClient
-    from scenarios.cli.signals import until_stopped
+def run_jobs(endpoint: str, fleet: str, *, domain: int) -> None:
+    """Serve the action thermofleet_msgs/action/DoJob, until Ctrl-C or SIGTERM.
 
+    Raises:
+        FleetError: rclpy or the package of the action is missing.
+    """
     try:
         from fleet.ros2.job_action import JobAction
     except ModuleNotFoundError as error:
@@ -128,7 +102,7 @@ def jobs_command(
         BusClient(endpoint, the_fleet(fleet, endpoint), stopped=stop.is_set) as link,
         JobAction(link, domain=domain) as jobs,
     ):
-        typer.echo(f"ready {jobs.name} {os.getpid()}")
+        echo(f"ready {jobs.name} {os.getpid()}")
         while not stop.is_set():
             jobs.serve(time.monotonic() + TURN_S)
         stop.leave("The action server was stopped; submitted jobs go on.")

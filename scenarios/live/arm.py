@@ -1,20 +1,17 @@
-"""`thermofleet arm`: run one arm of a fleet as its own process, simulated or replayed from a real arm's log."""
+"""One arm of a live fleet as a process: simulated, or replayed from a real arm's log; with or without an auctioneer."""
 
 import logging
 import os
 import secrets
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-import typer
 
-from agents.registry import WRAPPERS_HELP, names_of
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.replies import NoReply
 from fleet.bus.protocol import keys
@@ -33,29 +30,22 @@ from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.arm.node import ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.clock import FleetClock
+from fleet.live.consensus.node import ConsensusNode
+from fleet.live.consensus.participant import Membership
+from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from fleet.live.journal_upkeep import CompactingJournal, own_records, put_aside
 from fleet.motion import Plan
-from scenarios.cli.live.journals import folder_of, refuse_other_way
-from scenarios.cli.live.options import (
-    MAX_SPEED,
-    MIN_SPEED,
-    JobsOption,
-    JournalOption,
-    ModelOption,
-    NewEpochOption,
-    RateOption,
-    ScenarioFleetOption,
-    SeedOption,
-)
-from scenarios.cli.options import ENDPOINT, EndpointOption, RiskOption, ScenarioArg, check_name, number
-from scenarios.cli.signals import until_stopped
+from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, progress_bar
-from scenarios.load import load
-from scenarios.policy_loader import scope_of
+from scenarios.live.allocation import live_fleet
+from scenarios.live.auctioneer import own_jobs, summary
+from scenarios.live.cell import cell_message, cell_space
+from scenarios.live.journals import folder_of, refuse_other_way
+from scenarios.policy_loader import arm_policy_of, scope_of
 from scenarios.progress import Progress
 from scenarios.schema import Scenario
-from scenarios.schema_errors import choose
+from scenarios.specs import LiveModel, LiveSpec, RiskName
 
 log = logging.getLogger(__name__)
 
@@ -64,49 +54,39 @@ TURN_S, CLOCK_S, RETIRE_S = 0.25, 2.0, 1.0
 TOKEN_S, POLL_S = 4.0, 0.1
 """Real seconds for which the token of an exited process may remain, its session's lease with a margin; and between
 two requests for it."""
+FAREWELL_S = 2.0
+"""Real seconds to serve after all jobs are settled: peers that do not know it yet request the missing outcomes."""
 
 
-def arm_command(
-    scenario: ScenarioArg,
-    name: Annotated[str, typer.Argument(help="Arm of the scenario; with --source log any name.", callback=check_name)],
-    file: Annotated[Path | None, typer.Argument(help="--source log: a Gen3 log, a plain log, or a recording.")] = None,
-    source: Annotated[Literal["sim", "log"], typer.Option(help="sim (the scenario's arm), or log FILE.")] = "sim",
-    difficulty: ModelOption = "twin",
-    risk: RiskOption = "rc",
-    speed: Annotated[
-        float | None,
-        number("Fleet seconds per real second. Default: the auctioneer's, else 1.", MIN_SPEED, MAX_SPEED),
-    ] = None,
-    rate_hz: RateOption = STATE_HZ,
-    capacity: Annotated[int, number("Maximum concurrent jobs.", 1, 256)] = 1,
-    journal: JournalOption = None,
-    seed: SeedOption = 0,
-    policy: Annotated[
-        str,
-        typer.Option(
-            help=f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, your own as "
-            f"FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}. Default: an auctioneer awards them."
-        ),
-    ] = "",
-    jobs: JobsOption = "scenario",
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: ScenarioFleetOption = "",
-    new_epoch: NewEpochOption = False,
+def run_arm(
+    scenario: Scenario,
+    name: str,
+    spec: LiveSpec,
+    endpoint: str,
+    *,
+    alone: bool = False,
+    file: Path | None = None,
+    speed: float | None = None,
+    rate_hz: float = STATE_HZ,
+    capacity: int = 1,
 ) -> None:
-    """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
-    from scenarios.cli.live import consensus
+    """Run one arm of a fleet until its jobs are done, Ctrl-C or SIGTERM.
 
-    chosen = load(scenario)
-    if (source == "log") != (file is not None):
-        given = f"{source} {file or ''}".strip()
-        raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {given}).")
-    _check_policy(policy, file)
-    if new_epoch and not policy:
-        raise FleetError("--new-epoch is for an arm with --policy, or for thermofleet auction: leave it out.")
-    fleet, folder = folder_of(journal, fleet, chosen)
-    refuse_other_way(folder, (name,), alone=bool(policy), new_epoch=new_epoch)
+    Args:
+        alone: Whether it allocates jobs with its peers by the policy of `spec`, without an auctioneer.
+        file: Log that it replays in place of the simulated arm.
+        speed: Fleet seconds per real second; None for that of the auctioneer.
+
+    Raises:
+        FleetError: options contradict each other or the journals.
+    """
+    _check_allocation(spec.policy if alone else "", file)
+    if spec.new_epoch and not alone:
+        raise FleetError("--new-epoch is for an arm with --policy, or for thermofleet bus auctioneer: leave it out.")
+    fleet, folder = folder_of(spec.journal, spec.fleet, scenario)
+    refuse_other_way(folder, (name,), alone=alone, new_epoch=spec.new_epoch)
     with progress_bar() as progress:
-        simulated = partial(simulated_arm, chosen, name, difficulty, seed, progress, risk=risk)
+        simulated = partial(simulated_arm, scenario, name, spec.difficulty, spec.seed, progress, risk=spec.risk)
         arm = replayed_arm(name, file) if file else simulated()
     # An award that is put aside is not executed again: its lease expires at the auctioneer, which awards the job anew
     # or, if it had permitted the last cycle, calls it unfinished.
@@ -118,18 +98,16 @@ def arm_command(
         ExitStack() as resources,
     ):
         wait_for_name(link, name)
-        work_source = None
-        if policy:
-            consensus.refuse_auctioneer(link)
-            membership = consensus.membership_of(chosen, name, policy, jobs=jobs, seed=seed)
-            work_source = resources.enter_context(
-                consensus.work_source(folder / f"{name}.grants", membership, new_epoch=new_epoch)
+        source = None
+        if alone:
+            refuse_auctioneer(link)
+            membership = membership_of(scenario, name, spec.policy, jobs=spec.jobs, seed=spec.seed)
+            source = resources.enter_context(
+                work_source(folder / f"{name}.grants", membership, new_epoch=spec.new_epoch)
             )
-        node = make_node(
-            link, book, arm, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=work_source
-        )
+        node = make_node(link, book, arm, scenario, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=source)
         echo(f"ready {name} {endpoint} {os.getpid()}")
-        if policy and consensus.serve_until_done(node, stop):
+        if alone and serve_until_done(node, stop):
             return
         while not stop.is_set():
             node.serve(time.monotonic() + TURN_S)
@@ -137,11 +115,11 @@ def arm_command(
         stop.leave(f"Interrupted; the journal is {book.path}, and the same command continues.")
 
 
-def _check_policy(policy: str, file: Path | None) -> None:
+def _check_allocation(policy: str, file: Path | None) -> None:
     if policy and scope_of(policy) == "central":
         raise FleetError(
-            f"'{policy}' needs an auctioneer: start it with thermofleet auction --policy {policy}, and leave --policy "
-            "out for the arms."
+            f"'{policy}' needs an auctioneer: start it with thermofleet bus auctioneer --policy {policy}, and leave "
+            "--policy out for the arms."
         )
     if policy and file is not None:
         raise FleetError("An arm that replays a log takes no jobs: leave --policy out.")
@@ -167,12 +145,12 @@ class PreparedArm:
 def simulated_arm(
     scenario: Scenario,
     name: str,
-    difficulty: Literal["twin", "blind"],
+    difficulty: LiveModel,
     seed: int,
     progress: Progress,
     cache: Path | None = None,
     *,
-    risk: str = "rc",
+    risk: RiskName = "rc",
 ) -> PreparedArm:
     """Prepare the scenario's arm: its body, plans and twin are those of the same arm in `thermofleet run`.
 
@@ -180,11 +158,10 @@ def simulated_arm(
         FleetError: the scenario has no such arm.
     """
     from fleet.live.arm.simulated_body import SimulatedBody  # loads the engine
-    from scenarios.prepare.fleet import RiskName, prepare_arm
+    from scenarios.prepare.fleet import prepare_arm
     from scenarios.prepare.planned_arm import CellPlanner, air_offsets
 
-    kind = choose("risk", risk, RiskName)
-    arm = prepare_arm(scenario, name, difficulty=difficulty, risk=kind, cache=cache, progress=progress)
+    arm = prepare_arm(scenario, name, difficulty=difficulty, risk=risk, cache=cache, progress=progress)
     index = scenario.index_of(name)
     cell_c, offset_k = ambient_of(scenario), float(air_offsets(scenario)[index])
 
@@ -318,3 +295,67 @@ def fleet_clock(link: BusClient, speed: float | None) -> FleetClock:
     if speed is not None and speed != reply.speed:
         log.warning("The fleet's speed is %g, not %g.", reply.speed, speed)
     return FleetClock(reply.speed, epoch=reply.epoch).set_to(asked_s, time.monotonic(), reply.time_s)
+
+
+def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed: int) -> Membership:
+    """How the arm `name` of a scenario takes part in the consensus of its fleet, by a policy of scope `arm`.
+
+    Raises:
+        FleetError: the scenario has no such arm, or there is no such policy.
+    """
+    place = scenario.index_of(name)
+    chosen = arm_policy_of(policy)
+    chosen.reset(np.random.default_rng(np.random.SeedSequence([seed, 1, place])))
+    stream = jobs == "scenario"
+    fleet = live_fleet(scenario, ends=stream)
+    return Membership(
+        fleet=fleet,
+        choose=chosen.choose,
+        slots=scenario.slots,
+        places=frozenset(place.name for place in scenario.places),
+        stream=tuple(own_jobs(scenario, seed)) if stream else (),
+        horizon_s=fleet.horizon_s,
+        excludes=cell_space(scenario),
+        cell=cell_message(scenario, name),
+    )
+
+
+def refuse_auctioneer(link: BusClient) -> None:
+    """Check that the fleet has no auctioneer: it would award jobs that the arms allocate too.
+
+    Raises:
+        BusError: the fleet has one.
+    """
+    if present := link.tokens(keys.of_every_auction(link.fleet, "alive"), timeout_s=2.0):
+        names = ", ".join(sorted(present))
+        raise BusError(f"Fleet '{link.fleet}' has an auctioneer: '{names}'. Stop it first, or leave --policy out.")
+
+
+@contextmanager
+def work_source(
+    path: Path, membership: Membership, *, new_epoch: bool = False
+) -> Iterator[Callable[[ArmNode, int], ConsensusNode]]:
+    """Factory of an arm's work source, from the arm and its boot number; the journal of its grants is open meanwhile.
+
+    Raises:
+        FleetError: the journal cannot be used.
+    """
+    with Journal[GrantRecord](path, GrantRecord) as book:
+        yield lambda arm, boot: ConsensusNode(arm, membership, book, boot=boot, new_epoch=new_epoch)
+
+
+def serve_until_done(node: ArmNode, stop: Stop) -> bool:
+    """Serve until all jobs are settled, and print a summary; return False if stopped before that."""
+    source = node.work_source
+    assert isinstance(source, ConsensusNode)
+    while not stop.is_set() and not source.over:
+        node.serve(time.monotonic() + TURN_S)
+    if stop.is_set():
+        return False
+    left = source.participant.granter.register.settled.left
+    echo(summary(source.statuses(), node.clock.now_s(time.monotonic()), left))
+    echo(f"This is the view of one arm, after {source.participant.rounds} rounds of allocation.")
+    until_s = time.monotonic() + FAREWELL_S
+    while not stop.is_set() and time.monotonic() < until_s:
+        node.serve(min(until_s, time.monotonic() + TURN_S))
+    return True

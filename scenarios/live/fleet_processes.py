@@ -1,56 +1,39 @@
-"""`thermofleet up`: run a whole fleet, each participant as its own process: router, arms, recorder and auctioneer."""
+"""The processes of a live fleet on one machine: router, arms, recorder, auctioneer and page, under one supervisor."""
 
 import os
 import socket
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from agents.policy import no_simulator
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError, nearest
 from fleet.live.supervisor import Part, Supervisor
-from scenarios.cli.live.journals import folder_of, refuse_other_way
-from scenarios.cli.live.options import (
-    JobsOption,
-    ModelOption,
-    NewEpochOption,
-    ScenarioFleetOption,
-    SeedOption,
-    SpeedOption,
-)
-from scenarios.cli.options import PolicyOption, RiskOption, ScenarioArg, number, split_names
-from scenarios.cli.router import PORT, check_roster
+from scenarios.cli.from_fields import flags_of
+from scenarios.cli.options import split_names
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
 from scenarios.extras import require_extra
+from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.load import load
 from scenarios.policy_loader import plans, scope_of
-from scenarios.schema_errors import choose
+from scenarios.specs import PAGE_PORT, PORT, LiveSpec
 
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""
-PAGE_PORT, PAGE_READY = 8080, "ready page "
+PAGE_READY = "ready page "
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 
 
 def parts_of(
     scenario: str,
     names: tuple[str, ...],
+    spec: LiveSpec,
     *,
     port: int,
-    fleet: str,
     folder: Path,
-    speed: float,
-    policy: str,
-    difficulty: str,
-    risk: str = "rc",
-    jobs: str,
-    seed: int,
     tls: Path | None = None,
-    new_epoch: bool = False,
     host: str = "",
     at: str = "",
 ) -> tuple[Part, list[Part], Part, Part | None]:
@@ -59,6 +42,7 @@ def parts_of(
     Args:
         scenario: A library name or a file.
         names: Names of the arms.
+        spec: Of all processes; its journal is that of `folder`.
         folder: Folder of journals, recording and logs.
         tls: Folder with a certificate of every participant; None for plain TCP.
         host: Address on which the router listens; "" for loopback only.
@@ -70,83 +54,52 @@ def parts_of(
     from fleet.bus.client.router import reached_at
 
     own = f"{'tls' if tls else 'tcp'}/{reached_at(host or '127.0.0.1')}:{port}"
-    address = at or own
+    address, spec = at or own, replace(spec, journal=folder / "journals")
 
-    def part(name: str, command: str, *options: str, user: str, rank: int, essential: bool = False) -> Part:
+    def part(name: str, *words: str, user: str, rank: int, essential: bool = False) -> Part:
         endpoint = address if tls is None else Tls(tls, user).endpoint(address)
-        argv = (*PROGRAM, command, *options, "--endpoint", endpoint)
-        return Part(name=name, argv=argv, rank=rank, essential=essential)
+        return Part(name=name, argv=(*PROGRAM, *words, "--endpoint", endpoint), rank=rank, essential=essential)
 
-    shared = ("--fleet", fleet, "--speed", f"{speed:g}", "--journal", str(folder / "journals"), "--seed", str(seed))
-    allocation = ("--policy", policy, "--jobs", jobs)
-    without_auctioneer, ends = scope_of(policy) == "arm", jobs == "scenario"
-    begins = ("--new-epoch",) if new_epoch else ()
-    alone = (*allocation, *begins) if without_auctioneer else ()
-    options = (*shared, "--difficulty", difficulty, "--risk", risk, *alone)
+    shared, allocation = ("fleet", "speed", "journal", "seed"), ("policy", "jobs", "new_epoch")
+    alone, ends = scope_of(spec.policy) == "arm", spec.jobs == "scenario"
+    options = flags_of(spec, *shared, "difficulty", "risk", *(allocation if alone else ()))
     secure = () if tls is None else ("--tls", str(tls), "--scenario", scenario)
     listen = ("--port", str(port), *(("--host", host) if host else ()))
-    router = Part(name="router", argv=(*PROGRAM, "router", *listen, *secure), ready=own)
+    router = Part(name="router", argv=(*PROGRAM, "bus", "router", *listen, *secure), ready=own)
     arms = [
-        part(f"arm-{name}", "arm", scenario, name, *options, user=name, rank=2, essential=without_auctioneer and ends)
+        part(f"arm-{name}", "arm", "run", scenario, name, *options, user=name, rank=2, essential=alone and ends)
         for name in names
     ]
-    record = part("record", "record", fleet, "--out", str(folder / "recording"), user="recorder", rank=1)
-    if without_auctioneer:
+    recording = ("--out", str(folder / "recording"))
+    record = part("record", "bus", "record", spec.fleet, *recording, user="recorder", rank=1)
+    if alone:
         return router, arms, record, None
-    auction = part(
-        "auction", "auction", scenario, *shared, *allocation, *begins, user="auctioneer", rank=3, essential=ends
-    )
+    options = flags_of(spec, *shared, *allocation)
+    auction = part("auction", "bus", "auctioneer", scenario, *options, user="auctioneer", rank=3, essential=ends)
     return router, arms, record, auction
 
 
-def up_command(
-    scenario: ScenarioArg,
-    speed: SpeedOption = 60.0,
-    policy: PolicyOption = "matching",
-    difficulty: ModelOption = "twin",
-    risk: RiskOption = "rc",
-    jobs: JobsOption = "scenario",
-    seed: SeedOption = 0,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for journals, recording and logs. Default: runs/live-FLEET.")
-    ] = None,
-    port: Annotated[
-        int | None,
-        number("Loopback port of the router; 0 is any free one. Default: 7447, or any if taken.", 0, 65535),
-    ] = None,
-    fleet: ScenarioFleetOption = "",
-    tls: Annotated[
-        Path | None,
-        typer.Option(help="Folder that thermofleet keys wrote for this scenario: mutual TLS and access control."),
-    ] = None,
-    new_epoch: NewEpochOption = False,
-    arms: Annotated[
-        str, typer.Option(help="Start only these arms here, comma-separated; the others run on other machines.")
-    ] = "",
-    router: Annotated[
-        str,
-        typer.Option(
-            help="--arms: endpoint of a running router, as tls/HOST:PORT. Only the arms are started; router, recorder "
-            "and auctioneer run elsewhere."
-        ),
-    ] = "",
-    host: Annotated[
-        str, typer.Option(help="--tls: address on which the router listens, as 0.0.0.0. Default: loopback only.")
-    ] = "",
-    page: Annotated[
-        bool,
-        typer.Option("--page", help=f"Also serve a live page (thermofleet dashboard), on port {PAGE_PORT} if free."),
-    ] = False,
+def run_fleet(
+    scenario: str,
+    spec: LiveSpec,
+    *,
+    out: Path | None = None,
+    port: int | None = None,
+    tls: Path | None = None,
+    arms: str = "",
+    router: str = "",
+    host: str = "",
+    page: bool = False,
 ) -> None:
-    """Start a whole fleet, each participant as its own process, and keep it running until its jobs are done.
+    """Start a fleet, or a part of it, and keep it running until its jobs are done, Ctrl-C or SIGTERM.
 
-    A process that exits is restarted with back-off; Ctrl-C stops all in order. The same command with the same --out
-    continues from the journals. With --arms it starts a part of the fleet.
+    Raises:
+        FleetError: options contradict each other or the journals, or a process cannot be started.
     """
-    from scenarios.prepare.fleet import RiskName, prepare
+    from scenarios.prepare.fleet import prepare
 
     chosen = load(scenario)
-    fleet, folder = folder_of(out, fleet, chosen)
+    fleet, folder = folder_of(out, spec.fleet, chosen)
     if tls is not None and fleet != chosen.name:
         raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
     names = chosen_arms(arms, tuple(arm.name for arm in chosen.arms))
@@ -155,25 +108,18 @@ def up_command(
         _check_page(tls)
     if tls is not None:
         check_roster(tls, scenario)
-    if plans(policy):  # before anything is started
-        raise no_simulator(policy)
-    refuse_other_way(folder / "journals", names, alone=scope_of(policy) == "arm", new_epoch=new_epoch)
+    if plans(spec.policy):  # before anything is started
+        raise no_simulator(spec.policy)
+    refuse_other_way(folder / "journals", names, alone=scope_of(spec.policy) == "arm", new_epoch=spec.new_epoch)
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
-        prepare(chosen, difficulty=difficulty, risk=choose("risk", risk, RiskName), progress=progress)
+        prepare(chosen, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
     own_router, parts, record, auction = parts_of(
         scenario,
         names,
+        replace(spec, fleet=fleet),
         port=PORT if router else port or free_port(PORT if port is None else 0),
-        fleet=fleet,
         folder=folder,
-        speed=speed,
-        policy=policy,
-        difficulty=difficulty,
-        risk=risk,
-        jobs=jobs,
-        seed=seed,
         tls=tls,
-        new_epoch=new_epoch,
         host=host,
         at=router,
     )
@@ -194,8 +140,8 @@ def up_command(
             supervisor.start(shown, ready_s=START_S)
         watch = Tls(tls, "monitor").endpoint(at) if tls else at
         say(
-            f"{fleet} is up: {count} at {at}, {speed:g} times as fast as real time; logs in "
-            f"{supervisor.folder}. To watch it: thermofleet watch --scenario {scenario} --endpoint {watch}",
+            f"{fleet} is up: {count} at {at}, {spec.speed:g} times as fast as real time; logs in "
+            f"{supervisor.folder}. To watch it: thermofleet bus watch --scenario {scenario} --endpoint {watch}",
             out_console,
         )
         if shown is not None:
@@ -216,7 +162,20 @@ def up_command(
 def page_of(scenario: str, fleet: str, at: str, tls: Path | None) -> Part:
     """The live page of a fleet, on a port that is free now; it keeps the port when it is restarted."""
     endpoint, port = at if tls is None else Tls(tls, "operator").endpoint(at), free_port(PAGE_PORT)
-    argv = (*PROGRAM, "dashboard", scenario, "--endpoint", endpoint, "--fleet", fleet, "--port", str(port))
+    argv = (
+        *PROGRAM,
+        "bus",
+        "gateway",
+        "--page",
+        "--scenario",
+        scenario,
+        "--endpoint",
+        endpoint,
+        "--fleet",
+        fleet,
+        "--port",
+        str(port),
+    )
     return Part(name="page", argv=argv, rank=1, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
 
 
@@ -229,12 +188,12 @@ def _check_page(tls: Path | None) -> None:
     """
     require_extra("gateway")
     require_extra("report")
-    from scenarios.cli.live.gateway import TOKEN
+    from scenarios.live.http_server import TOKEN
 
     if tls is not None and not os.environ.get(TOKEN):
         raise FleetError(f"With --tls the page needs a token: set {TOKEN} to 16 or more random characters.")
     if tls is not None and not (tls / "operator.pem").is_file():
-        raise FleetError(f"The page needs a certificate: thermofleet keys {tls} --add operator:operator")
+        raise FleetError(f"The page needs a certificate: thermofleet bus keys {tls} --add operator:operator")
 
 
 def chosen_arms(text: str, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -276,3 +235,24 @@ def free_port(wanted: int = 0) -> int:
         except OSError:
             probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+def check_roster(folder: Path | None, scenario: str) -> None:
+    """Check that a folder of keys has a certificate for every arm of a scenario.
+
+    Raises:
+        FleetError: it has not, or it is not a folder of keys of this scenario.
+    """
+    from fleet.bus.security.access_control import read_roster
+
+    if folder is None:
+        raise FleetError("--scenario needs --tls: without TLS there are no certificates to check.")
+    chosen, roster = load(scenario), read_roster(folder)
+    if roster.fleet != chosen.name:
+        raise FleetError(f"The keys in '{folder}' are for the fleet '{roster.fleet}', not for '{chosen.name}'.")
+    missing = [arm.name for arm in chosen.arms if arm.name not in roster.of_role("arm")]
+    if missing:
+        raise FleetError(
+            f"No certificate in '{folder}' for {', '.join(missing)}; make one with: thermofleet bus keys {folder} "
+            f"--add {missing[0]}:arm."
+        )

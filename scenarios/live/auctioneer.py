@@ -1,14 +1,12 @@
-"""`thermofleet auction`: the fleet's auctioneer as a process of its own."""
+"""The auctioneer of a live fleet as a process, and the jobs of its scenario."""
 
 import logging
 import os
 import time
 from collections.abc import Mapping, Sequence
 from graphlib import TopologicalSorter
-from typing import Annotated
 
 import numpy as np
-import typer
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.discover import other_versions
@@ -20,24 +18,15 @@ from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.round import Timing
 from fleet.live.journal import Journal
 from fleet.live.journal_upkeep import put_aside
-from scenarios.cli.live.journals import folder_of, refuse_other_way
-from scenarios.cli.live.options import (
-    JobsOption,
-    JournalOption,
-    NewEpochOption,
-    ScenarioFleetOption,
-    SeedOption,
-    SpeedOption,
-)
-from scenarios.cli.options import ENDPOINT, EndpointOption, PolicyOption, ScenarioArg, check_name
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, progress_bar
 from scenarios.job_stream import draw_jobs
 from scenarios.live.allocation import ON_BUS_S, central_allocation
 from scenarios.live.cell import cell_message, cell_space
-from scenarios.load import load
+from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import OnBus
 from scenarios.schema import Scenario
+from scenarios.specs import LiveSpec
 
 log = logging.getLogger(__name__)
 
@@ -48,48 +37,38 @@ FAREWELL_S = (1.0, 10.0)
 """Real seconds to serve after the end; and at most, while a job is in its last cycle."""
 
 
-def auction_command(
-    scenario: ScenarioArg,
-    name: Annotated[
-        str, typer.Option(help="Name of the auctioneer; part of its keys.", callback=check_name)
-    ] = "auctioneer",
-    policy: PolicyOption = "matching",
-    speed: SpeedOption = 1.0,
-    journal: JournalOption = None,
-    jobs: JobsOption = "scenario",
-    seed: SeedOption = 0,
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: ScenarioFleetOption = "",
-    new_epoch: NewEpochOption = False,
-) -> None:
-    """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
-    chosen = load(scenario)
-    bus = OnBus(fleet=fleet or chosen.name, endpoint=endpoint, limit_s=ON_BUS_S)
-    allocate = central_allocation(policy, chosen, seed, ends=jobs == "scenario", bus=bus)
-    own = own_jobs(chosen, seed) if jobs == "scenario" else []
-    fleet, folder = folder_of(journal, fleet, chosen)
-    refuse_other_way(folder, (arm.name for arm in chosen.arms), alone=False)
+def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str) -> None:
+    """Run the auctioneer of a fleet until its jobs are settled, Ctrl-C or SIGTERM; its journal is `NAME.journal`.
+
+    Raises:
+        FleetError: the policy is not central, or the journals are of a shift without an auctioneer.
+    """
+    bus = OnBus(fleet=spec.fleet or scenario.name, endpoint=endpoint, limit_s=ON_BUS_S)
+    allocate = central_allocation(spec.policy, scenario, spec.seed, ends=spec.jobs == "scenario", bus=bus)
+    own = own_jobs(scenario, spec.seed) if spec.jobs == "scenario" else []
+    fleet, folder = folder_of(spec.journal, spec.fleet, scenario)
+    refuse_other_way(folder, (arm.name for arm in scenario.arms), alone=False)
     with progress_bar() as progress:
-        excludes, cell = cell_space(chosen, progress=progress), cell_message(chosen, name, progress=progress)
+        excludes, cell = cell_space(scenario, progress=progress), cell_message(scenario, name, progress=progress)
     aside = salvage(put_aside(folder / f"{name}.aside", name))
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
         Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord, put_aside=aside) as book,
     ):
-        places = frozenset(place.name for place in chosen.places)
-        timing = Timing(max_jobs=chosen.slots)
+        places = frozenset(place.name for place in scenario.places)
+        timing = Timing(max_jobs=scenario.slots)
         node = AuctionNode(
             link,
             name,
             book,
             allocate=allocate,
-            speed=speed,
+            speed=spec.speed,
             places=places,
             timing=timing,
-            arms=tuple(arm.name for arm in chosen.arms),
+            arms=tuple(arm.name for arm in scenario.arms),
             excludes=excludes,
-            new_epoch=new_epoch,
+            new_epoch=spec.new_epoch,
             cell=cell,
         )
         for sentence in other_versions(endpoint, fleet):
@@ -102,7 +81,7 @@ def auction_command(
         if node.auctioneer.ledger.ended:
             log.warning("That shift is over; another --journal (of thermofleet up: --out) begins a new one.")
         if own:
-            submit_stream(node, own, chosen.horizon_s, stop)
+            submit_stream(node, own, scenario.horizon_s, stop)
         else:
             while not stop.is_set():
                 node.serve(time.monotonic() + TURN_S)

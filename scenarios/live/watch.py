@@ -1,4 +1,4 @@
-"""`thermofleet watch`: show a fleet live on the terminal."""
+"""A live fleet on the terminal, until its shift has ended."""
 
 import math
 import os
@@ -8,10 +8,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Annotated
 
 import msgspec
-import typer
 from rich.live import Live
 
 from fleet.bus.client.client import BusClient
@@ -19,10 +17,9 @@ from fleet.bus.client.discover import fleets_at
 from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
 from fleet.errors import NoRouter
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot, describe_status
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+from scenarios.cli.options import the_fleet
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, err_console, out_console, say
-from scenarios.load import load
 from scenarios.show.watch import (
     JobBars,
     arm_line,
@@ -41,17 +38,19 @@ FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
 """Real seconds: between two frames; between two lines about every arm; of listening for one snapshot."""
 
 
-def watch_command(
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print one snapshot as JSON.")] = False,
-    joints: Annotated[bool, typer.Option("--joints", help="Show every motor; the key j changes that.")] = False,
-    scenario: Annotated[
-        str, typer.Option(help="Scenario of the fleet, to show what is left of the shift; the bus does not tell.")
-    ] = "",
+def watch(
+    endpoint: str, fleet: str, *, as_json: bool = False, joints: bool = False, end_s: float | None = None
 ) -> None:
-    """Watch a fleet until it has ended, or Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
-    end_s = load(scenario).horizon_s if scenario else None
+    """Show a fleet until its shift has ended, or Ctrl-C; or print one snapshot as JSON.
+
+    Args:
+        fleet: Its name; "" for the only one at the endpoint, and to wait for it.
+        joints: Show every joint.
+        end_s: End of the shift, s of fleet time, if it is known.
+
+    Raises:
+        FleetError: there is no such fleet, or there are several.
+    """
     news: deque[str] = deque(maxlen=100)
 
     def on_message(_: str, name: str, message: msgspec.Struct) -> None:

@@ -1,0 +1,93 @@
+"""Hyperparameters of a training of networks."""
+
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from fleet.fields import MAX_SEED, check, option
+
+Algorithm = Literal["mappo", "ippo"]
+Decisions = Literal["interval", "events"]
+"""As in `fleet.env.validation`, which agents do not import."""
+LONGEST_S = 1e7
+"""Longest horizon of a discount, 116 days."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkSize:
+    """Widths of the hidden layers."""
+
+    arm: int = 48
+    option: int = 48
+    pair: int = 16
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value < 1:
+                raise ValueError(f"NetworkSize.{name} must be >= 1 (got {value}).")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoConfig:
+    """Hyperparameters of a training."""
+
+    algorithm: Algorithm = "mappo"
+    size: NetworkSize = field(default_factory=NetworkSize)
+    envs: int = option("Shifts simulated in parallel.", 32, low=1, high=65_536)
+    steps: int | None = None
+    """Steps of every env in an iteration; by default 16 with events, 128 with intervals."""
+    epochs: int = 4
+    """Passes of the actor over an iteration's choices; the critic makes one over all steps."""
+    minibatch: int = 128
+    """Choices in one optimiser step of the actor."""
+    learning_rate: float = option(
+        "Learning rate; default: 0.0003, with --algo pairs 0.08.",
+        3e-4,
+        low=0,
+        high=10,
+        above=True,
+        flag="--lr",
+        shown="",
+    )
+    decisions: Decisions = option(
+        "Length of a training step: events (until an arm has a choice) or interval.",
+        "events",
+        choices=get_args(Decisions),
+        noun="kind of step",
+    )
+    """See `fleet.env.allocation_v1`."""
+    discount_s: float = 7200.0
+    """Horizon of the discount: gamma of a step is exp(-elapsed_s / discount_s)."""
+    trace_s: float = 900.0
+    """Horizon of the trace: lambda of a step is exp(-elapsed_s / trace_s). Longer than most jobs, so that the return of
+    a claim contains the reward of its job."""
+    clip: float = 0.2
+    entropy: float = option("Weight of the entropy bonus; not with --algo pairs.", 0.002, low=0, high=10)
+    max_gradient: float = 0.5
+    reward_scale: float = 0.1
+    warm_start: str = option("Rule that the network imitates first, for example wspt; default: none.", "")
+    seed: int = option("Seed for shifts, initialisation and minibatches.", 0, low=0, high=MAX_SEED)
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.algorithm not in get_args(Algorithm):
+            raise ValueError(f"algorithm must be one of {', '.join(get_args(Algorithm))} (got {self.algorithm!r}).")
+        whole, positive = (
+            ("steps", "epochs", "minibatch"),
+            ("clip", "max_gradient", "reward_scale"),
+        )
+        values = vars(self) | {"steps": self.length}
+        for names, allowed, valid in (
+            (whole, ">= 1", lambda value: value >= 1),
+            (positive, "> 0", lambda value: value > 0),
+            (("discount_s", "trace_s"), f"1 to {LONGEST_S:g}", lambda value: 1 <= value <= LONGEST_S),
+        ):
+            for name in names:
+                if not valid(values[name]):
+                    raise ValueError(f"{name} must be {allowed} (got {values[name]}).")
+
+    @property
+    def length(self) -> int:
+        """Steps of every env in an iteration."""
+        if self.steps is not None:
+            return self.steps
+        return 16 if self.decisions == "events" else 128

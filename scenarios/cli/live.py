@@ -1,0 +1,395 @@
+"""Commands that run a live fleet: up, `thermofleet arm run` and `thermofleet bus`."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from agents.registry import WRAPPERS_HELP, names_of
+from fleet.errors import FleetError
+from fleet.fields import MAX_SPEED, MIN_SPEED
+from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import (
+    ENDPOINT,
+    EndpointOption,
+    FleetOption,
+    JsonOption,
+    ScenarioArg,
+    check_name,
+    number,
+)
+from scenarios.cli.terminal import echo, out_console, say
+from scenarios.specs import PAGE_PORT, PORT, LiveSpec
+
+UNHEALTHY = 1
+"""Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
+_TLS, _LISTEN = "Mutual TLS", "ros2 listen"
+
+
+def up_command(
+    scenario: ScenarioArg,
+    given: Annotated[
+        Given,
+        From(LiveSpec, "speed", "policy", "difficulty", "risk", "jobs", "seed", "fleet", "new_epoch", speed=60.0),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for journals, recording and logs. Default: runs/live-FLEET.")
+    ] = None,
+    port: Annotated[
+        int | None,
+        number("Loopback port of the router; 0 is any free one. Default: 7447, or any if taken.", 0, 65535),
+    ] = None,
+    tls: Annotated[
+        Path | None,
+        typer.Option(help="Folder that `thermofleet bus keys` made for this scenario: TLS and access control."),
+    ] = None,
+    arms: Annotated[
+        str, typer.Option(help="Start only these arms here, comma-separated; the others run on other machines.")
+    ] = "",
+    router: Annotated[
+        str,
+        typer.Option(
+            help="--arms: endpoint of a running router, as tls/HOST:PORT. Only the arms are started; router, recorder "
+            "and auctioneer run elsewhere."
+        ),
+    ] = "",
+    host: Annotated[
+        str, typer.Option(help="--tls: address on which the router listens, as 0.0.0.0. Default: loopback only.")
+    ] = "",
+    page: Annotated[
+        bool,
+        typer.Option("--page", help=f"Also serve a live page (bus gateway --page), on port {PAGE_PORT} if free."),
+    ] = False,
+) -> None:
+    """Start a whole fleet, each participant as its own process, and keep it running until its jobs are done.
+
+    A process that exits is restarted with back-off; Ctrl-C stops all in order. The same command with the same --out
+    continues from the journals. With --arms it starts a part of the fleet.
+    """
+    from scenarios.live.fleet_processes import run_fleet
+
+    spec = LiveSpec(**given)
+    run_fleet(scenario, spec, out=out, port=port, tls=tls, arms=arms, router=router, host=host, page=page)
+
+
+def arm_command(
+    scenario: ScenarioArg,
+    name: Annotated[str, typer.Argument(help="Arm of the scenario; with --source log any name.", callback=check_name)],
+    given: Annotated[Given, From(LiveSpec, "difficulty", "risk", "seed", "journal", "jobs", "fleet", "new_epoch")],
+    file: Annotated[Path | None, typer.Argument(help="--source log: a Gen3 log, a plain log, or a recording.")] = None,
+    source: Annotated[Literal["sim", "log"], typer.Option(help="sim (the scenario's arm), or log FILE.")] = "sim",
+    policy: Annotated[
+        str,
+        typer.Option(
+            help=f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, your own as "
+            f"FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}. Default: an auctioneer awards them."
+        ),
+    ] = "",
+    speed: Annotated[
+        float | None,
+        number("Fleet seconds per real second. Default: the auctioneer's, else 1.", MIN_SPEED, MAX_SPEED),
+    ] = None,
+    rate_hz: Annotated[float, number("State messages per real second.", 0, 100, above=True)] = 10.0,
+    capacity: Annotated[int, number("Maximum concurrent jobs.", 1, 256)] = 1,
+    endpoint: EndpointOption = ENDPOINT,
+) -> None:
+    """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
+    from scenarios.load import load
+
+    chosen = load(scenario)
+    if (source == "log") != (file is not None):
+        words = f"{source} {file or ''}".strip()
+        raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {words}).")
+    from scenarios.live.arm import run_arm
+
+    spec = LiveSpec(**given)
+    spec = replace(spec, policy=policy) if policy else spec
+    run_arm(
+        chosen,
+        name,
+        spec,
+        endpoint,
+        alone=bool(policy),
+        file=file,
+        speed=speed,
+        rate_hz=rate_hz,
+        capacity=capacity,
+    )
+
+
+def auctioneer_command(
+    scenario: ScenarioArg,
+    given: Annotated[Given, From(LiveSpec, "policy", "speed", "journal", "jobs", "seed", "fleet", "new_epoch")],
+    name: Annotated[
+        str, typer.Option(help="Name of the auctioneer; part of its keys.", callback=check_name)
+    ] = "auctioneer",
+    endpoint: EndpointOption = ENDPOINT,
+) -> None:
+    """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
+    from scenarios.live.auctioneer import run_auctioneer
+    from scenarios.load import load
+
+    run_auctioneer(load(scenario), name, LiveSpec(**given), endpoint)
+
+
+def router_command(
+    port: Annotated[int, number("TCP port; 0 is any free one.", 0, 65535)] = PORT,
+    host: Annotated[str, typer.Option(help="Address to listen on; beyond loopback only with --tls.")] = "127.0.0.1",
+    state_hz: Annotated[
+        float, number("Telemetry messages forwarded per second and session; 0 is unlimited.", 0, 1_000_000)
+    ] = 100.0,
+    tls: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder that `thermofleet bus keys` made: mutual TLS, and access by role.", rich_help_panel=_TLS
+        ),
+    ] = None,
+    name: Annotated[
+        str,
+        typer.Option(
+            help="Participant whose certificate the router presents.", callback=check_name, rich_help_panel=_TLS
+        ),
+    ] = "router",
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Another router of the fleet, tls/HOST:PORT, to link with; may be repeated.", rich_help_panel=_TLS
+        ),
+    ] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="Refuse to start unless every arm of this scenario has a certificate.", rich_help_panel=_TLS),
+    ] = None,
+) -> None:
+    """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; it prints its endpoint once it listens."""
+    from fleet.bus.client.rate_limits import Limits
+    from fleet.bus.client.router import Router
+    from fleet.bus.security.tls import Tls
+    from scenarios.cli.signals import until_stopped
+
+    if scenario is not None:
+        from scenarios.live.fleet_processes import check_roster
+
+        check_roster(tls, scenario)
+    limits = Limits(state_hz=state_hz or None)
+    router = Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits, connect=connect or ())
+    with until_stopped() as stop, router:
+        echo(router.endpoint)  # flushed: a supervisor reads this line
+        stop.wait()
+        stop.leave("The router was interrupted; its clients keep trying to reconnect.")
+
+
+def watch_command(
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one snapshot as JSON.")] = False,
+    joints: Annotated[bool, typer.Option("--joints", help="Show every joint; the key j changes that.")] = False,
+    scenario: Annotated[
+        str, typer.Option(help="Scenario of the fleet, to show what is left of the shift; the bus does not tell.")
+    ] = "",
+) -> None:
+    """Watch a fleet until it has ended, or Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
+    from scenarios.live.watch import watch
+    from scenarios.load import load
+
+    watch(endpoint, fleet, as_json=as_json, joints=joints, end_s=load(scenario).horizon_s if scenario else None)
+
+
+def doctor_command(
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    seconds: Annotated[float, number("Real seconds to listen.", 0, 600, above=True)] = 3.0,
+    auctioneer: Annotated[
+        bool, typer.Option(help="The fleet should have one; --no-auctioneer: it should have none.")
+    ] = True,
+    scenario: Annotated[
+        str,
+        typer.Option(
+            help="Every arm of this scenario should be present. Default: only the arms that are found are checked."
+        ),
+    ] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Check the health of a fleet: whether its arms and its auctioneer are present, and their clocks agree.
+
+    Exit code 0: healthy; 1: a fault was found, or no fleet; 2: the router cannot be reached.
+    """
+    from scenarios.live.doctor import diagnose
+    from scenarios.load import load
+
+    expected = tuple(arm.name for arm in load(scenario).arms) if scenario else ()
+    healthy = diagnose(endpoint, fleet, seconds, auctioneer=auctioneer, expected=expected, as_json=as_json)
+    raise typer.Exit(0 if healthy else UNHEALTHY)
+
+
+def record_command(
+    fleet: Annotated[
+        str, typer.Argument(help="Name of the fleet; `up` uses the name of the scenario.", callback=check_name)
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the recording; an interrupted one is continued.")],
+    endpoint: EndpointOption = ENDPOINT,
+    rotate: Annotated[
+        float, number("Real seconds between two parts; a message is durable within a second.", 0.1, 86_400)
+    ] = 60.0,
+) -> None:
+    """Record what arms and auctioneer publish: a journal, then Parquet parts; readable at once."""
+    from fleet.bus.client.client import BusClient
+    from fleet.live.policy_client import CONNECT_S
+    from scenarios.cli.signals import until_stopped
+    from scenarios.live.recorder import BACKLOG, record
+
+    with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
+        echo(f"ready record {endpoint}")
+
+        def connect() -> BusClient:
+            return BusClient(endpoint, fleet, timeout_s=CONNECT_S, backlog=BACKLOG)
+
+        recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set, connect=connect)
+    missed = sum(count.missed for count in recorder.counts.values())
+    kept = sum(count.kept for count in recorder.counts.values())
+    say(f"Recorded {kept} messages in {out}, {missed} missed.", out_console)
+    stop.leave("The recording is complete up to now; the same command continues it.")
+
+
+def replay_command(
+    path: Annotated[Path, typer.Argument(help="Folder of a run or of a recording.")],
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: Annotated[str | None, typer.Option(help="Name of the fleet. Default: that of the recording.")] = None,
+    speed: Annotated[float, number("Recorded seconds per real second.", 0, MAX_SPEED, above=True)] = 1.0,
+) -> None:
+    """Publish a run or a recording on the bus, in real time or at --speed."""
+    from fleet.bus.client.client import BusClient
+    from scenarios.cli.signals import until_stopped
+    from scenarios.live.replayer import Replay
+
+    replay = Replay.of(path)
+    if not len(replay):
+        raise FleetError(f"'{path}' holds no messages.")
+    with until_stopped() as stop, BusClient(endpoint, fleet or replay.fleet) as link:
+        echo(f"ready replay {endpoint}")
+        count = replay.play(link, speed=speed, stopped=stop.is_set)
+    say(f"Published {count} of {len(replay)} messages.", out_console)
+    stop.leave("The replay was interrupted.")
+
+
+def gateway_command(
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    page: Annotated[
+        bool,
+        typer.Option(
+            "--page",
+            help="Also serve a live page: arms in 3-D, temperatures, jobs, offers, alerts, and what the role of a "
+            "token may request.",
+        ),
+    ] = False,
+    scenario: Annotated[
+        str,
+        typer.Option(
+            help="--page: scenario of the cell, to draw its fixtures too. Default: as the auctioneer describes it."
+        ),
+    ] = "",
+    port: Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)] = PAGE_PORT,
+    host: Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")] = "127.0.0.1",
+    token: Annotated[
+        str,
+        typer.Option(
+            envvar="THERMOFLEET_TOKEN",
+            help="Bearer token for all requests. Prefer the variable: other users can read command lines.",
+        ),
+    ] = "",
+    tokens: Annotated[
+        Path | None,
+        typer.Option(
+            help="File with ROLE TOKEN in each line, readable by you alone. Roles: monitor, submitter, operator; each "
+            "may do what the ones before it may."
+        ),
+    ] = None,
+) -> None:
+    """Serve the fleet over HTTP until Ctrl-C or SIGTERM; with --page also a live page for browsers."""
+    if scenario and not page:
+        raise FleetError("--scenario is for --page: leave it out.")
+    from scenarios.live.http_server import run_gateway, scene_of
+
+    shown = None
+    if page:
+        from scenarios.live.http_page import LivePage
+        from scenarios.load import load
+        from scenarios.show.replay import three_js
+
+        three_js()  # if it is missing, say so at once
+        shown = LivePage(scene_of(load(scenario)) if scenario else None)
+    run_gateway(endpoint, fleet, port, host, token, tokens, shown)
+
+
+def ros2_command(
+    mode: Annotated[
+        str,
+        typer.Argument(
+            help="bridge: publish every arm as JointState and DiagnosticArray. listen: show a real arm with a ROS 2 "
+            "driver as an arm that takes no jobs. jobs: serve the action thermofleet_msgs/action/DoJob, with rclpy."
+        ),
+    ],
+    topic: Annotated[
+        str, typer.Argument(help="listen: topic of the arm's sensor_msgs/JointState, as /joint_states.")
+    ] = "",
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    domain: Annotated[int, number("The ROS 2 domain.", 0, 232, envvar="ROS_DOMAIN_ID")] = 0,
+    router: Annotated[
+        str, typer.Option(help="Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.")
+    ] = "",
+    warning_c: Annotated[float, number("Motor temperature at which a warning begins, °C.", 0, 200)] = 60.0,
+    error_c: Annotated[float, number("bridge: motor temperature at which an error begins, °C.", 0, 200)] = 75.0,
+    humble: Annotated[
+        bool, typer.Option("--humble", help="bridge: for ROS 2 Humble, whose keys have no type hash.")
+    ] = False,
+    arm: Annotated[
+        str, typer.Option(help="Name of the arm in the fleet.", callback=check_name, rich_help_panel=_LISTEN)
+    ] = "real",
+    temperatures: Annotated[
+        str,
+        typer.Option(
+            help="Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.", rich_help_panel=_LISTEN
+        ),
+    ] = "",
+    hardware: Annotated[
+        str,
+        typer.Option(
+            help="Text before /JOINT in the hardware_id of these diagnostics; default: none.", rich_help_panel=_LISTEN
+        ),
+    ] = "",
+    joints: Annotated[
+        str, typer.Option(help="Names of its joints in ROS 2, from joint 1 on.", rich_help_panel=_LISTEN)
+    ] = "",
+    rate_hz: Annotated[
+        float, number("State messages per real second.", 0, 100, above=True, rich_help_panel=_LISTEN)
+    ] = 10.0,
+) -> None:
+    """Connect a fleet and ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra ros2."""
+    from scenarios.schema_errors import choose
+
+    mode = choose("mode", mode, Literal["bridge", "listen", "jobs"])
+    if (mode == "listen") != bool(topic):
+        raise FleetError(f"TOPIC is for listen, and listen needs one (got {mode} {topic}".rstrip() + ").")
+    from scenarios.live.ros2 import run_bridge, run_jobs, run_listener
+
+    if mode == "jobs":
+        run_jobs(endpoint, fleet, domain=domain)
+    elif mode == "bridge":
+        run_bridge(endpoint, fleet, domain=domain, router=router, humble=humble, warning_c=warning_c, error_c=error_c)
+    else:
+        run_listener(
+            topic,
+            endpoint,
+            fleet,
+            arm=arm,
+            temperatures=temperatures,
+            hardware=hardware,
+            joints=joints,
+            domain=domain,
+            router=router,
+            rate_hz=rate_hz,
+            warning_c=warning_c,
+        )

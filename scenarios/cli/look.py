@@ -1,0 +1,397 @@
+"""Commands that look at scenarios and results: show, layout, view, film, report and trace."""
+
+import os
+import re
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, get_args
+
+import typer
+
+from fleet.errors import FleetError
+from fleet.job import BOUNDS
+from fleet.robot import POSTURES, RATING, Cooling
+from scenarios.cli import options
+from scenarios.cli.from_fields import From, Given
+from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
+from scenarios.specs import Shot
+
+SMALLEST, LARGEST = 160, 3840
+"""Width and height of a film, px."""
+MOST_FRAMES = 100_000
+MOST_GIF_PIXELS = 600_000_000
+"""Of all frames of a GIF together: they stay in memory until the file is written."""
+NO_DISPLAY = (
+    "MuJoCo's viewer needs a display, and there is none (DISPLAY and WAYLAND_DISPLAY are not set). Use "
+    "`thermofleet film RUN`, `--rerun` or `--mcap`, or open the run's report.html."
+)
+_HOLD = "How long an arm holds a payload"
+
+
+def show_command(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(
+            help="A library name, a .toml file, or an instance of the suite, as test/0017. Default: list the library."
+        ),
+    ] = None,
+    hold: Annotated[
+        float | None,
+        options.number(
+            "Show no scenario, but how long an arm can hold this payload, kg.",
+            *BOUNDS["payload_kg"][:2],
+            rich_help_panel=_HOLD,
+        ),
+    ] = None,
+    posture: Annotated[
+        str,
+        typer.Option(
+            help=f"{', '.join(POSTURES)}, or seven comma-separated angles in degrees.",
+            rich_help_panel=_HOLD,
+        ),
+    ] = "outstretched",
+    ambient: Annotated[float, options.number("Ambient temperature, °C.", -40, 60, rich_help_panel=_HOLD)] = 25.0,
+    cooling: Annotated[
+        str,
+        typer.Option(help=f"Cooling of the arm: {', '.join(get_args(Cooling))}.", rich_help_panel=_HOLD),
+    ] = "still_air",
+    tool_kg: Annotated[
+        float, options.number("Mass of the gripper at the flange, kg.", 0, RATING.temporary_kg, rich_help_panel=_HOLD)
+    ] = 0.0,
+    beyond_rating: Annotated[
+        bool,
+        typer.Option("--beyond-rating", help="Accept a load beyond the rating of the arm.", rich_help_panel=_HOLD),
+    ] = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """List the scenarios of the library, or show one: its arms, its jobs and its thermal load factor.
+
+    The thermal load factor is the heat of all jobs relative to the capacity of
+    the fleet. Above 1.2 no policy keeps all motors below the warning limit.
+    With --hold it shows the time until the motors of an arm that holds a payload
+    reach the warning and error limits.
+    """
+    if hold is not None:
+        if scenario is not None:
+            raise FleetError(f"--hold needs no scenario; leave '{scenario}' out.")
+        _show_hold(hold, posture, ambient, cooling, tool_kg, beyond_rating, as_json)
+    elif scenario is None:
+        _list_library(as_json)
+    else:
+        from scenarios.load import load
+        from scenarios.show.describe import describe
+
+        chosen = load(scenario)
+        if as_json:
+            print_json(asdict(chosen))
+            return
+        with progress_bar() as progress:
+            parts = describe(chosen, progress)
+        for part in parts:
+            out_console.print(part)
+
+
+def _show_hold(
+    payload_kg: float,
+    posture: str,
+    ambient_c: float,
+    cooling: str,
+    tool_kg: float,
+    beyond_rating: bool,
+    as_json: bool,
+) -> None:
+    from scenarios.motion import hold
+
+    result = hold.hold(payload_kg, posture, ambient_c, cooling=cooling, tool_kg=tool_kg, beyond_rating=beyond_rating)
+    if as_json:
+        print_json(hold.as_json(result))
+    else:
+        out_console.print(hold.as_table(result))
+
+
+def _list_library(as_json: bool) -> None:
+    from scenarios.load import library, load
+
+    scenarios = {name: load(path) for name, path in library().items()}
+    if as_json:
+        print_json({name: s.description for name, s in scenarios.items()})
+        return
+    table = plain_table("scenario", "arms", "hours", "description", numbers=False)
+    for name, s in scenarios.items():
+        table.add_row(name, str(len(s.arms)), f"{s.horizon_s / 3600:g}", s.description)
+    out_console.print(table)
+
+
+def layout_command(
+    scenario: options.ScenarioArg,
+    out: Annotated[Path | None, typer.Option(help="Draw the cell from above as this PNG file.")] = None,
+    overwrite: options.OverwriteOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Show the reach of each arm, which jobs exclude each other in space, and how many arms can work at once.
+
+    Lists all problems of the cell, for example two arms that are too close at
+    home. Exit code 2: there are problems.
+    """
+    from fleet.files import atomic_path
+    from scenarios.load import load
+    from scenarios.result_folder import check_file, disk_errors
+    from scenarios.show.layout import layout_report, layout_scene, layout_tables
+
+    chosen = load(scenario)
+    if out is not None:
+        check_file(out, (".png",), overwrite)
+    with progress_bar() as progress:
+        report = layout_report(chosen, progress)
+    if as_json:
+        print_json(report)
+    else:
+        for part in layout_tables(chosen, report):
+            out_console.print(part)
+    if out is not None:
+        from matplotlib.image import imsave
+
+        from fleet.env.render.picture import Picture
+
+        with disk_errors(out):
+            out.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(out) as file:
+                imsave(file, Picture().frame(layout_scene(chosen, report)), format="png")
+        say(f"Drew the cell: {out}.")
+    for problem in report.problems:
+        say(f"Error: {problem}")
+    if report.problems:
+        raise typer.Exit(2)
+
+
+def view_command(
+    what: Annotated[str, typer.Argument(help="Folder of `thermofleet run`, or a scenario.")],
+    given: Annotated[Given, From(Shot, "speed", "begin_s", "meshes", speed=30.0)],
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the run as this file (.mcap) instead, in messages of ROS 2, for Foxglove, Rerun, RViz or "
+            "PlotJuggler; needs the extra `mcap`."
+        ),
+    ] = None,
+    gltf: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the run as this file (.glb) instead, for viewers of augmented reality and of the web; --speed "
+            "is that of its animation."
+        ),
+    ] = None,
+    every: Annotated[
+        float | None,
+        options.number(
+            "Time between two postures in these files, s. Default: as recorded, up to 250,000 postures.", 0.01, 3600
+        ),
+    ] = None,
+    overwrite: options.OverwriteOption = False,
+) -> None:
+    """Play a recorded shift in MuJoCo's viewer, or show the cell of a scenario; close its window to end.
+
+    With --mcap or --gltf the shift is written as a file instead, without a display.
+    """
+    shot = Shot(**given)
+    if mcap is not None or gltf is not None:
+        _write_files(what, mcap, gltf, every, shot.speed, overwrite)
+        return
+    if every is not None:
+        raise FleetError("--every is for --mcap and --gltf.")
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise FleetError(NO_DISPLAY)
+    import numpy as np
+
+    from fleet.physics.cell_player import CellPlayer
+    from scenarios.load import load
+    from scenarios.run.stored_run import read_run
+    from scenarios.show.film import Film, show_heat
+
+    if (Path(what) / "run.json").exists():
+        run = read_run(Path(what))
+        film, last_s, began_s = Film(run, meshes=shot.meshes), float(run.telemetry.time_s[-1]), time.monotonic()
+        player = film.player
+
+        def update() -> object:
+            return film.show(min(shot.begin_s + shot.speed * (time.monotonic() - began_s), last_s))
+
+    else:
+        scenario = load(what)
+        robots = [arm.robot() for arm in scenario.arms]
+        player = CellPlayer(robots, scenario.places, scenario.fixtures, meshes=shot.meshes)
+        home = np.array([robot.home_q for robot in robots])
+        ambient_c = np.full(home.shape, 20.0)
+
+        def update() -> object:
+            return show_heat(player, home, ambient_c, np.zeros(len(robots)), scenario.limits)
+
+    say(f"Showing '{what}'; close the window to end.", out_console)
+    player.open_viewer(update)
+
+
+def _write_files(
+    what: str,
+    mcap: Path | None,
+    gltf: Path | None,
+    every_s: float | None,
+    speed: float,
+    overwrite: bool,
+) -> None:
+    from fleet.files import atomic_path
+    from scenarios.extras import require_extra
+    from scenarios.result_folder import check_file, disk_errors
+
+    wanted = [("mcap", mcap, ".mcap"), ("gltf", gltf, ".glb")]
+    files = {name: (path, ending) for name, path, ending in wanted if path is not None}
+    extras = {"mcap": ("mcap", "ros2"), "gltf": ("report",)}
+    for name, (path, ending) in files.items():
+        check_file(path, (ending,), overwrite, f"--{name}")
+        for extra in extras[name]:
+            require_extra(extra)
+    if not (Path(what) / "run.json").exists():
+        raise FleetError(f"--mcap and --gltf need the folder of a `thermofleet run` (got '{what}').")
+    from scenarios.run.stored_run import read_run
+    from scenarios.show.moments import Moments
+
+    moments = Moments(read_run(Path(what)), every_s)
+    for name, (path, _) in files.items():
+        with progress_bar(kept="") as progress, disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(path) as file:
+                if name == "mcap":
+                    from scenarios.show.mcap import write_mcap
+
+                    write_mcap(file, moments, progress)
+                else:
+                    from scenarios.show.gltf import write_gltf
+
+                    write_gltf(file, moments, speed, progress)
+        hints = {
+            "mcap": f"open it in Foxglove, or: ros2 bag play {path}",
+            "gltf": f"{speed:g} × real time; open it in Blender or a web viewer",
+        }
+        size = f"{path.stat().st_size / 1e6:.1f} MB"
+        say(f"Wrote {len(moments.poses)} moments, {size}: {path} ({hints[name]}).", out_console)
+
+
+def film_command(
+    run: Annotated[Path, typer.Argument(help="Folder of `thermofleet run`.")],
+    given: Annotated[Given, From(Shot, "speed", "fps", "begin_s", "end_s", "meshes")],
+    out: Annotated[Path, typer.Option(help="Output file: .mp4, .webm or .gif.")] = Path("shift.mp4"),
+    size: Annotated[str, typer.Option(help="Width x height, px; even numbers.")] = "1280x720",
+    overwrite: options.OverwriteOption = False,
+) -> None:
+    """Film a recorded shift: the arms move, their motors coloured by temperature."""
+    from fleet.files import atomic_path
+    from scenarios.progress import Count
+    from scenarios.result_folder import check_file, disk_errors
+
+    suffix = out.suffix.lower()
+    check_file(out, (".mp4", ".webm", ".gif"), overwrite)
+    width, height = _size(size)
+    if sys.platform.startswith("linux"):  # MuJoCo chooses its OpenGL when it is loaded, and the default needs a display
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    from scenarios.run.stored_run import read_run
+    from scenarios.show.film import frames, times, write_film
+
+    shot = Shot(**given, width=width, height=height)
+    stored = read_run(run)
+    at_s = times(stored, shot)
+    most = min(MOST_FRAMES, MOST_GIF_PIXELS // (width * height)) if suffix == ".gif" else MOST_FRAMES
+    if len(at_s) > most:
+        raise FleetError(
+            f"The film would have {len(at_s)} pictures; at most {most} are possible in this size. Raise --speed (now "
+            f"{shot.speed:g}), lower --fps (now {shot.fps}), or choose a part with --begin and --end."
+        )
+    with progress_bar() as progress, disk_errors(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+
+        def counted():
+            for number, picture in enumerate(frames(stored, shot, at_s), 1):
+                progress("filming", Count(number, len(at_s)))
+                yield picture
+
+        with atomic_path(out) as file:
+            count = write_film(file, suffix[1:], counted(), shot)
+    length_s, megabytes = count / shot.fps, out.stat().st_size / 1e6
+    say(f"Filmed {count} pictures, {length_s:.1f} s, {megabytes:.1f} MB: {out}.", out_console)
+
+
+def _size(asked: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", asked)
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not all(SMALLEST <= px <= LARGEST and px % 2 == 0 for px in size):
+        raise FleetError(
+            f"--size must be WIDTHxHEIGHT, even numbers from {SMALLEST} to {LARGEST} (got '{asked}'), as in 1280x720."
+        )
+    return size
+
+
+def report_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of `thermofleet run`, or of a recording, finished or not.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The HTML file. Default: in the folder of a run, beside that of a recording.")
+    ] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="Of a recording: the scenario of the fleet, if no auctioneer described its cell.")
+    ] = None,
+    meshes: Annotated[
+        bool, typer.Option("--meshes", help="Of a run: Kinova's shells; needs the extra `meshes`.")
+    ] = False,
+) -> None:
+    """Write the report of a live recording, as `run` writes one of a simulated shift, or that of a run anew."""
+    from fleet.files import atomic_path
+    from scenarios.live.recording_report import recording_html
+    from scenarios.load import load
+    from scenarios.result_folder import disk_errors
+    from scenarios.run.run_folder import run_html
+    from scenarios.run.stored_run import read_run
+
+    if (folder / "run.json").exists():
+        path, run = out or folder / "report.html", read_run(folder)
+        html = run_html(run.card, run.scenario, run.telemetry, run.events, run.jobs, run.offers, meshes=meshes)
+    else:
+        path = out or folder.parent / "report.html"
+        html = recording_html(folder, None if scenario is None else load(scenario))
+    with disk_errors(path), atomic_path(path) as draft:
+        draft.write_text(html, encoding="utf-8")
+    say(f"Open {path} in a browser.", out_console)
+
+
+def trace_command(
+    event: Annotated[
+        str,
+        typer.Argument(
+            help="A row of the event log from 0; a kind such as fault, also with an arm or a job as fault@arm_1; or a "
+            "job, for its award. Of several events, the first one."
+        ),
+    ],
+    folder: Annotated[
+        Path | None,
+        typer.Option("--in", help="Folder of a run or a recording; default: the last of runs/.", show_default=False),
+    ] = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Follow an event to its job, plan, offers, twin, training data, configuration and code."""
+    from scenarios.show.trace import thread_of, thread_table
+
+    found = thread_of(folder or last_folder(Path("runs")), event)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        out_console.print(thread_table(found))
+
+
+def last_folder(runs: Path) -> Path:
+    """The folder of the run or recording that was written last.
+
+    Raises:
+        FleetError: there is none.
+    """
+    cards = [*runs.glob("*/run.json"), *runs.glob("*/recording.json")] if runs.is_dir() else []
+    if not cards:
+        raise FleetError(f"There is no run in '{runs}'; name the folder of a run or a recording with --in.")
+    return max(cards, key=lambda card: card.stat().st_mtime_ns).parent

@@ -1,0 +1,370 @@
+"""Requests to a live fleet: submit and follow jobs, ask for quotes, steer jobs and arms."""
+
+import getpass
+import re
+import secrets
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+from rich.table import Table
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.replies import NoReply, Replies
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
+    MOST_QUOTED,
+    NOT_PLANNED,
+    Admission,
+    JobEstimate,
+    JobSpec,
+    JobStatus,
+    PlanQuote,
+    Quote,
+    QuoteRequest,
+)
+from fleet.bus.protocol.operator import (
+    ALL_ARMS,
+    Action,
+    Cleared,
+    ClearRequest,
+    Controlled,
+    ControlRequest,
+    Pause,
+    ResetReply,
+    ResetRequest,
+    Resume,
+)
+from fleet.errors import BusError, FleetError, Refused, nearest
+from fleet.job import BOUNDS, KINDS
+from fleet.live.job_client import JobClient
+from fleet.live.monitor.snapshot import describe_status
+from scenarios.cli.options import the_fleet
+from scenarios.cli.signals import Stop, until_stopped
+from scenarios.cli.terminal import echo, out_console, say
+
+REPLY_S, ATTEMPTS = 5.0, 3
+"""Real seconds to wait for a reply, and number of attempts: the same request again is carried out once."""
+TURN_S = 0.2
+"""Real seconds between two checks for a stop request."""
+PAUSE_S = 0.2
+"""Real seconds before a request for quotes is repeated."""
+PATIENCE_S = 30.0
+"""Real seconds without a reply after which following ends."""
+MOST_CHARACTERS = 128
+"""Longest name of a person."""
+_UNKNOWN_KIND = re.compile(r"Invalid enum value '(.*)'", re.DOTALL)
+"""Message of msgspec; of all fields of a job, only its kind is an enumeration."""
+Decoded = TypeVar("Decoded")
+
+
+def submit_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, by: str = "", wait: bool = False) -> bool:
+    """Submit jobs and print the decision on each; return whether all are accepted and, after a wait, finished.
+
+    Args:
+        wait: Follow the accepted jobs to their end.
+
+    Raises:
+        FleetError: the submission is refused, or there is no auctioneer.
+    """
+    with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        client = JobClient(link, by, print_changes())
+        admissions = submit(client, jobs, link.fleet)
+        for admission in admissions:
+            decision = "accepted" if admission.accepted else "refused"
+            echo(f"{admission.job}: {decision}{f': {admission.reason}' if admission.reason else ''}")
+        accepted = [admission.job for admission in admissions if admission.accepted]
+        unfinished = follow(link, client, stop) if wait else []
+        stop.leave("Stopped following; the auctioneer has the jobs.")
+    return len(accepted) == len(admissions) and not unfinished
+
+
+def quote_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, timeout_s: float, as_json: bool) -> bool:
+    """Print the quotes of all arms without submitting a job; return whether an arm can do each job.
+
+    Args:
+        timeout_s: Real seconds to wait for arms.
+
+    Raises:
+        FleetError: there are too many jobs, or no arm replies.
+    """
+    if len(jobs) > MOST_QUOTED:
+        raise FleetError(f"A request can name at most {MOST_QUOTED} jobs (got {len(jobs)}).")
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        request = QuoteRequest("dry run", tuple(jobs), dry_run=True)
+        answers, until_s = query(link, request, timeout_s), time.monotonic() + timeout_s
+        while _is_unplanned(answers) and time.monotonic() < until_s:
+            link.serve(time.monotonic() + PAUSE_S)
+            answers = query(link, request, timeout_s)
+        name = link.fleet
+    quotes = {quote.arm: quote for quote in sorted(answers.messages.values(), key=lambda quote: quote.arm)}
+    if not quotes and not answers.refused:
+        raise BusError(f"No arm of fleet '{name}' replied. Is `thermofleet arm run` running?")
+    if as_json:
+        echo(msgspec.json.format(msgspec.json.encode(list(quotes.values())), indent=1).decode())
+    else:
+        out_console.print(quote_table(jobs, quotes))
+    for reason in answers.refused.values():
+        say(f"Refused: {reason}" if reason else f"An arm did not reply within {timeout_s:g} s.")
+    feasible = {estimate.job for quote in quotes.values() for estimate in quote.estimates if estimate.feasible}
+    return feasible.issuperset(job.name for job in jobs)
+
+
+def read_jobs(file: str) -> list[JobSpec]:
+    """Read the jobs of a file, or of standard input for `-`.
+
+    Raises:
+        FleetError: names the line (or the place in the list) and what is wrong there.
+    """
+    name = "standard input" if file == "-" else file
+    try:
+        raw = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
+    except OSError as error:
+        raise FleetError(f"Cannot read '{file}': {error.strerror}.") from error
+    if raw.lstrip().startswith(b"["):
+        jobs = _decode(raw, list[JobSpec], name)
+    else:
+        lines = enumerate(raw.splitlines(), start=1)
+        jobs = [_decode(line, JobSpec, f"{name}, line {number}") for number, line in lines if line.strip()]
+    if not jobs:
+        raise FleetError(f"{name} contains no jobs.")
+    return jobs
+
+
+def _decode(raw: bytes, kind: type[Decoded], where: str) -> Decoded:
+    try:
+        return msgspec.json.decode(raw, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise FleetError(f"{where}: {explain(error)}") from error
+
+
+def explain(error: Exception) -> str:
+    """Sentence for an error of msgspec, with the field as the file names it."""
+    problem, _, path = str(error).partition(" - at `$")
+    problem = problem.rstrip(".")
+    if unknown := _UNKNOWN_KIND.fullmatch(problem):
+        problem = f"No kind of job '{unknown[1]}'{nearest(unknown[1], KINDS)}".rstrip(".")
+    path = path.rstrip("`").lstrip(".")
+    bounds = BOUNDS.get(path.rpartition(".")[2])
+    if problem == "Number out of range" and bounds is not None:
+        problem = f"The number is too large; it must be {bounds}"
+    return f"{problem}{f' (at {path})' if path else ''}."
+
+
+def submit(client: JobClient, jobs: Sequence[JobSpec], fleet: str) -> list[Admission]:
+    """Submit jobs and return the auctioneer's decision on each.
+
+    Raises:
+        FleetError: it refused, or there is none.
+    """
+    try:
+        return client.submit_and_wait(jobs)
+    except Refused as error:
+        raise FleetError(f"The auctioneer refused the submission: {error}") from error
+    except NoReply as error:
+        raise BusError(
+            f"No auctioneer of fleet '{fleet}' replied. Is `thermofleet bus auctioneer` running? Arms that allocate by "
+            "consensus reply once all are present, or a majority has been for 20 s."
+        ) from error
+
+
+def follow(link: BusClient, client: JobClient, stop: Stop) -> list[str]:
+    """Serve until all followed jobs have ended, or until stopped; return the names of those not finished.
+
+    Raises:
+        BusError: the auctioneer is gone, and does not come back.
+    """
+    while client.open and not stop.is_set():
+        client.step()
+        link.serve(time.monotonic() + TURN_S)
+        if time.monotonic() > client.heard_s + PATIENCE_S:
+            raise BusError(
+                f"No reply from an auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; "
+                "accepted jobs are on its disk."
+            )
+    return [name for name, status in client.statuses.items() if status is None or status.state != "finished"]
+
+
+def print_changes() -> Callable[[JobStatus], None]:
+    """A function that prints a status of a job if its state is another one than before."""
+    states: dict[str, str] = {}
+
+    def show(status: JobStatus) -> None:
+        if states.get(status.job) != status.state:
+            states[status.job] = status.state
+            echo(describe_status(status))
+
+    return show
+
+
+def query(link: BusClient, request: QuoteRequest, timeout_s: float) -> Replies[Quote]:
+    """Request the quotes of every arm."""
+    return link.query_and_wait(keys.of_every_arm(link.fleet, "quote"), request, Quote, timeout_s=timeout_s)
+
+
+def _is_unplanned(answers: Replies[Quote]) -> bool:
+    """Whether an arm is still planning a job."""
+    estimates = (estimate for quote in answers.messages.values() for estimate in quote.estimates)
+    return any(estimate.reason == NOT_PLANNED for estimate in estimates)
+
+
+def one_job(
+    name: str, kind: str, places: Sequence[str], payload_kg: float, repetitions: int, dwell_s: float, force_n: float
+) -> JobSpec:
+    """Make the job that the options describe.
+
+    Raises:
+        FleetError: there is no such job.
+    """
+    fields = {
+        "name": name,
+        "kind": kind,
+        "places": list(places),
+        "payload_kg": payload_kg,
+        "repetitions": repetitions,
+        "dwell_s": dwell_s,
+        "force_n": force_n,
+    }
+    try:
+        msgspec.json.encode(fields)
+        return msgspec.convert(fields, JobSpec)
+    except msgspec.ValidationError as error:
+        raise FleetError(f"Invalid job: {explain(error)}") from error
+    except UnicodeEncodeError as error:
+        raise FleetError(f"--kind and --place must be UTF-8 text (got {error.object!a}).") from error
+
+
+def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
+    """All estimates: jobs in the given order, and under each job the arms."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("job")
+    table.add_column("arm")
+    for column in ("plan", "peak °C", "gained K", "P", "d", "duration s", "finish in s"):
+        table.add_column(column, justify="right")
+    table.add_column("")
+    for index, job in enumerate(jobs):
+        estimates = [(arm, each) for arm, quote in quotes.items() for each in quote.estimates if each.job == job.name]
+        rows = [(arm, row) for arm, estimate in estimates for row in rows_of(estimate)]
+        for line, (arm, row) in enumerate(rows):
+            again = line > 0 and rows[line - 1][0] == arm
+            last = line == len(rows) - 1 and index > 0
+            table.add_row("" if line else job.name, "" if again else arm, *row, end_section=last)
+    return table
+
+
+def rows_of(estimate: JobEstimate) -> list[list[str]]:
+    """Cells of each plan of an estimate; a dash for what the arm does not know."""
+    if not estimate.feasible:
+        return [["–"] * 7 + [f"cannot: {estimate.reason}"]]
+    return [_cells(plan) for plan in estimate.plans]
+
+
+def _cells(plan: PlanQuote) -> list[str]:
+    figures = (
+        (plan.peak_c, ".1f"),
+        (plan.gained_k, "+.1f"),
+        (plan.p_saturation, ".2f"),
+        (plan.difficulty, ".2f"),
+        (plan.duration_s, ".0f"),
+        (plan.finish_in_s, ".0f"),
+    )
+    return [str(plan.plan), *("–" if value is None else format(value, form) for value, form in figures), ""]
+
+
+def clear_space(arm: str, by: str, endpoint: str, fleet: str) -> None:
+    """Free the space of an absent arm.
+
+    Raises:
+        BusError: the request is refused, or nobody replies.
+    """
+    check_person(by)
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        request = ClearRequest(arm, by or user_name())
+        replies = link.query_and_wait(keys.of_jobs(link.fleet, "clear"), request, Cleared, timeout_s=REPLY_S)
+        name = link.fleet
+    for reason in replies.refusals:
+        where = " by all arms" if replies.messages else ""
+        raise BusError(f"The space of '{arm}' was not freed{where}: {reason}")
+    if not replies.messages:
+        raise BusError(
+            f"Neither an auctioneer nor an arm of fleet '{name}' replied within {REPLY_S:g} s. With TLS, use a "
+            "certificate of the role operator."
+        )
+    echo(f"{arm}: its space is free until the arm reports its space again.")
+
+
+def check_person(by: str) -> None:
+    """Check the name of the person who requests something.
+
+    Raises:
+        FleetError: it is too long.
+    """
+    if len(by) > MOST_CHARACTERS:
+        raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
+
+
+def user_name() -> str:
+    """Name of the user of this process; "" if it has none."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return ""
+
+
+def reset_arm(arm: str, by: str, endpoint: str, fleet: str) -> None:
+    """Clear the fault of an arm.
+
+    Raises:
+        Refused: the arm refuses.
+        BusError: it does not reply.
+    """
+    check_person(by)
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        key, message = keys.of_arm(link.fleet, arm, "reset"), ResetRequest(by or user_name())
+        try:
+            reply = link.ask(key, message, ResetReply, timeout_s=REPLY_S)
+        except NoReply as error:
+            raise BusError(
+                f"The arm '{arm}' did not reply. With TLS, use a certificate of the role operator."
+            ) from error
+    echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
+
+
+def control(actions: Sequence[Action], by: str, endpoint: str, fleet: str) -> None:
+    """Request actions, one after another, and print what became of them.
+
+    Raises:
+        Refused: one is refused.
+        BusError: nobody replies.
+    """
+    check_person(by)
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        for action in actions:
+            echo(describe(action, _request(link, ControlRequest(secrets.token_hex(8), action, by or user_name()))))
+
+
+def _request(link: BusClient, control: ControlRequest) -> Controlled:
+    key = keys.of_jobs(link.fleet, "control")
+    try:
+        return link.ask(key, control, Controlled, timeout_s=REPLY_S, attempts=ATTEMPTS)
+    except NoReply as error:
+        raise BusError(
+            f"Neither an auctioneer nor an arm of fleet '{link.fleet}' replied within {ATTEMPTS * REPLY_S:g} s. With "
+            "TLS, use a certificate of the role operator."
+        ) from error
+
+
+def describe(action: Action, reply: Controlled) -> str:
+    """One line about the outcome of an action."""
+    note = f" {reply.note}" if reply.note else ""
+    if isinstance(action, Pause | Resume):
+        arms = ", ".join("all arms" if arm == ALL_ARMS else arm for arm in sorted(reply.paused))
+        return f"Paused: {arms or 'none'}.{note}"
+    return f"{action.job}: {_state(reply.job)}{note}"
+
+
+def _state(job: JobStatus | None) -> str:
+    return "settled." if job is None else f"{job.state}, {job.cycles} of {job.repetitions} cycles."
