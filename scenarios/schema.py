@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from math import ceil
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -16,6 +16,12 @@ from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check
 from fleet.observation import MOST_SLOTS
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
+SplitName = Literal["train", "validation", "test", "sizes"]
+SPLITS: tuple[SplitName, ...] = get_args(SplitName)
+"""Of the suite."""
+RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
+"""Model of P(saturation): from the peak predicted by the identified or by the nominal thermal network of the arm, or
+a regression on features of the learned twin (`twin.saturation.model.evidence_of`)."""
 MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one per second."""
 MOST_CLEARANCE_M = 0.2

@@ -26,7 +26,8 @@ from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from scenarios.cli.live.submit import read_jobs
 from scenarios.live.http_access import read_tokens
-from scenarios.load import library, parse_toml
+from scenarios.load import library
+from scenarios.parse import parse_toml
 from twin.logs.formats import GEN3, PLAIN
 from twin.logs.reader import read
 

@@ -11,7 +11,7 @@ from scenarios.bounds.command import markdown
 from scenarios.bounds.references import Reference, load_references
 from scenarios.doc_tables import table
 from scenarios.leaderboard.submission import Submission, check, read, split_references
-from scenarios.load import SPLITS
+from scenarios.schema import SPLITS
 from scenarios.statistics.scores import Scores, ranked, score_cells, scores_of
 from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import manifest

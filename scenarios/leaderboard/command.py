@@ -34,7 +34,7 @@ def leaderboard_command(
     as the mean of random. With --verify, repeated shifts must give equal figures.
     """
     from scenarios.leaderboard.board import best_text, board_of, board_text, read_all, remark_text
-    from scenarios.load import SplitName
+    from scenarios.schema import SplitName
     from scenarios.statistics.scores import score_tables
     from scenarios.statistics.tables import LEGEND
 

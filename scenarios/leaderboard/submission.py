@@ -15,13 +15,13 @@ from fleet.engine.observe import PEAK_HIGH_C, PEAK_LOW_C
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
 from scenarios.bounds.references import Reference
-from scenarios.load import SplitName
 from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.fleet import RiskName
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
 from scenarios.run.decision_limit import DECISION_LIMIT_S
 from scenarios.run.evaluate import COUNTS, FIGURES, Outcome
+from scenarios.schema import SplitName
 from scenarios.suite.cells import JUDGED
 from scenarios.suite.splits import Row as Line
 from scenarios.suite.splits import cell_of_instance, line_of, manifest

@@ -34,7 +34,7 @@ from scenarios.prepare.planned_arm import PlannedArm, air_offsets, plan_arms
 from scenarios.prepare.problems import problems_of
 from scenarios.prepare.randomisation import Randomisation, Variation, randomisation_of
 from scenarios.progress import Count, Progress, check_progress, quiet
-from scenarios.schema import Scenario
+from scenarios.schema import RiskName, Scenario
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
@@ -42,9 +42,6 @@ if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
     from fleet.env.allocation_v1 import AllocationEnv, MaskPlace
 
 DifficultyName = Literal["twin", "blind", "oracle"]
-RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
-"""Model of P(saturation): from the peak predicted by the identified or by the nominal thermal network of the arm, or
-a regression on features of the learned twin (`twin.saturation.model.evidence_of`)."""
 RISK: RiskName = "rc"
 PlantName = Literal["profile", "mujoco"]
 BusName = Literal["zenoh", "memory"]

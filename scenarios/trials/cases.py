@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 from fleet.errors import FleetError, nearest
-from scenarios.load import INSTANCE, SPLITS, library, load
+from scenarios.load import INSTANCE, library, load
+from scenarios.schema import SPLITS
 from scenarios.suite.splits import Instance, instance, split
 from scenarios.trials.plan import Case, seeds_of_instance
 

@@ -14,7 +14,7 @@ from fleet.engine.state import DONE, WAITING, State, World
 from fleet.env.allocation_v1 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import JOINTS
-from scenarios.load import parse_scenario
+from scenarios.parse import parse_scenario
 from scenarios.schema import Scenario
 
 Trace = list[tuple[Any, ...]]

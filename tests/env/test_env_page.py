@@ -12,7 +12,7 @@ from fleet.observation import FIELDS, Layout
 from scenarios import make_batch, make_env
 from scenarios.cli.main import app
 from scenarios.doc_tables import fill_tables
-from scenarios.load import override
+from scenarios.parse import override
 from scenarios.schema import RewardSpec
 
 PAGE = Path(__file__).parents[2] / "docs" / "env.md"

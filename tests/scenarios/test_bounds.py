@@ -24,10 +24,11 @@ from scenarios.bounds.relaxation import Relaxation
 from scenarios.bounds.schedule import Replay, Schedules, ShiftSimulator, without_scores
 from scenarios.bounds.upper import upper_bound
 from scenarios.fault_price import weights_of
-from scenarios.load import SPLITS, parse_scenario
+from scenarios.parse import parse_scenario
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare
 from scenarios.run.evaluate import outcomes
+from scenarios.schema import SPLITS
 from scenarios.suite.splits import instance, manifest
 from scenarios.trials.scores import split_file
 

@@ -10,7 +10,8 @@ import pytest
 from agents.policy import WAIT
 from agents.registry import RULES
 from fleet.bus.exchange.channel import PERFECT, Channel
-from scenarios.load import load, parse_scenario
+from scenarios.load import load
+from scenarios.parse import parse_scenario
 from scenarios.policy_loader import PolicyFailed, policy_of
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.evaluate import FIGURES, Outcome, outcomes

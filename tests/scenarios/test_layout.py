@@ -11,7 +11,8 @@ import pytest
 from fleet.errors import FleetError, ScenarioError
 from scenarios.cli.main import main
 from scenarios.job_stream import all_works
-from scenarios.load import library, load, parse_scenario
+from scenarios.load import library, load
+from scenarios.parse import parse_scenario
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.report.layout import layout_report
 from scenarios.schema import Ambient

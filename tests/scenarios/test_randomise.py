@@ -7,7 +7,8 @@ import pytest
 
 from fleet.errors import FleetError, ScenarioError
 from scenarios.cli.options import parse_randomisation
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.run.evaluate import outcomes

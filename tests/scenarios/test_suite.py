@@ -7,11 +7,11 @@ import pytest
 
 from fleet.errors import ScenarioError
 from scenarios.job_stream import all_works
-from scenarios.load import SPLITS, load
+from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.report.load_factor import load_factor
 from scenarios.scenario_hash import scenario_content
-from scenarios.schema import BusSpec, Scenario
+from scenarios.schema import SPLITS, BusSpec, Scenario
 from scenarios.suite.axes import BUSES, DUE, Axes, scenario_of
 from scenarios.suite.cells import CELLS, layout
 from scenarios.suite.layouts import layout_of

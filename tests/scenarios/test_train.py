@@ -9,7 +9,8 @@ from agents.learned.ppo import PpoConfig
 from agents.learned.training_log import LOG
 from fleet.errors import FleetError
 from scenarios.cli.main import main
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.policy_loader import label, policy_of
 from scenarios.run.train_policy import CURVE, VALIDATION_SEED, TrainingPlan, train
 from scenarios.run.training_folder import NETWORK_STATE

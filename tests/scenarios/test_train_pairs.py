@@ -14,7 +14,8 @@ from agents.pair_scores import PAIRS_CARD, PARAMETERS, first_parameters
 from agents.pairs import Worth
 from fleet.errors import FleetError
 from scenarios.cli.main import main
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
 from scenarios.run import suite_batches

@@ -12,7 +12,8 @@ import pytest
 
 from agents.pair_scores import PARAMETERS, save_pairs
 from fleet.errors import FleetError
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.planned_arm import plan_arms
