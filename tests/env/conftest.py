@@ -175,12 +175,6 @@ def batch(small) -> Callable[..., BatchEnv]:
 
 
 @pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The plan cache of all tests of a run; never the user's."""
-    return tmp_path_factory.getbasetemp() / "cache"
-
-
-@pytest.fixture(scope="session")
 def cell(three_arms: dict[str, Any], job_streams) -> Scenario:
     """A cell of three arms, planned in a second, hot enough to fault."""
     streams = job_streams(hold_until_s=240.0, sort_until_s=200.0, sort_due_s=100.0)

@@ -60,12 +60,12 @@ def test_every_info_is_in_the_page(make, batch) -> None:
         assert f"| `reward_{name}` | {weight} |" in TEXT
 
 
-def test_the_example_of_the_page_runs(monkeypatch, cell, folder) -> None:
+def test_the_example_of_the_page_runs(monkeypatch, cell, plans) -> None:
     """With a cell that takes little time to plan."""
 
     def small(given: dict[str, Any]) -> dict[str, Any]:
         fields = {name: given.pop(name) for name in ("horizon_s",) if name in given}
-        return {"scenario": override(cell, **fields), "cache": folder, **given}
+        return {"scenario": override(cell, **fields), "cache": plans, **given}
 
     def env(scenario: str, **given: Any) -> Any:
         assert scenario == "quickstart"

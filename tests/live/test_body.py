@@ -28,7 +28,7 @@ def one_job(small, *, repetitions=3, payload=None, times=None):
     return arm, small.job("a", content, repetitions=repetitions), arm.plans[content][0]
 
 
-@settings(max_examples=15, deadline=None, phases=[Phase.generate])
+@settings(max_examples=15, phases=[Phase.generate])
 @given(st.data())
 def test_a_body_passes_the_same_shift_as_the_simulator(small, data):
     """One arm, the same jobs in the same order: temperatures at every tick and every event agree."""

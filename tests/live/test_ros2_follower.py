@@ -8,7 +8,7 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
@@ -22,6 +22,7 @@ from fleet.live.clock import FleetClock
 from fleet.ros2.conversion import Joints, joint_names
 from fleet.ros2.follower import FRESH_S, WARM_S, ArmReadings, Follower
 from fleet.ros2.node import Node
+from tests.profiles import examples
 
 PATIENCE_S = 15.0
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -104,7 +105,7 @@ def test_a_moving_arm_is_working(speed, mode):
     assert state_of(moved).mode == mode
 
 
-@settings(deadline=None, max_examples=50)
+@examples(50)
 @given(st.permutations(NAMES), st.lists(st.tuples(*[st.floats(-6, 6)] * 3), min_size=7, max_size=7))
 def test_the_order_of_joints_changes_no_reading(order, values):
     of = dict(zip(NAMES, values, strict=True))

@@ -87,7 +87,7 @@ def moved(by_m: tuple[float, float], turn_deg: float) -> tuple[Robot, Fixture, W
     )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.tuples(*[st.floats(-8.0, 8.0)] * 2), st.floats(-180.0, 180.0))
 def test_an_arm_that_stands_alike_elsewhere_has_the_same_plans(by_m, turn_deg):
     """The physics know no place and no compass: gravity and floor are the same after a move and a turn."""

@@ -80,12 +80,6 @@ class Said(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The cache that all tests of a run share; never the user's."""
-    return tmp_path_factory.getbasetemp() / "cache"
-
-
-@pytest.fixture(scope="session")
 def subject() -> SimpleNamespace:
     """An arm with heat of its own, light jobs that it knows to stay cool, and a small twin trained on them."""
     draw = np.random.default_rng(np.random.SeedSequence(8))

@@ -169,10 +169,10 @@ def test_weights_with_other_signs_are_refused(small):
 
 
 @pytest.fixture(scope="module")
-def fleet(three_arms, job_streams, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+def fleet(three_arms, job_streams, plans: Path) -> Fleet:
     streams = list(job_streams(300.0, None, 200.0).values())
     scenario = parse_scenario(three_arms | {"name": "three", "jobs": streams, "horizon_s": 600.0}, Path("three.toml"))
-    return prepare(scenario, difficulty="blind", cache=tmp_path_factory.mktemp("plans"))
+    return prepare(scenario, difficulty="blind", cache=plans)
 
 
 def test_a_reference_is_between_its_parts_and_its_schedule_can_be_replayed(fleet: Fleet):

@@ -19,11 +19,10 @@ from scenarios.schema import Ambient
 
 
 @pytest.fixture
-def cache(tmp_path_factory, monkeypatch):
-    """A folder of plans that the tests of this file share."""
-    folder = tmp_path_factory.getbasetemp() / "cache"
-    monkeypatch.setenv("THERMOFLEET_CACHE", str(folder))
-    return folder
+def cache(plans, monkeypatch):
+    """The folder of plans that all tests share."""
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
+    return plans
 
 
 def cell(*arms, places, clearance_m=0.02, **more):

@@ -74,10 +74,10 @@ def test_axes_are_honoured() -> None:
     assert [c for _, c in at(air="rising").ambient.points] == [22.0, 31.0]
 
 
-def test_heat_severity_raises_the_thermal_load(tmp_path_factory) -> None:
+def test_heat_severity_raises_the_thermal_load(plans) -> None:
     cell = next(cell for cell in CELLS if cell.arms == 2)
     scenario = scenario_of("x", cell, PLAIN, 0)
-    fleet = prepare(scenario, difficulty="blind", cache=tmp_path_factory.getbasetemp() / "cache")
+    fleet = prepare(scenario, difficulty="blind", cache=plans)
     assert {len([arm for arm in fleet.arms if work in arm.plans]) for work in all_works(scenario)} == {2}
     from scenarios.prepare.fleet import ShiftFactory
 

@@ -340,7 +340,7 @@ def test_no_job_is_done_twice_and_none_is_lost(council, rates, seed, actions):
 
 
 @pytest.mark.slow
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=1500)
 @given(rates, st.integers(0, 2**32), st.lists(st.sampled_from(ACTIONS), max_size=25))
 def test_no_job_is_done_twice_in_a_long_storm(council, rates, seed, actions):
     storm(council, rates, seed, actions)
