@@ -31,14 +31,19 @@ from fleet.robot import JOINTS, Robot, ThermalLimits
 from fleet.seeding import key_of
 from fleet.thermal import ThermalModel, gen3_network, thermal_model
 from tests import profiles  # noqa: F401 -- loads the profile of Hypothesis
+from tests.commands import start_server
 
 # A shell starts background jobs with Ctrl-C ignored, and their child processes inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the engine before xdist starts workers: each would compile it, at the same time."""
+    """Compile the engine before xdist starts workers: each would compile it, at the same time.
+
+    They also share one process that forks commands.
+    """
     if session.config.getoption("numprocesses", None):
+        start_server()
         library = Shifts().library()
         env = BatchEnv(library, 1)
         env.reset()

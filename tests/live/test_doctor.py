@@ -2,8 +2,6 @@
 
 import json
 import socket
-import subprocess
-import sys
 import threading
 import time
 from contextlib import ExitStack, contextmanager
@@ -21,6 +19,7 @@ from fleet.bus.protocol.messages import State
 from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 from scenarios.live.watch_screen import space_line
+from tests import commands
 
 PATIENCE_S = 30.0
 ASKED = ClockProbe(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)
@@ -191,10 +190,7 @@ def participants(endpoint, *, states=True, clocks=1):
 
 
 def doctor(endpoint, *options):
-    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "doctor", "--endpoint", endpoint]
-    done = subprocess.run(
-        [*command, "--seconds", "1", *options], capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
+    done = commands.run("doctor", "--endpoint", endpoint, "--seconds", "1", *options)
     return done.returncode, " ".join((done.stdout + done.stderr).split())
 
 

@@ -25,6 +25,7 @@ from scenarios.load import load
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.progress import quiet
 from scenarios.schema import Ambient
+from tests import commands
 from twin.logs.reader import read
 from twin.logs.recording import READINGS
 
@@ -49,15 +50,7 @@ class Process:
     """`thermofleet arm …` until the end of the block."""
 
     def __init__(self, *args, cache, cwd):
-        program = "import sys; from scenarios.cli.main import main; main(sys.argv[1:])"
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", program, "arm", *map(str, args)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=cwd,
-            env={**os.environ, "THERMOFLEET_CACHE": str(cache), "OMP_NUM_THREADS": "1"},
-        )
+        self.process = commands.start("arm", *args, cwd=cwd, env={**os.environ, "THERMOFLEET_CACHE": str(cache)})
         self.killer = threading.Timer(PATIENCE_S, self.process.kill)
         self.killer.start()
         self.ready = self.process.stdout.readline()

@@ -3,7 +3,6 @@
 import json
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ from scenarios.cli.live.auction import job_spec, own_jobs
 from scenarios.cli.live.journals import refuse_other_way
 from scenarios.load import load
 from scenarios.prepare.fleet import make_env
+from tests import commands
 
 ROOT = Path(__file__).parents[2]
 PATIENT_S = 20.0
@@ -187,10 +187,7 @@ def test_a_shift_is_continued_with_its_own_kind_of_allocation(tmp_path):
 @contextmanager
 def auctioneer(endpoint: str, folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
     """The command as a process that has said that it is ready."""
-    program = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "auction"]
-    options = ["--endpoint", endpoint, "--journal", folder, *words]
-    command = [*program, *map(str, options)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with commands.start("auction", "--endpoint", endpoint, "--journal", folder, *words) as process:
         assert process.stdout is not None
         try:
             said = process.stdout.readline()

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import time
 from contextlib import ExitStack
@@ -15,6 +14,7 @@ from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
 from scenarios.cli.main import main
+from tests import commands
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
@@ -25,12 +25,7 @@ def started(stack, *words):
     """A command that says it is ready."""
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     environment.pop("ROS_DOMAIN_ID", None)
-    process = stack.enter_context(
-        subprocess.Popen(
-            [sys.executable, "-c", "from scenarios.cli.main import main; main()", "ros2", *words],
-            cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )
-    )  # fmt: skip
+    process = stack.enter_context(commands.start("ros2", *words, env=environment))
     stack.callback(process.kill)
     assert process.stdout is not None
     assert process.stdout.readline().startswith("ready ")

@@ -6,7 +6,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -23,6 +22,7 @@ from fleet.bus.security.tls import Tls, identified
 from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.cli.live.up import chosen_arms, free_port, parts_of
+from tests import commands
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
@@ -32,8 +32,7 @@ PATIENT_S = 20.0
 @contextmanager
 def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The router as a process, and the line that it prints when it listens."""
-    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "router", *map(str, words)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with commands.start("router", *words) as process:
         assert process.stdout is not None
         try:
             yield process, process.stdout.readline().strip()
@@ -233,15 +232,7 @@ def test_a_whole_fleet_works_with_tls_and_access_control(thermofleet, small_toml
     place, out = tmp_path / "keys", tmp_path / "live"
     assert thermofleet("keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
     words = ("up", small_toml, "--tls", place, "--speed", 20, "--difficulty", "blind", "--out", out, "--policy", policy)
-    done = subprocess.run(
-        [sys.executable, "-c", "from scenarios.cli.main import main; main()", *map(str, words)],
-        cwd=ROOT,
-        env={**os.environ, "THERMOFLEET_CACHE": str(plans)},
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    done = commands.run(*words, env={**os.environ, "THERMOFLEET_CACHE": str(plans)})
     assert done.returncode == 0, done.stderr
     finished = [one for one in reports(out / "journals") if one.outcome == "finished"]
     assert len({one.job for one in finished}) == len(finished) >= 4
