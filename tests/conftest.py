@@ -283,8 +283,8 @@ def token_reaches():
     """Waits until a client sees a token that another has just declared: it passes through the router first."""
 
     def wait(link, key):
-        deadline_s, pause = time.monotonic() + 60.0, threading.Event()
-        while not link.tokens(key, timeout_s=60.0):
+        deadline_s, pause = time.monotonic() + 120.0, threading.Event()
+        while not link.tokens(key, timeout_s=120.0):
             assert time.monotonic() < deadline_s, f"{key} was not seen"
             pause.wait(0.02)
 

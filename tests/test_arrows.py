@@ -224,7 +224,7 @@ def test_a_package_file_holds_a_docstring_and_at_most_its_public_names():
 
 def loaded_by(*modules: str) -> set[str]:
     program = f"import sys, {', '.join(modules)}; print(*sys.modules)"
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
     return set(said.stdout.split())
 
 

@@ -153,13 +153,13 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-input"]
     alone = ["--no-deps", "--no-index"]
     build = [*pip, "wheel", *alone, "--no-build-isolation", "--wheel-dir", str(base / "dist"), str(source)]
-    subprocess.run(build, check=True, cwd=base, timeout=120, capture_output=True)
+    subprocess.run(build, check=True, cwd=base, timeout=300, capture_output=True)
     (wheel,) = (base / "dist").glob("*.whl")
     home = base / "venv"
     venv.create(home, symlinks=True)
     python = home / "bin" / "python"
     install = [*pip, "--python", str(python), "install", *alone, str(wheel)]
-    subprocess.run(install, check=True, cwd=base, timeout=120, capture_output=True)
+    subprocess.run(install, check=True, cwd=base, timeout=300, capture_output=True)
     own = Path(
         subprocess.check_output([python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]).decode()
     )
@@ -180,7 +180,7 @@ def there(home: Path, *command: str) -> str:
         env=env,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
     assert ran.returncode == 0, ran.stderr
@@ -237,7 +237,7 @@ print(steps)
 )
 def test_a_missing_extra_is_one_sentence(call, extra):
     program = f"{WITHOUT_EXTRAS}\n{call}"
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
     assert said.returncode
     command = r"pip install -e '\.\[(\w+)\]' -c constraints\.txt, in a copy of the repository"
     sentence = rf"This needs the library '\w+', which is not installed: {command}\."

@@ -27,8 +27,8 @@ from fleet.ros2.topics import (
     publisher_token,
 )
 from tests.profiles import examples
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 10.0
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = Topic("/chatter", STRING, STRING_HASH)

@@ -20,16 +20,16 @@ from fleet.bus.exchange.zenoh import MOST_OWN_SESSIONS, ZenohExchange
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, check_name, decode, encode, encoding
 from fleet.errors import BusError
+from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
 ROOT = Path(__file__).parents[2]
-PATIENT_S = 30.0
 
 
 @pytest.mark.parametrize("sessions", [1, 2, 8])
 def test_the_bus_and_the_memory_know_the_same(make_words, assert_same, sessions):
     rng = np.random.default_rng(0)
-    with ZenohExchange(ARMS, "same", timeout_s=PATIENT_S, sessions=sessions) as bus, MemoryExchange(ARMS) as memory:
+    with ZenohExchange(ARMS, "same", timeout_s=PATIENCE_S, sessions=sessions) as bus, MemoryExchange(ARMS) as memory:
         for tick in range(20):
             words = make_words(rng, 3, 10.0 * tick, slots=3 + tick % 3)
             assert_same(bus.share(words), memory.share(words))
@@ -39,12 +39,14 @@ def test_the_bus_and_the_memory_know_the_same(make_words, assert_same, sessions)
 def test_a_large_fleet_shares_two_sessions_and_knows_the_same(make_words, assert_same):
     arms = tuple(f"arm_{i}" for i in range(40))
     rng = np.random.default_rng(2)
-    with ZenohExchange(arms, "large", timeout_s=PATIENT_S) as bus, MemoryExchange(arms) as memory:
-        with open_client(bus.endpoint, timeout_s=5.0) as session:  # everything that is said goes over the router, too
+    with ZenohExchange(arms, "large", timeout_s=PATIENCE_S) as bus, MemoryExchange(arms) as memory:
+        with open_client(
+            bus.endpoint, timeout_s=PATIENCE_S
+        ) as session:  # everything that is said goes over the router, too
             heard = [
                 session.declare_subscriber(keys.of_every_arm("large", "difficulty"), zenoh.handlers.FifoChannel(99))
             ]
-            assert list(session.get("@/*/router", timeout=5.0))
+            assert list(session.get("@/*/router", timeout=PATIENCE_S))
             for tick in range(3):
                 words = make_words(rng, 40, 10.0 * tick)
                 assert_same(bus.share(words), memory.share(words))
@@ -52,7 +54,7 @@ def test_a_large_fleet_shares_two_sessions_and_knows_the_same(make_words, assert
         assert len({str(sample.key_expr) for sample in said}) == 40
         assert (bus.delivered, bus.late, bus.malformed) == (3 * 40 * 39, 0, 0)
         assert len(bus._groups) == 1
-    with ZenohExchange(arms[:MOST_OWN_SESSIONS], "small", timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(arms[:MOST_OWN_SESSIONS], "small", timeout_s=PATIENCE_S) as bus:
         assert len(bus._groups) == MOST_OWN_SESSIONS
 
 
@@ -76,7 +78,7 @@ def test_arms_that_share_a_session_are_waited_for_alike(make_words, caplog):
 
 def test_a_new_episode_knows_nothing_of_the_last_but_what_is_said_anew(make_words, assert_same):
     rng = np.random.default_rng(1)
-    with ZenohExchange(ARMS, "again", timeout_s=PATIENT_S) as bus, MemoryExchange(ARMS) as memory:
+    with ZenohExchange(ARMS, "again", timeout_s=PATIENCE_S) as bus, MemoryExchange(ARMS) as memory:
         for time_s in (0.0, 10.0, 20.0, 0.0, 10.0, 0.0):
             if time_s == 0.0:
                 bus.begin()
@@ -109,9 +111,9 @@ def test_fleets_on_one_router_and_fleets_on_two_do_not_mix(make_words, assert_sa
     rng = np.random.default_rng(2)
     with (
         Router() as router,
-        ZenohExchange(ARMS, "east", router.endpoint, timeout_s=PATIENT_S) as east,
-        ZenohExchange(ARMS, "west", router.endpoint, timeout_s=PATIENT_S) as west,
-        ZenohExchange(ARMS, "east", timeout_s=PATIENT_S) as far,
+        ZenohExchange(ARMS, "east", router.endpoint, timeout_s=PATIENCE_S) as east,
+        ZenohExchange(ARMS, "west", router.endpoint, timeout_s=PATIENCE_S) as west,
+        ZenohExchange(ARMS, "east", timeout_s=PATIENCE_S) as far,
     ):
         for tick in range(5):
             for bus in (east, west, far):
@@ -121,10 +123,10 @@ def test_fleets_on_one_router_and_fleets_on_two_do_not_mix(make_words, assert_sa
 
 
 def test_an_arm_is_on_the_bus_once():
-    with Router() as router, ZenohExchange(ARMS, "f", router.endpoint, timeout_s=PATIENT_S):
+    with Router() as router, ZenohExchange(ARMS, "f", router.endpoint, timeout_s=PATIENCE_S):
         with pytest.raises(BusError, match="already has arm_1 "):
-            ZenohExchange(["arm_1", "arm_9"], "f", router.endpoint, timeout_s=PATIENT_S).open()
-        ZenohExchange(["arm_9"], "f", router.endpoint, timeout_s=PATIENT_S).open().close()
+            ZenohExchange(["arm_1", "arm_9"], "f", router.endpoint, timeout_s=PATIENCE_S).open()
+        ZenohExchange(["arm_9"], "f", router.endpoint, timeout_s=PATIENCE_S).open().close()
 
 
 def state_json(**changes) -> bytes:
@@ -151,9 +153,9 @@ def test_what_a_stranger_says_is_counted_and_never_believed(make_words, assert_s
     """Each malformed word reaches the two or three arms that listen to the key; sharing goes on as if it were not."""
     rng = np.random.default_rng(3)
     with (
-        ZenohExchange(ARMS, "f", timeout_s=PATIENT_S) as bus,
+        ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus,
         MemoryExchange(ARMS) as memory,
-        open_client(bus.endpoint or "", timeout_s=PATIENT_S) as stranger,
+        open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as stranger,
     ):
         words = make_words(rng, 3, 0.0)
         assert_same(bus.share(words), memory.share(words))
@@ -175,14 +177,14 @@ def test_what_a_stranger_says_is_counted_and_never_believed(make_words, assert_s
 
 def barrier(stranger: zenoh.Session) -> None:
     """Wait until the router has taken all that the stranger said: it answers in order."""
-    assert list(stranger.liveliness().get("thermofleet/v4/f/arm/*/alive", timeout=PATIENT_S))
+    assert list(stranger.liveliness().get("thermofleet/v4/f/arm/*/alive", timeout=PATIENCE_S))
 
 
 def test_a_flood_passes_and_leaves_no_trace(make_words, assert_same):
     rng = np.random.default_rng(4)
     with (
         ZenohExchange(ARMS, "f", timeout_s=0.2) as bus,
-        open_client(bus.endpoint or "", timeout_s=PATIENT_S) as stranger,
+        open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as stranger,
     ):
         topics: tuple[keys.ArmTopic, ...] = ("state", "difficulty")
         for topic in topics:
@@ -205,18 +207,18 @@ def test_a_flood_passes_and_leaves_no_trace(make_words, assert_same):
 def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
     """With nothing but Zenoh: the caches answer a subscriber that was not there."""
     samples: queue.Queue[zenoh.Sample] = queue.Queue()
-    with ZenohExchange(ARMS, "f", timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus:
         words = make_words(np.random.default_rng(5), 3, 0.0)
         bus.share(words)
-        with open_client(bus.endpoint or "", timeout_s=PATIENT_S) as joiner:
+        with open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as joiner:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
             for topic in ("info", "difficulty"):
                 zenoh.ext.declare_advanced_subscriber(
                     joiner, keys.of_every_arm("f", topic), samples.put, history=history
                 )
-            tokens = joiner.liveliness().get(keys.of_every_arm("f", "alive"), timeout=PATIENT_S)
+            tokens = joiner.liveliness().get(keys.of_every_arm("f", "alive"), timeout=PATIENCE_S)
             present = {keys.parse(str(reply.ok.key_expr)).name for reply in tokens if reply.ok}
-            said = [samples.get(timeout=PATIENT_S) for _ in range(6)]
+            said = [samples.get(timeout=PATIENCE_S) for _ in range(6)]
     assert present == set(ARMS)
     for sample in said:
         key = keys.parse(str(sample.key_expr))
@@ -234,7 +236,7 @@ def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
 
 def test_closing_leaves_no_thread_and_no_port(make_words):
     threads = set(threading.enumerate())
-    bus = ZenohExchange(ARMS, "f", timeout_s=PATIENT_S).open()
+    bus = ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S).open()
     endpoint = bus.endpoint or ""
     bus.share(make_words(np.random.default_rng(0), 3, 0.0))
     bus.close()
@@ -272,7 +274,7 @@ print(heard.difficulty.sum(), flush=True)
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "4.0", "")

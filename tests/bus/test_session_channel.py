@@ -9,9 +9,9 @@ from fleet.bus.exchange.channel import Channel, Partition
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.env.allocation_v1 import parallel_env
+from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm_2", "arm_3")
-PATIENT_S = 30.0
 CHANNELS = {
     "perfect": Channel(),
     "ring": Channel(
@@ -29,7 +29,7 @@ CHANNELS = {
 @pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
 def test_the_bus_and_the_memory_know_the_same_under_a_channel(make_words, assert_same, channel):
     rng = np.random.default_rng(0)
-    with ZenohExchange(ARMS, "same", channel=channel, timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(ARMS, "same", channel=channel, timeout_s=PATIENCE_S) as bus:
         memory = MemoryExchange(ARMS, channel)
         for episode in range(2):
             for exchange in (bus, memory):
@@ -50,7 +50,7 @@ def test_the_same_seed_gives_the_same_awards_over_either(small, channel):
             env.step(policy.act(env.knowledge()))
         return [repr(event) for event in env.events], env.messages
 
-    with ZenohExchange(ARMS, "trace", channel=channel, timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(ARMS, "trace", channel=channel, timeout_s=PATIENCE_S) as bus:
         over_zenoh = shift(bus)
     assert over_zenoh == shift(MemoryExchange(ARMS, channel))
     assert sum("award" in event for event in over_zenoh[0]) > 5

@@ -12,9 +12,9 @@ import pytest
 from fleet.bus.client.router import Router
 from fleet.bus.exchange.group import SILENT_AFTER
 from fleet.bus.exchange.zenoh import ZenohExchange
+from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm_2")
-PATIENT_S = 30.0
 SHORT_S = 0.1
 
 
@@ -53,7 +53,7 @@ class Gate:
     def _pump(source: socket.socket, sink: socket.socket, gate: threading.Event) -> None:
         with suppress(OSError):
             while data := source.recv(65536):
-                gate.wait(PATIENT_S)
+                gate.wait(PATIENCE_S)
                 sink.sendall(data)
         for end in (source, sink):
             with suppress(OSError):
@@ -77,7 +77,7 @@ class Gate:
         for link in range(len(self._sockets)):
             self.cut(link)
         for thread in self._threads:
-            thread.join(PATIENT_S)
+            thread.join(PATIENCE_S)
         for pair in self._sockets:
             for end in pair:
                 end.close()
@@ -95,14 +95,14 @@ def until_all_is_heard(bus: ZenohExchange, make_words, time_s: float) -> tuple[i
     """Share until nothing is old any more; ticks that took, and the ages of the last but one."""
     rng = np.random.default_rng(9)
     age_s = np.zeros((3, 3))
-    end_s = time.monotonic() + PATIENT_S
+    end_s = time.monotonic() + PATIENCE_S
     tick = 0
     while time.monotonic() < end_s:
         heard = bus.share(make_words(rng, 3, time_s + 10.0 * tick))
         if not heard.age_s.any():
             return tick, age_s
         tick, age_s = tick + 1, heard.age_s
-    raise AssertionError(f"Not heard again within {PATIENT_S} s: ages {age_s}")
+    raise AssertionError(f"Not heard again within {PATIENCE_S} s: ages {age_s}")
 
 
 def test_a_word_that_does_not_come_leaves_the_last_one_with_its_age(gate, make_words, caplog):
@@ -152,7 +152,7 @@ def test_in_a_new_episode_nothing_is_known_of_an_arm_that_is_silent(gate, make_w
 
 
 def test_a_link_that_breaks_while_it_is_waited_for_ends_the_wait(gate, make_words):
-    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=PATIENCE_S) as bus:
         until_all_is_heard(bus, make_words, 0.0)
         gate.says[1].clear()
         gate.refuse()
@@ -160,7 +160,7 @@ def test_a_link_that_breaks_while_it_is_waited_for_ends_the_wait(gate, make_word
         breaks.start()
         start_s = time.monotonic()
         bus.share(make_words(np.random.default_rng(0), 3, 1e6))
-        assert time.monotonic() - start_s < PATIENT_S
+        assert time.monotonic() - start_s < PATIENCE_S
         breaks.join()
 
 
@@ -193,7 +193,7 @@ def test_an_arm_whose_link_was_cut_comes_back(gate, make_words):
             link = len(gate.says) - 1 if episode else 1
             gate.cut(link)
             late = bus.late
-            end_s = time.monotonic() + PATIENT_S
+            end_s = time.monotonic() + PATIENCE_S
             tick = 0
             while bus.late == late and time.monotonic() < end_s:
                 bus.share(make_words(rng, 3, 1e6 * (episode + 1) + 10.0 * tick))
@@ -205,7 +205,7 @@ def test_an_arm_whose_link_was_cut_comes_back(gate, make_words):
 
 def test_nobody_waits_for_an_arm_whose_token_is_gone(gate, make_words):
     """The patience of 30 s is not spent: the token goes with the link, and the arm cannot connect again."""
-    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=PATIENCE_S) as bus:
         until_all_is_heard(bus, make_words, 0.0)
         gate.refuse()
         gate.cut(1)
@@ -214,7 +214,7 @@ def test_nobody_waits_for_an_arm_whose_token_is_gone(gate, make_words):
         age_s = np.zeros((3, 3))
         for tick in range(100):
             age_s = bus.share(make_words(rng, 3, 1e6 + 10.0 * tick)).age_s
-        assert time.monotonic() - start_s < PATIENT_S
+        assert time.monotonic() - start_s < PATIENCE_S
         apart = np.array([[False, True, False], [True, False, True], [False, True, False]])
         assert (age_s[apart] > 0.0).all()
         assert (age_s[~apart] == 0.0).all()

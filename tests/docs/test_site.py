@@ -47,9 +47,9 @@ def test_search_works_from_a_folder_without_network(site: Path) -> None:
         view.click(".md-search__input")
         view.keyboard.type("clearance")
         found = view.locator(".md-search-result__link").first
-        found.wait_for(timeout=20_000)
+        found.wait_for(timeout=120_000)
         found.click()
-        view.wait_for_selector("article:has-text('clearance')", timeout=20_000)
+        view.wait_for_selector("article:has-text('clearance')", timeout=120_000)
         for page in ("index", "cli", "bus", "tutorials/judge_a_policy", "notebooks/evaluate_policies"):
             view.set_viewport_size({"width": 390, "height": 844})
             view.goto((site / f"{page}.html").as_uri())

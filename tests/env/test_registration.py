@@ -76,5 +76,5 @@ def test_make_batch_staggers_envs(cell, plans) -> None:
 )
 def test_importing_scenarios_registers_the_name(first) -> None:
     code = f"{first}; import pettingzoo as p; print([p.spec(kind, {NAME!r}).name for kind in ('parallel', 'aec')])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
     assert done.stdout.strip() == "['allocation', 'allocation']", done.stderr

@@ -26,8 +26,7 @@ from scenarios.live.recorder import Recorder
 from scenarios.live.recording import CARD, JOURNAL, part_files, read_card, read_parts, states
 from scenarios.live.replayer import Replay
 from tests.profiles import examples
-
-PATIENCE_S = 20.0
+from tests.waiting import PATIENCE_S
 
 
 def state(arm, tick, time_s=None):

@@ -20,8 +20,8 @@ from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 from scenarios.live.watch_screen import space_line
 from tests import commands
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 30.0
 ASKED = ClockProbe(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)
 """The fleet's time is 5000 s at the real second 100.005."""
 

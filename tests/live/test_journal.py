@@ -140,9 +140,9 @@ except JournalError as error:
     with Journal(path, KIND):
         with pytest.raises(JournalError, match="in use by another"):
             Journal(path, KIND).open()
-        result = subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT)
+        result = subprocess.run(ask, capture_output=True, text=True, check=True, timeout=300, cwd=ROOT)
         assert "in use by another process" in result.stdout
-    assert subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT).stdout == ""
+    assert subprocess.run(ask, capture_output=True, text=True, check=True, timeout=300, cwd=ROOT).stdout == ""
 
 
 def test_append_returns_after_the_records_are_on_disk(tmp_path):
@@ -203,7 +203,7 @@ with Journal(Path({str(tmp_path / "j")!r}), KIND) as journal:
     print(list(journal.records()), journal.path.read_bytes().count(b"xx"))
 """
     result = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60, cwd=ROOT
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300, cwd=ROOT
     )
     assert result.stdout.splitlines() == ["full", "[Text(text='kept')] 0"]
 

@@ -26,7 +26,7 @@ def port(tmp_path):
             yield int(router.endpoint.rsplit(":", 1)[1])
         finally:
             auction.terminate()
-            auction.communicate(timeout=30)
+            auction.communicate(timeout=300)
 
 
 def told(done: subprocess.CompletedProcess[str]) -> tuple[int, str]:

@@ -36,8 +36,8 @@ from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from scenarios.cli.main import app
 from tests import commands
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 30.0
 ARM = "arm 1+b"
 EXTRA = Participant("gateway", "submitter")
 TOKEN = "a token of this test"

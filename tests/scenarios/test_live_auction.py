@@ -23,9 +23,9 @@ from scenarios.cli.live.journals import refuse_other_way
 from scenarios.load import load
 from scenarios.prepare.fleet import make_env
 from tests import commands
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
-PATIENT_S = 20.0
 HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}
 
 
@@ -213,12 +213,12 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         assert code == 2
         assert "Fleet 'quickstart' has an auctioneer already: 'auctioneer'." in err
         process.send_signal(signal.SIGKILL)
-        process.wait(PATIENT_S)
+        process.wait(PATIENCE_S)
     with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
         file.write_text(json.dumps(HOLD | {"places": ["belt"]}))
         assert thermofleet("submit", file, *at)[:2] == (0, "a: accepted\n")
         process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=PATIENT_S)
+        out, err = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0
         assert "0 of 1 jobs finished" in out
         assert "Continuing from" in err
@@ -229,6 +229,6 @@ def test_the_end_of_a_shift_lists_unfinished_jobs(endpoint, tmp_path):
     text = (ROOT / "scenarios" / "library" / "quickstart.toml").read_text(encoding="utf-8")
     short.write_text(text.replace("horizon_s = 7200", "horizon_s = 600"), encoding="utf-8")
     with auctioneer(endpoint, tmp_path / "journal", short, "--speed", "1000") as process:
-        out, _ = process.communicate(timeout=PATIENT_S)
+        out, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert "unfinished, The shift ended before it was done." in out

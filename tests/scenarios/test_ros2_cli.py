@@ -15,9 +15,9 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
 from scenarios.cli.main import main
 from tests import commands
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 60.0
 TEMP_C = (30.0, 31.0, 32.5, 33.0, 34.0, 35.0, 36.0)
 
 

@@ -23,10 +23,9 @@ from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.cli.live.up import chosen_arms, free_port, parts_of
 from tests import commands
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
-PATIENT_S = 20.0
 
 
 @contextmanager
@@ -51,9 +50,9 @@ def folder(tmp_path: Path, thermofleet: pytest.CaptureFixture[str]) -> Path:
 def test_a_router_prints_its_endpoint_and_exits_on_a_signal(number, code):
     with started("--port", 0) as (process, endpoint):
         assert endpoint.startswith("tcp/127.0.0.1:")
-        with open_client(endpoint, timeout_s=PATIENT_S):
+        with open_client(endpoint, timeout_s=PATIENCE_S):
             process.send_signal(number)
-            out, err = process.communicate(timeout=PATIENT_S)
+            out, err = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == code
         assert out == ""
         assert ("The router was interrupted" in err) == (code == 130)
@@ -64,15 +63,15 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
     with started("--port", 0, "--tls", folder, "--scenario", "quickstart", "--state-hz", 5) as (process, endpoint):
         assert endpoint.startswith("tls/127.0.0.1:")
         with (
-            open_client(endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm,
-            open_client(endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "monitor")) as monitor,
+            open_client(endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "arm_0")) as arm,
+            open_client(endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "monitor")) as monitor,
         ):
             heard: list[str] = []
             listener = monitor.declare_subscriber(
                 "thermofleet/v4/quickstart/**", lambda s: heard.append(str(s.key_expr))
             )
             cache = keys.caches_of("thermofleet/v4/quickstart/arm/nobody")
-            assert list(monitor.get(cache, timeout=PATIENT_S)) == []
+            assert list(monitor.get(cache, timeout=PATIENCE_S)) == []
             state, sent = keys.of_arm("quickstart", "arm_0", "state"), 0
 
             def publish() -> None:
@@ -82,7 +81,7 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
                     arm.put(keys.of_arm("quickstart", "arm_1", "event"), b"not mine")
                 sent += 100
                 for session in (arm, monitor):
-                    assert list(session.get(cache, timeout=PATIENT_S)) == []
+                    assert list(session.get(cache, timeout=PATIENCE_S)) == []
 
             publish()
             wait_until(lambda: heard.count(state), publish)  # the first ones may come too soon after the connection
@@ -90,7 +89,7 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
             assert keys.of_arm("quickstart", "arm_1", "event") not in heard
             listener.undeclare()
         process.terminate()
-        assert process.wait(PATIENT_S) == 0
+        assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_port_in_use_is_one_sentence(thermofleet):

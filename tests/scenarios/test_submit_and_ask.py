@@ -25,8 +25,8 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.errors import FleetError
 from scenarios.cli.live.submit import batches, read_jobs
+from tests.waiting import PATIENCE_S
 
-PATIENT_S = 20.0
 HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}
 
 
@@ -104,7 +104,7 @@ def served(endpoint: str, declare: Callable[[BusClient], None]) -> Iterator[None
             yield
         finally:
             stop.set()
-            thread.join(PATIENT_S)
+            thread.join(PATIENCE_S)
 
 
 @contextmanager
