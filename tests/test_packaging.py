@@ -180,13 +180,14 @@ def there(home: Path, *command: str) -> str:
         env=env,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=1800,  # it compiles the engine
         check=False,
     )
     assert ran.returncode == 0, ran.stderr
     return ran.stdout
 
 
+@pytest.mark.ci_slow
 def test_the_wheel_is_what_is_imported_there(elsewhere):
     program = "import fleet, agents, twin, scenarios; print(*[p.__file__ for p in (fleet, agents, twin, scenarios)])"
     files = there(elsewhere, "python", "-c", program).split()
@@ -194,6 +195,7 @@ def test_the_wheel_is_what_is_imported_there(elsewhere):
     assert not any(Path(file).is_relative_to(ROOT) for file in files)
 
 
+@pytest.mark.ci_slow
 def test_the_wheel_brings_its_data(elsewhere):
     program = """
 from importlib.resources import files
@@ -205,6 +207,7 @@ print(*sorted(f.name for f in files("scenarios").joinpath("library").iterdir() i
     assert there(elsewhere, "python", "-c", program).split() == library
 
 
+@pytest.mark.ci_slow
 def test_the_command_works_there(elsewhere):
     assert "quickstart" in there(elsewhere, "thermofleet", "list")
     told = json.loads(there(elsewhere, "thermofleet", "hold", "--payload", "3", "--json"))
@@ -213,6 +216,7 @@ def test_the_command_works_there(elsewhere):
     assert told["cold"]["t75_min"][1] == pytest.approx(30.0, abs=1.5)
 
 
+@pytest.mark.ci_slow
 def test_an_episode_runs_there_without_any_extra(elsewhere):
     program = f"""{WITHOUT_EXTRAS}
 from scenarios import make_env

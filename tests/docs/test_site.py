@@ -22,6 +22,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.ci_slow
 def test_pages_are_made_from_readme_docstrings_and_notebooks(site: Path) -> None:
     for page, content in (
         ("index.html", "Two commands"),
@@ -33,6 +34,7 @@ def test_pages_are_made_from_readme_docstrings_and_notebooks(site: Path) -> None
         assert content in (site / page).read_text(encoding="utf-8"), page
 
 
+@pytest.mark.ci_slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_search_works_from_a_folder_without_network(site: Path) -> None:
     from playwright.sync_api import sync_playwright

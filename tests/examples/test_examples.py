@@ -5,6 +5,8 @@ import re
 import sys
 from types import ModuleType
 
+import pytest
+
 from scenarios.cli.live.up import free_port
 from tests import commands
 from tests.examples.programs import ROOT, program, started
@@ -27,6 +29,7 @@ def test_own_policy_finishes_a_shift(capsys) -> None:
         assert re.search(rf"{name}: reward -?[\d.]+, jobs \d+, peaks arm_0 [\d.]+ °C", told)
 
 
+@pytest.mark.ci_slow
 def test_own_policy_is_compared_beside_the_rules() -> None:
     own = f"{ROOT / 'examples' / 'own_policy.py'}:Careful"
     options = ["--policies", f"least_difficulty,{own}", "--baseline", "least_difficulty", "--seeds", "2"]
@@ -35,6 +38,7 @@ def test_own_policy_is_compared_beside_the_rules() -> None:
     assert "Careful" in done.stdout
 
 
+@pytest.mark.ci_slow
 def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:
     port = free_port()
     with started(program("monitor", port)) as monitor:

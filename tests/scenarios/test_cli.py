@@ -119,6 +119,7 @@ def test_without_round_robin_the_first_policy_is_the_baseline(thermofleet, small
         assert json.loads(thermofleet(*some, policies).out)["baseline"] == baseline
 
 
+@pytest.mark.ci_slow
 def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypatch, plans):
     from scenarios.prepare.fleet import prepare
 
