@@ -18,7 +18,7 @@ from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.operator import Cancel, Change, Pause, Resume, Settle
 from fleet.errors import JournalFull, Refused
 from fleet.live.consensus import settled_jobs
-from fleet.live.space import ANYWHERE
+from tests.live.conflicts import random_conflicts
 
 START_S = 100.0
 """Fleet time at the start."""
@@ -236,17 +236,6 @@ ACTIONS = (
     ),
 )
 rates = st.lists(st.floats(1 - 1e-3, 1 + 1e-3), min_size=1, max_size=5)
-
-
-def random_conflicts(seed: int, share: float):
-    """Return a symmetric relation in which this share of all plans exclude each other, and unknown ones all others."""
-
-    def excludes(arm: str, space: str, other: str, other_space: str) -> bool:
-        if ANYWHERE in (space, other_space):
-            return True
-        return random.Random(f"{seed} {sorted([space, other_space])}").random() < share
-
-    return excludes
 
 
 def storm(council, rates, seed: int, actions) -> None:
