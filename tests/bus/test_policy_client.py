@@ -24,7 +24,7 @@ from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
-from fleet.live.policy_client import CONNECT_S, PolicyClient
+from fleet.live.policy_client import PolicyClient
 from fleet.observation import FIELDS, Layout, Observation
 from tests.waiting import PATIENCE_S
 
@@ -162,7 +162,7 @@ def test_a_flood_of_replies_is_not_waited_for(router):
 
     with open_client(router.endpoint, timeout_s=PATIENCE_S) as impostor:
         impostor.declare_queryable(KEY, flood, complete=True)
-        with refused("Several processes reply as policy 'mine'", 2.0):
+        with refused("Several processes reply as policy 'mine'"):
             client(router).act(seen())
 
 
@@ -179,14 +179,14 @@ def test_a_decision_without_a_valid_reply_is_requested_again(router, served):
 
 
 def test_nobody_two_and_no_router_are_told_apart_at_once(router, served):
-    with refused(f"No process serves the policy 'mine' at tcp/.*: start it; .* '{KEY}'", 2.0):
+    with refused(f"No process serves the policy 'mine' at tcp/.*: start it; .* '{KEY}'"):
         client(router).act(seen())
     for _ in range(2):
         served('{"actions": {}}')
-    with refused("Several processes reply as policy 'mine' at tcp/.*: stop all but one", 2.0):
+    with refused("Several processes reply as policy 'mine' at tcp/.*: stop all but one"):
         client(router).act(seen())
     nowhere = PolicyClient("mine", fleet="f", endpoint="tcp/127.0.0.1:1", limit_s=PATIENCE_S)
-    with refused("No router answered at tcp/127.0.0.1:1 .* start a router with thermofleet router", CONNECT_S + 2.0):
+    with refused("No router answered at tcp/127.0.0.1:1 .* start a router with thermofleet router"):
         nowhere.act(seen())
 
 
