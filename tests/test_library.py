@@ -1,6 +1,6 @@
 """Every scenario of the library, found by looking: it loads, it can be done, it runs under every rule."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -17,14 +17,20 @@ from scenarios.run.shift import RunSpec, run
 FILES = (Path(__file__).parents[1] / "scenarios" / "library").glob("*.toml")
 NAMES = sorted(path.stem for path in FILES)
 TICKS = 20
-FIRST = ("quickstart", "active_waiting", "heat_wave", "people_near")
-"""Scenarios in which every rule is tried; in others a simple one and one that reads scores."""
-CASES = [
-    pytest.param(name, policy, marks=pytest.mark.slow if name == "scale_64" else ())  # slow to plan
-    for name in NAMES
-    for policy in RULES
-    if name in FIRST or policy in ("random", "wsept")
-]
+FIRST = ("quickstart", "heat_wave")
+"""Scenarios in which every rule is tried; CI tries it in two more, and in others a simple one and one that reads
+scores."""
+SECOND = ("active_waiting", "people_near")
+
+
+def cases() -> Iterator[object]:
+    """Names of scenarios and rules; a large fleet is slow to plan."""
+    for name in NAMES:
+        for policy in RULES:
+            if policy in ("random", "wsept"):
+                yield pytest.param(name, policy, marks=pytest.mark.slow if name == "scale_64" else ())
+            elif name in (*FIRST, *SECOND):
+                yield pytest.param(name, policy, marks=pytest.mark.ci_slow if name in SECOND else ())
 
 
 @pytest.fixture(scope="session")
@@ -52,7 +58,7 @@ def test_every_work_can_be_done_by_two_arms_or_more(fleet_of, name):
     assert len(fleet.scenario.arms) >= 2
 
 
-@pytest.mark.parametrize(("name", "policy"), CASES)
+@pytest.mark.parametrize(("name", "policy"), list(cases()))
 def test_every_rule_works_its_first_minutes(fleet_of, name, policy):
     fleet = fleet_of(name)
     asked = iter(range(TICKS + 1))
