@@ -3,8 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DEMO_STAMP := $(VENV)/.installed-demo
 OUT ?= out
-PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt
+UV := $(shell command -v uv 2>/dev/null)
 GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
 # Each trainer has its own environment, because their packages conflict. So do the environments that benchmarks/env.py
@@ -13,10 +15,10 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo leaderboard test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
+.PHONY: demo leaderboard test test-slow test-ci-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
 	fuzz docs pictures clean install
 
-demo: $(STAMP)
+demo: $(DEMO_STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
 
 # How well policies do on the test split of the suite, from the stored results.
@@ -24,10 +26,15 @@ leaderboard: $(STAMP)
 	@$(BIN)/thermofleet leaderboard
 
 test: $(STAMP)
-	@$(BIN)/python -m pytest -n 2 --dist loadfile
+	@$(BIN)/python -m pytest -n 2 --dist worksteal
 
+# Tests that take minutes, and properties with all their examples.
 test-slow: $(STAMP)
-	@$(BIN)/python -m pytest -m slow
+	@HYPOTHESIS_PROFILE=full $(BIN)/python -m pytest -m '(slow or ci_slow or hypothesis) and not adapter'
+
+# The slow tests that CI runs: whole demos, notebooks, tutorials, builds.
+test-ci-slow: $(STAMP)
+	@$(BIN)/python -m pytest -n 2 --dist worksteal -m ci_slow
 
 # Random message loss, crashes and full disks: fresh seeds, ten times the examples of `make test`.
 storm: $(STAMP)
@@ -47,7 +54,7 @@ $(ADAPTER_TESTS): test-adapter-%: .venv-adapters/%/.installed
 
 # Share of product lines that tests run, without compiled functions and the processes of live fleets.
 coverage: $(STAMP)
-	@$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:$(OUT)/coverage
+	@$(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-report=term:skip-covered --cov-report=html:$(OUT)/coverage
 
 lint: $(STAMP)
 	@$(BIN)/ruff format --check .
@@ -104,8 +111,11 @@ bench-env: .venv-adapters/bench/.installed
 install: $(STAMP)
 
 # A broken environment is removed, so that the next call builds a new one. setuptools is installed first, so that its
-# pinned version builds the package.
-$(STAMP): pyproject.toml constraints.txt
+# pinned version builds the package. torch comes by pip, which also looks on this disk, as it may be set up to: uv would
+# fetch the build for NVIDIA's GPUs, of gigabytes. uv installs the rest if it is there and can.
+$(STAMP): WANTED := dev
+$(DEMO_STAMP): WANTED := demo
+$(STAMP) $(DEMO_STAMP): pyproject.toml constraints.txt
 	@command -v "$(PYTHON)" >/dev/null 2>&1 || { \
 	  echo "thermofleet needs Python 3.11 or newer, and there is no '$(PYTHON)' here. Install it, or name one: make $(GOAL) PYTHON=/path/to/python3.11"; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
@@ -114,11 +124,13 @@ $(STAMP): pyproject.toml constraints.txt
 	  rm -rf $(VENV); \
 	  echo "'$(PYTHON) -m venv $(VENV)' could not make an environment. On Debian and Ubuntu the package python3-venv is missing then: apt install python3-venv"; exit 1; }
 	@echo "Installing thermofleet into $(VENV) (once, a few minutes; log in $(VENV)/install.log) …"
-	@{ $(PIP) setuptools && $(PIP) --no-build-isolation -e '.[dev]'; } >$(VENV)/install.log 2>&1 || { \
+	@{ $(PIP) setuptools torch && \
+	  { $(if $(UV),VIRTUAL_ENV=$(abspath $(VENV)) $(UV) pip install --quiet -c constraints.txt --no-build-isolation -e '.[$(WANTED)]' ||) \
+	    $(PIP) --no-build-isolation -e '.[$(WANTED)]'; }; } >$(VENV)/install.log 2>&1 || { \
 	  echo "The packages could not be installed. The usual reason is no network: they are fetched once, later runs need none."; \
 	  grep -oE 'ERROR: .*' $(VENV)/install.log | grep -vE 'conflicting dependencies|ResolutionImpossible' | sed 's/^ERROR:/pip said:/;q'; \
 	  echo "All that pip said is in $(VENV)/install.log; 'make $(GOAL)' tries again."; exit 1; }
-	@touch $(STAMP)
+	@touch $@ $(DEMO_STAMP)
 
 # A trainer's own pins override the shared ones. Its packages are installed as pinned, whatever they require.
 $(PINNED:%=.venv-adapters/%/.installed): .venv-adapters/%/.installed: constraints/%.txt constraints.txt pyproject.toml | $(STAMP)

@@ -28,8 +28,9 @@ from fleet.bus.exchange.channel import Channel, Partition
 from fleet.files import atomic_path, cache_folder
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
-from scenarios.run.shift import RunSpec, run
+from scenarios.run.shift import run
 from scenarios.schema import Scenario
+from scenarios.specs import RunSpec
 
 FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "heard")
 

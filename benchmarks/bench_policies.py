@@ -30,8 +30,9 @@ from fleet.env.validation import Decisions
 from fleet.files import atomic_path
 from scenarios.load import library, load
 from scenarios.policy_loader import label, policy_at, scope_of
-from scenarios.prepare.fleet import DifficultyName, Fleet, env_of, prepare
-from scenarios.run.shift import RunSpec, run
+from scenarios.prepare.fleet import Fleet, env_of, prepare
+from scenarios.run.shift import run
+from scenarios.specs import DifficultyName, RunSpec
 
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 PATIENCE_S = 120.0

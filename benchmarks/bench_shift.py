@@ -19,8 +19,9 @@ from typing import TypeVar
 from fleet.job import Place
 from scenarios.load import load
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.shift import RunSpec, run
+from scenarios.run.shift import run
 from scenarios.schema import ArmSpec, Scenario
+from scenarios.specs import RunSpec
 
 HOURS = 8
 RUNS = 3

@@ -26,7 +26,8 @@ from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.statistics import interval
 from scenarios.load import library, load
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.shift import RunSpec, run
+from scenarios.run.shift import run
+from scenarios.specs import RunSpec
 
 SIXTEEN = 4
 """Cells of four arms that stand beside each other, for the larger table."""

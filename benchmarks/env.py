@@ -29,8 +29,9 @@ from fleet.env.buffers import keep_pages
 from fleet.env.random_actions import random_legal
 from fleet.env.vector import BatchEnv, Library
 from scenarios.load import load
-from scenarios.prepare.fleet import DifficultyName, env_of, prepare
+from scenarios.prepare.fleet import env_of, prepare
 from scenarios.run.batch import Randomisation, library_of
+from scenarios.specs import DifficultyName
 
 WINDOWS, SHIFT = 3, 720
 PEERS = Path(__file__).parent / "peers.py"

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from math import ceil
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check
 from fleet.observation import MOST_SLOTS
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
+SplitName = Literal["train", "validation", "test", "sizes"]
+SPLITS: tuple[SplitName, ...] = get_args(SplitName)
+"""Of the suite."""
 MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one per second."""
 MOST_CLEARANCE_M = 0.2

@@ -6,13 +6,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 import pytest
-from hypothesis import settings
 
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.engine.batch import Shift
@@ -30,20 +30,20 @@ from fleet.motor import Motors, gen3_motors
 from fleet.robot import JOINTS, Robot, ThermalLimits
 from fleet.seeding import key_of
 from fleet.thermal import ThermalModel, gen3_network, thermal_model
-
-# No deadline: a busy machine is no reason to fail.
-settings.register_profile("thermofleet", deadline=None)
-settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
-settings.register_profile("storm", deadline=None, derandomize=False, print_blob=True, max_examples=1000)
-settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.environ.get("CI") else "thermofleet"))
+from tests import profiles  # noqa: F401 -- loads the profile of Hypothesis
+from tests.commands import start_server
 
 # A shell starts background jobs with Ctrl-C ignored, and their child processes inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the engine before xdist starts workers: each would compile it, at the same time."""
+    """Compile the engine before xdist starts workers: each would compile it, at the same time.
+
+    They also share one process that forks commands.
+    """
     if session.config.getoption("numprocesses", None):
+        start_server()
         library = Shifts().library()
         env = BatchEnv(library, 1)
         env.reset()
@@ -272,12 +272,19 @@ class AsArrays:
 
 
 @pytest.fixture(scope="session")
+def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The cache of plans and twins that all tests of a run share, in all workers; never the user's."""
+    base = tmp_path_factory.getbasetemp()
+    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
+
+
+@pytest.fixture(scope="session")
 def token_reaches():
     """Waits until a client sees a token that another has just declared: it passes through the router first."""
 
     def wait(link, key):
-        deadline_s, pause = time.monotonic() + 60.0, threading.Event()
-        while not link.tokens(key, timeout_s=60.0):
+        deadline_s, pause = time.monotonic() + 120.0, threading.Event()
+        while not link.tokens(key, timeout_s=120.0):
             assert time.monotonic() < deadline_s, f"{key} was not seen"
             pause.wait(0.02)
 

@@ -24,7 +24,7 @@ def start(home: Path, **variables: str) -> str:
     """Messages of a process that runs one kernel."""
     env = os.environ | {"XDG_CACHE_HOME": str(home)} | variables
     process = subprocess.run(
-        [sys.executable, "-c", DRAW], env=env, capture_output=True, text=True, timeout=120, check=True
+        [sys.executable, "-c", DRAW], env=env, capture_output=True, text=True, timeout=300, check=True
     )
     assert process.stdout == "[0 1 2]\n"
     return process.stderr

@@ -17,7 +17,8 @@ from fleet.errors import FleetError, ScenarioError
 from fleet.job import Job, Place, Work
 from fleet.robot import Mount
 from scenarios.live.requests import explain
-from scenarios.load import load, parse_scenario
+from scenarios.load import load
+from scenarios.parse import parse_scenario
 from scenarios.schema import Scenario
 
 ALLOWED = {

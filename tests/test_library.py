@@ -1,5 +1,7 @@
 """Every scenario of the library, found by looking: it loads, it can be done, it runs under every rule."""
 
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -10,51 +12,56 @@ from scenarios.job_stream import all_works
 from scenarios.load import library, load
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.run_folder import telemetry_table
-from scenarios.run.shift import RunSpec, run
+from scenarios.run.shift import run
+from scenarios.specs import RunSpec
 
-ROOT = Path(__file__).parents[1]
-FILES = sorted((ROOT / "scenarios" / "library").glob("*.toml"))
+FILES = (Path(__file__).parents[1] / "scenarios" / "library").glob("*.toml")
+NAMES = sorted(path.stem for path in FILES)
 TICKS = 20
-FIRST = ("quickstart", "active_waiting", "heat_wave", "people_near")
-"""Scenarios in which every rule is tried; in others a simple one and one that reads scores."""
+FIRST = ("quickstart", "heat_wave")
+"""Scenarios in which every rule is tried; CI tries it in two more, and in others a simple one and one that reads
+scores."""
+SECOND = ("active_waiting", "people_near")
 
 
-def marked(path: Path) -> object:
-    """The file as a parameter; large fleets are slow to plan."""
-    return pytest.param(path, marks=pytest.mark.slow if path.stem == "scale_64" else (), id=path.stem)
+def cases() -> Iterator[object]:
+    """Names of scenarios and rules; a large fleet is slow to plan."""
+    for name in NAMES:
+        for policy in RULES:
+            if policy in ("random", "wsept"):
+                yield pytest.param(name, policy, marks=pytest.mark.slow if name == "scale_64" else ())
+            elif name in (*FIRST, *SECOND):
+                yield pytest.param(name, policy, marks=pytest.mark.ci_slow if name in SECOND else ())
 
 
-@pytest.fixture(scope="module", params=[marked(path) for path in FILES])
-def fleet(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
-    """The fleet of a scenario, planned once."""
-    cache = tmp_path_factory.getbasetemp() / "cache"
-    return prepare(load(request.param), difficulty="blind", cache=cache)
+@pytest.fixture(scope="session")
+def fleet_of(plans: Path) -> Callable[[str], Fleet]:
+    """A function of the fleet of a scenario, planned once."""
+    return cache(lambda name: prepare(load(name), difficulty="blind", cache=plans))
 
 
 def test_the_library_lists_every_file():
-    assert set(library()) == {path.stem for path in FILES}
-    assert len(FILES) >= 12
+    assert set(library()) == set(NAMES)
+    assert len(NAMES) >= 12
 
 
-def test_every_work_can_be_done_by_two_arms_or_more(fleet):
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "scale_64"])
+def test_every_work_can_be_done_by_two_arms_or_more(fleet_of, name):
     """Otherwise there would be nothing to allocate; an arm whose own limit is lower than the load counts."""
+    fleet = fleet_of(name)
     able = {
         work: [arm.robot.name for arm in fleet.arms if work in arm.plans or work in arm.too_heavy]
         for work in all_works(fleet.scenario)
     }
     lonely = {f"{w.kind} at {w.places[0].name}, {w.payload_kg} kg": who for w, who in able.items() if len(who) < 2}
     assert lonely == {}
-
-
-def test_a_scenario_says_what_it_is(fleet):
     assert fleet.scenario.description.endswith((".", "?"))
     assert len(fleet.scenario.arms) >= 2
 
 
-@pytest.mark.parametrize("policy", RULES)
-def test_every_rule_works_its_first_minutes(fleet, policy):
-    if fleet.scenario.name not in FIRST and policy not in ("random", "wsept"):
-        pytest.skip("tried in the first scenarios")
+@pytest.mark.parametrize(("name", "policy"), list(cases()))
+def test_every_rule_works_its_first_minutes(fleet_of, name, policy):
+    fleet = fleet_of(name)
     asked = iter(range(TICKS + 1))
     spec = RunSpec(policy=policy, seed=1, bus="memory", difficulty="blind")
     result = run(fleet, spec, stopped=lambda: next(asked) >= TICKS)

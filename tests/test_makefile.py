@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make
 def make(goal: str, venv: Path, python: object) -> subprocess.CompletedProcess[str]:
     """`make goal` with its environment in `venv`."""
     command = ["make", "-C", str(ROOT), "--no-print-directory", goal, f"VENV={venv}", f"PYTHON={python}"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
 def script(path: Path, body: str) -> Path:
@@ -94,10 +95,33 @@ def test_the_next_call_tries_again_and_then_not_any_more(tmp_path, stub):
     assert make("install", venv, stub).returncode == 0
 
 
+@pytest.mark.parametrize("uv", ["exit 0", "exit 1", None])
+def test_the_demo_and_the_tests_install_only_what_they_need_with_uv_if_it_works(tmp_path, stub, monkeypatch, uv):
+    venv, log, tools = tmp_path / "venv", tmp_path / "log", tmp_path / "tools"
+    if uv is not None:
+        script(tools / "uv", f'echo "uv $*" >>"{log}"; {uv}')
+    monkeypatch.setenv("PATH", f"{tools}:/usr/bin:/bin")
+    program = script(venv / "bin" / "python", f'echo "python $*" >>"{log}"')
+    script(program.with_name("thermofleet"), "exit 0")
+
+    def installed(goal: str) -> list[str]:
+        log.write_text("", encoding="utf-8")
+        assert make(goal, venv, sys.executable).returncode == 0
+        lines = log.read_text(encoding="utf-8").splitlines()
+        return [f"{line.split()[0]} {line.split()[-1]}" for line in lines if " install " in line]
+
+    by = {"exit 0": ["uv"], "exit 1": ["uv", "python"], None: ["python"]}[uv]
+    assert installed("demo") == ["python torch", *(f"{tool} .[demo]" for tool in by)]
+    assert installed("demo") == []
+    assert installed("install") == ["python torch", *(f"{tool} .[dev]" for tool in by)]
+    (venv / ".installed-demo").touch()
+    assert installed("demo") == installed("install") == []
+
+
 @pytest.mark.parametrize("adapter", ["", "nobody"])
 def test_a_trainer_that_is_not_there(adapter):
     command = ["make", "-C", str(ROOT), "--no-print-directory", "test-adapter", f"ADAPTER={adapter}"]
-    said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    said = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert said.returncode != 0
     pinned = {path.stem for path in (ROOT / "constraints").glob("*.txt")}
     tested = {path.stem.removeprefix("test_") for path in (ROOT / "tests" / "adapters").glob("test_*.py")}

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.motor import (
@@ -53,7 +53,6 @@ def test_no_friction_at_rest():
     np.testing.assert_array_equal(friction_torque(REST, MOTORS), REST)
 
 
-@settings(deadline=None)
 @given(speeds)
 def test_friction_is_odd_and_its_heat_never_negative(qd):
     speed = np.full(JOINTS, qd)
@@ -61,14 +60,12 @@ def test_friction_is_odd_and_its_heat_never_negative(qd):
     assert np.all(friction_heat(speed, MOTORS) >= 0)
 
 
-@settings(deadline=None)
 @given(torques, speeds, temperatures)
 def test_current_turns_sign_with_torque_and_speed(tau, qd, housing_c):
     load, speed, warm = np.full(JOINTS, tau), np.full(JOINTS, qd), np.full(JOINTS, housing_c)
     np.testing.assert_allclose(current(-load, -speed, warm, MOTORS), -current(load, speed, warm, MOTORS))
 
 
-@settings(deadline=None)
 @given(temperatures, st.floats(0.1, 50.0))
 def test_hotter_magnets_need_more_current(housing_c, by_k):
     load, warm = np.full(JOINTS, 30.0), np.full(JOINTS, housing_c)
@@ -87,7 +84,6 @@ def test_copper_resistance_rises_39_percent_in_100_kelvin():
     np.testing.assert_allclose(hot / cold, 1.393)
 
 
-@settings(deadline=None)
 @given(st.floats(0.01, 2.0), st.floats(0.001, 2.0))
 def test_wear_increases_friction(wear, qd):
     speed = np.full(JOINTS, qd)

@@ -9,7 +9,7 @@ import mujoco
 import networkx as nx
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
@@ -124,28 +124,24 @@ def test_published_settling_temperature_of_the_rated_continuous_payload():
 # The step ------------------------------------------------------------------------------------------------------------
 
 
-@settings(deadline=None)
 @given(states, heats, lengths, lengths)
 def test_two_steps_equal_one_long_step(start_c, heat_w, a_s, b_s):
     twice = MODEL.step(MODEL.step(start_c, heat_w, 22.0, a_s), heat_w, 22.0, b_s)
     np.testing.assert_allclose(twice, MODEL.step(start_c, heat_w, 22.0, a_s + b_s), atol=1e-9)
 
 
-@settings(deadline=None)
 @given(states, heats, heats, lengths)
 def test_more_loss_is_never_cooler(start_c, heat_w, more_w, dt_s):
     cooler = MODEL.step(start_c, heat_w, 22.0, dt_s)
     assert np.all(MODEL.step(start_c, heat_w + more_w, 22.0, dt_s) >= cooler - 1e-9)
 
 
-@settings(deadline=None)
 @given(states, heats, arrays(float, NODES, elements=st.floats(0.0, 20.0)), lengths)
 def test_a_hotter_start_is_never_cooler_later(start_c, heat_w, hotter_k, dt_s):
     cooler = MODEL.step(start_c, heat_w, 22.0, dt_s)
     assert np.all(MODEL.step(start_c + hotter_k, heat_w, 22.0, dt_s) >= cooler - 1e-9)
 
 
-@settings(deadline=None)
 @given(states, st.floats(-20.0, 40.0), lengths)
 def test_without_heat_everything_stays_between_its_extremes(start_c, ambient_c, dt_s):
     end = MODEL.step(start_c, np.zeros(NODES), ambient_c, dt_s)
@@ -153,7 +149,6 @@ def test_without_heat_everything_stays_between_its_extremes(start_c, ambient_c, 
     assert end.max() <= max(start_c.max(), ambient_c) + 1e-9
 
 
-@settings(deadline=None)
 @given(states, heats, st.floats(0.1, 5000.0))
 def test_a_step_is_the_matrix_exponential(start_c, heat_w, dt_s):
     flow = -MODEL.laplacian / MODEL.capacity[:, None]
@@ -252,7 +247,6 @@ def test_beyond_some_load_nothing_settles():
     assert run[-1] - run[-180] > 1.0  # Still rising, by more than a kelvin in an hour, after two days.
 
 
-@settings(deadline=None)
 @given(arrays(float, JOINTS, elements=st.floats(0.0, 110.0)), st.floats(-40.0, 60.0))
 def test_settled_is_a_balance_above_the_room_or_nothing(tau_nm, ambient_c):
     # Newton's method without care would also find balances far below absolute zero, or the unstable ones.

@@ -5,7 +5,8 @@ import time
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
+"""Seconds until a wait fails: so many that a slow, busy machine passes."""
 PAUSE = threading.Event()
 """Never set: `PAUSE.wait(seconds)` passes time."""
 T = TypeVar("T")

@@ -26,7 +26,8 @@ from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from scenarios.live.http_app import read_tokens
 from scenarios.live.requests import read_jobs
-from scenarios.load import library, parse_toml
+from scenarios.load import library
+from scenarios.parse import parse_toml
 from twin.logs.formats import GEN3, PLAIN
 from twin.logs.reader import read
 

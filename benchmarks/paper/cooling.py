@@ -35,9 +35,10 @@ from scenarios.evaluate.comparison import figures_of_shifts
 from scenarios.evaluate.rollout import Outcome, outcomes
 from scenarios.json_rows import Row
 from scenarios.motion.hold import hold
-from scenarios.prepare.fleet import DifficultyName, prepare
+from scenarios.prepare.fleet import prepare
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
+from scenarios.specs import DifficultyName
 
 Array = np.ndarray
 

@@ -37,12 +37,13 @@ from fleet.thermal import WINDING
 from scenarios.evaluate.sources import drawn
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
-from scenarios.prepare.fleet import RISK, Fleet, RiskName, env_of, prepare
+from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.prepare.known_cell import let_plan
 from scenarios.prepare.simulated_history import PastJobs, experience, past_jobs
 from scenarios.prepare.simulated_logs import LOGS, identify_from_work
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
+from scenarios.specs import RISK, RiskName
 from twin.saturation.fit import Experience, fit_saturation
 from twin.saturation.model import EVIDENCE, METHODS
 from twin.saturation.reliability import brier, reliability

@@ -13,9 +13,10 @@ from fleet.observation import Observation
 from scenarios.evaluate.statistics import interval
 from scenarios.fault_price import weights_of
 from scenarios.load import load
-from scenarios.prepare.fleet import DifficultyName, prepare
+from scenarios.prepare.fleet import prepare
 from scenarios.run.batch import Randomisation, library_of
 from scenarios.run.outcome import common_figures
+from scenarios.specs import DifficultyName
 
 Array = np.ndarray
 ASKED = (1, 2, 3, 4, 6, 8)

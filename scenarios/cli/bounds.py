@@ -77,7 +77,7 @@ def bounds_command(
         tasks_of,
     )
     from scenarios.policy_loader import scope_of
-    from scenarios.prepare.fleet import DifficultyName
+    from scenarios.specs import DifficultyName
 
     if show_only:
         if not out.is_file():

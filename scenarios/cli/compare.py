@@ -121,8 +121,8 @@ def compare_command(
     from scenarios.evaluate.runner import run_study
     from scenarios.evaluate.scores import references_of
     from scenarios.evaluate.study import Study, cases_of, columns, suite_label, suite_of
-    from scenarios.prepare.fleet import RiskName
     from scenarios.show.comparison_page import Judged, comparison_page, result_text, verdict
+    from scenarios.specs import RiskName
 
     if bool(scenario) == bool(suite):
         raise FleetError("Give either scenarios or --suite.")

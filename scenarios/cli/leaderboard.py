@@ -64,7 +64,7 @@ def leaderboard_command(
         raise FleetError("--author, --about and --policies are for --submit: leave them out.")
     from scenarios.evaluate.leaderboard import best_text, board_of, board_text, read_all, remark_text
     from scenarios.evaluate.tables import LEGEND
-    from scenarios.load import SplitName
+    from scenarios.schema import SplitName
     from scenarios.show.comparison_page import narrow_score_tables
 
     split = choose("split", split, SplitName)

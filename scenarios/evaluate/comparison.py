@@ -20,16 +20,16 @@ from scenarios.evaluate.scores import (
 )
 from scenarios.evaluate.statistics import fewest, unit
 from scenarios.evaluate.study import Row, Study, suite_label
-from scenarios.evaluate.tables import Figure, figures_of
-from scenarios.policy_loader import has_trainings, scope_of
-from scenarios.prepare.fleet import RISK, DifficultyName, RiskName
+from scenarios.evaluate.tables import HEAD, LEGEND, Figure, figure_rows, figures_of, remarks
+from scenarios.policy_loader import has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
+from scenarios.show.table import Table
+from scenarios.specs import RISK, DifficultyName, RiskName
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.evaluate.references import Reference
-    from scenarios.show.table import Table
 
 Array = np.ndarray
 
@@ -102,11 +102,26 @@ class Comparison:
         return f"{self.scenario}{seeds} ({self.unit})"
 
     @property
-    def table(self) -> "Table":
+    def table(self) -> Table:
         """A group per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
-        from scenarios.show.comparison_page import comparison_table
-
-        return comparison_table(self)
+        caption = f"{self.title}: mean, paired difference to {self.baseline}, {LEGEND}"
+        perfect = self.channel == PERFECT.described()
+        if not perfect:
+            caption += f"\nChannel: {self.channel_text}."
+        if self.randomise:
+            caption += f"\nRandomisation: {self.randomise.text}."
+        scopes: list[tuple[str, ...]] = [
+            (label(policy), scope, "", "", "", "") for policy, scope in self.scopes.items()
+        ]
+        groups = {"scope": scopes}
+        for name in FIGURES:
+            figures = {policy: each[name] for policy, each in self.figures.items()}
+            groups[HEADINGS[name]] = figure_rows(figures, self.baseline, label, LEAST_DIGITS.get(name, 1))
+        notes = list(remarks(self.figures, self.draws))
+        central = [label(policy) for policy, scope in self.scopes.items() if scope == "central"]
+        if not perfect and central:
+            notes.append(f"Central policies read no messages: {', '.join(central)}.")
+        return Table.grouped(HEAD, groups, caption=caption, notes=notes)
 
     def _repr_html_(self) -> str:
         return str(self.table.html())

@@ -33,13 +33,14 @@ from scenarios.evaluate.upper_bound import Relaxation, upper_bound
 from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import blaming, policy_at, policy_of
-from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, ShiftFactory
+from scenarios.prepare.fleet import Fleet, ShiftFactory
 from scenarios.prepare.known_cell import simulator_of_shift
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
+from scenarios.specs import RISK, DifficultyName
 
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""

@@ -23,11 +23,12 @@ from scenarios.evaluate.store import opened
 from scenarios.evaluate.study import SHIFTS, Key, Row, Study, Unit, policy_hash
 from scenarios.extras import require_extra
 from scenarios.policy_loader import error_text, is_built_in
-from scenarios.prepare.fleet import Fleet, RiskName
+from scenarios.prepare.fleet import Fleet
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.processes import MOST_DEATHS, LocalWorker, Queue, Worker, run_all
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
+from scenarios.specs import RiskName
 
 HERE_S = 5.0
 """About the time that a worker process takes to start. This process does work that takes no longer, but runs no code of

@@ -21,11 +21,12 @@ from fleet.motion import Plan
 from fleet.robot import JOINTS
 from scenarios.extras import require_extra
 from scenarios.job_stream import all_works, rehearsal_works, works_of
-from scenarios.prepare.fleet import DifficultyName, Fleet, RiskName, prepare
+from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.prepare.planned_arm import PlannedArm, plan_arms
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
+from scenarios.specs import DifficultyName, RiskName
 
 if TYPE_CHECKING:  # need the extra `twin`
     from twin.baselines.torque import TorqueRms

@@ -8,7 +8,6 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -24,6 +23,7 @@ from scenarios.prepare.planned_arm import PlannedArm, air_offsets
 from scenarios.prepare.simulated_history import PastJobs, experience, past_jobs, repetitions_for
 from scenarios.progress import Progress
 from scenarios.schema import Scenario
+from scenarios.specs import RiskName
 from twin.saturation.fit import NotEnoughExperience, fit_saturation
 from twin.saturation.model import Evidence, SaturationModel, load_saturation, save_saturation
 from twin.thermal.calibrated import CalibratedTwin
@@ -32,9 +32,6 @@ from twin.thermal.parameters import HeatModel
 from twin.thermal.risk import PeakCurve
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.twin import Twin
-
-if TYPE_CHECKING:
-    from scenarios.prepare.fleet import RiskName
 
 Array = np.ndarray
 
@@ -59,7 +56,7 @@ def calibrate_twins(
     folder: Path,
     progress: Progress,
     *,
-    risk: "RiskName" = "rc",
+    risk: RiskName = "rc",
     jobs: int = PAST_JOBS,
 ) -> list[CalibratedTwin]:
     """Every arm's twin with its predicted peak and probability of saturation, from the folder where possible.
@@ -84,7 +81,7 @@ def calibrate_networks(
     folder: Path,
     progress: Progress,
     *,
-    risk: "RiskName" = "rc",
+    risk: RiskName = "rc",
     jobs: int = PAST_JOBS,
 ) -> list[RcTwin]:
     """Every arm's thermal network, identified for `rc`, else nominal; for `rc` and `rc-nominal` with its P(saturation).

@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet.errors import ScenarioError
 from fleet.seeding import child
-from scenarios.load import override, plain_values
+from scenarios.parse import override, plain_values
 from scenarios.schema import Ambient, Scenario
 
 MOST_ARRIVALS = 100.0

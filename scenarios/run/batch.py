@@ -17,10 +17,11 @@ from scenarios.cell_layout import near_of
 from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, works_of
 from scenarios.load import scenario_with
-from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare, world_of
+from scenarios.prepare.fleet import Fleet, prepare, world_of
 from scenarios.prepare.randomisation import Randomisation as Randomisation
 from scenarios.progress import Progress, check_progress, quiet
 from scenarios.schema import Scenario
+from scenarios.specs import RISK, DifficultyName, RiskName
 
 Array = np.ndarray
 _SINGLE = frozenset({"plant", "bus", "channel", "render_mode", "mask_in"})

@@ -11,12 +11,10 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from fleet.bus.exchange.channel import PERFECT
-from scenarios.evaluate.comparison import HEADINGS, LEAST_DIGITS, Comparison, Failed
-from scenarios.evaluate.rollout import FIGURES
+from scenarios.evaluate.comparison import Comparison, Failed
 from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import LEVEL, Interval, profile
-from scenarios.evaluate.tables import HEAD, LEGEND, figure_rows, remarks
+from scenarios.evaluate.tables import LEGEND
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, plain
 from scenarios.show.table import Column, Table
@@ -45,26 +43,6 @@ WIDTH_PX, HEIGHT_PX, ROW_PX, LETTER_PX = 820, 400, 24, 7.0
 MARGIN = {"l": 60, "r": 20, "t": 12, "b": 48}
 NAME = 28
 """Most characters of a policy's name in a chart."""
-
-
-def comparison_table(result: Comparison) -> Table:
-    """A group per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
-    caption = f"{result.title}: mean, paired difference to {result.baseline}, {LEGEND}"
-    perfect = result.channel == PERFECT.described()
-    if not perfect:
-        caption += f"\nChannel: {result.channel_text}."
-    if result.randomise:
-        caption += f"\nRandomisation: {result.randomise.text}."
-    scopes: list[tuple[str, ...]] = [(label(policy), scope, "", "", "", "") for policy, scope in result.scopes.items()]
-    groups = {"scope": scopes}
-    for name in FIGURES:
-        figures = {policy: each[name] for policy, each in result.figures.items()}
-        groups[HEADINGS[name]] = figure_rows(figures, result.baseline, label, LEAST_DIGITS.get(name, 1))
-    notes = list(remarks(result.figures, result.draws))
-    central = [label(policy) for policy, scope in result.scopes.items() if scope == "central"]
-    if not perfect and central:
-        notes.append(f"Central policies read no messages: {', '.join(central)}.")
-    return Table.grouped(HEAD, groups, caption=caption, notes=notes)
 
 
 def score_table(scores: Scores, labels: Mapping[str, str] | None = None) -> Table:
@@ -97,7 +75,7 @@ def _first(failures: Sequence[Failed]) -> dict[str, Failed]:
 
 def result_text(result: Comparison) -> Group:
     """The table of a comparison, then its scores, illegal actions and failures, for a console of rich."""
-    parts: list[RenderableType] = [comparison_table(result)] if result.figures else []
+    parts: list[RenderableType] = [result.table] if result.figures else []
     if result.scores:
         title = f"\nNormalised scores, paired difference to {label(result.baseline)}, {LEGEND}"
         parts += [Text(title), *narrow_score_tables(result.scores), *map(Text, result.scores.remarks)]
@@ -307,7 +285,7 @@ def _figures(result: Comparison) -> dict[str, object]:
     """Every figure of every policy, with the difference to the baseline, the best reward first."""
     about = f"{result.scenario}, {result.unit}. Mean and paired difference to {label(result.baseline)}"
     settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
-    table = comparison_table(result)
+    table = result.table
     return {
         "scenario": result.scenario,
         "baseline": label(result.baseline),

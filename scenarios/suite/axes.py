@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.bus.exchange.channel import Partition
 from fleet.robot import ThermalLimits
-from scenarios.load import parse_scenario
+from scenarios.parse import parse_scenario
 from scenarios.schema import Ambient, ArrivalSpec, BusSpec, JobStream, Scenario, Spread, TwinSpec
 from scenarios.suite.cells import SPREAD, Cell, layout
 from scenarios.suite.trades import TRADES, Task

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
-from scenarios.load import SPLITS, SplitName
-from scenarios.schema import ArmSpec
+from scenarios.schema import SPLITS, ArmSpec, SplitName
 from scenarios.suite.layouts import Layout, LayoutName, layout_of
 from scenarios.suite.trades import TradeName
 

@@ -10,10 +10,9 @@ from pathlib import Path
 
 from fleet.job import Job
 from scenarios.job_stream import works_of
-from scenarios.load import SPLITS
 from scenarios.prepare.fleet import prepare, world_of
 from scenarios.prepare.load_factor import load_factor
-from scenarios.schema import JobStream
+from scenarios.schema import SPLITS, JobStream
 from scenarios.suite.axes import Axes, scenario_of
 from scenarios.suite.cells import CELLS, Cell
 from scenarios.suite.splits import drawn_rows, line_of

@@ -12,9 +12,8 @@ import numpy as np
 from fleet.errors import ScenarioError
 from fleet.seeding import shift_seeds
 from scenarios.job_stream import draw_jobs
-from scenarios.load import SPLITS, SplitName
 from scenarios.scenario_hash import hash_of, scenario_hash
-from scenarios.schema import Scenario
+from scenarios.schema import SPLITS, Scenario, SplitName
 from scenarios.schema_errors import choose
 from scenarios.suite.axes import Axes, draw_axes, scenario_of
 from scenarios.suite.cells import CELLS, Cell

@@ -13,9 +13,10 @@ from fleet.engine.reward import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs
 from scenarios.evaluate.rollout import rollout
 from scenarios.fault_price import weights_of
-from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
+from scenarios.prepare.fleet import prepare
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
+from scenarios.specs import RISK, DifficultyName, RiskName
 from scenarios.suite.splits import Instance
 
 Array = np.ndarray

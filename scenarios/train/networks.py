@@ -21,12 +21,13 @@ from fleet.files import atomic_path
 from scenarios.evaluate.rollout import Act, acts_of, known_in, rollout
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, policy_of
-from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
+from scenarios.prepare.fleet import prepare
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.scenario_hash import scenario_hash
 from scenarios.schema import Scenario
+from scenarios.specs import RISK, DifficultyName, RiskName
 from scenarios.train.folder import NETWORK_STATE, check_folder, holds_training, skip_complete, write_card
 from scenarios.train.instances import Ground
 

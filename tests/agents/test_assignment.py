@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.assignment import matching
@@ -13,6 +13,7 @@ from agents.costs import RISK, quickest, thermal
 from agents.registry import RULES, make_policy
 from agents.rules import cheapest_pairs
 from fleet.observation import LONG_S, Layout, Observation
+from tests.profiles import examples
 
 INF = np.inf
 ASSIGNMENTS = {"ssi": cheapest_pairs, "matching": matching}
@@ -44,7 +45,7 @@ def worth(cost: np.ndarray, pairs: list[tuple[int, int]]) -> tuple[int, float]:
     return -len(pairs), float(sum(cost[a, j] for a, j in pairs))
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(costs())
 def test_matching_is_the_best_of_all_assignments(cost):
     best = min(worth(cost, pairs) for pairs in every_assignment(cost))
@@ -52,13 +53,13 @@ def test_matching_is_the_best_of_all_assignments(cost):
 
 
 @pytest.mark.parametrize("rule", ASSIGNMENTS.values(), ids=ASSIGNMENTS)
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(cost=costs())
 def test_no_rule_gives_what_is_not_allowed(rule, cost):
     assert allowed(cost, rule(cost))
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(costs())
 def test_ssi_leaves_nothing_that_an_arm_could_have(cost):
     pairs = cheapest_pairs(cost)
@@ -141,7 +142,7 @@ def test_quickest_is_the_time_until_the_finish():
 
 
 @pytest.mark.parametrize("cost", COSTS.values(), ids=COSTS)
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(data=st.data())
 def test_every_cost_is_infinite_exactly_where_an_arm_may_not_claim(cost, data):
     arms, jobs = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 4))
@@ -165,7 +166,7 @@ def test_every_cost_is_infinite_exactly_where_an_arm_may_not_claim(cost, data):
     assert (np.isposinf(matrix) == (legal == 0)).all()
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.lists(st.floats(0, 7), min_size=2, max_size=5), st.data())
 def test_more_risk_never_makes_an_arm_cheaper_than_before(difficulty, data):
     p = data.draw(st.lists(st.floats(0, 0.5), min_size=len(difficulty), max_size=len(difficulty)))
@@ -205,7 +206,7 @@ def test_a_job_waits_for_the_arm_that_is_home_soon_and_finishes_it_first() -> No
 
 
 @pytest.mark.parametrize("name", [name for name, rule in RULES.items() if rule.scope == "central" and not rule.plans])
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(seed=st.integers(0, 2**32))
 def test_a_central_policy_reads_no_messages(name, seed):
     rng, layout = np.random.default_rng(seed), Layout(3, 4)

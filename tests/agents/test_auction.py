@@ -2,18 +2,19 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from agents.auction import auction
+from tests.profiles import examples
 
 
 def total(benefit: np.ndarray, pairs) -> float:
     return float(sum(benefit[arm, job] for arm, job in pairs))
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.integers(1, 8), st.integers(1, 12), st.integers(0, 2**32), st.sampled_from([0.3, 0.05, 0.01]))
 def test_the_total_is_within_arms_times_epsilon_of_the_optimum(arms, jobs, seed, epsilon) -> None:
     rng = np.random.default_rng(seed)
@@ -25,7 +26,7 @@ def test_the_total_is_within_arms_times_epsilon_of_the_optimum(arms, jobs, seed,
     assert best - arms * epsilon - 1e-9 <= total(benefit, pairs) <= best + 1e-9
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**32))
 def test_whole_numbers_with_a_small_epsilon_give_the_optimum(arms, jobs, seed) -> None:
     """Bertsekas 1988: with whole benefits and ε < 1/n the outcome is optimal."""

@@ -3,10 +3,11 @@
 import networkx as nx
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.consensus import NOBODY, Belief, agree, bid, merge
+from tests.profiles import examples
 
 FEW = st.sampled_from([0.0, 0.5, 1.0, 1.5, 2.0, np.inf])
 MANY = st.floats(-7, 7) | st.just(np.inf)
@@ -41,7 +42,7 @@ def matrix(graph: nx.Graph) -> np.ndarray:
     return nx.to_numpy_array(graph, nodelist=sorted(graph), dtype=bool).T
 
 
-@settings(deadline=None, max_examples=300)
+@examples(300)
 @given(auctions())
 def test_connected_arms_agree_in_time_without_conflict_on_what_the_greedy_one_would_choose(auction):
     """Choi, Brunet & How 2009: theorem 1 (rounds, agreement) and its corollary (the sequential greedy outcome)."""
@@ -58,7 +59,6 @@ def test_connected_arms_agree_in_time_without_conflict_on_what_the_greedy_one_wo
     assert all(np.isfinite(cost[arm, job]) for arm, job in enumerate(claims) if job != NOBODY)
 
 
-@settings(deadline=None)
 @given(auctions(connected=False))
 def test_each_part_of_a_broken_graph_agrees_as_if_the_others_were_not(auction):
     cost, graph = auction
@@ -69,7 +69,6 @@ def test_each_part_of_a_broken_graph_agrees_as_if_the_others_were_not(auction):
         assert (found.belief.winner[members] == found.belief.winner[members[0]]).all()
 
 
-@settings(deadline=None)
 @given(auctions(bids=MANY), st.randoms(use_true_random=False))
 def test_relabelling_arms_and_jobs_relabels_the_outcome(auction, random):
     cost, graph = auction
@@ -84,7 +83,6 @@ def test_relabelling_arms_and_jobs_relabels_the_outcome(auction, random):
         assert plain[old] == (of_job[moved[new]] if moved[new] != NOBODY else NOBODY)
 
 
-@settings(deadline=None)
 @given(auctions(connected=False), st.data())
 def test_links_that_carry_one_way_come_to_an_end_and_strong_ones_agree(auction, data):
     cost, graph = auction

@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.rules import Wspt, WsptCool
 from fleet.observation import Layout, Observation
+from tests.profiles import examples
 
 
 def seen(value, duration_s, p, mask) -> dict[str, Observation]:
@@ -38,7 +39,7 @@ def test_the_careful_one_rests_where_it_would_run_warm() -> None:
     assert WsptCool().act(seen([[9]], [[60]], [[0.9]], [[1]])) == {"arm_0": 0}
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data(), arms=st.integers(1, 3), slots=st.integers(1, 3))
 def test_no_other_first_pair_is_worth_more(data, arms, slots) -> None:
     def draw(low, high):

@@ -5,11 +5,12 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.registry import make_policy
 from fleet.observation import Layout, Observation
+from tests.profiles import examples
 
 
 def queue(duration_s, due_s, value, now_s: float = 0.0, **fields) -> Observation:
@@ -39,7 +40,7 @@ def finish_s(order, duration_s) -> np.ndarray:
 jobs = st.lists(st.tuples(st.integers(1, 900), st.integers(1, 3000), st.integers(1, 9)), min_size=1, max_size=5)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(jobs)
 def test_on_one_arm_each_rule_is_the_best_of_all_sequences_for_its_criterion(drawn) -> None:
     """Smith 1956: spt for the sum of finish times, wspt for the weighted one. Jackson 1955: edd for the lateness."""
@@ -60,7 +61,7 @@ def test_on_one_arm_each_rule_is_the_best_of_all_sequences_for_its_criterion(dra
     assert sequence("fifo", duration_s, due_s, value) == list(range(len(drawn)))
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(jobs)
 def test_atc_is_wspt_when_everything_is_late_and_least_slack_when_all_else_is_equal(drawn) -> None:
     duration_s, due_s, value = (np.array(row, dtype=float) for row in zip(*drawn, strict=True))

@@ -58,7 +58,7 @@ def played(world, policy, *, seed=0, weights=WEIGHTS):
     return ShiftSimulator(world, weights, 1, simulator=lambda: simulator_of(world, weights)).follow([policy])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10_000), hot=st.booleans(), moment=st.sampled_from([50.0, 100.0]))
 def test_no_job_before_its_release_changes_a_claim(small, seed, hot, moment):
     shifts = small.Shifts(arms=3, jobs=10, ticks=40, limits=HOT if hot else ThermalLimits(), crowding=0.3)
@@ -90,7 +90,7 @@ def test_it_finds_the_proven_optimum_where_all_jobs_are_known(small, seed):
     assert played(world, Patient()).reward[0] == pytest.approx(optimum(world, WEIGHTS), abs=1e-9)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10_000), ticks=st.integers(0, 20))
 def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
     """From any moment of a shift, with all jobs on offer, a schedule gives the reward and the awards of the shift."""

@@ -5,13 +5,14 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
 from agents.policy import WAIT
 from agents.rolling_horizon import NONE, RollingHorizon, Sequences, pack
 from fleet.observation import Layout, Observation
+from tests.profiles import examples
 
 WARNING_C = 60.0
 
@@ -57,7 +58,7 @@ def act(*fleet: Observation) -> list[int]:
     return list(RollingHorizon().act({f"arm_{i}": each for i, each in enumerate(fleet)}).values())
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.integers(0, 2**32))
 def test_the_program_finds_the_best_of_all_selections(seed) -> None:
     rng, arms, jobs = np.random.default_rng(seed), 3, 4
@@ -106,7 +107,7 @@ def test_a_sure_fault_is_no_plan_and_a_hot_job_leaves_no_second_one() -> None:
     assert (hot.second != NONE).sum() == 0
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(st.floats(60, 3000), st.floats(60, 3000), st.floats(40, 90), st.floats(40, 90), st.floats(20, 40))
 def test_the_second_peak_is_that_of_a_network_with_one_time_constant(first_s, second_s, one_c, two_c, start_c) -> None:
     """dT/dt = (T∞ − T) / τ, T∞ of each job at least the start: peaks from the start, and one job after the other."""

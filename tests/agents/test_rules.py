@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -15,6 +15,7 @@ from agents.registry import RULES, make_policy
 from agents.rules import LeastDifficulty, RandomLegal
 from fleet.env.allocation_v1 import parallel_env
 from fleet.observation import LONG_S, Layout, Observation
+from tests.profiles import examples
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -210,7 +211,7 @@ def test_least_difficulty_without_any_score_hands_out_the_oldest_in_order() -> N
 
 
 @pytest.mark.parametrize("name", ["least_difficulty", "consensus"])
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(st.data())
 def test_by_advantage_agrees_with_one_who_sees_everything(name, data) -> None:
     """Greedy matching in exact fractions; so no two arms ever claim the same job."""
@@ -287,7 +288,7 @@ def test_consensus_without_any_score_hands_out_the_oldest_in_order() -> None:
     assert act("consensus", fleet([[np.nan, 5.0], [np.nan, 0.0]], free=[1, 0])) == [[2, 0]]
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(st.data())
 def test_consensus_gives_no_job_twice_on_any_connected_graph(data) -> None:
     arms, slots = data.draw(st.integers(2, 5)), data.draw(st.integers(1, 4))

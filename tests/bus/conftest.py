@@ -14,9 +14,9 @@ from fleet.bus.exchange.protocol import Broadcast, PeerView
 from fleet.bus.security.access_control import of_arms
 from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
+from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
-PATIENT_S = 20.0
 Connect = Callable[[str], zenoh.Session]
 
 
@@ -111,7 +111,7 @@ def connect(router: Router, side: str, folder: Path) -> Iterator[Connect]:
 
         def session(name: str) -> zenoh.Session:
             tls = Tls(folder, name) if side == "guarded" else None
-            return stack.enter_context(open_client(router.endpoint, timeout_s=PATIENT_S, tls=tls))
+            return stack.enter_context(open_client(router.endpoint, timeout_s=PATIENCE_S, tls=tls))
 
         yield session
 

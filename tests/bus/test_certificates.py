@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def openssl(*words: object) -> str:
-    done = subprocess.run(["openssl", *map(str, words)], capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(["openssl", *map(str, words)], capture_output=True, text=True, timeout=300, check=False)
     return done.stdout + done.stderr
 
 

@@ -15,8 +15,8 @@ from fleet.bus.protocol import keys
 from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
+from tests.waiting import PATIENCE_S
 
-PATIENT_S = 20.0
 LIMIT = 65_536
 STATE_HZ = 25.0
 Connect = Callable[[str], zenoh.Session]
@@ -37,7 +37,7 @@ def connect(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         def session(name: str) -> zenoh.Session:
             if name not in sessions:
                 tls = Tls(folder, name) if secure else None
-                sessions[name] = stack.enter_context(open_client(router.endpoint, timeout_s=PATIENT_S, tls=tls))
+                sessions[name] = stack.enter_context(open_client(router.endpoint, timeout_s=PATIENCE_S, tls=tls))
             return sessions[name]
 
         yield session
@@ -56,16 +56,16 @@ def sizes(connect: Connect, key: str, say_all: Callable[[zenoh.Session], object]
     settled(connect("monitor"))
     say_all(arm)
     say(arm, keys.of_arm("f", "arm_0", "event"), 1)
-    got = [heard.get(timeout=PATIENT_S)]
+    got = [heard.get(timeout=PATIENCE_S)]
     while got[-1] != 1:
-        got.append(heard.get(timeout=PATIENT_S))
+        got.append(heard.get(timeout=PATIENCE_S))
     listener.undeclare()
     return got[:-1]
 
 
 def settled(session: zenoh.Session) -> None:
     """Wait until the router has taken all that the session said or declared before."""
-    assert list(session.get(keys.caches_of("thermofleet/v4/f/arm/nobody"), timeout=PATIENT_S)) == []
+    assert list(session.get(keys.caches_of("thermofleet/v4/f/arm/nobody"), timeout=PATIENCE_S)) == []
 
 
 EVENT = keys.of_arm("f", "arm_0", "event")
@@ -95,7 +95,7 @@ def test_what_caches_say_to_each_other_is_no_way_round(connect):
     settled(connect("monitor"))
     for size in (LIMIT + 1, LIMIT):
         say(connect("arm_0"), key, size)
-    assert heard.get(timeout=PATIENT_S) == LIMIT
+    assert heard.get(timeout=PATIENCE_S) == LIMIT
     listener.undeclare()
 
 
@@ -116,10 +116,10 @@ def test_a_question_and_an_answer_that_are_too_big_are_dropped(connect):
     def answers(size: int) -> list[int]:
         began_s = time.monotonic()
         replies = connect("auctioneer").get(
-            key, payload=b"q" * size, consolidation=zenoh.ConsolidationMode.NONE, timeout=PATIENT_S
+            key, payload=b"q" * size, consolidation=zenoh.ConsolidationMode.NONE, timeout=PATIENCE_S
         )
         got = [len(one.ok.payload) for one in replies if one.ok]
-        assert time.monotonic() - began_s < PATIENT_S / 2, "nobody waits for what was dropped"
+        assert time.monotonic() - began_s < PATIENCE_S / 2, "nobody waits for what was dropped"
         return got
 
     assert answers(LIMIT + 1) == []
@@ -140,8 +140,8 @@ def test_a_question_to_a_cache_is_not_larger_than_others(connect, asked):
     queryable = connect("arm_0").declare_queryable(f"{EVENT}/@adv/pub/1", reply)
     settled(connect("arm_0"))
     for size in (LIMIT + 1, 2 * LIMIT, LIMIT):
-        assert list(connect("monitor").get(asked, payload=b"q" * size, timeout=PATIENT_S)) == []
-    assert sizes.get(timeout=PATIENT_S) == LIMIT
+        assert list(connect("monitor").get(asked, payload=b"q" * size, timeout=PATIENCE_S)) == []
+    assert sizes.get(timeout=PATIENCE_S) == LIMIT
     queryable.undeclare()
 
 
@@ -164,7 +164,7 @@ def test_telemetry_too_often_is_thinned_to_the_limit(connect):
     settled(connect("monitor"))
     said = 0
     began_s = time.monotonic()
-    while heard.qsize() < 5 and time.monotonic() - began_s < PATIENT_S:
+    while heard.qsize() < 5 and time.monotonic() - began_s < PATIENCE_S:
         connect("arm_0").put(key, b"state")
         said += 1
     assert heard.qsize() >= 5
@@ -194,7 +194,7 @@ def test_a_flood_of_telemetry_takes_nothing_from_other_words_and_other_arms(conn
     say(connect("arm_0"), end, 1)
     got: list[str] = []
     while not got or got[-1] != end:
-        got.append(heard.get(timeout=PATIENT_S))
+        got.append(heard.get(timeout=PATIENCE_S))
     assert got.count(difficulty) == 50
     assert got.count(other) == 1
     assert got.count(flood) < 500
@@ -207,14 +207,14 @@ def test_without_a_rate_every_word_passes():
     heard: queue.Queue[int] = queue.Queue()
     with (
         Router() as router,
-        open_client(router.endpoint, timeout_s=PATIENT_S) as monitor,
-        open_client(router.endpoint, timeout_s=PATIENT_S) as arm,
+        open_client(router.endpoint, timeout_s=PATIENCE_S) as monitor,
+        open_client(router.endpoint, timeout_s=PATIENCE_S) as arm,
     ):
         listener = monitor.declare_subscriber(key, lambda sample: heard.put(len(sample.payload)))
         settled(monitor)
         for size in range(1000):
             say(arm, key, size)
-        assert [heard.get(timeout=PATIENT_S) for _ in range(1000)] == list(range(1000))
+        assert [heard.get(timeout=PATIENCE_S) for _ in range(1000)] == list(range(1000))
         listener.undeclare()
 
 

@@ -11,8 +11,8 @@ import pytest
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.queue import Mailbox
 from fleet.live.supervisor import Supervisor
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 20.0
 WAIT_S = 0.05
 
 
@@ -28,13 +28,13 @@ def late_signal():
 
     def ring(*_):
         rung.append(time.monotonic())
-        assert len(rung) == 1, "still waiting a second after the time was up"
+        assert len(rung) == 1, "still waiting ten seconds after the time was up"
         until_s = rung[0] + WAIT_S
         while time.monotonic() < until_s:
             pass
 
     before = signal.signal(signal.SIGALRM, ring)
-    yield lambda: signal.setitimer(signal.ITIMER_REAL, WAIT_S / 2, 1.0)
+    yield lambda: signal.setitimer(signal.ITIMER_REAL, WAIT_S / 2, 10.0)
     signal.setitimer(signal.ITIMER_REAL, 0.0)
     signal.signal(signal.SIGALRM, before)
 
@@ -53,7 +53,7 @@ def test_a_signal_that_takes_as_long_as_the_wait_does_not_make_it_endless(late_s
     until_s = time.monotonic() + WAIT_S
     late_signal()
     wait(until_s, tmp_path)
-    assert WAIT_S / 2 <= time.monotonic() - until_s + WAIT_S < 1.0
+    assert WAIT_S / 2 <= time.monotonic() - until_s + WAIT_S < 10.0
 
 
 def test_what_several_threads_put_in_comes_out_once_and_in_the_order_of_each():

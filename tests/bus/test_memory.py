@@ -5,13 +5,14 @@ from dataclasses import fields, replace
 import networkx as nx
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.protocol import UNHEARD, PeerView
 from fleet.errors import BusError
+from tests.profiles import examples
 
 ARMS = ("a", "b", "c", "d")
 
@@ -68,7 +69,7 @@ def test_a_directed_edge_carries_one_way(make_words):
     np.testing.assert_array_equal(age_s, [[0.0, np.inf], [0.0, 0.0]])
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=40)
+@examples(40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(ticks=st.integers(0, 4), dt_s=st.sampled_from([0.1, 1.0, 10.0]), seed=st.integers(0, 99))
 def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, ticks, dt_s, seed):
     """Against a second method: look the word of t − delay up by hand."""

@@ -20,6 +20,8 @@ import pytest
 import zenoh
 from jsonschema import Draft202012Validator
 
+from tests import commands
+
 ROOT = Path(__file__).parents[2]
 CONTRACT = ROOT / "docs" / "contract"
 API = json.loads((CONTRACT / "asyncapi.json").read_text(encoding="utf-8"))
@@ -32,7 +34,6 @@ ARM = {"arm_alive", "arm_state", "arm_info", "arm_difficulty"}
 """What a simulated shift has."""
 CONSENSUS = {"arm_bid", "arm_claim", "arm_operation"}
 PATIENCE_S = 240.0
-COMMAND = [sys.executable, "-c", "from scenarios.cli.main import main; main()"]
 REPEATED = 2
 """Requests of each channel that are sent again."""
 
@@ -192,14 +193,8 @@ def port() -> int:
 def started(folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
     """A command as a process of its own, which is ended with the block."""
     with (folder / f"{words[0]}.log").open("a+") as log:
-        process = subprocess.Popen(
-            [*COMMAND, *map(str, words)],
-            cwd=ROOT,
-            env={**os.environ, "THERMOFLEET_CACHE": str(folder / "cache")},
-            stdout=log,
-            stderr=log,
-            text=True,
-        )
+        env = {**os.environ, "THERMOFLEET_CACHE": str(folder / "cache")}
+        process = commands.start(*words, env=env, stdout=log, stderr=log)
         try:
             yield process
         finally:

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 
 import pytest
 import zenoh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from zenoh.ext import Int64, z_deserialize
 
@@ -26,8 +26,9 @@ from fleet.ros2.node import (
     node_token,
     publisher_token,
 )
+from tests.profiles import examples
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 10.0
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = Topic("/chatter", STRING, STRING_HASH)
@@ -100,7 +101,7 @@ def test_a_namespace_is_part_of_key_and_token():
     assert "/%robot1%arm%joint_states/" in publisher_token(topic, "z", "n", 1)
 
 
-@settings(deadline=None, max_examples=50)
+@examples(50)
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1), st.binary(min_size=16, max_size=16))
 def test_an_attachment_is_what_zenoh_itself_would_serialise(number, time_ns, sender):
     attached = zenoh.ZBytes(attachment(number, time_ns, sender))
@@ -119,13 +120,13 @@ def test_a_domain_that_ros_does_not_allow_is_refused(number):
         Topic("/chatter", STRING, NO_HASH, domain=number)
 
 
-@settings(deadline=None, max_examples=50)
+@examples(50)
 @given(st.text(max_size=20))
 def test_any_name_becomes_part_of_a_topic(name):
     Topic(f"/{plain_name(name)}/joint_states", STRING, NO_HASH)
 
 
-@settings(deadline=None, max_examples=50)
+@examples(50)
 @given(st.from_regex(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", fullmatch=True))
 def test_a_good_name_stays(name):
     assert plain_name(name) == name

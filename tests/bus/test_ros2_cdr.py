@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pycdr2 import IdlStruct
 from pycdr2.types import float64, int32, sequence, uint8, uint32
@@ -26,10 +26,11 @@ from fleet.ros2.cdr import (
     write_joints,
 )
 from fleet.ros2.conversion import Diagnostic, Joints
+from tests.profiles import examples
 
 STORES = {name: get_typestore(Stores[f"ROS2_{name}"]) for name in ("HUMBLE", "JAZZY", "LYRICAL")}
 
-UNHURRIED = settings(deadline=None, max_examples=50)
+UNHURRIED = examples(50)
 """The first message of a kind builds its reader."""
 HEADER = b"\x00\x01\x00\x00"
 """CDR, little endian, no options (OMG DDSI-RTPS 2.5, table 10.3)."""

@@ -4,7 +4,7 @@ import math
 import random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.messages import DifficultyScores, MalformedMessage, State
@@ -23,8 +23,9 @@ from fleet.ros2.conversion import (
     joints_of,
     temperatures,
 )
+from tests.profiles import examples
 
-UNHURRIED = settings(deadline=None, max_examples=50)
+UNHURRIED = examples(50)
 LIMITS = ThermalLimits()
 finite = st.floats(allow_nan=False, allow_infinity=False)
 seven = st.tuples(*[finite] * 7)

@@ -12,15 +12,16 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router, loopback, open_client, reachable
 from fleet.bus.security.tls import Tls, identified
 from fleet.errors import BusError, NoRouter, is_name
+from tests.waiting import PATIENCE_S
 
 
 def test_the_router_listens_where_it_says():
     with Router() as router:
         host, port = router.endpoint.removeprefix("tcp/").split(":")
         assert host == "127.0.0.1"
-        with socket.create_connection((host, int(port)), timeout=10):
+        with socket.create_connection((host, int(port)), timeout=PATIENCE_S):
             pass
-        open_client(router.endpoint, timeout_s=10).close()
+        open_client(router.endpoint, timeout_s=PATIENCE_S).close()
 
 
 def test_two_routers_listen_on_different_ports():
@@ -52,8 +53,8 @@ def test_lines_that_nobody_opens_keep_nobody_out():
         router = stack.enter_context(Router())
         host, port = router.endpoint.removeprefix("tcp/").split(":")
         for _ in range(150):
-            stack.enter_context(socket.create_connection((host, int(port)), timeout=10))
-        open_client(router.endpoint, timeout_s=2.5).close()
+            stack.enter_context(socket.create_connection((host, int(port)), timeout=PATIENCE_S))
+        open_client(router.endpoint, timeout_s=9.0).close()
 
 
 def test_no_router_is_said_within_the_time_given():

@@ -30,10 +30,9 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, GrantedEntry
 from fleet.bus.protocol.messages import encode, encoding
 from fleet.bus.security.tls import Tls
-from tests.waiting import serve_until
+from tests.waiting import PATIENCE_S, serve_until
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
-PATIENT_S = 20.0
 HERE = "thermofleet/v4/f"
 Connect = Callable[[str], zenoh.Session]
 
@@ -43,7 +42,7 @@ def settled(session: zenoh.Session) -> None:
 
     A question travels with the priority of what is said, so it cannot overtake it; everybody may ask the caches.
     """
-    assert list(session.get(keys.caches_of(f"{HERE}/arm/nobody"), timeout=PATIENT_S)) == []
+    assert list(session.get(keys.caches_of(f"{HERE}/arm/nobody"), timeout=PATIENCE_S)) == []
 
 
 def ask(session: zenoh.Session, key: str) -> list[str]:
@@ -53,7 +52,7 @@ def ask(session: zenoh.Session, key: str) -> list[str]:
         payload=b"?",
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=PATIENT_S,
+        timeout=PATIENCE_S,
     )
     return sorted(reply.ok.payload.to_string() for reply in replies if reply.ok)
 
@@ -101,7 +100,7 @@ def test_an_arm_says_nothing_under_the_key_of_another(router, side, connect, wha
     arm, mine = connect("arm_1"), keys.of_arm("f", "arm_1", "state")
     getattr(arm, what)(key, *([b"not mine"] if what == "put" else []))
     arm.put(mine, b"mine")
-    assert [heard.get(timeout=PATIENT_S) for _ in range(1 + (side == "open"))] == [key, mine][side == "guarded" :]
+    assert [heard.get(timeout=PATIENCE_S) for _ in range(1 + (side == "open"))] == [key, mine][side == "guarded" :]
     for ear in ears:
         ear.undeclare()
 
@@ -125,9 +124,9 @@ def test_every_role_says_what_is_its_own_and_nothing_else(router, side, connect,
         session.put(own, b"mine")
     settled(session)
     inside(router).put("the/end", b"")
-    got = [heard.get(timeout=PATIENT_S)]
+    got = [heard.get(timeout=PATIENCE_S)]
     while got[-1] != "the/end":
-        got.append(heard.get(timeout=PATIENT_S))
+        got.append(heard.get(timeout=PATIENCE_S))
     ear.undeclare()
     assert got[:-1] == [found for found in ([] if side == "guarded" else [key]) + [own] if found]
 
@@ -174,11 +173,11 @@ def test_nobody_pretends_that_another_is_there(side, connect, fake):
     # A name of its own for each side and fake: tokens of the test before may still be on their way out.
     own = f"{HERE}/arm/arm_1/{side}/{fake.split('/')[3]}"
     tokens = [rogue.liveliness().declare_token(key) for key in (fake, own)]
-    got = [seen.get(timeout=PATIENT_S)]
+    got = [seen.get(timeout=PATIENCE_S)]
     while got[-1] != own:
-        got.append(seen.get(timeout=PATIENT_S))
+        got.append(seen.get(timeout=PATIENCE_S))
     settled(rogue)
-    replies = connect("recorder").liveliness().get(f"{HERE}/**", timeout=PATIENT_S)
+    replies = connect("recorder").liveliness().get(f"{HERE}/**", timeout=PATIENCE_S)
     there = {str(reply.ok.key_expr) for reply in replies if reply.ok}
     assert own in there
     assert (fake in got, fake in there) == ((side == "open"),) * 2
@@ -231,7 +230,7 @@ def test_an_error_of_zenohs_is_lost_under_a_wildcard_and_a_refusal_is_not(router
     settled(arm)
 
     def reasons(where: str) -> list[str]:
-        return [reply.err.payload.to_string() for reply in auctioneer.get(where, timeout=PATIENT_S) if reply.err]
+        return [reply.err.payload.to_string() for reply in auctioneer.get(where, timeout=PATIENCE_S) if reply.err]
 
     assert reasons(key) == ["too warm"]
     assert reasons(everywhere) == ([] if side == "guarded" else ["too warm"])
@@ -249,7 +248,7 @@ def test_an_error_of_zenohs_is_lost_under_a_wildcard_and_a_refusal_is_not(router
         settled(raw(answers))
         for where in (key, everywhere):
             got: list[Replies[Ack]] = []
-            asks.query(where, award, Ack, got.append, timeout_s=PATIENT_S)
+            asks.query(where, award, Ack, got.append, timeout_s=PATIENCE_S)
             serve_until(lambda got=got: bool(got), answers, asks)
             assert got[0].refused == {key: "too warm"}
 
@@ -293,7 +292,7 @@ def test_an_arm_neither_renews_nor_reports_nor_claims_for_another(router, side, 
             handler = zenoh.handlers.Callback(got.append, drop=over.set, indirect=False)
             rogue.get(
                 key, handler, payload=encode(word), encoding=encoding(type(word)), target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE, timeout=PATIENT_S,
+                consolidation=zenoh.ConsolidationMode.NONE, timeout=PATIENCE_S,
             )  # fmt: skip
             serve_until(over.is_set, auctioneer)
             return [str(reply.ok.encoding).split(".")[1] for reply in got]
@@ -341,12 +340,12 @@ def test_a_late_joiner_gets_the_last_words_and_gaps_are_noticed(connect):
         history=ext.HistoryConfig(detect_late_publishers=True, max_samples=2),
         recovery=ext.RecoveryConfig(heartbeat=True),
     )
-    assert [heard.get(timeout=PATIENT_S) for _ in range(2)] == ["b", "c"]
+    assert [heard.get(timeout=PATIENCE_S) for _ in range(2)] == ["b", "c"]
     early.put("d")
-    assert heard.get(timeout=PATIENT_S) == "d"
+    assert heard.get(timeout=PATIENCE_S) == "d"
     late = publisher("arm_1")
     late.put("e")
-    assert heard.get(timeout=PATIENT_S) == "e"
+    assert heard.get(timeout=PATIENCE_S) == "e"
     for entity in (subscriber, early, late):
         entity.undeclare()
 

@@ -13,9 +13,9 @@ from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.certificates import issue
 from fleet.bus.security.keyring import add, make
 from fleet.bus.security.tls import Tls
+from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
-PATIENT_S = 20.0
 HERE = "thermofleet/v4/f"
 
 
@@ -23,7 +23,7 @@ HERE = "thermofleet/v4/f"
 def test_a_certificate_gives_no_more_rights_in_another_mode(open_stranger, guarded, folder, mode, inside):
     heard: queue.Queue[str] = queue.Queue()
     with (
-        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "monitor")) as monitor,
+        open_client(guarded.endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "monitor")) as monitor,
         open_stranger(guarded.endpoint, Tls(folder, "arm_1").link(serves=False), mode) as rogue,
     ):
         ears = [
@@ -31,7 +31,7 @@ def test_a_certificate_gives_no_more_rights_in_another_mode(open_stranger, guard
             for session in (monitor, inside(guarded))
         ]
         got: list[str] = []
-        end_s = time.monotonic() + PATIENT_S
+        end_s = time.monotonic() + PATIENCE_S
         # A peer or a router sends nothing before it has learnt who listens.
         while len(got) < 2 and time.monotonic() < end_s:
             rogue.put(keys.of_arm("f", "arm_0", "state"), b"not mine")
@@ -53,16 +53,16 @@ def test_somebody_whom_the_authority_knows_and_the_roster_does_not_may_do_nothin
     heard: queue.Queue[str] = queue.Queue()
     ear = inside(guarded).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
     with (
-        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(stranger, "arm_9")) as rogue,
-        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm,
+        open_client(guarded.endpoint, timeout_s=PATIENCE_S, tls=Tls(stranger, "arm_9")) as rogue,
+        open_client(guarded.endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "arm_0")) as arm,
     ):
         deaf: list[zenoh.Sample] = []
         subscriber = rogue.declare_subscriber(f"{HERE}/**", deaf.append, allowed_origin=zenoh.Locality.REMOTE)
         rogue.put(keys.of_arm("f", "arm_9", "state"), b"not in the roster")
-        assert list(rogue.get(f"{HERE}/**", timeout=PATIENT_S)) == []
+        assert list(rogue.get(f"{HERE}/**", timeout=PATIENCE_S)) == []
         arm.put(keys.of_arm("f", "arm_0", "state"), b"mine")
-        assert heard.get(timeout=PATIENT_S) == keys.of_arm("f", "arm_0", "state")
-        assert list(rogue.get(f"{HERE}/**", timeout=PATIENT_S)) == []
+        assert heard.get(timeout=PATIENCE_S) == keys.of_arm("f", "arm_0", "state")
+        assert list(rogue.get(f"{HERE}/**", timeout=PATIENCE_S)) == []
         assert deaf == []
         subscriber.undeclare()
     ear.undeclare()
@@ -77,10 +77,10 @@ def test_one_that_is_added_may_speak_when_the_router_starts_again(tmp_path, insi
     for _ in range(2):  # the second time with a new certificate of the same authority
         with (
             Router(tls=Tls(place, "router")) as router,
-            open_client(router.endpoint, timeout_s=PATIENT_S, tls=Tls(place, "arm_7")) as arm,
+            open_client(router.endpoint, timeout_s=PATIENCE_S, tls=Tls(place, "arm_7")) as arm,
         ):
             ear = inside(router).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
             arm.put(key, b"mine")
-            assert heard.get(timeout=PATIENT_S) == key
+            assert heard.get(timeout=PATIENCE_S) == key
             ear.undeclare()
         add(place, new, days=60, overwrite=True)

@@ -20,18 +20,18 @@ from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, check_name, decode, encode, encoding
 from fleet.errors import BusError
+from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
 ROOT = Path(__file__).parents[2]
-PATIENT_S = 30.0
 
 
 @pytest.mark.parametrize("channel", [Channel(), Channel(topology="ring", delay_s=10.0, loss=0.5)], ids=["all", "some"])
 def test_the_bus_carries_every_message_and_the_arms_know_what_the_memory_delivers(make_words, assert_same, channel):
     arms, rng, samples = tuple(f"arm {i}+*@" for i in range(12)), np.random.default_rng(2), queue.Queue()
-    with ZenohExchange(arms, "same", channel=channel, timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(arms, "same", channel=channel, timeout_s=PATIENCE_S) as bus:
         memory, said = MemoryExchange(arms, channel), []
-        with open_client(bus.endpoint or "", timeout_s=PATIENT_S) as observer:
+        with open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as observer:
             ears = [
                 observer.declare_subscriber(keys.of_every_arm("same", topic), samples.put)
                 for topic in ("state", "difficulty")
@@ -43,7 +43,7 @@ def test_the_bus_carries_every_message_and_the_arms_know_what_the_memory_deliver
                 words = make_words(rng, 12, 10.0 * tick, slots=3 + tick % 3)
                 said.append(words)
                 assert_same(bus.share(words), memory.share(words))
-            heard = [samples.get(timeout=PATIENT_S) for _ in range(2 * 12 * 10)]
+            heard = [samples.get(timeout=PATIENCE_S) for _ in range(2 * 12 * 10)]
             for ear in ears:
                 ear.undeclare()
         assert (bus.delivered, bus.late) == (memory.delivered, memory.late)
@@ -66,7 +66,7 @@ def test_the_bus_carries_every_message_and_the_arms_know_what_the_memory_deliver
 
 def test_a_new_episode_knows_nothing_of_the_last_but_what_is_said_anew(make_words, assert_same):
     rng = np.random.default_rng(1)
-    with ZenohExchange(ARMS, "again", timeout_s=PATIENT_S) as bus, MemoryExchange(ARMS) as memory:
+    with ZenohExchange(ARMS, "again", timeout_s=PATIENCE_S) as bus, MemoryExchange(ARMS) as memory:
         for time_s in (0.0, 10.0, 20.0, 0.0, 10.0, 0.0):
             if time_s == 0.0:
                 bus.begin()
@@ -96,18 +96,18 @@ def test_one_arm_alone_needs_nobody(make_words):
 
 
 def test_an_arm_is_on_the_bus_once():
-    with Router() as router, ZenohExchange(ARMS, "f", router.endpoint, timeout_s=PATIENT_S):
+    with Router() as router, ZenohExchange(ARMS, "f", router.endpoint, timeout_s=PATIENCE_S):
         with pytest.raises(BusError, match="already has arm_1 "):
-            ZenohExchange(["arm_1", "arm_9"], "f", router.endpoint, timeout_s=PATIENT_S).open()
-        ZenohExchange(["arm_9"], "f", router.endpoint, timeout_s=PATIENT_S).open().close()
+            ZenohExchange(["arm_1", "arm_9"], "f", router.endpoint, timeout_s=PATIENCE_S).open()
+        ZenohExchange(["arm_9"], "f", router.endpoint, timeout_s=PATIENCE_S).open().close()
 
 
 def test_what_a_stranger_says_is_never_believed(make_words, assert_same):
     rng = np.random.default_rng(3)
     with (
-        ZenohExchange(ARMS, "f", timeout_s=PATIENT_S) as bus,
+        ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus,
         MemoryExchange(ARMS) as memory,
-        open_client(bus.endpoint or "", timeout_s=PATIENT_S) as stranger,
+        open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as stranger,
     ):
         for tick in range(3):
             words = make_words(rng, 3, 10.0 * tick)
@@ -120,24 +120,24 @@ def test_what_a_stranger_says_is_never_believed(make_words, assert_same):
 
 def barrier(session: zenoh.Session) -> None:
     """Wait until the router has taken all that the session said: it answers in order."""
-    assert list(session.liveliness().get("thermofleet/v4/*/arm/*/alive", timeout=PATIENT_S))
+    assert list(session.liveliness().get("thermofleet/v4/*/arm/*/alive", timeout=PATIENCE_S))
 
 
 def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
     """With nothing but Zenoh: the caches answer a subscriber that was not there."""
     samples: queue.Queue[zenoh.Sample] = queue.Queue()
-    with ZenohExchange(ARMS, "f", timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus:
         words = make_words(np.random.default_rng(5), 3, 0.0)
         bus.share(words)
-        with open_client(bus.endpoint or "", timeout_s=PATIENT_S) as joiner:
+        with open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as joiner:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
             for topic in ("info", "difficulty"):
                 zenoh.ext.declare_advanced_subscriber(
                     joiner, keys.of_every_arm("f", topic), samples.put, history=history
                 )
-            tokens = joiner.liveliness().get(keys.of_every_arm("f", "alive"), timeout=PATIENT_S)
+            tokens = joiner.liveliness().get(keys.of_every_arm("f", "alive"), timeout=PATIENCE_S)
             present = {keys.parse(str(reply.ok.key_expr)).name for reply in tokens if reply.ok}
-            said = [samples.get(timeout=PATIENT_S) for _ in range(6)]
+            said = [samples.get(timeout=PATIENCE_S) for _ in range(6)]
     assert present == set(ARMS)
     for sample in said:
         key = keys.parse(str(sample.key_expr))
@@ -155,7 +155,7 @@ def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
 
 def test_closing_leaves_no_thread_and_no_port(make_words):
     threads = set(threading.enumerate())
-    bus = ZenohExchange(ARMS, "f", timeout_s=PATIENT_S).open()
+    bus = ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S).open()
     endpoint = bus.endpoint or ""
     bus.share(make_words(np.random.default_rng(0), 3, 0.0))
     bus.close()
@@ -193,7 +193,7 @@ print(heard.difficulty.sum(), flush=True)
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "4.0", "")

@@ -8,9 +8,9 @@ from fleet.bus.exchange.channel import Channel, Partition
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.env.allocation_v1 import parallel_env
+from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm_2", "arm_3")
-PATIENT_S = 30.0
 CHANNELS = {
     "perfect": Channel(),
     "ring": Channel(
@@ -35,7 +35,7 @@ def test_the_same_seed_gives_the_same_awards_over_either(small, channel):
             env.step(policy.act(env.knowledge()))
         return [repr(event) for event in env.events], env.messages
 
-    with ZenohExchange(ARMS, "trace", channel=channel, timeout_s=PATIENT_S) as bus:
+    with ZenohExchange(ARMS, "trace", channel=channel, timeout_s=PATIENCE_S) as bus:
         over_zenoh = shift(bus)
     assert over_zenoh == shift(MemoryExchange(ARMS, channel))
     assert sum("award" in event for event in over_zenoh[0]) > 5

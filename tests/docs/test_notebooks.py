@@ -16,6 +16,7 @@ SHOWN = {
 """What the HTML or text outputs of each notebook contain."""
 
 
+@pytest.mark.ci_slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.ci_slow
 def test_pages_are_made_from_readme_docstrings_and_notebooks(site: Path) -> None:
     for page, content in (
         ("index.html", "Two commands"),
@@ -33,6 +34,7 @@ def test_pages_are_made_from_readme_docstrings_and_notebooks(site: Path) -> None
         assert content in (site / page).read_text(encoding="utf-8"), page
 
 
+@pytest.mark.ci_slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_search_works_from_a_folder_without_network(site: Path) -> None:
     from playwright.sync_api import sync_playwright
@@ -47,9 +49,9 @@ def test_search_works_from_a_folder_without_network(site: Path) -> None:
         view.click(".md-search__input")
         view.keyboard.type("clearance")
         found = view.locator(".md-search-result__link").first
-        found.wait_for(timeout=20_000)
+        found.wait_for(timeout=120_000)
         found.click()
-        view.wait_for_selector("article:has-text('clearance')", timeout=20_000)
+        view.wait_for_selector("article:has-text('clearance')", timeout=120_000)
         for page in ("index", "cli", "bus/messages", "tutorials/judge_a_policy", "notebooks/evaluate_policies"):
             view.set_viewport_size({"width": 390, "height": 844})
             view.goto((site / f"{page}.html").as_uri())

@@ -114,6 +114,7 @@ def terminal(tmp_path: Path) -> Iterator[Terminal]:
     opened.close()
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_a_tutorial_runs_as_its_page_says(page: Path, terminal: Terminal) -> None:
     steps = blocks(page.read_text(encoding="utf-8"))

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.engine.shift import open_jobs, step
 from fleet.engine.state import World, initial
 from fleet.telemetry import IDLE, WORKING
+from tests.profiles import examples
 
 
 def world_of(small, places, arms=3, slots=4, **more):
@@ -66,7 +67,7 @@ def referee(slot_job, mask, stations, actions, difficulty, occupied, touches, aw
 PLACES = ["bench", "rack", ("bench", "rack"), ("rack", "press"), "press", "shelf"]
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.data())
 def test_awards_equal_the_reference(small, data) -> None:
     places = data.draw(st.lists(st.sampled_from(PLACES), min_size=1, max_size=6))

@@ -228,7 +228,7 @@ def test_an_arm_that_begins_too_hot_faults_at_once(small) -> None:
     assert (steps[0].state.status[0, 0], steps[0].state.cycles[0, 0]) == (WAITING, 0)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(narrow=st.floats(0.02, 3.0), clear_s=st.floats(0.0, 25.0), dt_s=st.sampled_from([5.0, 10.0, 60.0]))
 def test_events_are_in_order_for_any_distance_of_limits(small, narrow, clear_s, dt_s) -> None:
     """A fault and the fall below the restart limit may be in one step."""

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.engine.shift import open_jobs, step
@@ -12,9 +12,10 @@ from fleet.engine.state import State, initial
 from fleet.events import Event
 from fleet.telemetry import IDLE
 from tests.engine.play import DT_S, play, times, with_random_difficulty
+from tests.profiles import examples
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     approach=st.integers(1, 800),
     cycle=st.integers(5, 1500),

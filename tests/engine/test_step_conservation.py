@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.engine.shift import open_jobs, step
@@ -14,6 +14,7 @@ from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 from tests.engine.play import DT_S, times, with_random_difficulty
+from tests.profiles import examples
 
 
 @st.composite
@@ -37,7 +38,7 @@ def shifts(draw):
     return arms, rows, ticks, actions, narrow, crowded
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(shifts())
 def test_jobs_and_time_are_conserved(small, shift) -> None:
     arms, rows, ticks, seed, narrow, crowded = shift

@@ -14,7 +14,7 @@ from fleet.engine.state import DONE, WAITING, State, World
 from fleet.env.allocation_v1 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import JOINTS
-from scenarios.load import parse_scenario
+from scenarios.parse import parse_scenario
 from scenarios.schema import Scenario
 
 Trace = list[tuple[Any, ...]]
@@ -172,12 +172,6 @@ def batch(small) -> Callable[..., BatchEnv]:
         return BatchEnv(small.Shifts(**(shift or {})).library(), num_envs, **options)
 
     return make_batch
-
-
-@pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The plan cache of all tests of a run; never the user's."""
-    return tmp_path_factory.getbasetemp() / "cache"
 
 
 @pytest.fixture(scope="session")

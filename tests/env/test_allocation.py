@@ -59,7 +59,7 @@ def test_a_shift_without_jobs_lasts_to_the_horizon(make, play) -> None:
 def test_zenoh_and_memory_give_the_same_episode(make, play) -> None:
     memory = make({"ticks": 12}, keep_events=True)
     over_zenoh = make(
-        {"ticks": 12}, exchange=ZenohExchange(memory.possible_agents, fleet="same episode", timeout_s=20.0)
+        {"ticks": 12}, exchange=ZenohExchange(memory.possible_agents, fleet="same episode", timeout_s=120.0)
     )
     try:
         traces = [[env.reset(seed=6), *play.go_on(env, np.random.default_rng(6))] for env in (memory, over_zenoh)]

@@ -234,44 +234,44 @@ def beyond(cell) -> dict[str, Any]:
     return {"places": places}
 
 
-def test_jobs_that_no_arm_can_do_are_refused_with_a_remedy(cell, folder) -> None:
+def test_jobs_that_no_arm_can_do_are_refused_with_a_remedy(cell, plans) -> None:
     message = r"jobs\[1\]\.places: no arm can do 'sort' with 0\.2 or 0\.5 kg \(left at 'shelf': .+\); move the places"
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
         with pytest.raises(ScenarioError, match=message):
-            make(cell, difficulty="blind", cache=folder, **beyond(cell))
+            make(cell, difficulty="blind", cache=plans, **beyond(cell))
 
 
-def test_unknown_scenarios_and_fields_are_refused(cell, folder) -> None:
+def test_unknown_scenarios_and_fields_are_refused(cell, plans) -> None:
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
         with pytest.raises(ScenarioError, match="No scenario 'quickstrat'; did you mean 'quickstart'"):
             make("quickstrat")
         with pytest.raises(ScenarioError, match=r"There is no scenario file '.*none\.toml'"):
             make(Path("none.toml"))
         with pytest.raises(ScenarioError, match=r"unknown key 'horizon'; did you mean 'horizon_s'"):
-            make(cell, difficulty="blind", cache=folder, horizon=60)
+            make(cell, difficulty="blind", cache=plans, horizon=60)
         with pytest.raises(ScenarioError, match="No difficulty 'twins'; did you mean 'twin'"):
-            make(cell, difficulty="twins", cache=folder)
+            make(cell, difficulty="twins", cache=plans)
 
 
-def test_unknown_overrides_are_refused_with_the_nearest_name(cell, folder) -> None:
+def test_unknown_overrides_are_refused_with_the_nearest_name(cell, plans) -> None:
     with pytest.raises(ScenarioError, match="unknown key 'render_mod'; did you mean 'render_mode'"):
-        make_env(cell, difficulty="blind", cache=folder, render_mod="ansi")
+        make_env(cell, difficulty="blind", cache=plans, render_mod="ansi")
     with pytest.raises(ScenarioError, match="unknown key 'randomize'; did you mean 'randomise'"):
-        make_batch(cell, 2, difficulty="blind", cache=folder, randomize=None)
+        make_batch(cell, 2, difficulty="blind", cache=plans, randomize=None)
     single = {"plant": "mujoco", "bus": "zenoh", "channel": None, "render_mode": "ansi", "mask_in": "info"}
     for name, value in single.items():
         with pytest.raises(ScenarioError, match=rf"make_batch\(\) takes no {name}; only make_env\(\) does\."):
-            make_batch(cell, 2, difficulty="blind", cache=folder, **{name: value})
+            make_batch(cell, 2, difficulty="blind", cache=plans, **{name: value})
 
 
-def test_a_seed_override_is_refused_with_where_it_belongs(cell, folder) -> None:
+def test_a_seed_override_is_refused_with_where_it_belongs(cell, plans) -> None:
     with pytest.raises(ScenarioError, match=r"make_env\(\) takes no seed: give it to reset\(seed=…\)"):
-        make_env(cell, difficulty="blind", cache=folder, seed=3)
+        make_env(cell, difficulty="blind", cache=plans, seed=3)
 
 
-def test_overrides_may_be_numpy_numbers(cell, folder) -> None:
+def test_overrides_may_be_numpy_numbers(cell, plans) -> None:
     own, numpys = (
-        make_env(cell, difficulty="blind", cache=folder, horizon_s=horizon_s, slots=slots, ambient={"points": points})
+        make_env(cell, difficulty="blind", cache=plans, horizon_s=horizon_s, slots=slots, ambient={"points": points})
         for horizon_s, slots, points in (
             (60, 3, [[0.0, 30.0]]),
             (np.int64(60), np.uint8(3), np.array([[0.0, 30.0]])),
@@ -282,47 +282,47 @@ def test_overrides_may_be_numpy_numbers(cell, folder) -> None:
     assert own.episode.world.ticks == numpys.episode.world.ticks == 6
     assert own.observation_space("left") == numpys.observation_space("left")
     with pytest.raises(ScenarioError, match="expected numbers, texts, lists and tables, got <object"):
-        make_env(cell, difficulty="blind", cache=folder, horizon_s=object())
+        make_env(cell, difficulty="blind", cache=plans, horizon_s=object())
 
 
-def test_progress_must_be_a_function(cell, folder) -> None:
+def test_progress_must_be_a_function(cell, plans) -> None:
     wrong: Any = 3
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
         with pytest.raises(ScenarioError, match=r"progress must be a function of .* \(got 3\)"):
-            make(cell, difficulty="blind", cache=folder, progress=wrong)
+            make(cell, difficulty="blind", cache=plans, progress=wrong)
 
 
-def test_a_batch_that_cannot_fit_is_refused_before_it_is_made(cell, folder) -> None:
+def test_a_batch_that_cannot_fit_is_refused_before_it_is_made(cell, plans) -> None:
     with pytest.raises(ValueError, match=r"num_envs must be at most \d+, as this machine has \d+ GB: the observations"):
-        make_batch(cell, 10**9, difficulty="blind", cache=folder)
+        make_batch(cell, 10**9, difficulty="blind", cache=plans)
 
 
-def test_a_cache_folder_may_be_a_string(cell, folder) -> None:
-    make_env(cell, difficulty="blind", cache=str(folder)).reset(seed=0)
-    make_batch(cell, 1, difficulty="blind", cache=str(folder)).reset()
+def test_a_cache_folder_may_be_a_string(cell, plans) -> None:
+    make_env(cell, difficulty="blind", cache=str(plans)).reset(seed=0)
+    make_batch(cell, 1, difficulty="blind", cache=str(plans)).reset()
 
 
-def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, folder) -> None:
+def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, plans) -> None:
     wrong: Any = 0.3
     none: Any = None
     with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.exchange\.channel\.Channel \(got 0\.3\)"):
-        make_env(cell, difficulty="blind", cache=folder, channel=wrong)
+        make_env(cell, difficulty="blind", cache=plans, channel=wrong)
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
         with pytest.raises(ScenarioError, match=r"cache must be the path of a folder \(got 0\.3\)"):
             make(cell, difficulty="blind", cache=wrong)
     for name in ("autoreset", "stagger"):
         with pytest.raises(ValueError, match=rf"{name} must be True or False \(got 0\.3\)"):
-            make_batch(cell, 2, difficulty="blind", cache=folder, **{name: wrong})
+            make_batch(cell, 2, difficulty="blind", cache=plans, **{name: wrong})
     with pytest.raises(ScenarioError, match="No difficulty 'None'"):
-        make_env(cell, difficulty=none, cache=folder)
+        make_env(cell, difficulty=none, cache=plans)
     for make in (make_env, lambda scenario: make_batch(scenario, 2)):
         with pytest.raises(ScenarioError, match=r"scenario must be a library name, .+ \(got 0\.3\)"):
             make(wrong)
     with pytest.raises(ScenarioError, match=r"randomise must be a scenarios\.run\.batch\.Randomisation \(got 0\.3\)"):
-        make_batch(cell, 2, difficulty="blind", cache=folder, randomise=wrong)
+        make_batch(cell, 2, difficulty="blind", cache=plans, randomise=wrong)
 
 
-def test_variants_with_other_arms_are_refused(cell, folder) -> None:
+def test_variants_with_other_arms_are_refused(cell, plans) -> None:
     arms = [
         {"name": a.name, "position_m": list(a.position_m), "tilt_deg": list(a.tilt_deg), "home": a.home}
         for a in cell.arms
@@ -341,14 +341,14 @@ def test_variants_with_other_arms_are_refused(cell, folder) -> None:
         for variant in variants:
             randomise = Randomisation(variants=[variant])
             with pytest.raises(ScenarioError, match=what):
-                make_batch(cell, 2, difficulty="blind", cache=folder, randomise=randomise)
+                make_batch(cell, 2, difficulty="blind", cache=plans, randomise=randomise)
 
 
 @pytest.mark.parametrize("warmer_k", [(0.0, 1e6), (-1000.0, 0.0)])
-def test_invalid_ambient_temperatures_are_refused(cell, folder, warmer_k) -> None:
+def test_invalid_ambient_temperatures_are_refused(cell, plans, warmer_k) -> None:
     randomise = Randomisation(ambient_k=warmer_k)
     with pytest.raises(ScenarioError, match=r"ambient_k \(.+\) goes too far: .+ between -40 and 60 °C \(got \["):
-        make_batch(cell, 2, difficulty="blind", cache=folder, randomise=randomise)
+        make_batch(cell, 2, difficulty="blind", cache=plans, randomise=randomise)
 
 
 @pytest.mark.parametrize(

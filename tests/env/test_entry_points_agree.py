@@ -15,15 +15,16 @@ from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.batch import library_of
-from scenarios.run.shift import RunResult, RunSpec, run
+from scenarios.run.shift import RunResult, run
+from scenarios.specs import RunSpec
 
 SEED = 2
 
 
 @pytest.fixture(scope="module", params=["blind", "oracle", pytest.param("twin", marks=pytest.mark.slow)])
-def fleet(request, cell, folder) -> Fleet:
+def fleet(request, cell, plans) -> Fleet:
     """Return the prepared cell."""
-    return prepare(cell, difficulty=request.param, cache=folder)
+    return prepare(cell, difficulty=request.param, cache=plans)
 
 
 @pytest.fixture(scope="module", params=["random", "round_robin"])
@@ -107,11 +108,12 @@ def test_bus_and_watcher_do_not_change_a_run(fleet, recorded) -> None:
     assert over_zenoh.total_reward == recorded.total_reward
 
 
-def test_both_plants_agree_over_half_an_hour(cell, folder) -> None:
+@pytest.mark.ci_slow
+def test_both_plants_agree_over_half_an_hour(cell, plans) -> None:
     """All arms in MuJoCo, with the actions recorded with the profile plant."""
     streams = tuple(replace(s, arrivals=replace(s.arrivals, stop_s=None)) for s in cell.jobs[:2])
     longer = replace(cell, horizon_s=1800.0, jobs=streams, limits=ThermalLimits())
-    fleet = prepare(longer, difficulty="blind", cache=folder)
+    fleet = prepare(longer, difficulty="blind", cache=plans)
     profile, simulated = env_of(fleet), env_of(fleet, plant="mujoco")
     policy = policy_of("least_difficulty")
     policy.reset(np.random.default_rng(0))

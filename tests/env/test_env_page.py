@@ -9,7 +9,7 @@ import pytest
 from docs.tables import fill_tables, main
 from fleet.engine.reward import TERMS
 from fleet.observation import FIELDS, Layout
-from scenarios.load import override
+from scenarios.parse import override
 from scenarios.prepare.fleet import make_env
 from scenarios.run.batch import make_batch
 from scenarios.schema import RewardSpec
@@ -59,12 +59,12 @@ def test_every_info_is_in_the_page(make, batch) -> None:
         assert f"| `reward_{name}` | {weight} |" in TEXT
 
 
-def test_the_example_of_the_page_runs(monkeypatch, cell, folder) -> None:
+def test_the_example_of_the_page_runs(monkeypatch, cell, plans) -> None:
     """With a cell that takes little time to plan."""
 
     def small(given: dict[str, Any]) -> dict[str, Any]:
         fields = {name: given.pop(name) for name in ("horizon_s",) if name in given}
-        return {"scenario": override(cell, **fields), "cache": folder, **given}
+        return {"scenario": override(cell, **fields), "cache": plans, **given}
 
     def env(scenario: str, **given: Any) -> Any:
         assert scenario == "quickstart"

@@ -5,13 +5,14 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.env.render.floor_plan import SMALLEST, floor_plan, text_width
 from fleet.env.render.scene import Cell, MountKind, grid_cell
 from fleet.job import Fixture
 from fleet.robot import JOINTS, rotation
+from tests.profiles import examples
 
 metres = st.floats(-50, 50)
 points = st.tuples(metres, metres, metres)
@@ -35,7 +36,7 @@ def inside(x: float, y: float, box: tuple[int, int, int, int], margin: float = 0
     return left + margin <= x <= right - margin and top + margin <= y <= bottom - margin
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(cells(), sizes)
 def test_every_arm_and_station_is_on_the_floor(cell, size) -> None:
     plan = floor_plan(cell, size)
@@ -97,7 +98,7 @@ def test_arms_at_one_place_do_not_cover_each_other(arms, size) -> None:
     assert gaps.min() >= 1.82 * plan.reach  # motors; the arcs of the work done may touch
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(cells(), sizes)
 def test_names_of_stations_cover_no_arm_and_no_other_name(cell, size) -> None:
     plan = floor_plan(cell, size)

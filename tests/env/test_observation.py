@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit
 
@@ -15,13 +15,14 @@ from fleet.engine.state import State, World
 from fleet.observation import FIELDS, Layout, Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
+from tests.profiles import examples
 
 
 def test_fields_and_attributes_are_the_same_in_the_same_order() -> None:
     assert [f.name for f in FIELDS] == [f.name for f in fields(Observation) if f.name != "action_mask"]
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     arms=st.integers(1, 6), slots=st.integers(1, 9), plans=st.integers(1, 3),
     lead=st.sampled_from([(), (2,), (3, 2)]), seed=st.integers(0, 99),
@@ -213,7 +214,7 @@ def compare_with_reference(play, episode: Episode, seed: int) -> tuple[State, in
         runner.step(play.chosen(runner.mask, rng.random((len(world.arms), 2))))
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(
     seed=st.integers(0, 2**31), arms=st.integers(1, 4), jobs=st.integers(0, 9), slots=st.integers(1, 5),
     ambient_c=st.sampled_from([20.0, 45.0, 58.0]), power_off=st.booleans(), share=st.sampled_from([0.0, 0.2, 1.0]),

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import event, given, settings
+from hypothesis import event, given
 from hypothesis import strategies as st
 
 from fleet.engine.state import DONE, EXPIRED, RUNNING, WAITING, State
@@ -13,6 +13,7 @@ from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
 from fleet.job import MOST_FAULTS, Job
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
+from tests.profiles import examples
 
 TICKS, DT_S = 45, 10.0
 PLACES = ("bench", "press", "rack")
@@ -100,7 +101,7 @@ def env_of(small, draft: Draft, **options: Any) -> AllocationEnv:
     return parallel_env(lambda seed: Episode(world, plant, ("t",) * len(arms), seed), **options)
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(draft=drafts())
 def test_invariants_of_a_shift(small, play, draft) -> None:
     env, rng = env_of(small, draft), np.random.default_rng(draft.seed)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.engine.batch import shifts_of
@@ -18,16 +18,18 @@ from scenarios.evaluate.rollout import outcomes
 from scenarios.job_stream import draw_jobs
 from scenarios.prepare.fleet import Fleet, make_env, prepare
 from scenarios.run.batch import Randomisation, library_of, make_batch
-from scenarios.run.shift import RunSpec, run
+from scenarios.run.shift import run
+from scenarios.specs import RunSpec
+from tests.profiles import examples
 
 SEED = 30
 VARIED = Randomisation(ambient_k=(-1.0, 3.0), arrivals=(0.8, 1.5), variants=[{"spread": {"scale": 2.0, "seed": 9}}])
 
 
 @pytest.fixture(scope="module")
-def fleet(cell, folder) -> Fleet:
+def fleet(cell, plans) -> Fleet:
     """Return the prepared cell."""
-    return prepare(cell, difficulty="blind", cache=folder)
+    return prepare(cell, difficulty="blind", cache=plans)
 
 
 def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
@@ -38,8 +40,8 @@ def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
 @pytest.mark.parametrize("difficulty", ["blind", "oracle"])
 @pytest.mark.parametrize("e", [0, 5])
 @pytest.mark.parametrize("randomise", [None, VARIED], ids=["plain", "randomised"])
-def test_a_row_equals_make_env_with_the_same_seed(cell, folder, play, e, difficulty, randomise) -> None:
-    options: dict[str, Any] = {"difficulty": difficulty, "randomise": randomise, "cache": folder}
+def test_a_row_equals_make_env_with_the_same_seed(cell, plans, play, e, difficulty, randomise) -> None:
+    options: dict[str, Any] = {"difficulty": difficulty, "randomise": randomise, "cache": plans}
     batch, env = make_batch(cell, 6, SEED, **options), make_env(cell, **options)
     obs, _ = batch.reset()
     observed = play.single(env, env.reset(seed=SEED + e))
@@ -63,7 +65,7 @@ def test_a_row_equals_make_env_with_the_same_seed(cell, folder, play, e, difficu
     assert faults > 0
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(seed=st.integers(0, 2**63))
 def test_a_shift_as_arrays_has_the_jobs_of_the_scenario(fleet, seed) -> None:
     library, entropy = library_of(fleet), np.random.SeedSequence(seed)
@@ -82,8 +84,8 @@ def test_a_shift_as_arrays_has_the_jobs_of_the_scenario(fleet, seed) -> None:
     assert all(np.array_equal(value, getattr(again, name)) for name, value in vars(shift).items())
 
 
-def test_policies_are_compared_on_the_shifts_that_run_plays(cell, folder) -> None:
-    fleets = [prepare(cell, difficulty="blind", randomise=each, cache=folder) for each in (None, VARIED)]
+def test_policies_are_compared_on_the_shifts_that_run_plays(cell, plans) -> None:
+    fleets = [prepare(cell, difficulty="blind", randomise=each, cache=plans) for each in (None, VARIED)]
     rewards = [[outcome.reward for outcome in outcomes(fleet, "wspt", range(6))] for fleet in fleets]
     for fleet, expected in zip(fleets, rewards, strict=True):
         specs = [RunSpec(policy="wspt", seed=seed, bus="memory", difficulty="blind") for seed in range(6)]
@@ -131,8 +133,8 @@ def test_randomisation_depends_on_the_seed_and_not_on_noise(fleet, play) -> None
     play.same(rows[0], {name: values[2:5] for name, values in rows[1].items()})
 
 
-def test_a_warmer_cell_warms_every_motor(cell, folder) -> None:
-    options: dict[str, Any] = {"difficulty": "blind", "cache": folder, "limits": {}}
+def test_a_warmer_cell_warms_every_motor(cell, plans) -> None:
+    options: dict[str, Any] = {"difficulty": "blind", "cache": plans, "limits": {}}
     cool = make_batch(cell, 5, 0, **options)
     warm = make_batch(cell, 5, 0, randomise=Randomisation(ambient_k=(3.0, 3.0)), **options)
     nobody = np.zeros((5, 3), int)
@@ -147,9 +149,9 @@ def test_a_warmer_cell_warms_every_motor(cell, folder) -> None:
     assert 3.0 + 1e-6 < warmer.max() < 3.1  # a warmer motor has slightly higher losses
 
 
-def test_rows_of_two_variants_equal_batches_of_each(cell, folder, play) -> None:
+def test_rows_of_two_variants_equal_batches_of_each(cell, plans, play) -> None:
     """Compare the rows of a batch of two variants with a batch of each."""
-    options: dict[str, Any] = {"difficulty": "oracle", "cache": folder}
+    options: dict[str, Any] = {"difficulty": "oracle", "cache": plans}
     variant = {"spread": {"scale": 2.0, "seed": 9}}
     both = make_batch(cell, 12, SEED, randomise=Randomisation(variants=[variant]), **options)
     alone = [make_batch(cell, 12, SEED, **options, **each) for each in ({}, variant)]

@@ -8,7 +8,6 @@ from pathlib import Path
 from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
-COMMAND = [sys.executable, "-c", "from scenarios.cli.main import main; main()"]
 
 
 def program(name, *arguments):
@@ -17,14 +16,18 @@ def program(name, *arguments):
 
 
 @contextmanager
-def started(command, **options):
-    """A process that is killed at the end of the block; what it prints can be read."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **options)
+def killed_afterwards(process):
+    """A process that is killed at the end of the block."""
     try:
         yield process
     finally:
         process.kill()
         process.communicate(timeout=PATIENCE_S)
+
+
+def started(command, **options):
+    """A process that is killed at the end of the block; what it prints can be read."""
+    return killed_afterwards(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **options))
 
 
 @contextmanager

@@ -2,12 +2,14 @@
 
 import importlib.util
 import re
-import subprocess
 import sys
 from types import ModuleType
 
+import pytest
+
 from scenarios.live.fleet_processes import free_port
-from tests.examples.programs import COMMAND, ROOT, program, started
+from tests import commands
+from tests.examples.programs import ROOT, program, started
 from tests.waiting import PATIENCE_S
 
 
@@ -27,19 +29,21 @@ def test_own_policy_finishes_a_shift(capsys) -> None:
         assert re.search(rf"{name}: reward -?[\d.]+, jobs \d+, peaks arm_0 [\d.]+ °C", told)
 
 
+@pytest.mark.ci_slow
 def test_own_policy_is_compared_beside_the_rules() -> None:
     own = f"{ROOT / 'examples' / 'own_policy.py'}:Careful"
     options = ["--policies", f"least_difficulty,{own}", "--baseline", "least_difficulty", "--seeds", "2"]
-    command = [*COMMAND, "compare", "quickstart", *options, "--difficulty", "oracle"]
-    done = subprocess.run(command, timeout=120, capture_output=True, text=True, check=True)
+    done = commands.run("compare", "quickstart", *options, "--difficulty", "oracle")
+    assert done.returncode == 0, done.stderr
     assert "Careful" in done.stdout
 
 
+@pytest.mark.ci_slow
 def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:
     port = free_port()
     with started(program("monitor", port)) as monitor:
         options = ["--difficulty", "blind", "--listen", str(port), "--out", str(tmp_path / "run"), "--seed", "1"]
-        subprocess.run([*COMMAND, "run", "quickstart", *options], check=True, timeout=120, capture_output=True)
+        assert commands.run("run", "quickstart", *options).returncode == 0
         told, _ = monitor.communicate(timeout=PATIENCE_S)
         assert monitor.returncode == 0
     assert all(f"arm_{i}" in told for i in range(4))

@@ -9,7 +9,8 @@ import pytest
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Result
 from fleet.bus.protocol.messages import State
-from tests.examples.programs import COMMAND, program, running, started, submit_jobs
+from tests import commands
+from tests.examples.programs import killed_afterwards, program, running, started, submit_jobs
 from tests.waiting import PATIENCE_S, serve_until
 
 
@@ -44,12 +45,13 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
         keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status), history=True
     )
     at = ("--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}")
-    command = [*COMMAND, "bus", "auctioneer", "quickstart", "--jobs", "none", *at, "--journal", str(tmp_path / "j")]
-    with started(command, stderr=subprocess.PIPE) as auction:
+    started_auction = commands.start(
+        "bus", "auctioneer", "quickstart", "--jobs", "none", *at, "--journal", tmp_path / "j"
+    )
+    with killed_afterwards(started_auction) as auction:
         assert auction.stdout.readline().startswith("ready")
         for arm in range(4):  # those of the scenario are not there; until then each may be anywhere
-            clear = [*COMMAND, "arm", "clear", f"arm_{arm}", *at]
-            cleared = subprocess.run(clear, capture_output=True, text=True, timeout=60, check=True)
+            cleared = commands.run("arm", "clear", f"arm_{arm}", *at)
             assert cleared.stdout == f"arm_{arm}: its space is free until the arm reports its space again.\n"
         with running("own_arm", port, "f", "a"), running("own_arm", port, "f", "b"):
             submit_jobs(port)
@@ -72,8 +74,10 @@ def test_own_allocator_has_real_arms_do_the_jobs(bus, tmp_path):
     with running("own_allocator", port, "f") as allocator, ExitStack() as stack:
         for name in ("arm_0", "arm_1"):
             options = ["--difficulty", "blind", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"]
-            command = [*COMMAND, "arm", "run", "quickstart", name, *options, "--journal", str(tmp_path / name)]
-            arm = stack.enter_context(started(command, stderr=subprocess.DEVNULL))
+            command = commands.start(
+                "arm", "run", "quickstart", name, *options, "--journal", tmp_path / name, stderr=subprocess.DEVNULL
+            )
+            arm = stack.enter_context(killed_afterwards(command))
             assert arm.stdout.readline().startswith("ready")
         submit_jobs(port, timeout_s=150.0)
         assert allocator.poll() is None

@@ -225,6 +225,15 @@ class ModelFleet:
         for _ in range(len(self.packets)):
             self.deliver(rng.randrange(len(self.packets)) if rng else 0)
 
+    def run_until(self, condition, absent: str = "") -> None:
+        """Run without faults, one arm unheard, until a condition is true."""
+        for _ in range(400):
+            if condition():
+                return
+            self.run_without_faults(0.1, 0.1, absent)
+            self.check()
+        raise AssertionError("the condition was never met")
+
     def run_without_faults(self, seconds: float, dt_s: float = 0.25, absent: str = "") -> None:
         """Run without faults for some time; one arm may be absent."""
         self.full = self.kill_next = False

@@ -42,8 +42,8 @@ from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
 from fleet.robot import ThermalLimits
 from fleet.thermal import WINDING
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 15.0
 LIMITS = ThermalLimits()
 SPEED = 60.0
 JOB = JobSpec(name="j", kind="hold", places=("bench",), repetitions=3)
@@ -113,7 +113,7 @@ def bus(tmp_path, small):
         def ask(line, topic, word, kind):
             for _ in range(50):  # the router may not know yet that the arm answers
                 got = []
-                line.query(keys.of_arm("f", "arm_0", topic), word, kind, got.append, timeout_s=5.0)
+                line.query(keys.of_arm("f", "arm_0", topic), word, kind, got.append, timeout_s=PATIENCE_S)
                 serve(partial(bool, got))
                 assert not got[0].refused, got[0].refused
                 if got[0].messages:

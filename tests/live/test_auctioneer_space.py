@@ -31,15 +31,6 @@ def states(fleet) -> list[str]:
     return [status.state for status in fleet.auctioneer.status()]
 
 
-def run_until(fleet, condition, absent: str = "") -> None:
-    for _ in range(200):
-        if condition():
-            return
-        fleet.run_without_faults(0.1, 0.1, absent)
-        fleet.check()
-    raise AssertionError("the condition was never met")
-
-
 def clear(fleet, arm: str, present=()):
     return fleet.auctioneer.clear(ClearRequest(arm, "a person"), frozenset(present), fleet.true_s)
 
@@ -64,13 +55,13 @@ def test_an_arm_that_was_never_heard_keeps_all_its_space(fleet_of):
         fleet.run_without_faults(0.1, 0.1, absent="arm_1")
     status = fleet.auctioneer.status()[0]
     assert (status.state, status.reason) == ("waiting", "It waits until arm_1 is out of the way.")
-    run_until(fleet, lambda: states(fleet) == ["finished"])
+    fleet.run_until(lambda: states(fleet) == ["finished"])
 
 
 def test_the_space_of_a_silent_arm_stays_taken_until_a_person_frees_it(fleet_of):
     fleet = fleet_of(2)
     fleet.submit(*jobs(2, repetitions=1000))
-    run_until(fleet, lambda: any(arm.out for arm in fleet.arms.values()))
+    fleet.run_until(lambda: any(arm.out for arm in fleet.arms.values()))
     name = next(arm.name for arm in fleet.arms.values() if arm.out)
     with pytest.raises(Refused, match="present and says itself"):
         clear(fleet, name, present=[name])
@@ -88,13 +79,13 @@ def test_the_space_of_a_silent_arm_stays_taken_until_a_person_frees_it(fleet_of)
     length = len(fleet.journal)
     assert clear(fleet, name).arm == name
     assert len(fleet.journal) == length  # the same request again changes nothing
-    run_until(fleet, lambda: "awarded" in states(fleet), absent=name)
+    fleet.run_until(lambda: "awarded" in states(fleet), absent=name)
 
 
 def test_the_space_of_an_arm_lost_in_its_last_cycle_stays_taken(fleet_of):
     fleet = fleet_of(2)
     fleet.submit(*jobs(1, repetitions=2))
-    run_until(fleet, lambda: any(work.in_last_cycle for arm in fleet.arms.values() for work in arm.current.values()))
+    fleet.run_until(lambda: any(work.in_last_cycle for arm in fleet.arms.values() for work in arm.current.values()))
     name = next(arm.name for arm in fleet.arms.values() if arm.out)
     fleet.submit(*jobs(2)[1:])
     for _ in range(100):
@@ -103,8 +94,8 @@ def test_the_space_of_an_arm_lost_in_its_last_cycle_stays_taken(fleet_of):
     assert states(fleet) == ["unfinished", "waiting"]
     fleet.arms[name].move_home()
     clear(fleet, name)
-    run_until(fleet, lambda: states(fleet) == ["unfinished", "finished"], absent=name)
-    run_until(fleet, lambda: states(fleet) == ["finished", "finished"])  # it returns the job, as it was not done
+    fleet.run_until(lambda: states(fleet) == ["unfinished", "finished"], absent=name)
+    fleet.run_until(lambda: states(fleet) == ["finished", "finished"])  # it returns the job, as it was not done
 
 
 @pytest.mark.parametrize("heard", [Lease, State, Report])
@@ -112,7 +103,7 @@ def test_an_arm_that_is_heard_after_it_was_cleared_takes_its_space_until_it_is_h
     """The person was wrong: the arm is still in its last cycle."""
     fleet = fleet_of(2)
     fleet.submit(*jobs(1, repetitions=2))
-    run_until(fleet, lambda: any(work.in_last_cycle for arm in fleet.arms.values() for work in arm.current.values()))
+    fleet.run_until(lambda: any(work.in_last_cycle for arm in fleet.arms.values() for work in arm.current.values()))
     arm = next(arm for arm in fleet.arms.values() if arm.out)
     (name,) = arm.current
     for _ in range(50):
@@ -131,7 +122,7 @@ def test_an_arm_that_is_heard_after_it_was_cleared_takes_its_space_until_it_is_h
     for _ in range(20):
         fleet.run_without_faults(0.1, 0.1, absent=arm.name)
         assert states(fleet)[1] == "waiting"
-    run_until(fleet, lambda: states(fleet) == ["finished", "finished"])
+    fleet.run_until(lambda: states(fleet) == ["finished", "finished"])
 
 
 def test_only_space_that_is_taken_can_be_cleared(fleet_of):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
-from fleet.live.space import ANYWHERE
+from tests.live.conflicts import random_conflicts
 
 
 def lossy_network(fleet, rng: random.Random) -> None:
@@ -144,17 +144,6 @@ ACTIONS = (
     *(steer, steer, clear, clear_one_that_lives_on, kill_auctioneer, fill_disk, no_faults),
 )
 rates = st.tuples(*[st.floats(1 - 1e-3, 1 + 1e-3)] * 4)
-
-
-def random_conflicts(seed: int, share: float):
-    """Return a symmetric relation in which this share of all plans exclude each other, and unknown ones all others."""
-
-    def excludes(arm: str, space: str, other: str, other_space: str) -> bool:
-        if ANYWHERE in (space, other_space):
-            return True
-        return random.Random(f"{seed} {sorted([space, other_space])}").random() < share
-
-    return excludes
 
 
 @example((1.0, 1.0, 1.0, 1.0), 3, [clear_one_that_lives_on, clear_one_that_lives_on], 0, 1.0)

@@ -28,7 +28,16 @@ def one_job(small, *, repetitions=3, payload=None, times=None):
     return arm, small.job("a", content, repetitions=repetitions), arm.plans[content][0]
 
 
-@settings(max_examples=15, deadline=None, phases=[Phase.generate])
+def started(small, allowed, *, done=0, repetitions=3, payload=None, **options):
+    """A body with a job of which some cycles are done, and some allowed; `options` are those of `body_of`."""
+    arm, job, plan = one_job(small, repetitions=repetitions, payload=payload)
+    body = body_of(arm, **options)
+    body.start(job, plan, done)
+    body.allow_cycles(allowed)
+    return body
+
+
+@settings(max_examples=15, phases=[Phase.generate])
 @given(st.data())
 def test_a_body_passes_the_same_shift_as_the_simulator(small, data):
     """One arm, the same jobs in the same order: temperatures at every tick and every event agree."""
@@ -105,10 +114,7 @@ def test_a_job_ends_at_its_planned_time_for_any_step(small):
 
 
 def test_without_permission_it_returns_home_before_the_last_cycle(small):
-    arm, job, plan = one_job(small)
-    body = body_of(arm, dt_s=1.0)
-    body.start(job, plan, 0)
-    body.allow_cycles(2)
+    body = started(small, 2, dt_s=1.0)
     events = body.advance(24.0)
     assert body.cycles == 2
     assert body.last_cycle_in_s() == pytest.approx(1.0 + 3.0)  # on its way home, and back again
@@ -123,10 +129,7 @@ def test_without_permission_it_returns_home_before_the_last_cycle(small):
 
 
 def test_early_permission_makes_it_one_stint(small):
-    arm, job, plan = one_job(small)
-    body = body_of(arm, dt_s=1.0)
-    body.start(job, plan, 0)
-    body.allow_cycles(2)
+    body = started(small, 2, dt_s=1.0)
     body.advance(22.0)
     assert body.last_cycle_in_s() == pytest.approx(1.0)
     body.allow_cycles(3)
@@ -137,10 +140,7 @@ def test_early_permission_makes_it_one_stint(small):
     ("when", "cycles", "home_s"), [(2.0, 0, 5.0), (3.5, 1, 15.0), (13.0, 1, 15.0), (14.0, 2, 25.0)]
 )
 def test_a_paused_arm_finishes_its_cycle_and_returns_home(small, when, cycles, home_s):
-    arm, job, plan = one_job(small)
-    body = body_of(arm, dt_s=0.5)
-    body.start(job, plan, 0)
-    body.allow_cycles(3)
+    body = started(small, 3, dt_s=0.5)
     body.advance(when)
     body.allow_cycles(body.cycles)
     events = body.advance(50.0)
@@ -149,10 +149,7 @@ def test_a_paused_arm_finishes_its_cycle_and_returns_home(small, when, cycles, h
 
 
 def test_a_pause_within_a_cycle_has_no_effect(small):
-    arm, job, plan = one_job(small)
-    body = body_of(arm, dt_s=0.5)
-    body.start(job, plan, 0)
-    body.allow_cycles(3)
+    body = started(small, 3, dt_s=0.5)
     body.advance(9.0)
     body.allow_cycles(0)
     body.advance(11.0)
@@ -185,10 +182,7 @@ def test_a_released_job_is_dropped_at_home(small):
 
 
 def test_release_in_the_last_cycle_finishes_no_job(small):
-    arm, job, plan = one_job(small)
-    body = body_of(arm, dt_s=1.0)
-    body.start(job, plan, 2)
-    body.allow_cycles(3)
+    body = started(small, 3, done=2, dt_s=1.0)
     body.advance(8.0)
     body.release()
     assert [e.kind for e in body.advance(60.0)] == ["home"]
@@ -230,10 +224,7 @@ def test_a_faulted_body_is_not_free(small):
 
 
 def test_a_person_clears_a_fault_once_the_arm_is_cool_and_it_goes_home(small):
-    arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
-    body = body_of(arm)
-    body.start(job, plan, 0)
-    body.allow_cycles(5000)
+    body = started(small, 5000, repetitions=5000, payload=small.HOT)
     while body.truth.mode[0, 0] != FAULTED:
         body.advance(body.time_s + DT_S)
     assert f"a fault can be cleared below {LIMITS.restart_c:g} °C" in body.clear_fault()

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -24,8 +24,8 @@ from fleet.errors import FleetError
 from scenarios.live.recorder import Recorder, lock_folder, record
 from scenarios.live.recording import CARD, JOURNAL, part_files, read_card, read_parts, states
 from scenarios.live.replayer import Replay
-
-PATIENCE_S = 20.0
+from tests.profiles import examples
+from tests.waiting import PATIENCE_S
 
 
 def state(arm, tick, time_s=None):
@@ -76,7 +76,7 @@ def test_recorded_messages_are_read_back(tmp_path):
     assert read_card(tmp_path).status == "finished"
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(
     st.lists(st.tuples(st.integers(0, 30), st.sampled_from(["", "save", "write", "crash"])), min_size=1, max_size=60)
 )
@@ -108,7 +108,7 @@ def test_every_message_is_kept_once_and_gaps_are_known(tmp_path_factory, steps):
     assert all("the recording ended" in gap["reason"] for gap in gaps)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.data())
 def test_a_torn_journal_loses_only_what_was_not_saved(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("r")

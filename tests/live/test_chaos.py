@@ -68,6 +68,7 @@ def test_jobs_are_counted_that_a_journal_has_left_out(chaos, tmp_path):
     files.close()
 
 
+@pytest.mark.ci_slow
 def test_a_fleet_survives_a_kill_of_its_auctioneer():
     told = strike("kill-auctioneer", jobs=8)
     assert told.returncode == 0, told.stdout + told.stderr
@@ -75,6 +76,7 @@ def test_a_fleet_survives_a_kill_of_its_auctioneer():
     assert row[1:3] == ["8", "8"]  # all of them, and none twice, says the exit code
 
 
+@pytest.mark.ci_slow
 def test_a_fleet_with_certificates_refuses_intruders():
     told = strike("trespass", jobs=12)
     assert told.returncode == 0, told.stdout + told.stderr

@@ -29,21 +29,12 @@ def status(fleet, name: str):
     return next(status for status in fleet.auctioneer.status((name,)))
 
 
-def run_until(fleet, condition, absent: str = "") -> None:
-    for _ in range(400):
-        if condition():
-            return
-        fleet.run_without_faults(0.1, 0.1, absent)
-        fleet.check()
-    raise AssertionError("the condition was never met")
-
-
 def finishing(fleet, name: str = "a"):
     """Run until a job of one cycle may be committed, then let its arm fall silent; return the arm's name."""
     fleet.submit(job(name, 1))
-    run_until(fleet, lambda: any(w.in_last_cycle for arm in fleet.arms.values() for w in arm.current.values()))
+    fleet.run_until(lambda: any(w.in_last_cycle for arm in fleet.arms.values() for w in arm.current.values()))
     arm = status(fleet, name).arm
-    run_until(fleet, lambda: status(fleet, name).state == "unfinished", absent=arm)
+    fleet.run_until(lambda: status(fleet, name).state == "unfinished", absent=arm)
     return arm
 
 
@@ -60,24 +51,24 @@ def test_a_waiting_job_is_cancelled_at_once_and_its_followers_are_given_up(fleet
 
 def test_a_job_at_work_is_cancelled_after_the_cycle_in_progress_also_over_a_restart(fleet):
     fleet.submit(job("a"))
-    run_until(fleet, lambda: status(fleet, "a").cycles > 3)
+    fleet.run_until(lambda: status(fleet, "a").cycles > 3)
     reply = ask(fleet, Cancel("a"), "one")
     assert (reply.changed, reply.job.state, reply.job.repetitions) == (True, "awarded", 1000)
     fleet.auctioneer = fleet.restart()
     assert not ask(fleet, Cancel("a"), "one").changed
-    run_until(fleet, lambda: status(fleet, "a").state == "cancelled")
-    run_until(fleet, lambda: not any(arm.out for arm in fleet.arms.values()))
+    fleet.run_until(lambda: status(fleet, "a").state == "cancelled")
+    fleet.run_until(lambda: not any(arm.out for arm in fleet.arms.values()))
     assert not fleet.auctioneer.ledger.open
     assert not any(arm.done for arm in fleet.arms.values())
     fleet.submit(job("b", 2))
-    run_until(fleet, lambda: status(fleet, "b").state == "finished")
+    fleet.run_until(lambda: status(fleet, "b").state == "finished")
 
 
 def test_a_job_in_its_last_cycle_is_finished_in_spite_of_a_cancellation(fleet):
     fleet.submit(job("a", 1))
-    run_until(fleet, lambda: status(fleet, "a").state == "finishing")
+    fleet.run_until(lambda: status(fleet, "a").state == "finishing")
     assert "last cycle" in ask(fleet, Cancel("a")).note
-    run_until(fleet, lambda: status(fleet, "a").state == "finished")
+    fleet.run_until(lambda: status(fleet, "a").state == "finished")
 
 
 def test_an_unfinished_job_is_settled_as_done_and_stays_so(fleet):
@@ -110,19 +101,19 @@ def test_an_unfinished_job_is_redone_only_after_its_arm_was_stopped_and_cleared(
 
 def test_a_paused_arm_gives_its_job_back_and_gets_none_until_it_is_resumed(fleet):
     fleet.submit(job("a"))
-    run_until(fleet, lambda: status(fleet, "a").cycles > 3)
+    fleet.run_until(lambda: status(fleet, "a").cycles > 3)
     arm = status(fleet, "a").arm
     ask(fleet, Pause(arm))
     fleet.auctioneer = fleet.restart()
-    run_until(fleet, lambda: status(fleet, "a").arm not in ("", arm))
+    fleet.run_until(lambda: status(fleet, "a").arm not in ("", arm))
     assert ask(fleet, Pause()).paused == {arm: "ann", "*": "ann"}
     with pytest.raises(Refused, match="All arms are paused"):
         ask(fleet, Resume(arm))
-    run_until(fleet, lambda: not fleet.auctioneer.ledger.open)
+    fleet.run_until(lambda: not fleet.auctioneer.ledger.open)
     fleet.run_without_faults(3.0)
     assert status(fleet, "a").state == "waiting"
     assert ask(fleet, Resume()).paused == {}
-    run_until(fleet, lambda: status(fleet, "a").state == "awarded")
+    fleet.run_until(lambda: status(fleet, "a").state == "awarded")
     with pytest.raises(Refused, match="no arm 'x'"):
         ask(fleet, Pause("x"))
 

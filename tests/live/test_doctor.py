@@ -2,8 +2,6 @@
 
 import json
 import socket
-import subprocess
-import sys
 import threading
 import time
 from contextlib import ExitStack, contextmanager
@@ -21,8 +19,9 @@ from fleet.bus.protocol.messages import State
 from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 from scenarios.show.watch import space_line
+from tests import commands
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 30.0
 ASKED = ClockProbe(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)
 """The fleet's time is 5000 s at the real second 100.005."""
 
@@ -191,18 +190,7 @@ def participants(endpoint, *, states=True, clocks=1):
 
 
 def doctor(endpoint, *options):
-    command = [
-        sys.executable,
-        "-c",
-        "from scenarios.cli.main import main; main()",
-        "bus",
-        "doctor",
-        "--endpoint",
-        endpoint,
-    ]
-    done = subprocess.run(
-        [*command, "--seconds", "1", *options], capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
+    done = commands.run("bus", "doctor", "--endpoint", endpoint, "--seconds", "1", *options)
     return done.returncode, " ".join((done.stdout + done.stderr).split())
 
 

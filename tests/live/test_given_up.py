@@ -4,7 +4,7 @@ import time
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec, Report, Submission
@@ -43,7 +43,6 @@ def awarded(number: int, arm: str) -> Awarded:
     return Awarded(f"w{number}", "r", "j", arm, "q", 0, float(number))
 
 
-@settings(deadline=None)
 @given(attempts)
 def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts):
     """Against a list of faults; a replay of the journal, and of its snapshot, gives the same."""

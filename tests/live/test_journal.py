@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import Award, JobSpec
@@ -21,6 +21,7 @@ from fleet.live.consensus.register import Register
 from fleet.live.journal import Journal
 from fleet.live.journal_records import Closed, CommitPermitted
 from fleet.live.journal_upkeep import CompactingJournal, TimeRecorder
+from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,7 +54,7 @@ def read(path):
         return list(journal.records())
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.lists(st.lists(record, max_size=4), max_size=6), st.lists(record, max_size=3))
 def test_records_are_read_in_the_order_of_writing(tmp_path_factory, batches, later):
     path = tmp_path_factory.mktemp("journal") / "deep" / "arm.jsonl"
@@ -71,7 +72,7 @@ def test_every_line_is_plain_json(tmp_path):
     ]
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.data())
 def test_an_unfinished_last_line_is_removed_and_counted(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("journal") / "j"
@@ -94,7 +95,7 @@ def test_an_unfinished_line_is_logged(tmp_path, caplog):
     assert "last line (8 bytes)" in caplog.text
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(st.data())
 def test_damage_is_reported_with_file_and_line(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("journal") / "j"
@@ -139,9 +140,9 @@ except JournalError as error:
     with Journal(path, KIND):
         with pytest.raises(JournalError, match="in use by another"):
             Journal(path, KIND).open()
-        result = subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT)
+        result = subprocess.run(ask, capture_output=True, text=True, check=True, timeout=300, cwd=ROOT)
         assert "in use by another process" in result.stdout
-    assert subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT).stdout == ""
+    assert subprocess.run(ask, capture_output=True, text=True, check=True, timeout=300, cwd=ROOT).stdout == ""
 
 
 def test_append_returns_after_the_records_are_on_disk(tmp_path):
@@ -201,7 +202,9 @@ with Journal(Path({str(tmp_path / "j")!r}), KIND) as journal:
         print("full")
     print(list(journal.records()), journal.path.read_bytes().count(b"xx"))
 """
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300, cwd=ROOT
+    )
     assert result.stdout.splitlines() == ["full", "[Text(text='kept')] 0"]
 
 

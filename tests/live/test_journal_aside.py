@@ -9,7 +9,7 @@ from functools import cache
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import Award, JobSpec
@@ -22,6 +22,7 @@ from fleet.live.auction.records import AuctionRecord, Awarded, Operated, salvage
 from fleet.live.journal import Journal
 from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted, Progress, Started
 from fleet.live.journal_upkeep import put_aside
+from tests.profiles import examples
 
 KINDS = ("deleted", "doubled", "repeated at the end", "changed")
 
@@ -114,7 +115,7 @@ def names_in(*records) -> set[str]:
     return named | ({"next"} if "j0" in named else set())
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(st.integers(0, 5), st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
 def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice(worked, seed, kind, index, rng):
     fleet = worked(seed)
@@ -224,7 +225,7 @@ def test_a_damaged_line_in_the_middle_is_not_taken_for_a_wrong_job(tmp_path):
         book.open()
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.integers(0, 3), st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
 def test_one_wrong_record_in_the_journal_of_an_arm_does_not_stop_it(boots, kind, index, rng):
     award = Award("r:a", "r", "au", "q", spec("a"))

@@ -4,7 +4,7 @@ import graphlib
 from dataclasses import replace
 
 import msgspec
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
@@ -13,6 +13,7 @@ from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.past_jobs import PastJobs
 from fleet.live.auction.records import AuctionRecord, Awarded, ContactLost, ContactRegained, Expired, ShiftEnded
 from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted
+from tests.profiles import examples
 
 
 def spec(name: str, *after: str, place: str = "rack", **changes) -> JobSpec:
@@ -73,7 +74,7 @@ def test_the_number_of_jobs_is_limited():
     assert admissions[1].reason == "There are 2 open jobs already; submit it again when some are finished."
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.dictionaries(st.sampled_from("abcdef"), st.sets(st.sampled_from("abcdefg"), max_size=2), min_size=1))
 def test_accepted_jobs_can_be_ordered_and_rejected_ones_cannot(graph):
     """Against the standard library's topological sorter."""
@@ -214,7 +215,7 @@ def next_record(book: Ledger, job: str, choice: int, time_s: int):
     return possible[choice % len(possible)]
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(steps)
 def test_a_replay_of_the_journal_gives_the_same_ledger(steps):
     """Any history of three jobs: a replay gives the same states, and the same numbers of changes."""
@@ -232,7 +233,7 @@ def test_a_replay_of_the_journal_gives_the_same_ledger(steps):
     assert again.number == 3 + len(changes)
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(steps, steps, st.booleans())
 def test_a_snapshot_gives_the_same_ledger_as_the_records(steps, later, ends):
     """Also encoded as JSON, and with further records; only unneeded awards are missing."""
@@ -253,7 +254,7 @@ def test_a_snapshot_gives_the_same_ledger_as_the_records(steps, later, ends):
     assert book.open.keys() | {e.award for e in book.jobs.values() if e.award} <= needed.keys()
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(steps, st.data())
 def test_a_late_report_changes_the_same_after_compaction(steps, data):
     """A report on any earlier award: on one that was dropped it would have changed nothing."""

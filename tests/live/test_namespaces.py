@@ -11,9 +11,9 @@ import pytest
 
 from fleet.errors import FleetError
 from fleet.live.supervisor import Part
+from tests.waiting import PATIENCE_S
 
 CHAOS = Path(__file__).parents[2] / "benchmarks" / "chaos"
-PATIENCE_S = 20.0
 CALL = "import socket, sys; s = socket.create_connection(sys.argv[1].split(':')); s.sendall(b'x'); s.recv(1)"
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 from fleet.bus.client.client import AnotherReplies
@@ -56,6 +56,7 @@ from fleet.motion import Plan
 from fleet.planning.planner import Planner
 from fleet.planning.time_limit import check_time
 from fleet.robot import ThermalLimits
+from tests.profiles import examples
 
 SILENT_S, GROWN_BYTES = 1.0, 50_000_000
 JOB = JobSpec(name="j", kind="hold", places=("bench",), repetitions=3, dwell_s=1.0)
@@ -184,7 +185,7 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
+@examples(400, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_no_message_stops_an_arm_or_an_auctioneer(participants, data):
     arm, auction = participants

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.policy import EveryArm, Policy, for_all_arms
@@ -21,6 +21,7 @@ from fleet.observation import FIELDS, LONG_S, Observation
 from fleet.offered_plans import PLANS
 from fleet.robot import ThermalLimits
 from scenarios.live.allocation import CentralAllocation
+from tests.profiles import examples
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central" and not rule.plans]
 SIMULATED_ONLY = {
@@ -209,7 +210,7 @@ def test_quotes_become_observations() -> None:
 
 
 @pytest.mark.parametrize("name", CENTRAL)
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(seed=st.integers(0, 2**32))
 def test_every_central_policy_awards_jobs_with_a_bid_once(name, seed) -> None:
     rng = np.random.default_rng(seed)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
@@ -26,6 +26,7 @@ from scenarios.live.recording_report import heat_use, order_events, recording_ht
 from scenarios.live.replayer import Replay
 from scenarios.run.schedule import schedule
 from scenarios.show.run_page import report_html
+from tests.profiles import examples
 
 ARMS = ("arm_0", "arm_1")
 
@@ -159,7 +160,7 @@ events = st.builds(
 )
 
 
-@settings(max_examples=500, deadline=None)
+@examples(500)
 @given(st.lists(events, max_size=30), st.lists(events.map(lambda event: replace(event, kind="return")), max_size=6))
 def test_whatever_was_lost_there_is_a_schedule(log, returns):
     plan = schedule(order_events(log, returns), ARMS, 20.0)

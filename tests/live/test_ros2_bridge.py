@@ -16,8 +16,8 @@ from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.ros2 import bridge as ros2_bridge
 from fleet.ros2.bridge import Bridge
 from fleet.ros2.node import Node
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 15.0
 HUMBLE, JAZZY = (get_typestore(Stores[f"ROS2_{name}"]) for name in ("HUMBLE", "JAZZY"))
 JOINT_STATE, DIAGNOSTICS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray"
 JOINTS_KEY = "0/shop/arm_0/joint_states/sensor_msgs::msg::dds_::JointState_/"
@@ -35,7 +35,7 @@ class Domain:
 
     def __init__(self, stack: ExitStack, fleet: str = "shop", **how) -> None:
         router = stack.enter_context(Router())
-        self.session = stack.enter_context(open_client(router.endpoint, timeout_s=5.0))
+        self.session = stack.enter_context(open_client(router.endpoint, timeout_s=PATIENCE_S))
         self.came: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
         self.ear = self.session.declare_subscriber("0/**", self.came.put)
         self.fleet = stack.enter_context(BusClient(router.endpoint, fleet))
@@ -58,7 +58,7 @@ class Domain:
         return found[0]
 
     def tokens(self):
-        replies = self.session.liveliness().get("@ros2_lv/0/**", timeout=5.0)
+        replies = self.session.liveliness().get("@ros2_lv/0/**", timeout=PATIENCE_S)
         return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok)
 
 

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
@@ -22,8 +22,9 @@ from fleet.live.clock import FleetClock
 from fleet.ros2.bridge import FRESH_S, WARM_S, ArmReadings, Follower
 from fleet.ros2.conversion import Joints, joint_names
 from fleet.ros2.node import Node
+from tests.profiles import examples
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 15.0
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 TYPES = JAZZY.types
 NAMES = joint_names(7)
@@ -104,7 +105,7 @@ def test_a_moving_arm_is_working(speed, mode):
     assert state_of(moved).mode == mode
 
 
-@settings(deadline=None, max_examples=50)
+@examples(50)
 @given(st.permutations(NAMES), st.lists(st.tuples(*[st.floats(-6, 6)] * 3), min_size=7, max_size=7))
 def test_the_order_of_joints_changes_no_reading(order, values):
     of = dict(zip(NAMES, values, strict=True))
@@ -134,7 +135,7 @@ class Place:
 
     def __init__(self, stack: ExitStack) -> None:
         router = stack.enter_context(Router())
-        self.ros = stack.enter_context(open_client(router.endpoint, timeout_s=5.0))
+        self.ros = stack.enter_context(open_client(router.endpoint, timeout_s=PATIENCE_S))
         self.link, self.peer = (stack.enter_context(BusClient(router.endpoint, "shop")) for _ in range(2))
         self.states: list[State] = []
         self.infos: list[Info] = []
@@ -225,9 +226,11 @@ def test_a_real_arm_takes_no_work_and_gives_the_reason(place):
     place.until(lambda: place.states, live)
     job = JobSpec(name="j", kind="hold", places=("rack",))
     got = []
-    place.peer.query(keys.of_every_arm("shop", "quote"), QuoteRequest("a", (job,)), Quote, got.append, timeout_s=5.0)
+    place.peer.query(
+        keys.of_every_arm("shop", "quote"), QuoteRequest("a", (job,)), Quote, got.append, timeout_s=PATIENCE_S
+    )
     award = Award("a.j", "a", "boss", "q", job)
-    place.peer.query(keys.of_arm("shop", "real", "award"), award, Ack, got.append, timeout_s=5.0)
+    place.peer.query(keys.of_arm("shop", "real", "award"), award, Ack, got.append, timeout_s=PATIENCE_S)
     place.until(lambda: len(got) == 2, live)
     words = [word for answers in got for word in answers.messages.values()]
     (quote,) = (word for word in words if isinstance(word, Quote))

@@ -34,6 +34,7 @@ def test_a_seed_repeats_the_same_events_in_every_process():
     assert digests[0] == digests[1]
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize(
     "mutation", ["submission-unwritten", "commit-ignored", "space-ignored", "repeats-recorded", "pause-ignored"]
 )

@@ -2,8 +2,6 @@
 
 import http.client
 import json
-import subprocess
-import sys
 import threading
 import time
 from contextlib import ExitStack, contextmanager
@@ -37,8 +35,9 @@ from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from scenarios.cli.main import app
+from tests import commands
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 30.0
 ARM = "arm 1+b"
 EXTRA = Participant("gateway", "submitter")
 TOKEN = "a token of this test"
@@ -111,11 +110,7 @@ def test_the_doctor_finds_a_fleet_with_access_control_healthy(fleet):
 @contextmanager
 def gateway(fleet, name):
     """The address of a gateway with the certificate of this one."""
-    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", *COMMANDS["gateway"]]
-    started = subprocess.Popen(
-        [*command, "--endpoint", Tls(fleet.keys, name).endpoint(fleet.endpoint)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    started = commands.start(*COMMANDS["gateway"], "--endpoint", Tls(fleet.keys, name).endpoint(fleet.endpoint))
     try:
         ready = started.stdout.readline()
         assert ready.startswith("ready gateway http://127.0.0.1:"), ready + started.stderr.read()

@@ -34,8 +34,8 @@ from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from scenarios.cli.main import app
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 30.0
 COMMANDS = {
     ("job", "cancel", "j"): Cancel("j"),
     ("job", "settle", "j", "redo"): Settle("j", "redo"),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
@@ -25,7 +25,6 @@ def test_false_alarms_stay_below_alpha_whatever_the_scores_are_like(draw, alpha,
         assert false >= binom.ppf(0.0001, trials, exact)
 
 
-@settings(deadline=None)
 @given(
     scores=st.lists(st.floats(-5, 5), min_size=9, max_size=60),
     alpha=st.floats(0.1, 0.9),

@@ -19,6 +19,7 @@ from fleet.physics.cell_model import cell_model
 from fleet.physics.meshes import MESH_OF_GEOM
 from fleet.physics.models import ArmModel, build_cell
 from fleet.robot import GEN3, POSTURES, Mount, Robot, rotation
+from tests.profiles import examples
 
 FLOOR = ArmModel(Robot(name="arm_0"))
 MOUNTS = {
@@ -78,7 +79,7 @@ def test_gravity_torque_is_that_of_the_published_masses(posture, payload_kg):
 
 @pytest.mark.parametrize("name", MOUNTS)
 @given(q=joints, payload_kg=st.floats(0.0, 5.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_turned_mount_is_a_turned_gravity(name, q, payload_kg):
     mounted = ArmModel(Robot(name="arm_0", mount=MOUNTS[name]))
     floor = ArmModel(Robot(name="arm_0"))
@@ -87,7 +88,7 @@ def test_a_turned_mount_is_a_turned_gravity(name, q, payload_kg):
 
 
 @given(q=joints, payload_kg=st.floats(0.0, 5.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_gravity_torque_is_the_slope_of_the_potential_energy(q, payload_kg):
     arm = ArmModel(Robot(name="arm_0", mount=MOUNTS["tilted"], tool_kg=0.7))
 
@@ -103,7 +104,7 @@ def test_gravity_torque_is_the_slope_of_the_potential_energy(q, payload_kg):
 
 
 @given(q=joints, qd=joints, qdd=joints, payload_kg=st.floats(0.0, 5.0))
-@settings(max_examples=30, deadline=None)
+@examples(30)
 def test_inverse_dynamics_undoes_forward_dynamics(q, qd, qdd, payload_kg):
     robot = Robot(name="arm_0", mount=MOUNTS["wall"], tool_kg=0.4)
     tau = ArmModel(robot).inverse_dynamics(q[None], qd[None], qdd[None], payload_kg)[0]
@@ -117,7 +118,7 @@ def test_inverse_dynamics_undoes_forward_dynamics(q, qd, qdd, payload_kg):
 
 
 @given(q=joints, force=arrays(float, 3, elements=st.floats(-60.0, 60.0)))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_force_on_the_tool_enters_through_the_jacobian(q, force):
     still = np.zeros((1, 7))
     step = 1e-6

@@ -87,7 +87,7 @@ def moved(by_m: tuple[float, float], turn_deg: float) -> tuple[Robot, Fixture, W
     )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.tuples(*[st.floats(-8.0, 8.0)] * 2), st.floats(-180.0, 180.0))
 def test_an_arm_that_stands_alike_elsewhere_has_the_same_plans(by_m, turn_deg):
     """The physics know no place and no compass: gravity and floor are the same after a move and a turn."""
@@ -213,7 +213,7 @@ def test_a_plan_that_takes_too_long_is_given_up_in_its_own_thread_alone(tmp_path
     with ThreadPoolExecutor(1) as pool, time_limit(0.0):
         with pytest.raises(PlanningTimeout, match="more than 0 s"):
             planner.plan(WORKS["pick_place"])
-        assert pool.submit(other.plan, WORKS["hold"]).result(60.0)
+        assert pool.submit(other.plan, WORKS["hold"]).result(300.0)
     assert not list(tmp_path.glob("a/*.npz"))
     assert planner.plan(WORKS["pick_place"])
 

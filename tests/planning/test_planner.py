@@ -18,6 +18,7 @@ from fleet.planning.collision import CollisionChecker
 from fleet.planning.kinematics import InverseKinematics, Pose, Unreachable, angle_between, nearest_turn
 from fleet.planning.planner import Planner
 from fleet.robot import GEN3, POSTURES, Mount, Robot, rotation
+from tests.profiles import examples
 
 DT_S = 1.0 / RATE_HZ
 ROBOTS = {
@@ -71,7 +72,7 @@ def works(draw):
 
 @pytest.mark.parametrize("name", ROBOTS)
 @given(what=works())
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.filter_too_much])
 def test_every_sample_keeps_the_limits(name, what):
     try:
         plans = PLANNERS[name].plan(what)
@@ -148,7 +149,7 @@ def test_a_hold_carries_all_the_time_and_lasts_its_dwell():
 
 
 @given(heavy=st.floats(1.0, 4.0), share=st.floats(0.0, 1.0))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_torque_is_affine_in_the_payload(heavy, share):
     planner = PLANNERS["floor"]
     none, some, all_ = (planner.plan(work("pick_place", payload_kg=kg))[0] for kg in (0.0, share * heavy, heavy))
@@ -239,7 +240,7 @@ def test_continuous_joints_take_the_short_way():
 
 
 @given(q=st.tuples(*[st.floats(-1.8, 1.8)] * 7).map(np.array), elbow_deg=st.sampled_from([0.0, 60.0, -60.0]))
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_inverse_kinematics_finds_poses_that_exist(q, elbow_deg):
     robot = ROBOTS["wall"]
     inverse = InverseKinematics(ARMS["wall"])

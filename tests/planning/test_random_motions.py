@@ -210,7 +210,7 @@ def test_light_motion_stays_cool_and_lies_outside_the_mix(typical, light):
     assert outside.mean() > 0.6
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(st.sampled_from([(0.0, 0.0, 0.0), (180.0, 0.0, 0.0), (90.0, 0.0, 0.0), (0.0, 45.0, 30.0)]), st.integers(0, 99))
 def test_draws_succeed_on_any_mount(tilt_deg, seed):
     robot = Robot(name="arm", mount=Mount(position_m=(0.0, 0.0, 1.0), tilt_deg=tilt_deg))

@@ -21,9 +21,10 @@ from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.scores import split_file
 from scenarios.evaluate.upper_bound import HeatBudget, Relaxation, upper_bound
 from scenarios.fault_price import weights_of
-from scenarios.load import SPLITS, parse_scenario
+from scenarios.parse import parse_scenario
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare
+from scenarios.schema import SPLITS
 from scenarios.suite.splits import instance, manifest
 from tests.exhaustive import optimum
 
@@ -164,10 +165,10 @@ def test_weights_with_other_signs_are_refused(small):
 
 
 @pytest.fixture(scope="module")
-def fleet(three_arms, job_streams, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+def fleet(three_arms, job_streams, plans: Path) -> Fleet:
     streams = list(job_streams(300.0, None, 200.0).values())
     scenario = parse_scenario(three_arms | {"name": "three", "jobs": streams, "horizon_s": 600.0}, Path("three.toml"))
-    return prepare(scenario, difficulty="blind", cache=tmp_path_factory.mktemp("plans"))
+    return prepare(scenario, difficulty="blind", cache=plans)
 
 
 def test_a_reference_is_between_its_parts_and_its_schedule_can_be_replayed(fleet: Fleet):

@@ -4,13 +4,13 @@ import json
 import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from scenarios.load import library
 from scenarios.run.run_folder import FILES
+from tests.commands import REAL
 
 QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
 
@@ -49,7 +49,7 @@ def test_the_same_seed_gives_the_same_files_in_another_process(thermofleet, smal
     one, two = tmp_path / "one", tmp_path / "two"
     assert thermofleet("run", small_toml, *QUICK, "--out", one).code == 0
     env = {**os.environ, "THERMOFLEET_CACHE": str(plans), "PYTHONHASHSEED": "7"}
-    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "run", str(small_toml), *QUICK]
+    command = [*REAL, "run", str(small_toml), *QUICK]
     subprocess.run([*command, "--out", str(two)], check=True, env=env, capture_output=True, timeout=300)
     for name in FILES:
         assert (one / name).read_bytes() == (two / name).read_bytes(), name
@@ -119,6 +119,7 @@ def test_without_round_robin_the_first_policy_is_the_baseline(thermofleet, small
         assert json.loads(thermofleet(*some, policies).out)["baseline"] == baseline
 
 
+@pytest.mark.ci_slow
 def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypatch, plans):
     from scenarios.prepare.fleet import prepare
 

@@ -10,10 +10,12 @@ from fleet.job import Fixture
 from fleet.physics.contacts import ContactFinder
 from scenarios.cell_layout import cell_of
 from scenarios.cli.run import metrics_table
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.prepare.fleet import prepare
-from scenarios.run.shift import RunSpec, run
+from scenarios.run.shift import run
 from scenarios.schema import Scenario
+from scenarios.specs import RunSpec
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ from fleet.errors import FleetError
 from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.run_folder import FILES, event_table, telemetry_table, write
-from scenarios.run.shift import RunResult, RunSpec, run
+from scenarios.run.shift import RunResult, run
+from scenarios.specs import RunSpec
 
 
 @pytest.fixture

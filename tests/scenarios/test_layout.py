@@ -11,18 +11,18 @@ import pytest
 from fleet.errors import FleetError, ScenarioError
 from scenarios.cli.main import main
 from scenarios.job_stream import all_works
-from scenarios.load import library, load, parse_scenario
+from scenarios.load import library, load
+from scenarios.parse import parse_scenario
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.schema import Ambient
 from scenarios.show.layout import layout_report
 
 
 @pytest.fixture
-def cache(tmp_path_factory, monkeypatch):
-    """A folder of plans that the tests of this file share."""
-    folder = tmp_path_factory.getbasetemp() / "cache"
-    monkeypatch.setenv("THERMOFLEET_CACHE", str(folder))
-    return folder
+def cache(plans, monkeypatch):
+    """The folder of plans that all tests share."""
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
+    return plans
 
 
 def cell(*arms, places, clearance_m=0.02, **more):

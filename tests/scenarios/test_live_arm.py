@@ -25,11 +25,12 @@ from scenarios.load import load
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.progress import quiet
 from scenarios.schema import Ambient
+from tests import commands
+from tests.waiting import PATIENCE_S
 from twin.logs.reader import read
 from twin.logs.recording import READINGS
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
-PATIENCE_S = 60.0
 TIME_S = np.arange(0.0, 4.0, 0.1)
 
 
@@ -49,15 +50,7 @@ class Process:
     """`thermofleet arm …` until the end of the block."""
 
     def __init__(self, *args, cache, cwd):
-        program = "import sys; from scenarios.cli.main import main; main(sys.argv[1:])"
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", program, "arm", "run", *map(str, args)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=cwd,
-            env={**os.environ, "THERMOFLEET_CACHE": str(cache), "OMP_NUM_THREADS": "1"},
-        )
+        self.process = commands.start("arm", "run", *args, cwd=cwd, env={**os.environ, "THERMOFLEET_CACHE": str(cache)})
         self.killer = threading.Timer(PATIENCE_S, self.process.kill)
         self.killer.start()
         self.ready = self.process.stdout.readline()
@@ -163,7 +156,7 @@ def test_a_log_is_replayed_as_an_arm(small_toml, plans, log, tmp_path):
             states, info = heard_from(link, "heat", lambda states: states and states[-1].mode == "idle")
             job = JobSpec(name="j", kind="hold", places=("bench",))
             answers = link.query_and_wait(
-                keys.of_every_arm("heat", "quote"), QuoteRequest("q", (job,), dry_run=True), Quote, timeout_s=10.0
+                keys.of_every_arm("heat", "quote"), QuoteRequest("q", (job,), dry_run=True), Quote, timeout_s=PATIENCE_S
             )
             assert arm.end(signal.SIGTERM)[0] == 0
     assert info.twin == "log real.csv"
@@ -252,7 +245,7 @@ made = simulated_arm(load("quickstart"), "arm_0", "blind", 0, quiet, Path({str(t
 made.body(0.0, 0.1).advance(1.0)
 print(*sys.modules)
 """
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
     heavy = {"mujoco", "mink", "ruckig", "scipy", "torch", "pettingzoo", "gymnasium", "numba", "pyarrow", "plotly"}
     assert set(said.stdout.split()) & heavy == set()
 

@@ -3,7 +3,6 @@
 import json
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,9 +22,10 @@ from scenarios.live.auctioneer import job_spec, own_jobs
 from scenarios.live.journals import refuse_other_way
 from scenarios.load import load
 from scenarios.prepare.fleet import make_env
+from tests import commands
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
-PATIENT_S = 20.0
 HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}
 
 
@@ -195,10 +195,7 @@ def test_a_shift_is_continued_with_its_own_kind_of_allocation(tmp_path):
 @contextmanager
 def auctioneer(endpoint: str, folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
     """The command as a process that has said that it is ready."""
-    program = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "bus", "auctioneer"]
-    options = ["--endpoint", endpoint, "--journal", folder, *words]
-    command = [*program, *map(str, options)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with commands.start("bus", "auctioneer", "--endpoint", endpoint, "--journal", folder, *words) as process:
         assert process.stdout is not None
         try:
             said = process.stdout.readline()
@@ -226,12 +223,12 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         assert code == 2
         assert "Fleet 'quickstart' has an auctioneer already: 'auctioneer'." in err
         process.send_signal(signal.SIGKILL)
-        process.wait(PATIENT_S)
+        process.wait(PATIENCE_S)
     with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
         file.write_text(json.dumps(HOLD | {"places": ["belt"]}))
         assert thermofleet("job", "submit", file, *at)[:2] == (0, "a: accepted\n")
         process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=PATIENT_S)
+        out, err = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0
         assert "0 of 1 jobs finished" in out
         assert "Continuing from" in err
@@ -242,6 +239,6 @@ def test_the_end_of_a_shift_lists_unfinished_jobs(endpoint, tmp_path):
     text = (ROOT / "scenarios" / "library" / "quickstart.toml").read_text(encoding="utf-8")
     short.write_text(text.replace("horizon_s = 7200", "horizon_s = 600"), encoding="utf-8")
     with auctioneer(endpoint, tmp_path / "journal", short, "--speed", "1000") as process:
-        out, _ = process.communicate(timeout=PATIENT_S)
+        out, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert "unfinished, The shift ended before it was done." in out

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.errors import ScenarioError
-from scenarios.load import library, load, override, own_seed, parse_scenario
+from scenarios.load import library, load, own_seed
+from scenarios.parse import override, parse_scenario
 
 FILE = Path("heat.toml")
 

@@ -26,9 +26,11 @@ from scenarios.evaluate.study import Case, Study, policy_hash
 from scenarios.load import load
 from scenarios.policy_loader import is_built_in, is_on_bus, label, policy_of, scope_of, source_of
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.shift import RunSpec, run
+from scenarios.run.shift import run
+from scenarios.specs import RunSpec
+from tests import commands
 from tests.bus.test_policy_client import KEY, seen
-from tests.examples.programs import COMMAND, ROOT, running, started
+from tests.examples.programs import ROOT, running, started
 from tests.waiting import PATIENCE_S
 
 MOST_WAITING = 32
@@ -145,8 +147,7 @@ def test_few_requests_wait_for_a_process_and_the_oldest_are_dropped():
 def test_compare_tells_the_failure_and_goes_on(small_toml):
     with Router() as router:
         options = ["--policies", f"wspt,bus:mine@{router.endpoint}", "--difficulty", "blind", "--seeds", "2", "--json"]
-        command = [*COMMAND, "compare", str(small_toml), *options]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S * 4, check=False)
+        done = commands.run("compare", small_toml, *options)
     comparison = json.loads(done.stdout)
     assert "No process serves the policy 'mine' at tcp/127.0.0.1" in json.dumps(comparison)
     assert "policy_client.py" in json.dumps(comparison)

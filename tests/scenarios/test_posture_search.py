@@ -51,7 +51,7 @@ def held(temp_c, tau, seconds):
     return temp_c
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.floats(0.0, 2400.0), st.floats(15.0, 45.0))
 def test_hidden_housings_follow_from_how_fast_windings_warm(seconds, load_nm):
     tau = np.array([1.0, -load_nm, 1.0, 0.4 * load_nm, 0.5, 4.0, 0.0])

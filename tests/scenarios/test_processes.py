@@ -44,7 +44,7 @@ def test_processes_end_with_the_one_that_began_them(tmp_path):
         """)
     )
     # Returns when no process has its output open.
-    killed = subprocess.run([sys.executable, str(script)], capture_output=True, timeout=60, check=False)
+    killed = subprocess.run([sys.executable, str(script)], capture_output=True, timeout=300, check=False)
     assert killed.returncode == -signal.SIGKILL
 
 

@@ -11,7 +11,8 @@ from scenarios.evaluate import runner
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.store import read_rows
 from scenarios.evaluate.study import SHIFTS, Case, Study
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.randomisation import Randomisation
 

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import time
 from contextlib import ExitStack
@@ -15,9 +14,10 @@ from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
 from scenarios.cli.main import main
+from tests import commands
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 60.0
 TEMP_C = (30.0, 31.0, 32.5, 33.0, 34.0, 35.0, 36.0)
 
 
@@ -25,12 +25,7 @@ def started(stack, *words):
     """A command that says it is ready."""
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     environment.pop("ROS_DOMAIN_ID", None)
-    process = stack.enter_context(
-        subprocess.Popen(
-            [sys.executable, "-c", "from scenarios.cli.main import main; main()", "bus", "ros2", *words],
-            cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )
-    )  # fmt: skip
+    process = stack.enter_context(commands.start("bus", "ros2", *words, env=environment))
     stack.callback(process.kill)
     assert process.stdout is not None
     assert process.stdout.readline().startswith("ready ")

@@ -6,7 +6,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -24,17 +23,16 @@ from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
 from scenarios.specs import LiveSpec
-from tests.waiting import wait_until
+from tests import commands
+from tests.waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
-PATIENT_S = 20.0
 
 
 @contextmanager
 def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The router as a process, and the line that it prints when it listens."""
-    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "bus", "router", *map(str, words)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with commands.start("bus", "router", *words) as process:
         assert process.stdout is not None
         try:
             yield process, process.stdout.readline().strip()
@@ -53,9 +51,9 @@ def folder(tmp_path: Path, thermofleet: pytest.CaptureFixture[str]) -> Path:
 def test_a_router_prints_its_endpoint_and_exits_on_a_signal(number, code):
     with started("--port", 0) as (process, endpoint):
         assert endpoint.startswith("tcp/127.0.0.1:")
-        with open_client(endpoint, timeout_s=PATIENT_S):
+        with open_client(endpoint, timeout_s=PATIENCE_S):
             process.send_signal(number)
-            out, err = process.communicate(timeout=PATIENT_S)
+            out, err = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == code
         assert out == ""
         assert ("The router was interrupted" in err) == (code == 130)
@@ -66,15 +64,15 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
     with started("--port", 0, "--tls", folder, "--scenario", "quickstart", "--state-hz", 5) as (process, endpoint):
         assert endpoint.startswith("tls/127.0.0.1:")
         with (
-            open_client(endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm,
-            open_client(endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "monitor")) as monitor,
+            open_client(endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "arm_0")) as arm,
+            open_client(endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "monitor")) as monitor,
         ):
             heard: list[str] = []
             listener = monitor.declare_subscriber(
                 "thermofleet/v4/quickstart/**", lambda s: heard.append(str(s.key_expr))
             )
             cache = keys.caches_of("thermofleet/v4/quickstart/arm/nobody")
-            assert list(monitor.get(cache, timeout=PATIENT_S)) == []
+            assert list(monitor.get(cache, timeout=PATIENCE_S)) == []
             state, sent = keys.of_arm("quickstart", "arm_0", "state"), 0
 
             def publish() -> None:
@@ -84,7 +82,7 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
                     arm.put(keys.of_arm("quickstart", "arm_1", "event"), b"not mine")
                 sent += 100
                 for session in (arm, monitor):
-                    assert list(session.get(cache, timeout=PATIENT_S)) == []
+                    assert list(session.get(cache, timeout=PATIENCE_S)) == []
 
             publish()
             wait_until(lambda: heard.count(state), publish)  # the first ones may come too soon after the connection
@@ -92,7 +90,7 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
             assert keys.of_arm("quickstart", "arm_1", "event") not in heard
             listener.undeclare()
         process.terminate()
-        assert process.wait(PATIENT_S) == 0
+        assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_port_in_use_is_one_sentence(thermofleet):
@@ -236,15 +234,7 @@ def test_a_whole_fleet_works_with_tls_and_access_control(thermofleet, small_toml
         thermofleet("bus", "keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
     )
     words = ("up", small_toml, "--tls", place, "--speed", 20, "--difficulty", "blind", "--out", out, "--policy", policy)
-    done = subprocess.run(
-        [sys.executable, "-c", "from scenarios.cli.main import main; main()", *map(str, words)],
-        cwd=ROOT,
-        env={**os.environ, "THERMOFLEET_CACHE": str(plans)},
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    done = commands.run(*words, env={**os.environ, "THERMOFLEET_CACHE": str(plans)})
     assert done.returncode == 0, done.stderr
     finished = [one for one in reports(out / "journals") if one.outcome == "finished"]
     assert len({one.job for one in finished}) == len(finished) >= 4

@@ -11,8 +11,9 @@ import pytest
 from agents.registry import RULES
 from scenarios.load import load
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.shift import RunResult, RunSpec, run, summary
+from scenarios.run.shift import RunResult, run, summary
 from scenarios.scenario_hash import scenario_hash
+from scenarios.specs import RunSpec
 
 TICKS = 18
 

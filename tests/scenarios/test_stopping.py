@@ -8,8 +8,7 @@ import pytest
 
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import Interrupted
-
-PATIENCE_S = 10.0
+from tests.waiting import PATIENCE_S
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -26,8 +26,8 @@ from fleet.bus.protocol.auction import (
 from fleet.errors import FleetError
 from fleet.live.job_client import batches
 from scenarios.live.requests import read_jobs
+from tests.waiting import PATIENCE_S
 
-PATIENT_S = 20.0
 HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}
 
 
@@ -105,7 +105,7 @@ def served(endpoint: str, declare: Callable[[BusClient], None]) -> Iterator[None
             yield
         finally:
             stop.set()
-            thread.join(PATIENT_S)
+            thread.join(PATIENCE_S)
 
 
 @contextmanager

@@ -7,11 +7,11 @@ import pytest
 
 from fleet.errors import ScenarioError
 from scenarios.job_stream import all_works
-from scenarios.load import SPLITS, load
+from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.load_factor import load_factor
 from scenarios.scenario_hash import scenario_content
-from scenarios.schema import BusSpec, Scenario
+from scenarios.schema import SPLITS, BusSpec, Scenario
 from scenarios.suite.axes import BUSES, DUE, Axes, scenario_of
 from scenarios.suite.cells import CELLS, layout
 from scenarios.suite.layouts import layout_of
@@ -74,10 +74,10 @@ def test_axes_are_honoured() -> None:
     assert [c for _, c in at(air="rising").ambient.points] == [22.0, 31.0]
 
 
-def test_heat_severity_raises_the_thermal_load(tmp_path_factory) -> None:
+def test_heat_severity_raises_the_thermal_load(plans) -> None:
     cell = next(cell for cell in CELLS if cell.arms == 2)
     scenario = scenario_of("x", cell, PLAIN, 0)
-    fleet = prepare(scenario, difficulty="blind", cache=tmp_path_factory.getbasetemp() / "cache")
+    fleet = prepare(scenario, difficulty="blind", cache=plans)
     assert {len([arm for arm in fleet.arms if work in arm.plans]) for work in all_works(scenario)} == {2}
     from scenarios.prepare.fleet import ShiftFactory
 

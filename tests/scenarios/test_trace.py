@@ -18,8 +18,9 @@ from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.provenance import code_hash
 from scenarios.run.run_folder import write
-from scenarios.run.shift import RunSpec, run
+from scenarios.run.shift import run
 from scenarios.show.trace import NOT_RECORDED, rows_of, thread_of, thread_table
+from scenarios.specs import RunSpec
 
 JOBS = ("a", "b")
 LOG = [

@@ -9,7 +9,8 @@ from agents.learned.ppo import PpoConfig
 from agents.learned.training_log import LOG
 from fleet.errors import FleetError
 from scenarios.cli.main import main
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.policy_loader import label, policy_of
 from scenarios.train.folder import NETWORK_STATE
 from scenarios.train.networks import CURVE, VALIDATION_SEED, TrainingPlan, train

@@ -15,7 +15,8 @@ from agents.pairs import Worth
 from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.evaluate.rollout import outcomes
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
 from scenarios.suite.splits import Instance, instance

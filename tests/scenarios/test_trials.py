@@ -17,7 +17,8 @@ from scenarios.evaluate.comparison import comparison_of, comparisons
 from scenarios.evaluate.rollout import FIGURES, outcomes
 from scenarios.evaluate.store import RESULTS, opened, read_rows
 from scenarios.evaluate.study import SHIFTS, Case, Key, Row, Study, Unit, policy_hash, seeds_of_instance
-from scenarios.load import load, override
+from scenarios.load import load
+from scenarios.parse import override
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.planned_arm import plan_arms
@@ -201,7 +202,7 @@ def again(function):
 with limit.watching(), limit.decision():
     again(lambda: again(turn))  # one more level, for an alarm that comes while the one before is caught
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 1
     assert "longer than 0.05 s, and the policy catches what should end it" in ended.stderr
 

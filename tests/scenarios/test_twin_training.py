@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 
 from scenarios.job_stream import rehearsal_works
-from scenarios.load import load, override
+from scenarios.load import load
 from scenarios.motion.known_arm import known_arm
+from scenarios.parse import override
 from scenarios.prepare.planned_arm import plan_arms
 from scenarios.prepare.train_twins import train_twin, train_twins
 from scenarios.prepare.twin_folder import quality, train_arms

@@ -27,7 +27,7 @@ SAMPLE_S = STRIDE * TIMESTEP_S
 # The scene
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(payload_kg=st.floats(0.01, 6.0), seed=st.integers(0, 2**31))
 def test_a_loaded_hand_is_a_model_compiled_with_the_load(payload_kg, seed):
     spec = mujoco.MjSpec.from_string(gen3_xml().decode())

@@ -10,6 +10,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 
 from fleet.difficulty import KNOWN
+from tests.profiles import examples
 from twin.saturation.fit import (
     LEAST_JOBS,
     LEAST_OF_EACH,
@@ -54,7 +55,7 @@ def told(model, past: Experience) -> np.ndarray:
     return model.risk(past.features, past.duration_s).at(past.known_c)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(seed=st.integers(0, 9999), strength=st.sampled_from([0.01, 1.0, 100.0]))
 def test_without_bounds_it_is_scikit_learn_s(seed, strength) -> None:
     rng = np.random.default_rng(seed)
@@ -66,7 +67,7 @@ def test_without_bounds_it_is_scikit_learn_s(seed, strength) -> None:
     assert offset == pytest.approx(theirs.intercept_[0], abs=2e-4)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(seed=st.integers(0, 9999))
 def test_bounded_slopes_are_the_best_of_those_allowed(seed) -> None:
     rng = np.random.default_rng(seed)
@@ -140,7 +141,7 @@ def test_a_curve_never_falls_and_never_promises(seed, jobs) -> None:
     assert p.max() <= 1 - 1 / (jobs + 2)
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 99), joint=st.integers(0, 6), more=st.floats(0.1, 20))
 def test_neither_warmth_nor_load_makes_a_job_safer(seed, joint, more) -> None:
     past, _ = world(60, seed)

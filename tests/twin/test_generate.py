@@ -134,7 +134,7 @@ def test_windows_share_noise_as_they_share_time(source, make_plan, motion):
 # Motion from a trained twin
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(s=st.floats(0.0, 6.0), seed=st.integers(0, 2**31))
 def test_motion_can_be_executed_from_home_to_home(twin, records, make_plan, s, seed):
     phases = [Phase(r.copy(), np.repeat([0.5, 0.0], [len(r) // 3, len(r) - len(r) // 3])) for r in records[:3]]

@@ -5,9 +5,10 @@ import sys
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.profiles import examples
 from twin.vae.checkpoint import save
 from twin.vae.config import TwinConfig
 from twin.vae.inference import Networks, decode, posterior, reconstruct
@@ -33,7 +34,7 @@ def drawn(seed, *shape):
     return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(config=configs, count=st.integers(1, 7), joints=st.integers(1, 3), batch=st.integers(1, 28))
 def test_windows_of_an_arm_go_through_each_network_alone(config, count, joints, batch):
     """`joints` of each network: 1 with a network per joint, all of the arm with one network."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss
@@ -20,7 +20,6 @@ jobs = st.builds(
 )
 
 
-@settings(deadline=None)
 @given(jobs=jobs, bins=st.integers(1, 12))
 def test_the_table_is_scikit_learn_s(jobs, bins) -> None:
     p, event = jobs

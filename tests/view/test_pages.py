@@ -42,7 +42,7 @@ def page(browser: Browser, run_folder: Path) -> Iterator[Page]:
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: said.append(request.url) if not request.url.startswith("file:") else None)
     page.goto((run_folder / "report.html").as_uri())
-    page.wait_for_selector("body[data-ready]", timeout=60_000)
+    page.wait_for_selector("body[data-ready]", timeout=300_000)
     yield page
     page.close()
     assert [line for line in said if "GL Driver Message" not in line] == []
@@ -108,7 +108,7 @@ def test_the_keyboard_plays_and_turns(page: Page) -> None:
 def test_a_narrow_page_overprints_nothing(page: Page, width: int) -> None:
     page.set_viewport_size({"width": width, "height": 850})
     page.reload()
-    page.wait_for_selector("body[data-ready]", timeout=60_000)
+    page.wait_for_selector("body[data-ready]", timeout=300_000)
     page.wait_for_timeout(500)
     boxes = [
         page.locator(f"#figure .{name}").first.bounding_box() for name in ("legend", "xaxislayer-above", "legend2")
@@ -132,7 +132,7 @@ def test_words_have_contrast_in_light_and_dark(browser: Browser, run_folder: Pat
     for scheme in ("light", "dark"):
         page = browser.new_page(color_scheme=scheme)  # pyright: ignore[reportArgumentType]
         page.goto((run_folder / "report.html").as_uri())
-        page.wait_for_selector("body[data-ready]", timeout=60_000)
+        page.wait_for_selector("body[data-ready]", timeout=300_000)
         for selector in ("h1", ".verdict", ".faint", ".status", "#events td", "#figure .ytick text"):
             colours = page.locator(selector).first.evaluate(COLOURS)
             ink, paper = (

@@ -30,8 +30,7 @@ from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.round import Assignment
 from fleet.live.journal import Journal
 from fleet.live.journal_upkeep import put_aside
-
-PATIENCE_S = 15.0
+from tests.waiting import PATIENCE_S
 
 
 def first_come(bidding):
@@ -150,7 +149,7 @@ class Bus:
     def ask(self, key, request, kind):
         """Return the replies to a query of an outsider."""
         replies = []
-        self.link().query(key, request, kind, replies.append, timeout_s=5.0)
+        self.link().query(key, request, kind, replies.append, timeout_s=PATIENCE_S)
         self.until(lambda: replies)
         return replies[0]
 

@@ -24,6 +24,7 @@ from fleet.errors import JournalFull
 from fleet.live import journal, journal_upkeep
 from fleet.live.auction.job_rules import status_reply
 from fleet.live.journal import Journal
+from tests.waiting import PATIENCE_S
 
 TWICE = ("Started", "Started")
 """Of the owner, which compaction keeps, and of the start."""
@@ -171,7 +172,7 @@ def test_the_status_of_1500_jobs_fits_into_one_message_with_open_jobs_first(bus)
 
 def test_an_arm_of_an_older_version_is_named_with_its_version(bus):
     bus.arm("arm 2")
-    with open_client(bus.endpoint, timeout_s=5.0) as session:
+    with open_client(bus.endpoint, timeout_s=PATIENCE_S) as session:
         token = session.liveliness().declare_token("thermofleet/v2/f/arm/arm%201/alive")
         (sentence,) = other_versions(bus.endpoint, "f")
         token.undeclare()

@@ -12,8 +12,7 @@ from fleet.errors import BusError, Refused
 from fleet.live.auction import node as auction_node
 from fleet.live.auction.node import AuctionNode
 from fleet.live.monitor.snapshot import FleetListener
-
-PATIENCE_S = 15.0
+from tests.waiting import PATIENCE_S
 
 
 def test_a_fleet_has_one_auctioneer(bus, token_reaches):

@@ -54,7 +54,7 @@ def test_without_message_loss_the_allocation_is_that_of_a_central_policy(council
 
 
 @pytest.mark.parametrize("name", ARM_POLICIES)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32), jobs=st.integers(1, 6))
 def test_every_arm_policy_completes_all_jobs(council, name, seed, jobs):
     rng = random.Random(seed)

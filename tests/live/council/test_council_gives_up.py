@@ -9,7 +9,7 @@ from fleet.bus.protocol.auction import JobSpec
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=50)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(1, 5), st.lists(st.booleans(), max_size=5), st.data())
 def test_a_job_that_always_faults_is_given_up_by_all_and_others_go_on(council, arms, restarts, data):
     other = JobSpec(name="other", kind="hold", places=("y",), repetitions=3)

@@ -34,8 +34,8 @@ from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from fleet.robot import ThermalLimits
 from scenarios.live.arm import refuse_auctioneer
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 20.0
 SPEED = 120.0
 ROSTER = ("arm_0", "arm_1", "arm_2")
 FLEET = LiveFleet(arms=ROSTER)

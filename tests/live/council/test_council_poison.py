@@ -5,7 +5,7 @@ import time
 from contextlib import ExitStack
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -33,6 +33,7 @@ from fleet.live.consensus.participant import Membership
 from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from tests.live.test_poison import GROWN_BYTES, SILENT_S, Wire, odd, resident
+from tests.profiles import examples
 
 ROSTER = ("arm_0", "arm_1", "arm_2")
 JOB = JobSpec("j", "hold", ("bench",), repetitions=3, due_s=1e6)
@@ -118,7 +119,7 @@ def messages(number: int, action) -> dict:
     }
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@examples(300, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_no_message_stops_an_arm_without_an_auctioneer(node, data):
     node.count = getattr(node, "count", 10**9) + 1

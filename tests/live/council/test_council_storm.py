@@ -18,7 +18,7 @@ from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.operator import Cancel, Change, Pause, Resume, Settle
 from fleet.errors import JournalFull, Refused
 from fleet.live.consensus import settled_jobs
-from fleet.live.space import ANYWHERE
+from tests.live.conflicts import random_conflicts
 
 START_S = 100.0
 """Fleet time at the start."""
@@ -238,17 +238,6 @@ ACTIONS = (
 rates = st.lists(st.floats(1 - 1e-3, 1 + 1e-3), min_size=1, max_size=5)
 
 
-def random_conflicts(seed: int, share: float):
-    """Return a symmetric relation in which this share of all plans exclude each other, and unknown ones all others."""
-
-    def excludes(arm: str, space: str, other: str, other_space: str) -> bool:
-        if ANYWHERE in (space, other_space):
-            return True
-        return random.Random(f"{seed} {sorted([space, other_space])}").random() < share
-
-    return excludes
-
-
 def storm(council, rates, seed: int, actions) -> None:
     rng = random.Random(seed)
     limit = rng.choice([2, 2, 2000])
@@ -340,7 +329,7 @@ def test_no_job_is_done_twice_and_none_is_lost(council, rates, seed, actions):
 
 
 @pytest.mark.slow
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=1500)
 @given(rates, st.integers(0, 2**32), st.lists(st.sampled_from(ACTIONS), max_size=25))
 def test_no_job_is_done_twice_in_a_long_storm(council, rates, seed, actions):
     storm(council, rates, seed, actions)

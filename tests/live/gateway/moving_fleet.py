@@ -23,9 +23,9 @@ from fleet.bus.protocol.operator import (
     Settle,
 )
 from fleet.job import BOUNDS
+from tests.waiting import PATIENCE_S
 
 WARNING_C, ERROR_C = 60.0, 75.0
-PATIENCE_S = 60.0
 PLACES = ("conveyor", "pallet", "clamp")
 
 

@@ -7,13 +7,13 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from fleet.bus.client.router import Router
+from tests import commands
 from tests.waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[3]
@@ -22,18 +22,7 @@ ROOT = Path(__file__).parents[3]
 @contextmanager
 def process(endpoint, *options):
     """The command in a process of its own, from when it says that it is ready, and its address."""
-    command = [
-        sys.executable,
-        "-u",
-        "-c",
-        "from scenarios.cli.main import main; main()",
-        "bus",
-        "gateway",
-        "--fleet",
-        "f",
-    ]
-    command += ["--endpoint", endpoint, "--port", "0", *options]
-    started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    started = commands.start("bus", "gateway", "--fleet", "f", "--endpoint", endpoint, "--port", 0, *options)
     try:
         line = started.stdout.readline()
         assert line.startswith("ready gateway http://127.0.0.1:"), line + started.stderr.read()
@@ -62,18 +51,7 @@ def test_the_command_waits_for_a_router():
         port = free.getsockname()[1]
     with Router(port):
         pass  # now the port is free, and was a router's
-    command = [
-        sys.executable,
-        "-u",
-        "-c",
-        "from scenarios.cli.main import main; main()",
-        "bus",
-        "gateway",
-        "--fleet",
-        "f",
-    ]
-    command += ["--endpoint", f"tcp/127.0.0.1:{port}", "--port", "0"]
-    started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    started = commands.start("bus", "gateway", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}", "--port", 0)
     try:
         assert "Waiting for a router." in started.stderr.readline()
         assert started.poll() is None

@@ -8,7 +8,7 @@ import pytest
 
 from fleet.bus.client.router import Router
 from tests.live.gateway.served import CRATE_JSON, Served, events, numbers_of, of
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 
 def test_the_stream_has_all_messages(gateway, arm):
@@ -55,7 +55,7 @@ def test_a_stuck_reader_is_dropped_and_delays_no_other(router, arm):
             if number % 100 == 99:
                 events(file, lambda found, n=number: n in numbers_of(found))
                 slowest_s = max(slowest_s, time.monotonic() - said_s)
-        assert slowest_s < 5.0
+        assert slowest_s < PATIENCE_S
         wait_until(lambda: len(served.readers.connected) == 1)  # the stuck one is gone, the other still reads
         arm.happens(600)
         assert events(file, lambda found: 600 in numbers_of(found))
@@ -88,22 +88,21 @@ def test_the_number_of_readers_is_limited(gateway):
     ],
     ids=["bodies", "headers", "connections"],
 )
-def test_300_unfinished_requests_hold_nobody_up(router, arm, begun):
-    with Served(router) as served, ExitStack() as lines:
+def test_300_unfinished_requests_hold_nobody_up(router, arm, begun, monkeypatch):
+    monkeypatch.setattr("scenarios.cli.live.gateway.HEADER_S", 3 * PATIENCE_S)
+    with Served(router, body_s=3 * PATIENCE_S) as served, ExitStack() as lines:
         for _ in range(300):
             line = lines.enter_context(socket.create_connection(("127.0.0.1", served.port)))
             line.sendall(begun.encode())
-        start_s = time.monotonic()
         for request in (("GET", "/v4/fleet"), ("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})):
-            wait_until(
-                lambda request=request: served.ask(*request)[0] == 200
-            )  # the rate of one address is limited, too
-        assert time.monotonic() - start_s < 3.0
+            wait_until(lambda request=request: served.ask(*request)[0] == 200)  # the rate is limited, too
 
 
-def test_requests_beyond_the_rate_are_refused_until_a_pause(router):
+def test_requests_beyond_the_rate_are_refused_until_a_pause(router, monkeypatch):
     with Served(router) as served:
-        answers = [served.ask("GET", "/")[0] for _ in range(400)]
+        with monkeypatch.context() as patch:
+            patch.setattr("scenarios.live.http_access.RATE_HZ", 1.0)  # which a slow machine also exceeds
+            answers = [served.ask("GET", "/")[0] for _ in range(400)]
         assert answers[:100] == [200] * 100
         assert 429 in answers
-        wait_until(lambda: served.ask("GET", "/")[0] == 200, patience_s=5.0)
+        wait_until(lambda: served.ask("GET", "/")[0] == 200)

@@ -8,7 +8,6 @@ import select
 import signal
 import struct
 import subprocess
-import sys
 import termios
 import time
 from io import StringIO
@@ -29,6 +28,7 @@ from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
 from scenarios.live.fleet_processes import free_port
 from scenarios.live.watch import GONE_S, ShiftEnd
 from scenarios.show.watch import PLAIN, JobBars, arm_line, format_age, format_scores, format_time, plain_event, screen
+from tests import commands
 from tests.waiting import PATIENCE_S
 
 
@@ -114,7 +114,7 @@ def test_the_key_j_shows_all_joints_and_q_ends(fleet):
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")} | {"TERM": "xterm"}
     process = subprocess.Popen(
-        command("--endpoint", fleet.endpoint),
+        [*commands.REAL, "watch", "--endpoint", fleet.endpoint],
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
@@ -176,15 +176,9 @@ def test_ages_and_times_are_short():
     assert "no token" in arm_line(arm_now(token=False))
 
 
-def command(*arguments):
-    return [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "bus", "watch", *arguments]
-
-
 def test_without_a_terminal_lines_are_printed_until_stopped(fleet):
     for number, code in ((signal.SIGTERM, 0), (signal.SIGINT, 130)):
-        process = subprocess.Popen(
-            command("--endpoint", fleet.endpoint), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
+        process = commands.start("bus", "watch", "--endpoint", fleet.endpoint, stderr=subprocess.DEVNULL)
         try:
             assert process.stdout.readline() == "a joined\n"
             fleet.say()
@@ -199,9 +193,7 @@ def test_without_a_terminal_lines_are_printed_until_stopped(fleet):
 
 
 def test_a_snapshot_is_json(fleet):
-    done = subprocess.run(
-        command("--endpoint", fleet.endpoint, "--json"), capture_output=True, text=True, timeout=60, check=True
-    )
+    done = commands.run("bus", "watch", "--endpoint", fleet.endpoint, "--json")
     told = json.loads(done.stdout)
     assert told["fleet"] == "f"
     assert [(arm["arm"], arm["token"], arm["present"]) for arm in told["arms"]] == [("a", True, False)]
@@ -221,7 +213,7 @@ def test_the_end_of_a_shift_is_told_when_all_have_left():
 
 def test_watch_waits_for_a_router_and_a_fleet():
     port = free_port()
-    with subprocess.Popen(command("--endpoint", f"tcp/127.0.0.1:{port}"), stdout=subprocess.PIPE, text=True) as process:
+    with commands.start("bus", "watch", "--endpoint", f"tcp/127.0.0.1:{port}", stderr=None) as process:
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(2.0)
         with Router(port) as router, BusClient(router.endpoint, "f") as link:
@@ -238,9 +230,7 @@ def test_an_ambiguous_fleet_is_an_error(fleets, token_reaches):
         for link in links:
             link.declare_token(keys.of_arm(link.fleet, "a", "alive"))
             token_reaches(links[0], keys.of_arm(link.fleet, "a", "alive"))
-        done = subprocess.run(
-            command("--endpoint", router.endpoint, "--json"), capture_output=True, text=True, timeout=60
-        )
+        done = commands.run("bus", "watch", "--endpoint", router.endpoint, "--json")
         for link in links:
             link.close()
     assert done.returncode == 2
