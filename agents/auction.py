@@ -7,11 +7,30 @@ the total benefit of n arms is within n · ε of the optimum.
 
 Source: Bertsekas, The Auction Algorithm: A Distributed Relaxation Method for the Assignment Problem, Annals of
 Operations Research 14, 1988; all arms without a job bid at once (Jacobi version).
+
+The consensus-based auction algorithm for one job per arm: arms bid, and forward the best bids they received.
+
+In a round every arm without a job bids for its cheapest job among those where it beats the best bid it knows. Then it
+adopts, for every job, the best bid of its own and its neighbours' beliefs, and loses its job if that bid is another
+arm's. After at most (diameter × the smaller number of arms and jobs) rounds all connected arms agree, and no job has
+two winners. The outcome is that of the greedy choice of the cheapest pair by a central auctioneer. Each component of a
+disconnected graph agrees separately.
+
+Source: Choi, Brunet & How (2009), Consensus-Based Decentralized Auctions for Robust Task Allocation, IEEE T-RO 25(4),
+algorithms 1 and 2 and theorem 1; here a bid is a cost, and the lower one wins.
 """
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
-from agents.heat_rules import Wsept
+from agents.heat import Wsept
+from agents.policy import WAIT
+from agents.rules import LeastDifficulty, least_difficult
+from agents.staleness import advantage
+from fleet.observation import Observation
+from fleet.robot import JOINTS
 
 Array = np.ndarray
 
@@ -70,3 +89,113 @@ class Auction(Wsept):
             return []
         won = auction(by_slot, self.relative_epsilon * float(by_slot.max()))
         return [(arm, slot * plans + int(best[arm, slot])) for arm, slot in won]
+
+
+_UNKNOWN = JOINTS + 1.0
+"""Cost of a feasible job without a score: above every score, because two scores differ by at most JOINTS."""
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """The best bid known for each job, and its bidder; leading axes [...] are those of the arms."""
+
+    cost: Array
+    """[..., job], inf without a bid."""
+    winner: Array
+    """Index of the arm, int [..., job], NOBODY without a bid. An arm has the job that it believes to have won."""
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Beliefs of the arms after the last round."""
+
+    belief: Belief
+    """[arm, job]."""
+    rounds: int
+    """Number of rounds in which some arm's belief changed."""
+
+    @property
+    def claims(self) -> Array:
+        """The job each arm has by its own belief, int [arm], NOBODY for none."""
+        won = self.belief.winner == np.arange(len(self.belief.winner))[:, None]
+        return np.where(won.any(axis=1), won.argmax(axis=1) if won.size else NOBODY, NOBODY)
+
+
+def bid(belief: Belief, cost: Array, me: Array | int) -> Belief:
+    """Beliefs after every arm without a job has bid for the cheapest one it can win; ties: the first job.
+
+    Args:
+        belief: [..., job].
+        cost: Of each job to the arm, [..., job], inf for infeasible ones.
+        me: Index of the arm, [...].
+    """
+    mine = np.asarray(me)[..., None]
+    better = (cost < belief.cost) | ((cost == belief.cost) & (mine < belief.winner))
+    idle = ~(belief.winner == mine).any(axis=-1, keepdims=True)
+    winnable = np.where(idle & better, cost, np.inf)
+    chosen = (winnable.argmin(axis=-1)[..., None] == np.arange(cost.shape[-1])) & np.isfinite(winnable)
+    return Belief(np.where(chosen, cost, belief.cost), np.where(chosen, mine, belief.winner))
+
+
+def merge(received: Belief) -> Belief:
+    """The best of the beliefs [..., sender, job] received by an arm, its own included; ties: the first arm."""
+    cost = received.cost.min(axis=-2)
+    none = np.iinfo(received.winner.dtype).max
+    winner = np.where(received.cost == cost[..., None, :], received.winner, none).min(axis=-2)
+    return Belief(cost, winner)
+
+
+def agree(cost: Array, links: Array) -> Agreement:
+    """Rounds of bids and messages until no arm's belief changes.
+
+    Args:
+        cost: Of each job to each arm, [arm, job], inf for infeasible ones.
+        links: Whether messages are delivered, bool, [receiver, sender].
+    """
+    arms, jobs = cost.shape
+    belief = Belief(np.full((arms, jobs), np.inf), np.full((arms, jobs), NOBODY))
+    if not jobs:
+        return Agreement(belief, 0)
+    received = (links | np.eye(arms, dtype=bool))[..., None]  # [receiver, sender, 1]
+    # Every change is a better bid for a job, or a forwarded bid, which bounds the rounds also with one-way links.
+    for rounds in range(arms * (jobs * arms + 1)):
+        sent = bid(belief, cost, np.arange(arms))
+        merged = merge(Belief(np.where(received, sent.cost, np.inf), np.where(received, sent.winner, NOBODY)))
+        if np.array_equal(merged.cost, belief.cost) and np.array_equal(merged.winner, belief.winner):
+            return Agreement(belief, rounds)
+        belief = merged
+    raise AssertionError("bids only improve, so the loop ends")
+
+
+class Consensus(LeastDifficulty):
+    """Arms bid their difficulty relative to the fleet's average, and agree on the allocation of jobs.
+
+    Scope arm. With messages from all peers an arm can compute the agreement alone: the choice of `least_difficulty`. In
+    simulation, `act` runs the rounds of bids along the links that delivered a message at this step, so distant arms
+    agree through the arms between them. Late messages do not count: arms without a link claim independently. Rounds
+    take no time and are not counted as messages.
+    """
+
+    only_choices = True
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """Each arm's claim after the last round."""
+        seen = list(observations.values())
+        cost = np.array([self._bids(obs, place) for place, obs in enumerate(seen)])
+        if not np.isfinite(cost).any():
+            return dict.fromkeys(observations, WAIT)
+        online = [(obs.peer_heard > 0) & (obs.peer_age_s <= 0) for obs in seen]
+        links = np.array([np.insert(row, place, False) for place, row in enumerate(online)], dtype=bool)
+        claims = agree(cost, links).claims.tolist()
+        return {
+            arm: WAIT if claim == NOBODY else least_difficult(observations[arm], claim) + 1
+            for arm, claim in zip(observations, claims, strict=True)
+        }
+
+    def _bids(self, observation: Observation, place: int) -> Array:
+        """Cost of each slot to this arm, [slot]; inf for those that it may not claim."""
+        legal = np.any(observation.action_mask[1:-1].reshape(len(observation.offered), -1), axis=1)
+        if not legal.any():
+            return np.full(len(legal), np.inf)
+        relative = advantage(observation, place, legal, self._trust)[place]
+        return np.where(legal, np.where(np.isnan(relative), _UNKNOWN, relative), np.inf).round(9)

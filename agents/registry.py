@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from fleet.errors import nearest
 
 if TYPE_CHECKING:  # slow to import, and the help of commands needs names only
-    from agents.heat_guards import Guard
+    from agents.heat import Guard
     from agents.policy import ArmPolicy, Policy
 
 

@@ -1,6 +1,22 @@
-"""Dispatching rules. Except `wspt_cool` they are non-idling: a free arm that may claim a job does so."""
+"""Dispatching rules. Except `wspt_cool` they are non-idling: a free arm that may claim a job does so.
+
+Cost of giving each job to each arm by each plan: matrices [arm, option] from the observations of all arms.
+
++inf where the arm may not claim the job. Lower is better, and only differences count.
+
+Central policies that assign jobs by a cost matrix [arm, option] of `agents.rules`.
+
+They may assign two jobs that share a station, or two plans that exclude each other. As with any claims, the arm with
+the lower difficulty then gets its job, and the other arm chooses again.
+
+Dispatching rules of the textbook, without heat: each is an index of jobs, or an order of arms.
+
+They are non-idling: a free arm that may claim a job does so. Source of all: Pinedo, Scheduling, 6th ed., Springer 2022,
+chapter 14.
+"""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -222,3 +238,285 @@ def _first_able(
                 if observations[arm].action_mask[option + 1]:
                     return arm, option
     return None, -1
+
+
+RISK = 9.0
+"""The cost of a job in which a motor surely passes its warning limit is 1 + RISK times its difficulty."""
+LATE_PER_H = 1.0
+"""Cost of an hour of tardiness for each unit of a job's value, in units of difficulty."""
+TIME_PER_H = 0.01
+"""Cost of an hour until the finish: it decides where difficulties are equal."""
+COST_DIGITS = 9
+"""Costs are rounded to this many digits, so that rounding errors do not break ties."""
+
+
+def thermal(observations: Sequence[Observation]) -> Array:
+    """Difficulty weighted by risk, relative to the fleet's average for that job; late and valuable jobs come first.
+
+    The difficulty is weighted by 1 + RISK · P(saturation). As in `agents.rules.LeastDifficulty` it is relative to the
+    average of the arms that may claim the job, and an unknown difficulty equals that average. If no arm has a
+    difficulty, the risk decides, then the time until the finish.
+    """
+    able, one = _able(observations), observations[0]
+    difficulty, known = _stack(observations, "difficulty"), _stack(observations, "known") > 0
+    difficulty = np.where(known, difficulty, _mean(difficulty, known & able, one, otherwise=1.0))
+    tardiness_s = np.maximum(0.0, _busy_s(observations) - _stack(observations, "slack_s"))
+    late = LATE_PER_H * per_option(one, _stack(observations, "value")) * tardiness_s / 3600.0
+    time = TIME_PER_H * _finish_s(observations) / 3600.0
+    cost = difficulty * (1.0 + RISK * _stack(observations, "p_saturation")) + late + time
+    # Waiting makes a job late for every arm: the average lateness decides between jobs, not between arms.
+    return np.where(able, cost - _mean(cost, able, one) - _mean(late, able, one), np.inf).round(COST_DIGITS)
+
+
+def quickest(observations: Sequence[Observation]) -> Array:
+    """Seconds until the arm would finish the job; heat is ignored."""
+    return np.where(_able(observations), _finish_s(observations), np.inf).round(COST_DIGITS)
+
+
+def _able(observations: Sequence[Observation]) -> Array:
+    """Whether the arm may claim the job now, bool, [arm, option]."""
+    return np.stack([seen.action_mask[1:-1] for seen in observations]) > 0
+
+
+def _finish_s(observations: Sequence[Observation]) -> Array:
+    """Seconds until the arm would finish the job, after its current one, [arm, option]."""
+    return _busy_s(observations) + _stack(observations, "duration_s")
+
+
+def _busy_s(observations: Sequence[Observation]) -> Array:
+    return np.array([[float(seen.busy_s)] for seen in observations])
+
+
+def _stack(observations: Sequence[Observation], field: str) -> Array:
+    return np.stack([np.asarray(getattr(seen, field), dtype=float) for seen in observations])
+
+
+def _mean(values: Array, where: Array, one: Observation, otherwise: float = 0.0) -> Array:
+    """Average over some of the arms and the plans of a job, [option]; the same for all plans of a job.
+
+    Args:
+        one: Any observation of the fleet.
+    """
+    plans = plans_of(one)
+    total = np.where(where, values, 0.0).sum(axis=0).reshape(-1, plans).sum(axis=1)
+    count = where.sum(axis=0).reshape(-1, plans).sum(axis=1)
+    return per_option(one, np.where(count > 0, total / np.maximum(count, 1), otherwise))
+
+
+class Ssi(Stateless):
+    """Sequential single-item auction: greedy, the cheapest pair of arm and job first.
+
+    Scope central: it compares the costs of all arms.
+    """
+
+    scope: ClassVar = "central"
+    only_choices = True
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of the pairs of arm and job."""
+        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
+            return dict.fromkeys(observations, WAIT)
+        seen = list(observations.values())
+        return claims_of(observations, self.pairs(self.cost(seen), plans_of(seen[0])))
+
+    def cost(self, observations: Sequence[Observation]) -> Array:
+        """[arm, option] of the observations of all arms."""
+        return thermal(observations)
+
+    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
+        """Pairs (arm, option) of a cost matrix [arm, option]."""
+        return cheapest_pairs(cost, plans)
+
+
+class Matching(Ssi):
+    """As many jobs as possible at the least total cost: an optimal matching of arms and jobs.
+
+    Scope central: it compares the costs of all arms.
+    """
+
+    only_choices = True
+
+    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
+        """Pairs (arm, option) of a cost matrix [arm, option]."""
+        return matched_options(cost, plans)
+
+
+class QuickestSsi(Ssi):
+    """As `ssi`, by the time until the finish alone. Scope central."""
+
+    only_choices = True
+
+    def cost(self, observations: Sequence[Observation]) -> Array:
+        """[arm, option] of the observations of all arms."""
+        return quickest(observations)
+
+
+class QuickestMatching(QuickestSsi, Matching):
+    """As `matching`, by the time until the finish alone. Scope central."""
+
+    only_choices = True
+
+
+class Ahead:
+    """Base of assignments in which arms that are home soon take part, by the time until they would finish.
+
+    A pair of such an arm claims nothing: its job waits for it, and the next decision finds it free or makes another
+    plan. The arm's predicted peak is that from its present temperatures. Whether its space will be free is unknown:
+    `space_free` of an arm at work is always 0.
+    """
+
+    soon_s: ClassVar = 120.0
+    """Longest time until such an arm is home."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of the pairs whose arm is free."""
+        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
+            return dict.fromkeys(observations, WAIT)
+        actions = super().act({arm: self._soon(seen) for arm, seen in observations.items()})  # pyright: ignore
+        return {arm: action if observations[arm].action_mask[action] else WAIT for arm, action in actions.items()}
+
+    def _soon(self, seen: Observation) -> Observation:
+        """The observation of an arm that is home soon, with the claims that it could make and their times then."""
+        if not (seen.working and seen.busy_s <= self.soon_s):
+            return seen
+        mask = seen.action_mask.copy()
+        mask[1:-1] = (seen.feasible > 0) & (per_option(seen, seen.station_free) > 0)
+        late_s = float(seen.busy_s)
+        return replace(
+            seen,
+            action_mask=mask,
+            busy_s=np.zeros_like(seen.busy_s),
+            duration_s=seen.duration_s + late_s,
+            slack_s=seen.slack_s - late_s,
+        )
+
+
+class MatchingAhead(Ahead, Matching):
+    """As `matching`, with arms that are home soon as well. Scope central, as `matching`."""
+
+    only_choices = True
+
+
+def matched_options(cost: Array, plans: int) -> list[tuple[int, int]]:
+    """As `matching`, pairs (arm, option) of a cost matrix [arm, option]: each arm has the cheapest plan for its job."""
+    by_slot = cost.reshape(len(cost), -1, plans)
+    best = by_slot.argmin(axis=2)
+    return [(arm, slot * plans + int(best[arm, slot])) for arm, slot in matching(by_slot.min(axis=2))]
+
+
+def matching(cost: Array) -> list[tuple[int, int]]:
+    """The cheapest of the largest matchings of a cost matrix [arm, slot], as pairs (arm, slot); inf is never paired.
+
+    Source: Kuhn 1955; Crouse 2016 for rectangular matrices.
+    """
+    from scipy.optimize import linear_sum_assignment  # slow import that few processes need
+
+    allowed = np.isfinite(cost)
+    if not allowed.any():
+        return []
+    cost = cost - cost[allowed].min()
+    # More than any saving elsewhere, so that a forbidden pair is the last resort.
+    forbidden = (cost[allowed].max() + 1.0) * (min(cost.shape) + 1)
+    rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden))
+    return [(a, j) for a, j in zip(rows.tolist(), columns.tolist(), strict=True) if allowed[a, j]]
+
+
+TIME_DIGITS = 1
+"""Due dates of a job by different arms are equal up to rounding; decimals of a second that count."""
+
+
+class Fifo(IndexRule):
+    """First in, first out: the oldest job of the queue first, to the arm that needs the least time for it.
+
+    Scope central: it compares the arms' times.
+    """
+
+    only_choices = True
+
+    def index(self, seen: Observation) -> Array:
+        """Place in the queue from its end, then the shorter duration, [option]."""
+        return _first_by(per_option(seen, np.arange(len(seen.offered))), seen.duration_s)
+
+
+class Edd(IndexRule):
+    """Earliest due date first, to the arm that needs the least time for the job.
+
+    Optimal for the largest lateness on one machine (Jackson 1955). Scope central: it compares the arms' times.
+    """
+
+    only_choices = True
+
+    def index(self, seen: Observation) -> Array:
+        """Minus the time until the due date, then the shorter duration, [option]."""
+        return _first_by((seen.slack_s.astype(float) + seen.duration_s).round(TIME_DIGITS), seen.duration_s)
+
+
+class Spt(QuickestSsi):
+    """Shortest processing time first: the claims of `quickest_ssi`, whose arms are all free when they claim.
+
+    Optimal for the sum of completion times on one machine (Smith 1956). Scope central: it compares the arms' times.
+    """
+
+    only_choices = True
+
+
+class Atc(IndexRule):
+    """Apparent tardiness cost: value per time, discounted by exp(−slack / (k · mean duration)) until the slack is 0.
+
+    Without slack it is `wspt`; with much slack the less urgent job waits. Scope central: it compares the arms' times.
+
+    Source: Vepsalainen & Morton, Management Science 33, 1987; k = 2 as there for little congestion.
+    """
+
+    only_choices = True
+    look_ahead: ClassVar = 2.0
+    """k."""
+
+    def index(self, seen: Observation) -> Array:
+        """Value per second times urgency, [option]."""
+        duration_s, legal = np.maximum(seen.duration_s, 1.0).astype(float), seen.action_mask[1:-1] > 0
+        mean_s = duration_s[legal].mean() if legal.any() else 1.0
+        urgency = np.exp(-np.maximum(seen.slack_s, 0.0) / (self.look_ahead * mean_s))
+        return per_option(seen, seen.value) / duration_s * urgency
+
+
+class LeastLoaded:
+    """The oldest job goes to the able arm with the least working time in this shift, by the durations of its claimed
+    plans.
+
+    Scope central: it compares the work of all arms. The observation does not contain the work so far, so the rule adds
+    the durations of its claims; a claim that lost is subtracted.
+    """
+
+    scope: ClassVar = "central"
+    only_choices = False
+    """A lost claim becomes known in the next interval."""
+
+    def __init__(self) -> None:
+        self.reset(np.random.default_rng(0))
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift: no arm has worked."""
+        self._load_s: dict[str, float] = {}
+        self._claimed_s: dict[str, float] = {}
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """One pass over the slots from the oldest job; each goes to the able arm with the least working time."""
+        for arm, claimed_s in self._claimed_s.items():
+            if arm in observations and observations[arm].last_award < 0:
+                self._load_s[arm] -= claimed_s
+        self._claimed_s = {}
+        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
+            return dict.fromkeys(observations, WAIT)
+        actions = oldest_jobs_to(sorted(observations, key=lambda arm: self._load_s.get(arm, 0.0)), observations)
+        self._claimed_s = {
+            arm: float(observations[arm].duration_s[action - 1]) for arm, action in actions.items() if action != WAIT
+        }
+        for arm, claimed_s in self._claimed_s.items():
+            self._load_s[arm] = self._load_s.get(arm, 0.0) + claimed_s
+        return actions
+
+
+def _first_by(first: Array, then: Array) -> Array:
+    """Index by one quantity and, where it is equal, by another; less is better, and both are below 10⁶."""
+    return -(first.astype(float) * 1e6 + then)

@@ -23,17 +23,17 @@ from typing import Any
 
 import zenoh
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router, open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest, Submission
 from fleet.bus.protocol.messages import State, encode
+from fleet.bus.router import Router, open_client
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, Awarded
-from fleet.live.auction.round import Timing
+from fleet.live.auction.rounds import Timing
 from fleet.live.journal import Journal
-from scenarios.live.allocation import CentralAllocation
+from scenarios.live.auctioneer import CentralAllocation
 from scenarios.policy_loader import policy_at
 
 FLEET = "bench"

@@ -26,11 +26,11 @@ from result_tables import channel_table
 
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.files import atomic_path, cache_folder
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.shift import run
-from scenarios.schema import Scenario
-from scenarios.specs import RunSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import RunSpec
+from scenarios.spec.schema import Scenario
 
 FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "heard")
 

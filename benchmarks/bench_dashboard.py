@@ -23,13 +23,13 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import auction as bus
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.cell import Cell, CellArm, CellRequest
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.bus.router import Router
 
 FLEET, JOBS = "bench", 16
 GOAL_CORE, GOAL_MB = 0.25, 150.0

@@ -22,19 +22,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.assignment import Ssi
-from agents.consensus import Consensus
-from agents.mpc import Mpc
+from agents.auction import Consensus
+from agents.planners import Mpc, RollingHorizon
 from agents.policy import Planner
 from agents.registry import RULES
-from agents.rolling_horizon import RollingHorizon
+from agents.rules import Ssi
 from fleet.env.lookahead import Lookahead
 from fleet.observation import Layout, Observation
 from scenarios.evaluate.hindsight import ShiftSimulator
-from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, scope_of
-from scenarios.prepare.fleet import ShiftFactory, prepare
-from scenarios.prepare.known_cell import simulator_of_shift
+from scenarios.prepare.fleet import ShiftFactory, prepare, simulator_of_shift
+from scenarios.spec.jobs import weights_of
 from scenarios.suite.splits import instance
 
 PLANS = 2

@@ -16,12 +16,11 @@ from collections.abc import Callable
 import numpy as np
 import zenoh
 
-from fleet.bus.client.router import open_client
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.protocol import Broadcast
+from fleet.bus.exchange.memory import Broadcast, MemoryExchange
 from fleet.bus.exchange.zenoh import ZenohExchange, messages_of
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import encode
+from fleet.bus.router import open_client
 
 SLOTS = 8
 WARM_UP = 5

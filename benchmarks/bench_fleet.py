@@ -25,7 +25,7 @@ from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
-from fleet.bus.client.client import BusClient, Replies
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -43,8 +43,8 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import State, encode
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.live.fleet_processes import PROGRAM, free_port
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare
+from scenarios.spec.load import load
 
 FLEET, DEALER = "bench", "dealer"
 TARGET = 0.04

@@ -15,10 +15,10 @@ import statistics
 import time
 from multiprocessing.connection import Connection
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router, open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, encode
+from fleet.bus.router import Router, open_client
 
 FLEET = "bench"
 SLOTS = 8

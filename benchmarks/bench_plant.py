@@ -24,11 +24,11 @@ import mujoco
 import numpy as np
 
 from agents.registry import make_policy
+from fleet.arm.plant import MujocoPlant
 from fleet.engine.shift import StepRecord
 from fleet.engine.state import State
-from fleet.physics.mujoco_plant import MujocoPlant
-from scenarios.load import load
 from scenarios.prepare.fleet import ShiftFactory, env_of, prepare
+from scenarios.spec.load import load
 
 TICKS = 20
 RUNS = 9

@@ -26,13 +26,13 @@ import pyarrow.parquet as pq
 from result_tables import live_table, steps_table
 
 from agents.registry import RULES
-from fleet.env.validation import Decisions
+from fleet.env.allocation_v1 import Decisions
 from fleet.files import atomic_path
-from scenarios.load import library, load
 from scenarios.policy_loader import label, policy_at, scope_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.shift import run
-from scenarios.specs import DifficultyName, RunSpec
+from scenarios.spec.load import library, load
+from scenarios.spec.options import DifficultyName, RunSpec
 
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 PATIENCE_S = 120.0

@@ -17,11 +17,11 @@ from dataclasses import replace
 from typing import TypeVar
 
 from fleet.job import Place
-from scenarios.load import load
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.shift import run
-from scenarios.schema import ArmSpec, Scenario
-from scenarios.specs import RunSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import RunSpec
+from scenarios.spec.schema import ArmSpec, Scenario
 
 HOURS = 8
 RUNS = 3

@@ -18,16 +18,16 @@ from pathlib import Path
 import numpy as np
 
 from agents.registry import RULES
-from fleet.physics.contacts import ContactFinder
-from fleet.physics.models import build_cell
-from fleet.planning.space import space_table
+from fleet.arm.cell import ContactFinder
+from fleet.arm.model import build_cell
+from fleet.arm.space import space_table
 from fleet.robot import Mount, Robot
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.statistics import interval
-from scenarios.load import library, load
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.shift import run
-from scenarios.specs import RunSpec
+from scenarios.spec.load import library, load
+from scenarios.spec.options import RunSpec
 
 SIXTEEN = 4
 """Cells of four arms that stand beside each other, for the larger table."""

@@ -20,15 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.replies import Replies
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest, JobSpec, Submission, SubmissionReply
 from fleet.live.supervisor import Supervisor
 from scenarios.live.fleet_processes import free_port, parts_of
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare
-from scenarios.specs import LiveSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import LiveSpec
 
 SCENARIO, START_S, REPLY_S, EXPIRES_S = "quickstart", 60.0, 5.0, 2.0
 """Real seconds: to start a process, to wait for a reply, and until a job expires."""

@@ -19,11 +19,10 @@ from pathlib import Path
 
 import zenoh
 
-from fleet.bus.client.rate_limits import Limits
-from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol import keys
+from fleet.bus.router import Limits, Router, open_client
 from fleet.bus.security.access_control import of_arms
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 
 ARMS = [f"arm_{i}" for i in range(16)]

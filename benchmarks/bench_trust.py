@@ -16,10 +16,10 @@ from rich.table import Table
 from sklearn.metrics import average_precision_score, roc_auc_score
 
 from scenarios.cli.terminal import progress_bar
-from scenarios.load import load
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
-from twin.saturation.reliability import brier, reliability
+from scenarios.spec.load import load
+from twin.p_saturation import brier, reliability
 
 POLICY = "round_robin"
 UNKNOWN = 0.5

@@ -29,14 +29,12 @@ from joblib import Parallel, delayed
 from torch import Tensor
 
 from fleet.motion import RATE_HZ
-from twin.vae.checkpoint import save
 from twin.vae.config import TwinConfig
 from twin.vae.inference import reconstruct
 from twin.vae.model import LstmVae, build, weights_of
 from twin.vae.onnx import export_onnx
-from twin.vae.run import Run
-from twin.vae.train import SIDE_BY_SIDE, Motion, train, train_all
-from twin.vae.twin import Fit, Twin
+from twin.vae.train import SIDE_BY_SIDE, Motion, Run, train, train_all
+from twin.vae.twin import Fit, Twin, save
 from twin.vae.window import Scaler, cut, resample, starts
 
 JOINTS = 7

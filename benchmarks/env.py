@@ -25,13 +25,11 @@ from pathlib import Path
 import numpy as np
 
 from fleet.engine.tables import Tables
-from fleet.env.buffers import keep_pages
 from fleet.env.random_actions import random_legal
-from fleet.env.vector import BatchEnv, Library
-from scenarios.load import load
-from scenarios.prepare.fleet import env_of, prepare
-from scenarios.run.batch import Randomisation, library_of
-from scenarios.specs import DifficultyName
+from fleet.env.vector import BatchEnv, Library, keep_pages
+from scenarios.prepare.fleet import Randomisation, env_of, library_of, prepare
+from scenarios.spec.load import load
+from scenarios.spec.options import DifficultyName
 
 WINDOWS, SHIFT = 3, 720
 PEERS = Path(__file__).parent / "peers.py"

@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 if TYPE_CHECKING:  # imported from the code under test when it runs
-    from scenarios.specs import DifficultyName
+    from scenarios.spec.options import DifficultyName
 
 SCENARIOS = ("quickstart", "active_waiting", "heat_wave")
 POLICIES = ("random", "round_robin", "coolest_first", "least_difficulty", "consensus", "wspt", "wspt_cool")

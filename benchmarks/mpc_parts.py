@@ -1,6 +1,6 @@
 """Variants of `mpc` without discount, search or heat, for `thermofleet compare`; docs/policies.md has the command."""
 
-from agents.mpc import Mpc
+from agents.planners import Mpc
 from agents.policy import Lookahead
 
 OUT_OF_REACH_C = 1e6

@@ -34,15 +34,14 @@ import numpy as np
 import torch
 from result_tables import course, trainings
 
-from fleet.engine.reward import RewardWeights
+from fleet.engine.batch import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs, random_legal
 from scenarios.evaluate.rollout import Act, rollout
-from scenarios.fault_price import weights_of
 from scenarios.json_rows import Rows
-from scenarios.load import load
-from scenarios.prepare.fleet import Fleet, env_of, prepare
-from scenarios.run.batch import library_of
+from scenarios.prepare.fleet import Fleet, env_of, library_of, prepare
 from scenarios.run.provenance import code_hash
+from scenarios.spec.jobs import weights_of
+from scenarios.spec.load import load
 from scenarios.train.networks import rule_actions
 
 Array = np.ndarray

@@ -36,13 +36,10 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.job_rules import MAX_OPEN_JOBS
-from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord
-from fleet.live.auction.round import Assignment, Bidding, Timing
-from fleet.live.journal import Journal
-from fleet.live.journal_records import EpochBegun
-from fleet.live.journal_upkeep import TimeRecorder
+from fleet.live.auction.rounds import Assignment, Bidding, SendAward, Timing
+from fleet.live.journal import EpochBegun, Journal, TimeRecorder
 
 WEEK_S = 7 * 24 * 3600.0
 BATCH, BACKLOG = 10, 200

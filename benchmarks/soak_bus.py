@@ -17,9 +17,7 @@ from pathlib import Path
 import numpy as np
 from soak import BACKLOG, BATCH, PLAN, first_come, read_options, rss_mb
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.replies import Replies
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -37,6 +35,7 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State
+from fleet.bus.router import Router
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord
 from fleet.live.journal import Journal

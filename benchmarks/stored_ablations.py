@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from scenarios.evaluate.rollout import COUNTS, POSSIBLE
-from scenarios.evaluate.tables import Figure, figures_of
+from scenarios.evaluate.statistics import Figure, figures_of
 
 Array = np.ndarray
 Shift = tuple[int, int, int]

@@ -7,25 +7,24 @@ from math import prod
 from typing import Any
 
 from agents.registry import RULES, WRAPPERS
-from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol import messages
 from fleet.bus.protocol.auction import MOST_JOBS, ArmEvent
-from fleet.bus.protocol.contract import Schema, descriptions, schemas
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES, Schema, descriptions, schemas
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.protocol.registry import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, Channel, MessageType
-from fleet.engine.reward import RewardWeights
+from fleet.bus.router import Limits
+from fleet.engine.batch import RewardWeights
 from fleet.events import MEANINGS
 from fleet.job import BOUNDS, LONGEST_GRASP_S, LONGEST_JOB_S
-from fleet.live.arm.award_executor import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
+from fleet.live.arm.awards import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
 from fleet.live.auction.job_rules import MAX_OPEN_JOBS
-from fleet.live.auction.round import Timing
+from fleet.live.auction.rounds import Timing
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 from scenarios.cli.main import COMMANDS, load_command
-from scenarios.schema import RewardSpec
 from scenarios.show.table import markdown_table as table
+from scenarios.spec.schema import RewardSpec
 
 
 def _key_table() -> str:

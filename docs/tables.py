@@ -22,7 +22,7 @@ sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "docs")) if path not in 
 
 from reference_tables import TABLES as REFERENCE
 
-from agents.learned.training_log import read_log
+from agents.learned.evolution import read_log
 from benchmarks.paper.__main__ import study
 from benchmarks.result_tables import (
     bold_if,
@@ -39,10 +39,7 @@ from benchmarks.result_tables import (
 )
 from benchmarks.stored_ablations import FIGURES as ABLATION_FIGURES
 from benchmarks.stored_ablations import stored
-from fleet.bus.protocol.contract import (
-    asyncapi,
-    schema_document,
-)
+from fleet.bus.protocol.contract import asyncapi, schema_document
 from fleet.errors import FleetError
 from scenarios.evaluate.comparison import HEADINGS
 from scenarios.evaluate.leaderboard import BASELINE, SOURCE, Submission, benchmark_tables, read_all, split_references
@@ -51,7 +48,7 @@ from scenarios.evaluate.statistics import Interval, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
 from scenarios.show.table import markdown_table as table
-from scenarios.suite.cells import CELLS
+from scenarios.suite.instances import CELLS
 from scenarios.suite.splits import instance
 
 Array = np.ndarray

@@ -54,7 +54,7 @@ class Kernel:
     """A function that Python calls, compiled or not.
 
     Args:
-        function: Its arguments are arrays, scalars, named tuples of them, and bundles (`fleet.engine.bundle`).
+        function: Its arguments are arrays, scalars, named tuples of them, and bundles (`fleet.engine.tables`).
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -89,7 +89,18 @@ def kernel(function: Callable[..., Any]) -> Kernel:
 
 def compiled_sources() -> tuple[Path, ...]:
     """Files whose functions are compiled, or whose constants are compiled into functions."""
-    names = ("jit", "arrivals", "seeding", "motor", "difficulty", "robot", "telemetry", "thermal", "observation", "job")
+    names = (
+        "jit",
+        "arrivals",
+        "seeding",
+        "heat/motor",
+        "difficulty",
+        "robot",
+        "telemetry",
+        "heat/thermal",
+        "observation",
+        "job",
+    )
     return (*(_PACKAGE / f"{name}.py" for name in names), *sorted((_PACKAGE / "engine").glob("*.py")))
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet.heat.motor import Motors, friction_heat, reference_current
 from fleet.job import Work
-from fleet.motor import Motors, friction_heat, reference_current
 
 Array = np.ndarray
 

@@ -6,10 +6,10 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from fleet.heat.motor import Motors, gen3_motors
+from fleet.heat.thermal import NODES, WINDING, ThermalModel, advance, drive_heat, gen3_network, thermal_model
 from fleet.motion import Drive, Plan, drives
-from fleet.motor import Motors, gen3_motors
 from fleet.robot import JOINTS
-from fleet.thermal import NODES, WINDING, ThermalModel, advance, drive_heat, gen3_network, thermal_model
 
 Array = np.ndarray
 

@@ -5,8 +5,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from scenarios.prepare.fleet import make_batch as make_batch
     from scenarios.prepare.fleet import make_env as make_env
-    from scenarios.run.batch import make_batch as make_batch
 
 __all__ = ["make_batch", "make_env"]
 
@@ -17,9 +17,8 @@ def __getattr__(name: str) -> Any:  # one of several functions
         raise AttributeError(f"module 'scenarios' has no attribute '{name}'.")
     import_module("scenarios.prepare.env_registration")
     from scenarios.prepare import fleet
-    from scenarios.run import batch
 
-    return batch.make_batch if name == "make_batch" else fleet.make_env
+    return fleet.make_batch if name == "make_batch" else fleet.make_env
 
 
 if "pettingzoo" in sys.modules:  # `pettingzoo.make` then knows the environment

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from fleet.env.render.scene import Cell, mount_kind
+from fleet.env.render.floor_plan import Cell, mount_kind
 from fleet.errors import ScenarioError
-from scenarios.schema import Scenario
+from scenarios.spec.schema import Scenario
 
 
 def cell_of(scenario: Scenario) -> Cell:

@@ -15,8 +15,8 @@ from types import ModuleType
 
 import numpy as np
 
-from agents.heat_guards import guarded
-from agents.pair_scores import PAIRS, load_pairs
+from agents.heat import guarded
+from agents.pairs import PAIRS, load_pairs
 from agents.policy import SCOPES, ArmPolicy, Local, Planner, Policy, for_all_arms, no_simulator
 from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
 from fleet.bus.protocol.keys import ENDPOINT
@@ -261,7 +261,7 @@ def _maker(name: str, bus: OnBus, depth: int = 0) -> Callable[[], Policy] | Call
     if _is_folder(name) and _has_pairs(name):
         return lambda: load_pairs(Path(name))
     if _is_folder(name):
-        from agents.learned.policy import load_policy  # loads torch
+        from agents.learned.policy import load_policy
 
         return lambda: load_policy(Path(name))
     return _made_by(name)[0]

@@ -27,8 +27,8 @@ IMPORTED = (
     *("scenarios.cli.main", "scenarios.cli.look", "scenarios.cli.run", "scenarios.cli.live", "scenarios.cli.jobs"),
     *("scenarios.run.shift", "scenarios.run.run_folder", "scenarios.prepare.fleet"),
     *("scenarios.live.arm", "scenarios.live.auctioneer", "scenarios.live.requests", "scenarios.show.watch"),
-    *("fleet.live.arm.node", "fleet.live.auction.node", "fleet.env.allocation_v1", "fleet.planning.planner"),
-    *("fleet.bus.client.router", "pyarrow.parquet", "numba", "scipy.optimize"),
+    *("fleet.live.arm.node", "fleet.live.auction.node", "fleet.env.allocation_v1", "fleet.arm.planner"),
+    *("fleet.bus.router", "pyarrow.parquet", "numba", "scipy.optimize"),
 )
 """Modules that commands import."""
 _LARGEST = 1 << 18

@@ -15,21 +15,20 @@ import numpy as np
 import pytest
 
 from fleet.difficulty import Difficulty, DifficultyModel
-from fleet.engine.batch import Shift
+from fleet.engine.batch import RewardWeights, Shift
 from fleet.engine.profile_plant import ProfilePlant
-from fleet.engine.reward import RewardWeights
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
 from fleet.engine.world import Arm, Space, build_world
 from fleet.env.allocation_v1 import Episode
 from fleet.env.lookahead import CellSimulator
 from fleet.env.vector import BatchEnv, Library
+from fleet.heat.motor import Motors, gen3_motors
+from fleet.heat.thermal import ThermalModel, gen3_network, thermal_model
 from fleet.job import Job, Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
-from fleet.motor import Motors, gen3_motors
 from fleet.robot import JOINTS, Robot, ThermalLimits
 from fleet.seeding import key_of
-from fleet.thermal import ThermalModel, gen3_network, thermal_model
 from tests import profiles  # noqa: F401 -- loads the profile of Hypothesis
 from tests.commands import start_server
 

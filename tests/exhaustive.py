@@ -4,8 +4,7 @@ from itertools import product
 
 import numpy as np
 
-from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.reward import RewardWeights
+from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.state import DONE, State, World
 from fleet.engine.tables import tables_of
 from fleet.observation import Layout

@@ -6,20 +6,25 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson
 
-from fleet.heat.insulation import CLASSES, GEN3_INSULATION, Insulation, arrhenius_rate, life_used, montsinger_rate
-from fleet.heat.tool_drift import (
+from fleet.arm.cell import cell_model
+from fleet.arm.model import ArmModel
+from fleet.heat.effects import (
     ALUMINIUM_PER_K,
+    CLASSES,
+    GEN3_INSULATION,
     GEN3_SEGMENTS_M,
     SEGMENTS,
+    Insulation,
+    arrhenius_rate,
     drift_m,
+    life_used,
+    montsinger_rate,
     most_drift_m,
     segment_temperatures,
 )
-from fleet.physics.cell_model import cell_model
-from fleet.physics.models import ArmModel
+from fleet.heat.thermal import HOUSING, NODES, WINDING
 from fleet.robot import JOINTS, Mount, Robot
-from fleet.thermal import HOUSING, NODES, WINDING
-from scenarios.run.heat_use import HeatUse
+from scenarios.run.metrics import HeatUse
 
 ARM = Robot(name="arm", mount=Mount())
 

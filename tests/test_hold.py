@@ -12,12 +12,12 @@ from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
 
 from fleet.errors import FleetError
-from fleet.motor import gen3_motors, reference_current
+from fleet.heat.motor import gen3_motors, reference_current
+from fleet.heat.thermal import NODES, drive_heat, gen3_network, thermal_model
 from fleet.robot import JOINTS, POSTURES
-from fleet.thermal import NODES, drive_heat, gen3_network, thermal_model
 from scenarios.cli.main import app
 from scenarios.motion.hold import LIMITS_C, HoldError, as_json, as_table, courses, hold
-from scenarios.motion.posture import PostureError
+from scenarios.motion.recover import PostureError
 
 J2, J4 = 1, 3
 

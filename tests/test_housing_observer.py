@@ -6,9 +6,8 @@ from scipy.integrate import solve_ivp
 
 from fleet.engine.shift import step
 from fleet.engine.state import initial
-from fleet.housing_observer import housing_observer
-from fleet.motor import gen3_motors
-from fleet.thermal import HOUSING, WINDING, gen3_network, thermal_model
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import HOUSING, WINDING, gen3_network, housing_observer, thermal_model
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
 

@@ -17,9 +17,9 @@ from fleet.errors import FleetError, ScenarioError
 from fleet.job import Job, Place, Work
 from fleet.robot import Mount
 from scenarios.live.requests import explain
-from scenarios.load import load
-from scenarios.parse import parse_scenario
-from scenarios.schema import Scenario
+from scenarios.spec.load import load
+from scenarios.spec.parse import parse_scenario
+from scenarios.spec.schema import Scenario
 
 ALLOWED = {
     "payload_kg": (0, 10),

@@ -8,12 +8,12 @@ import pytest
 
 from agents.registry import RULES
 from fleet.robot import JOINTS
-from scenarios.job_stream import all_works
-from scenarios.load import library, load
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.run_folder import telemetry_table
 from scenarios.run.shift import run
-from scenarios.specs import RunSpec
+from scenarios.spec.jobs import all_works
+from scenarios.spec.load import library, load
+from scenarios.spec.options import RunSpec
 
 FILES = (Path(__file__).parents[1] / "scenarios" / "library").glob("*.toml")
 NAMES = sorted(path.stem for path in FILES)

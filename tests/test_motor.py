@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.motor import (
+from fleet.heat.motor import (
     copper_loss,
     current,
     friction_heat,

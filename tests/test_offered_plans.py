@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import NODES, WINDING, gen3_network, simulate_temperatures, thermal_model
 from fleet.motion import drives
-from fleet.motor import gen3_motors
 from fleet.offered_plans import COOLER_K, offered_plans, predicted_rise
-from fleet.thermal import NODES, WINDING, gen3_network, simulate_temperatures, thermal_model
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
 

@@ -199,7 +199,7 @@ def test_the_wheel_is_what_is_imported_there(elsewhere):
 def test_the_wheel_brings_its_data(elsewhere):
     program = """
 from importlib.resources import files
-for package, path in (("fleet", "physics/assets/gen3.xml"), ("fleet", "data/gen3_thermal.json")):
+for package, path in (("fleet", "arm/assets/gen3.xml"), ("fleet", "data/gen3_thermal.json")):
     assert files(package).joinpath(path).is_file(), path
 print(*sorted(f.name for f in files("scenarios").joinpath("library").iterdir() if f.name.endswith(".toml")))
 """

@@ -15,10 +15,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from fleet.motion import Drive
-from fleet.motor import Motors, gen3_motors, reference_current
-from fleet.robot import JOINTS
-from fleet.thermal import (
+from fleet.heat.motor import Motors, gen3_motors, reference_current
+from fleet.heat.thermal import (
     HOUSING,
     NODES,
     WINDING,
@@ -32,6 +30,8 @@ from fleet.thermal import (
     thermal_model,
     winding,
 )
+from fleet.motion import Drive
+from fleet.robot import JOINTS
 
 MODEL = thermal_model(gen3_network())
 MOTORS = gen3_motors()

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.motor import Motors, copper_loss, friction_heat, gen3_motors
+from fleet.heat.motor import Motors, copper_loss, friction_heat, gen3_motors
+from fleet.heat.thermal import HOUSING, WINDING, gen3_network, node_heat, thermal_model
 from fleet.robot import JOINTS
-from fleet.thermal import HOUSING, WINDING, gen3_network, node_heat, thermal_model
 from twin.logs.reader import read, read_folder
 from twin.logs.recording import Recording, interval_current_sq, interval_speed
 

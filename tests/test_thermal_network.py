@@ -5,9 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fleet.motor import Motors, gen3_motors
-from fleet.robot import COOLING, JOINTS, Cooling
-from fleet.thermal import (
+from fleet.heat.motor import Motors, gen3_motors
+from fleet.heat.thermal import (
     HOUSING,
     NODES,
     WINDING,
@@ -21,6 +20,7 @@ from fleet.thermal import (
     thermal_model,
     winding,
 )
+from fleet.robot import COOLING, JOINTS, Cooling
 
 MODEL = thermal_model(gen3_network())
 MOTORS = gen3_motors()

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.heat.touch import burn_threshold_c, seconds_above, surface_c
+from fleet.heat.effects import burn_threshold_c, seconds_above, surface_c
 from fleet.robot import JOINTS
-from scenarios.run.heat_use import HeatUse
+from scenarios.run.metrics import HeatUse
 
 TEMPERATURES = st.floats(20.0, 80.0)
 

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleet.errors import FleetError
-from twin.logs.recording import Recording
-from twin.logs.resampling import GAP_S, Stretch, stretches
+from twin.logs.recording import GAP_S, Recording, Stretch, stretches
 
 Array = np.ndarray
 

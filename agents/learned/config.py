@@ -7,7 +7,7 @@ from fleet.fields import MAX_SEED, check, option
 
 Algorithm = Literal["mappo", "ippo"]
 Decisions = Literal["interval", "events"]
-"""As in `fleet.env.validation`, which agents do not import."""
+"""As in `fleet.env.allocation_v1`, which agents do not import."""
 LONGEST_S = 1e7
 """Longest horizon of a discount, 116 days."""
 

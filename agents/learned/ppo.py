@@ -6,11 +6,13 @@ only on steps at which an arm has a choice.
 
 Steps may differ in length, so the process is a semi-Markov one: discounts go by the time that a step took (Bradtke &
 Duff, NeurIPS 1994; Sutton, Precup & Singh, Artificial Intelligence 1999).
+
+Warm start of a training: the actor imitates a rule before it learns by reinforcement.
 """
 
 import pickle
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +30,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from agents.learned.config import PpoConfig
-from agents.learned.features import has_choice
-from agents.learned.network import Actor, Critic, masked
-from agents.learned.policy import draw
+from agents.learned.policy import Actor, Critic, draw, has_choice, masked
 from agents.policy import WAIT
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
@@ -275,3 +275,46 @@ class Trainer:
         except (RuntimeError, KeyError, ValueError, EOFError, pickle.UnpicklingError) as error:
             raise CheckpointError(f"{path}: the training cannot be resumed ({error}).") from error
         return saved
+
+
+Array = np.ndarray
+
+
+def imitate(
+    actor: Actor,
+    layout: Layout,
+    batches: Iterable[tuple[Array, Array, Array]],
+    rng: np.random.Generator,
+    *,
+    epochs: int = 4,
+    minibatch: int = 512,
+    learning_rate: float = 2e-3,
+) -> list[float]:
+    """Learn the actions of a rule by cross-entropy.
+
+    Args:
+        batches: Vectors float32 [row, size], masks [row, action] and actions int [row]; rows without a choice are
+            ignored.
+
+    Returns:
+        Mean cross-entropy of each batch in its last epoch, nat.
+    """
+    optimizer = torch.optim.Adam(actor.parameters(), lr=learning_rate)
+    batch_means: list[float] = []
+    for vectors, masks, actions in batches:
+        choice = has_choice(masks, layout.read(vectors, masks).headroom_k)
+        if not choice.any():
+            continue
+        seen, legal, chosen = (torch.from_numpy(np.ascontiguousarray(a[choice])) for a in (vectors, masks, actions))
+        losses: list[float] = []
+        for _ in range(epochs):
+            losses = []
+            for rows in np.array_split(rng.permutation(len(seen)), -(-len(seen) // minibatch)):
+                at = torch.from_numpy(rows)
+                loss = nn.functional.cross_entropy(masked(actor(layout, seen[at]), legal[at]), chosen[at].long())
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+                losses.append(float(loss.detach()))
+        batch_means.append(float(np.mean(losses)))
+    return batch_means

@@ -54,8 +54,8 @@ from random_faults import GAP_S, KILL, Figures, run
 from trespass import trespass
 from wall_clock import clock_jump
 
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare
+from scenarios.spec.load import load
 
 FAULTS = {
     "kill-arm": Fault(kill_arm),

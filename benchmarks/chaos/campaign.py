@@ -12,18 +12,17 @@ from namespaces import Namespaces
 from partition import Proxy
 from wall_clock import WallClocks
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
+from fleet.bus.router import open_client
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.certificates import HERE
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import HERE, make
 from fleet.bus.security.tls import Tls
 from fleet.live.supervisor import Supervisor
 from scenarios.live.fleet_processes import free_port, parts_of
-from scenarios.load import load
-from scenarios.specs import LiveSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import LiveSpec
 
 START_S = 60.0
 LATE_REPORTS_S = 10.0

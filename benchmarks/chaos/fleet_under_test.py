@@ -13,7 +13,7 @@ from pathlib import Path
 import zenoh
 from journal_files import JournalFiles
 
-from fleet.bus.client.client import BusClient
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobStatus, Result, Status, StatusRequest
 from fleet.bus.protocol.messages import State

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from fleet.live.arm.journal_records import ArmRecord, Closed, JobsFinished
+from fleet.live.arm.awards import ArmRecord, Closed, JobsFinished
 
 
 class _Line(msgspec.Struct):

@@ -25,18 +25,17 @@ from mesh_parts import FLEET, SCENARIO, job_of, names_of
 from namespaces import Namespaces, unavailable_reason
 from partition import CUT_S, Proxy
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, JobStatus, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.router import open_client
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.certificates import HERE
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import HERE, make
 from fleet.bus.security.tls import Tls
 from fleet.live.supervisor import Backoff, Part, Supervisor
 from scenarios.live.fleet_processes import PROGRAM, free_port
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare
+from scenarios.spec.load import load
 
 PARTS = Path(__file__).with_name("mesh_parts.py")
 START_S, BACK_S, LATE_REPORTS_S, AT_ONCE = 300.0, 120.0, 20.0, 64

@@ -13,22 +13,22 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from fleet.bus.client.client import BusClient
+from fleet.bus.client import BusClient
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.security.tls import Tls
 from fleet.job import Work
-from fleet.live.arm.journal_records import ArmRecord
+from fleet.live.arm.awards import ArmRecord
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.round import Timing
+from fleet.live.auction.rounds import Timing
 from fleet.live.journal import Journal
 from scenarios.cli.signals import Stop, until_stopped
-from scenarios.live.allocation import CentralAllocation
 from scenarios.live.arm import PreparedArm, make_node, simulated_arm
-from scenarios.load import load
+from scenarios.live.auctioneer import CentralAllocation
 from scenarios.policy_loader import policy_at
 from scenarios.progress import quiet
+from scenarios.spec.load import load
 
 SCENARIO, FLEET = "quickstart", "mesh"
 CELL = 4

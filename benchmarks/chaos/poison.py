@@ -23,7 +23,7 @@ from fleet.bus.protocol.auction import (
     Submission,
 )
 from fleet.bus.protocol.consensus import Bid, Claim
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode, encoding
 from fleet.bus.protocol.operator import ClearRequest
 

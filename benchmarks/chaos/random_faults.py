@@ -34,7 +34,7 @@ from processes import (
 )
 from wall_clock import clock_jump
 
-from fleet.bus.client.replies import Replies
+from fleet.bus.client import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, JobSpec, JobState, Status, StatusRequest, Submission, SubmissionReply
 from scenarios.live.recording import read_parts

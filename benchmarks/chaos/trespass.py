@@ -19,7 +19,6 @@ import zenoh
 from fleet_under_test import Fleet
 from malformed import awards_of
 
-from fleet.bus.client.router import open_client
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Award,
@@ -35,9 +34,9 @@ from fleet.bus.protocol.auction import (
     Submission,
 )
 from fleet.bus.protocol.messages import Refusal, State, encode, encoding
+from fleet.bus.router import open_client
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.certificates import issue
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 
 ROGUE = "rogue"

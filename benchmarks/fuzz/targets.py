@@ -16,20 +16,19 @@ import numpy as np
 
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.security.access_control import read_roster
 from fleet.errors import FleetError, visible
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord
+from fleet.live.arm.awards import ArmHistory, ArmRecord
 from fleet.live.auction.ledger import AuctionRecord
-from fleet.live.consensus.records import GrantRecord
+from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.journal import Journal
-from scenarios.live.http_app import read_tokens
+from scenarios.live.gateway import read_tokens
 from scenarios.live.requests import read_jobs
-from scenarios.load import library
-from scenarios.parse import parse_toml
-from twin.logs.formats import GEN3, PLAIN
-from twin.logs.reader import read
+from scenarios.spec.load import library
+from scenarios.spec.parse import parse_toml
+from twin.logs.reader import GEN3, PLAIN, read
 
 logging.disable(logging.CRITICAL)
 KINDS = tuple(EXAMPLES)
@@ -194,7 +193,7 @@ def log_seeds() -> Iterator[bytes]:
 def checkpoint(data: bytes) -> None:
     """Cards and weights of twins; the first byte says which file."""
     from twin.thermal import checkpoint as thermal
-    from twin.vae import checkpoint as vae
+    from twin.vae import twin as vae
 
     place = folder() / "twin"
     place.mkdir(exist_ok=True)
@@ -217,7 +216,7 @@ def checkpoint(data: bytes) -> None:
 @cache
 def twin_files() -> tuple[bytes, bytes]:
     """Card and weights of a small twin."""
-    from twin.vae import checkpoint as vae
+    from twin.vae import twin as vae
     from twin.vae.config import TwinConfig
     from twin.vae.train import train
 
@@ -232,7 +231,7 @@ def twin_files() -> tuple[bytes, bytes]:
 def checkpoint_seeds() -> Iterator[bytes]:
     """Files that can be loaded."""
     from twin.thermal import checkpoint as thermal
-    from twin.thermal.result import Identified, Parameter, nominal_heat_model
+    from twin.thermal.identify import Identified, Parameter, nominal_heat_model
 
     one = Parameter(name="c", joint=1, value=1.0, low=0.5, high=2.0, prior=1.0, prior_sd=0.2, sd=0.1)
     rest = {"ambient_c": 25.0, "ambient_sd_k": 1.0, "source": "torque", "memory_s": (1.0,) * 7, "seconds": 9.0}

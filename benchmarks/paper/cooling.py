@@ -28,17 +28,17 @@ from benchmarks.paper.harness import (
     seeds_of,
 )  # fmt: skip
 from benchmarks.result_tables import difference
-from fleet.motor import thermal_data
+from fleet.heat.motor import thermal_data
+from fleet.heat.thermal import ThermalModel, gen3_network, housing, in_series, modal_model, winding
 from fleet.robot import COOLING, JOINTS, Cooling, ThermalLimits
-from fleet.thermal import ThermalModel, gen3_network, housing, in_series, modal_model, winding
 from scenarios.evaluate.comparison import figures_of_shifts
 from scenarios.evaluate.rollout import Outcome, outcomes
 from scenarios.json_rows import Row
 from scenarios.motion.hold import hold
 from scenarios.prepare.fleet import prepare
-from scenarios.schema import Scenario
-from scenarios.schema_errors import choose
-from scenarios.specs import DifficultyName
+from scenarios.spec.options import DifficultyName
+from scenarios.spec.parse import choose
+from scenarios.spec.schema import Scenario
 
 Array = np.ndarray
 

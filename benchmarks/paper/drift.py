@@ -22,17 +22,16 @@ from benchmarks.paper.harness import (
 )
 from benchmarks.paper.subjects import SHORT, Study, sensed, usual_study, with_steps
 from benchmarks.paper.transfer import continue_training
+from fleet.heat.motor import Motors
+from fleet.heat.thermal import ThermalModel, thermal_model
 from fleet.motion import Plan
-from fleet.motor import Motors
 from fleet.seeding import child
-from fleet.thermal import ThermalModel, thermal_model
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
-from scenarios.prepare.cool_motion import cold_peaks, records
-from scenarios.prepare.planned_arm import ArmHardware
-from scenarios.prepare.simulated_logs import own_logs
-from twin.thermal.identify import identify
-from twin.thermal.parameters import HeatModel
+from scenarios.prepare.arms import ArmHardware
+from scenarios.prepare.identify import own_logs
+from scenarios.prepare.twins import cold_peaks, records
+from twin.thermal.identify import HeatModel, identify
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Measures
 from twin.vae.train import train

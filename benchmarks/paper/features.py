@@ -31,17 +31,17 @@ from benchmarks.paper.harness import (
     seeded,
 )
 from benchmarks.paper.subjects import SHORT, USUAL, Jobs, Sample, Study, jobs_of, sensed, usual_study, with_steps
+from fleet.arm.model import ArmModel
+from fleet.arm.random_motions import light_jobs
 from fleet.errors import FleetError
+from fleet.heat.motor import Motors
 from fleet.motion import Plan
-from fleet.motor import Motors
-from fleet.physics.models import ArmModel
-from fleet.planning.random_motions import light_jobs
 from fleet.seeding import child
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.motion.generate import MOST_DRAWS, GenerationError, Verification, propose
-from scenarios.prepare.cool_motion import cold_peaks, records
-from twin.baselines.reconstruction import untrained_config
+from scenarios.prepare.twins import cold_peaks, records
+from twin.baselines import untrained_config
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.twin import Twin

@@ -21,10 +21,10 @@ from joblib import delayed
 
 from fleet.errors import FleetError
 from scenarios.json_rows import Row, Rows
-from scenarios.load import load
 from scenarios.processes import worker_processes
 from scenarios.progress import brief
-from scenarios.schema import Scenario
+from scenarios.spec.load import load
+from scenarios.spec.schema import Scenario
 
 KeyedRows = Iterable[tuple[str, Mapping[str, Any]]]
 

@@ -15,9 +15,8 @@ from benchmarks.paper.harness import Table, seeded
 from benchmarks.paper.subjects import CARRIER, LABELS, Jobs, Study, cached_twin, detection, jobs_of, usual_study
 from fleet.motion import CHANNELS, Plan
 from scenarios.json_rows import Row
-from scenarios.prepare.simulated_logs import LOGS, identify_from_work
-from twin.baselines.reconstruction import untrained_config
-from twin.baselines.torque import torque_over_known
+from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
+from twin.baselines import torque_over_known, untrained_config
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Features
@@ -128,7 +127,7 @@ def scorers_of(study: Study, config: TwinConfig, seed: np.random.SeedSequence) -
     twin, untrained, collapsed = (
         cached_twin(motion, each, seed) for each in (config, untrained_config(config), collapsed_config(config))
     )
-    arm = identify_from_work(study.hardware, study.train.plans[:LOGS], rng, ambient_c=study.ambient_c)
+    arm = identify_from_work(study.hardware, study.train.plans[:SIMULATED_LOGS], rng, ambient_c=study.ambient_c)
     nominal, identified = (
         replace(each, warning_c=study.warning_c)
         for each in (RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c), RcTwin.of(arm))

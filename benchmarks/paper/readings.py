@@ -36,19 +36,18 @@ from benchmarks.paper.harness import (
     whole,
 )
 from benchmarks.paper.subjects import ALARM_RATE, SCENARIOS, Sample, Study, arm_of, cached_twin, jobs_of, make_study
+from fleet.arm.model import ArmModel
 from fleet.errors import FleetError
 from fleet.motion import Plan
-from fleet.physics.models import ArmModel
 from scenarios.evaluate.statistics import Interval, mean_by_group
 from scenarios.json_rows import Row
 from scenarios.motion.generate import Rejected, planned
-from scenarios.prepare.cool_motion import cold_peaks
-from scenarios.schema import Scenario
-from twin.conformal import largest_p_value, p_value
-from twin.saturation.reliability import wilson
+from scenarios.prepare.twins import cold_peaks
+from scenarios.spec.schema import Scenario
+from twin.p_saturation import wilson
 from twin.vae.config import TwinConfig
 from twin.vae.generate import Variation, vary
-from twin.vae.measures import TAU, Calibration, Features
+from twin.vae.measures import TAU, Calibration, Features, largest_p_value, p_value
 from twin.vae.twin import Twin
 
 Array = np.ndarray

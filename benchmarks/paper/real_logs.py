@@ -26,24 +26,16 @@ from benchmarks.paper.subjects import CARRIER
 from fleet.difficulty import difficulty_of_error
 from fleet.errors import FleetError, LogError
 from fleet.files import cache_folder
+from fleet.heat.thermal import HOUSING, WINDING
 from fleet.motion import CHANNELS
 from fleet.robot import JOINTS
-from fleet.thermal import HOUSING, WINDING
 from scenarios.evaluate.statistics import Interval, percentile_interval
 from scenarios.json_rows import Row
-from scenarios.prepare.train_twins import train_or_load
-from scenarios.prepare.twin_folder import LOG_INPUT
-from twin.logs.heat_log import heat_logs
+from scenarios.prepare.twins import LOG_INPUT, train_or_load
 from twin.logs.reader import read_folder
-from twin.logs.recording import READINGS, Recording
-from twin.logs.resampling import Stretch, stretches
-from twin.thermal.forecast import continued_peaks, planned_peaks
-from twin.thermal.identify import identify
-from twin.thermal.kalman import filter_log
-from twin.thermal.least_squares import Noise, Problem
-from twin.thermal.parameters import HeatModel, ParameterVector
-from twin.thermal.result import Identified
-from twin.thermal.thermal_twin import RcTwin
+from twin.logs.recording import READINGS, Recording, Stretch, heat_logs, stretches
+from twin.thermal.identify import HeatModel, Identified, Noise, ParameterVector, Problem, identify
+from twin.thermal.thermal_twin import RcTwin, continued_peaks, filter_log, planned_peaks
 from twin.training_data import cool_stretches
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Calibration, Features

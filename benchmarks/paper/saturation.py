@@ -32,21 +32,18 @@ from benchmarks.paper.subjects import Study, alarm_threshold, cached_twin, raise
 from fleet.difficulty import SETTLING_S
 from fleet.engine.shift import StepRecord
 from fleet.events import Event
+from fleet.heat.thermal import WINDING
 from fleet.robot import ThermalLimits
-from fleet.thermal import WINDING
 from scenarios.evaluate.sources import drawn
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
-from scenarios.prepare.fleet import Fleet, env_of, prepare
-from scenarios.prepare.known_cell import let_plan
-from scenarios.prepare.simulated_history import PastJobs, experience, past_jobs
-from scenarios.prepare.simulated_logs import LOGS, identify_from_work
-from scenarios.schema import Scenario
-from scenarios.schema_errors import choose
-from scenarios.specs import RISK, RiskName
-from twin.saturation.fit import Experience, fit_saturation
-from twin.saturation.model import EVIDENCE, METHODS
-from twin.saturation.reliability import brier, reliability
+from scenarios.prepare.calibrate import PastJobs, experience, past_jobs
+from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
+from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
+from scenarios.spec.options import RISK, RiskName
+from scenarios.spec.parse import choose
+from scenarios.spec.schema import Scenario
+from twin.p_saturation import EVIDENCE, METHODS, Experience, brier, fit_saturation, reliability
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.twin import Twin
 
@@ -132,7 +129,7 @@ def judge_twin(work: PastWork, twin: Twin) -> tuple[dict[str, Row], dict[str, Ro
 def judge_networks(work: PastWork) -> dict[str, Row]:
     """Prediction of the nominal thermal network, and of one identified from logs of some of the labelled jobs."""
     study, rng = work.study, np.random.default_rng([work.seed, 9])
-    logged = [work.jobs.plans[i] for i in work.fit[:LOGS]]
+    logged = [work.jobs.plans[i] for i in work.fit[:SIMULATED_LOGS]]
     arm = identify_from_work(study.hardware, logged, rng, ambient_c=study.ambient_c)
     nominal = RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c)
     return {"rc nominal": judge_network(nominal, work), "rc identified": judge_network(RcTwin.of(arm), work)}

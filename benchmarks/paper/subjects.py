@@ -16,20 +16,19 @@ from scipy.stats import spearmanr
 from sklearn.metrics import average_precision_score, roc_auc_score
 
 from benchmarks.paper.harness import scenarios_of
+from fleet.arm.random_motions import light_jobs, random_jobs
 from fleet.errors import FleetError
 from fleet.files import cache_folder
+from fleet.heat.motor import Motors, friction_torque, gen3_motors
+from fleet.heat.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.motion import CHANNELS, Phase, Plan, distinct
-from fleet.motor import Motors, friction_torque, gen3_motors
-from fleet.planning.random_motions import light_jobs, random_jobs
 from fleet.robot import JOINTS, Robot, ThermalLimits
 from fleet.seeding import child
-from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
-from scenarios.prepare.cool_motion import cold_peaks, records
-from scenarios.prepare.planned_arm import ArmHardware
-from scenarios.prepare.train_twins import train_or_load
-from scenarios.schema import Scenario
-from twin.conformal import allowed, fewest
+from scenarios.prepare.arms import ArmHardware
+from scenarios.prepare.twins import cold_peaks, records, train_or_load
+from scenarios.spec.schema import Scenario
 from twin.vae.config import TwinConfig
+from twin.vae.measures import allowed, fewest
 from twin.vae.twin import Twin
 from twin.vae.window import windows_of
 

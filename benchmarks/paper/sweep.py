@@ -49,11 +49,10 @@ from fleet.errors import FleetError, nearest
 from fleet.motion import RATE_HZ, Plan
 from scenarios.evaluate.statistics import Interval, mean_by_group
 from scenarios.json_rows import Row
-from scenarios.prepare.cool_motion import records
-from twin.vae.config import TwinConfig
+from scenarios.prepare.twins import records
+from twin.vae.config import RECIPE, TwinConfig
 from twin.vae.model import one_thread
 from twin.vae.train import Motion, train, train_all
-from twin.vae.training_key import RECIPE
 from twin.vae.twin import Twin
 from twin.vae.window import cut_jobs, windows_of
 

@@ -49,16 +49,13 @@ from fleet.robot import Mount, Robot
 from fleet.seeding import child
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
-from scenarios.prepare.cool_motion import records
-from scenarios.prepare.simulated_logs import own_logs
-from twin.logs.recording import Recording
-from twin.logs.resampling import stretches
+from scenarios.prepare.identify import own_logs
+from scenarios.prepare.twins import records
+from twin.logs.recording import Recording, stretches
 from twin.training_data import cool_stretches
-from twin.vae.config import TwinConfig
+from twin.vae.config import TwinConfig, hash_records, seed_text
 from twin.vae.model import one_thread
-from twin.vae.run import Run
-from twin.vae.train import train
-from twin.vae.training_key import hash_records, seed_text
+from twin.vae.train import Run, train
 from twin.vae.twin import Twin
 from twin.vae.window import Scaler, draw_windows, windows_of
 

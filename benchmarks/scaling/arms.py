@@ -47,11 +47,10 @@ def measure(arms: int, most_in_hall: int) -> dict[str, object]:
     from hall import hall
 
     from agents.registry import make_policy
+    from fleet.arm.space import space_table
     from fleet.env.vector import BatchEnv
-    from fleet.planning.space import space_table
-    from scenarios.load import load
-    from scenarios.prepare.fleet import prepare
-    from scenarios.run.batch import Randomisation, library_of
+    from scenarios.prepare.fleet import Randomisation, library_of, prepare
+    from scenarios.spec.load import load
 
     halls = -(-arms // most_in_hall)
     own_arms, costs = arms // halls, dict[str, float]()
@@ -93,7 +92,7 @@ def _shift(env: Any, policy: Any, seed: int) -> tuple[float, float]:  # modules 
     import numpy as np
 
     from agents.policy import only_choices
-    from fleet.env.validation import actions_of
+    from fleet.env.allocation_v1 import actions_of
 
     obs, _ = env.reset(seed=[seed])
     over, engine_s, matching_s, lazy = False, 0.0, 0.0, only_choices(policy)

@@ -5,18 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from agents.assignment import Matching
 from agents.policy import WAIT, plans_of
-from fleet.env.validation import actions_of
+from agents.rules import Matching
+from fleet.env.allocation_v1 import actions_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.observation import Observation
 from scenarios.evaluate.statistics import interval
-from scenarios.fault_price import weights_of
-from scenarios.load import load
-from scenarios.prepare.fleet import prepare
-from scenarios.run.batch import Randomisation, library_of
-from scenarios.run.outcome import common_figures
-from scenarios.specs import DifficultyName
+from scenarios.prepare.fleet import Randomisation, library_of, prepare
+from scenarios.run.metrics import common_figures
+from scenarios.spec.jobs import weights_of
+from scenarios.spec.load import load
+from scenarios.spec.options import DifficultyName
 
 Array = np.ndarray
 ASKED = (1, 2, 3, 4, 6, 8)

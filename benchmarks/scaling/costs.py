@@ -17,13 +17,13 @@ from typing import Any
 
 from load import JOINTS, estimate_of, job_of, quote_of, state_of
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Quote, QuoteRequest
 from fleet.bus.protocol.messages import State
+from fleet.bus.router import Router
 from fleet.bus.security.access_control import of_arms
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 
 FLEET, PATIENCE_S, PERIOD_S = "f", 60.0, 0.1

@@ -3,8 +3,8 @@
 import json
 from dataclasses import asdict
 
-from scenarios.schema import ArrivalSpec, JobStream, Scenario, Spread, TwinSpec
-from scenarios.suite.layouts import layout_of
+from scenarios.spec.schema import ArrivalSpec, JobStream, Scenario, Spread, TwinSpec
+from scenarios.suite.instances import layout_of
 
 SHOWN = ("name", "position_m", "tilt_deg", "home")
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from fleet.bus.protocol.auction import LEASE_S, Ack, Award, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
 from fleet.bus.protocol.messages import State, encode
 from fleet.bus.protocol.registry import STATE_HZ
-from fleet.live.arm.award_executor import RENEWALS
-from fleet.live.auction.round import Timing
+from fleet.live.arm.awards import RENEWALS
+from fleet.live.auction.rounds import Timing
 
 JOB_S = 340.0
 """Real seconds between two jobs of an arm: quickstart has one job in 85 s for four arms."""

@@ -1,4 +1,4 @@
-"""A simulated bus: the calls of `fleet.bus.client.client.BusClient` on a `World`.
+"""A simulated bus: the calls of `fleet.bus.client.BusClient` on a `World`.
 
 Messages are passed as objects; some are encoded and decoded on their way, as a check of the contract. A subscriber with
 history gets what its publisher has cached, in order and once, as soon as both reach each other, but for `MISSED`.
@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 from world import Process, Sleep, World
 
-from fleet.bus.client.replies import AnotherReplies, Replies
+from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import decode_as, encode, encoding
 from fleet.bus.protocol.registry import channel_for

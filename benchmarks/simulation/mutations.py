@@ -8,20 +8,15 @@ from mutation import add_mutation, unwritten
 
 from fleet.errors import JournalError
 from fleet.live import journal as journal_module
-from fleet.live.arm.award_executor import AwardExecutor
-from fleet.live.arm.journal_records import ArmHistory, AwardAccepted
-from fleet.live.auction import round as round_module
+from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor
+from fleet.live.auction import rounds as round_module
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.past_jobs import PastJobs
-from fleet.live.auction.records import Awarded
-from fleet.live.auction.round import Timing
-from fleet.live.auction.writer import LedgerWriter
-from fleet.live.consensus.claimant import Claimant
-from fleet.live.consensus.granter import Granter
-from fleet.live.consensus.records import JobGranted
-from fleet.live.journal import Journal
-from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted
+from fleet.live.auction.records import Awarded, PastJobs
+from fleet.live.auction.rounds import LedgerWriter, Timing
+from fleet.live.consensus.grants import Claimant, Granter
+from fleet.live.consensus.jobs import JobGranted
+from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, Journal
 from fleet.live.supervisor import Supervisor
 
 

@@ -24,20 +24,17 @@ from fleet.errors import BusError
 from fleet.live import journal as journal_module
 from fleet.live import supervisor as supervisor_module
 from fleet.live.arm import node as arm_module
-from fleet.live.arm.auctioneer_client import AuctioneerClient
-from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord
-from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor, ExecutorConfig
+from fleet.live.arm.node import ArmConfig, ArmNode, AuctioneerClient
 from fleet.live.auction import ledger as ledger_module
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord
-from fleet.live.auction.round import Allocate, Timing
-from fleet.live.consensus import settled_jobs
+from fleet.live.auction.rounds import Allocate, Timing
+from fleet.live.consensus import jobs
+from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
-from fleet.live.consensus.records import GrantRecord
-from fleet.live.journal import Journal
-from fleet.live.journal_upkeep import CompactingJournal
+from fleet.live.journal import CompactingJournal, Journal
 from fleet.live.space import Excludes
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.live.arm import fleet_clock, restart_history
@@ -270,7 +267,7 @@ def simulated_system(world: World) -> Iterator[None]:
     replace(supervisor_module, "threading", SimpleNamespace(Thread=Thread, Event=threading.Event))
     replace(journal_module, "COMPACT_BYTES", 5_000)  # so that both happen in a short shift
     replace(ledger_module, "MAX_SETTLED", 5)
-    replace(settled_jobs, "MAX_SETTLED", 5)
+    replace(jobs, "MAX_SETTLED", 5)
     replace(arm_module, "plan_key", lambda plan: plan.space)
     replace(arm_module, "space_name", str)
     try:

@@ -33,7 +33,7 @@ from fleet.bus.protocol.operator import (
 )
 from fleet.job import reason_to_give_up
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.round import Assignment, Timing
+from fleet.live.auction.rounds import Assignment, Timing
 from fleet.live.consensus.participant import Membership
 from fleet.live.space import ANYWHERE, Excludes
 from fleet.robot import ThermalLimits

@@ -8,8 +8,7 @@ from mutation import add_mutation, unwritten
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
 from fleet.errors import Refused
 from fleet.live.auction import auctioneer as auctioneer_module
-from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.ledger_view import LedgerView
+from fleet.live.auction.ledger import Ledger, LedgerView
 from fleet.live.auction.records import Operated
 from fleet.live.journal import Journal
 from scenarios.live import recorder as recorder_module

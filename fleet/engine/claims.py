@@ -9,9 +9,19 @@ An arm takes the space of its whole plan from the award until it is home again, 
 
 import numpy as np
 
-from fleet.engine.event_log import AWARD, EXPIRE, ILLEGAL, LOST, EventBuffer, record_event
 from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State
-from fleet.engine.tables import Jobs, OpenJobs, Simulation, Tables
+from fleet.engine.tables import (
+    AWARD,
+    EXPIRE,
+    ILLEGAL,
+    LOST,
+    EventBuffer,
+    Jobs,
+    OpenJobs,
+    Simulation,
+    Tables,
+    record_event,
+)
 from fleet.jit import jit, jit_inline, nonnegative
 from fleet.telemetry import IDLE, WORKING
 

@@ -1,7 +1,7 @@
 """Exact moments at which a motor crosses a temperature limit within a step, and the step that contains one.
 
 Under constant heat the network's temperatures are T(t) = M (y + (exp(−λt) − 1)(y − z/λ)) with M = C^(−1/2) V,
-y = Vᵀ C^(1/2) T₀ and z = Vᵀ C^(−1/2) (P + g Ta), λ and V the rates and modes of `fleet.thermal.ThermalModel`.
+y = Vᵀ C^(1/2) T₀ and z = Vᵀ C^(−1/2) (P + g Ta), λ and V the rates and modes of `fleet.heat.thermal.ThermalModel`.
 """
 
 import math
@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.engine.tables import Tables
+from fleet.heat.thermal import NODES
 from fleet.jit import jit, jit_inline
 from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED
-from fleet.thermal import NODES
 
 Array = np.ndarray
 

@@ -1,7 +1,7 @@
 """What every arm knows at a moment: one observation vector per arm of many envs.
 
 `fleet.observation` says what the fields mean. Peers are those of this moment; where messages take time or get lost,
-`fleet.engine.peers` replaces the peers' fields by what was delivered.
+`fleet.engine.shift` replaces the peers' fields by what was delivered.
 """
 
 import numpy as np

@@ -8,12 +8,12 @@ import numpy as np
 from fleet.engine.shift import StepRecord
 from fleet.engine.state import State, World
 from fleet.events import Event
+from fleet.heat.motor import current
+from fleet.heat.thermal import HOUSING, WINDING
 from fleet.motion import RATE_HZ, Drive, Plan
-from fleet.motor import current
 from fleet.robot import JOINTS
 from fleet.seeding import random_normal
 from fleet.telemetry import FAULTED, IDLE, WORKING, Telemetry
-from fleet.thermal import HOUSING, WINDING
 
 Array = np.ndarray
 

@@ -9,13 +9,12 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from fleet.difficulty import Forecast
-from fleet.housing_observer import HousingObserver
+from fleet.heat.motor import Motors
+from fleet.heat.thermal import NODES, HousingObserver, ThermalModel
 from fleet.job import MOST_FAULTS
 from fleet.motion import Drive
-from fleet.motor import Motors
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import IDLE
-from fleet.thermal import NODES, ThermalModel
 
 Array = np.ndarray
 

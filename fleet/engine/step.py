@@ -9,27 +9,29 @@ import numpy as np
 
 from fleet.engine.claims import give_up, resolve_claims, return_to_queue, update_offers
 from fleet.engine.crossings import hottest, step_with_crossing
-from fleet.engine.event_log import (
+from fleet.engine.observe import observe
+from fleet.engine.state import DONE, GIVEN_UP, WAITING
+from fleet.engine.tables import (
     FAULT,
     FINISH,
     GIVE_BACK,
     GIVE_UP,
     HOME,
+    LANES,
     MOVED,
     RECOVER,
     RETURN,
     WARNING,
+    WIDE,
+    Simulation,
     record_event,
 )
-from fleet.engine.observe import observe
-from fleet.engine.state import DONE, GIVEN_UP, WAITING
-from fleet.engine.tables import LANES, WIDE, Simulation
+from fleet.heat.motor import magnet_factor, winding_heat
+from fleet.heat.thermal import NODES
 from fleet.jit import jit, jit_inline, kernel, nonnegative
 from fleet.job import MOST_FAULTS
-from fleet.motor import magnet_factor, winding_heat
 from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED, IDLE, WORKING
-from fleet.thermal import NODES
 
 Array = np.ndarray
 
@@ -42,7 +44,7 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
     """Take every arm of some envs through one step.
 
     Args:
-        weights: Reward per unit of each term, [term], in the order of `fleet.engine.reward.TERMS`.
+        weights: Reward per unit of each term, [term], in the order of `fleet.engine.batch.TERMS`.
         terms: Receives the reward terms and their sum, [env, term + 1].
         rows: Envs, int [row].
     """

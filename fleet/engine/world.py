@@ -8,13 +8,21 @@ import numpy as np
 
 from fleet.difficulty import Difficulty, DifficultyModel, Forecast, stack_forecasts
 from fleet.engine.state import JobTable, Offers, PlanTable, World
-from fleet.housing_observer import HousingObserver, housing_observer
+from fleet.heat.motor import Motors, gen3_motors, stack_motors
+from fleet.heat.thermal import (
+    HOUSING,
+    HousingObserver,
+    ThermalModel,
+    gen3_network,
+    housing_observer,
+    stack_models,
+    steady_state,
+    thermal_model,
+)
 from fleet.job import Job, Work, check_precedence
 from fleet.motion import Drive, Plan, drive
-from fleet.motor import Motors, gen3_motors, stack_motors
 from fleet.offered_plans import PLANS, offered_plans
 from fleet.robot import GEN3, Robot, ThermalLimits
-from fleet.thermal import HOUSING, ThermalModel, gen3_network, stack_models, steady_state, thermal_model
 
 Array = np.ndarray
 Space = Callable[[Sequence[Plan]], tuple[Array, Array]]

@@ -1,4 +1,8 @@
-"""Thermal job allocation, version 1: arms claim jobs, heat up, and must not fault.
+"""Seeds, counts and actions as callers give them, checked alike wherever they are given.
+
+Spaces of one arm, for the single environment and the batch.
+
+Thermal job allocation, version 1: arms claim jobs, heat up, and must not fault.
 
 A PettingZoo `ParallelEnv` as a thin view of the one engine `fleet.engine.step`. Agents are the arms, fixed for the
 whole episode. At every step each answers Discrete(slots · plans + 2): 0 waits or goes on and is always legal,
@@ -7,7 +11,9 @@ back after the present cycle. Of two claims for one job, station or space the lo
 index.
 """
 
-from typing import Any, Literal, get_args
+from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Any, Literal, TypeGuard, get_args
 
 import numpy as np
 from gymnasium import spaces
@@ -15,22 +21,151 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.protocol import Exchange
-from fleet.engine.reward import TERMS, RewardWeights
+from fleet.bus.exchange.memory import Exchange, MemoryExchange
+from fleet.engine.batch import TERMS, RewardWeights
 from fleet.engine.shift import Episode as Episode
 from fleet.engine.shift import EpisodeFactory as EpisodeFactory
 from fleet.engine.shift import ShiftRunner, Watch
 from fleet.engine.state import State, World
 from fleet.env.lookahead import CellSimulator, Lookahead
-from fleet.env.render.renderer import Renderer
-from fleet.env.render.scene import Cell
-from fleet.env.spaces import arm_spaces, spaces_like
-from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, decisions_of, seed_of
+from fleet.env.render.floor_plan import Cell
+from fleet.env.render.picture import Renderer
 from fleet.events import Event
+from fleet.heat.thermal import WINDING
 from fleet.observation import Layout, Observation
 from fleet.telemetry import MODES
-from fleet.thermal import WINDING
+
+Decisions = Literal["interval", "events"]
+"""Length of a step: one decision interval, or until an arm may claim a job."""
+
+_LARGEST = 2**62
+
+
+def seed_of(seed: object) -> np.random.SeedSequence:
+    """The seed of a shift, of any size.
+
+    Raises:
+        ValueError: no integer, or one below 0.
+    """
+    if not _whole(seed) or seed < 0:
+        raise ValueError(f"seed must be an integer >= 0 (got {seed!r}).")
+    return np.random.SeedSequence(int(seed))
+
+
+def seeds_of(seed: object, envs: int) -> list[np.random.SeedSequence]:
+    """The seeds of a batch: counted up from one, or one each, or by chance where there is none.
+
+    Raises:
+        ValueError: neither one seed nor one for each env.
+    """
+    if seed is None:
+        return np.random.SeedSequence().spawn(envs)
+    if _whole(seed):
+        return [seed_of(int(seed) + e) for e in range(envs)]  # as a uint8, 255 + 1 would be 0
+    if isinstance(seed, list | tuple | range | np.ndarray) and np.shape(seed) == (envs,):
+        return [seed_of(each) for each in seed]
+    raise ValueError(f"seed must be one integer or one for each of {envs} envs (got {seed!r}).")
+
+
+def at_least_one(name: str, value: object) -> int:
+    """A count.
+
+    Raises:
+        ValueError: no integer, or one below 1.
+    """
+    if not _whole(value) or value < 1 or value > _LARGEST:
+        raise ValueError(f"{name} must be an integer >= 1 (got {value!r}).")
+    return int(value)
+
+
+def switch(name: str, value: object) -> bool:
+    """A choice of yes or no.
+
+    Raises:
+        ValueError: neither.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False (got {value!r}).")
+    return bool(value)
+
+
+def decisions_of(value: object) -> Decisions:
+    """The length of a step.
+
+    Raises:
+        ValueError: none of the allowed ones.
+    """
+    for each in get_args(Decisions):
+        if value == each:
+            return each
+    raise ValueError(f"decisions must be one of {', '.join(map(repr, get_args(Decisions)))} (got {value!r}).")
+
+
+def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:
+    """What each agent does, int64 [agent]; one that is left out waits.
+
+    Raises:
+        ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
+    """
+    if not isinstance(actions, Mapping):
+        raise ValueError(f"step() takes a dictionary of agents and their actions (got {actions!r}).")
+    chosen = np.zeros(len(agents), dtype=np.int64)
+    found = 0
+    for a, agent in enumerate(agents):
+        if agent in actions:
+            chosen[a] = _integer(agent, actions[agent])
+            found += 1
+    if found < len(actions):
+        agent_of(agents, next(iter(sorted(set(actions) - set(agents), key=str))))
+    return chosen
+
+
+def agent_of(agents: Sequence[str], agent: object) -> str:
+    """An agent that is there.
+
+    Raises:
+        ValueError: it is not; names those that are.
+    """
+    if agent not in agents:
+        raise ValueError(f"No agent '{agent}' in this fleet. Agents: {', '.join(agents)}.")
+    return str(agent)
+
+
+def _integer(agent: str, action: object) -> int:
+    """One integer; those beyond 64 bits stand for one that no action space has, so their agents wait."""
+    if type(action) is not int:
+        value = np.asarray(action)
+        if value.size == 1 and np.issubdtype(value.dtype, np.integer):
+            action = int(value.reshape(()))
+        elif not isinstance(action, int) or isinstance(action, bool):
+            raise ValueError(f"The action of '{agent}' must be one integer (got {action!r}).")
+    return max(-_LARGEST, min(_LARGEST, int(action)))
+
+
+def _whole(value: object) -> TypeGuard[int]:
+    """Whether it is one integer, of Python or NumPy."""
+    if isinstance(value, int):
+        return not isinstance(value, bool)
+    return isinstance(value, np.integer | np.ndarray) and np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iu"
+
+
+def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:
+    """What one arm observes, and what it may answer."""
+    low, high = layout.bounds
+    observation = spaces.Dict(
+        {
+            "observation": spaces.Box(low, high, dtype=np.float32),
+            "action_mask": spaces.Box(0, 1, (layout.actions,), dtype=np.int8),
+        }
+    )
+    return observation, spaces.Discrete(layout.actions)
+
+
+def spaces_like(first: tuple[spaces.Dict, spaces.Discrete]) -> tuple[spaces.Dict, spaces.Discrete]:
+    """Spaces with a random generator of their own that share the bounds of others, which are large with many arms."""
+    observation, action = first
+    return spaces.Dict({name: copy(space) for name, space in observation.items()}), copy(action)
+
 
 Array = np.ndarray
 

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.engine.batch import Engine, Shift
+from fleet.engine.batch import Engine, RewardWeights, Shift
 from fleet.engine.play import Executed, Plans
-from fleet.engine.reward import RewardWeights
 from fleet.engine.state import DONE, GIVEN_UP, PER_JOB, RUNNING, State
 from fleet.engine.tables import Tables
+from fleet.heat.thermal import HOUSING, WINDING
 from fleet.observation import Layout, Observation
-from fleet.thermal import HOUSING, WINDING
 
 Array = np.ndarray
 

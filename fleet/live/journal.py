@@ -3,6 +3,12 @@
 Each line is one `append`: `{"crc":"0a1b2c3d","records":[…]}`, with the CRC-32 of the encoded records. A line is
 complete or absent: an unfinished last line was torn by a crash before `append` returned, and is removed on opening. Any
 other line whose checksum differs is damage, and the journal refuses to open.
+
+Records that the journals of arms and auctioneers have in common; each journal adds a few of its own.
+
+One name means one thing in every journal. Times are fleet seconds, 0 where the writer does not know the time.
+
+Journals that stay short while they are written, and fleet time in them.
 """
 
 import errno
@@ -14,11 +20,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import UnionType
-from typing import Generic, Self, TypeVar, cast
+from typing import Any, Generic, Literal, Self, TypeVar, cast
 
 import msgspec
 
-from fleet.errors import JournalError, JournalFull
+from fleet.bus.protocol.auction import Count, JobSpec, Name
+from fleet.errors import JournalError, JournalFull, printable
 from fleet.files import atomic_path
 
 _LOG = logging.getLogger(__name__)
@@ -330,3 +337,200 @@ class Journal(Generic[Record]):
 def _ignore(record: bytes, reason: str) -> tuple[()]:
     """Leave a record out."""
     return ()
+
+
+class Started(msgspec.Struct, frozen=True, tag="started"):
+    """The process starts, for the first time or again."""
+
+    name: str = ""
+    """Of the arm or auctioneer."""
+    time_s: float = 0.0
+    boot: Count = 0
+    """Counts the starts of an arm from 1."""
+
+
+class EpochBegun(msgspec.Struct, frozen=True, tag="epoch_begun"):
+    """The journal is new, and has this name; or an arm without an auctioneer has learned it from another."""
+
+    epoch: str
+    time_s: float = 0.0
+    succeeds: bool = False
+    """A person has requested that it takes the place of another one: arms may know older epochs."""
+
+
+class ClockTick(msgspec.Struct, frozen=True, tag="clock_tick"):
+    """Fleet time has reached this value."""
+
+    time_s: float
+
+
+class JobsAccepted(msgspec.Struct, frozen=True, tag="jobs_accepted"):
+    """These jobs were submitted and accepted."""
+
+    jobs: tuple[JobSpec, ...]
+    by: str = ""
+    time_s: float = 0.0
+
+
+class Progress(msgspec.Struct, frozen=True, tag="progress"):
+    """Number of cycles of a job that are done, by any arm."""
+
+    job: Name
+    cycles: Count
+
+
+class CommitPermitted(msgspec.Struct, frozen=True, tag="commit_permitted"):
+    """The arm may begin the last cycle; from now on the job goes to no other arm."""
+
+    award: Name
+    time_s: float = 0.0
+    cycles: Count = 0
+    """Done then, where an auctioneer writes it."""
+
+
+class Released(msgspec.Struct, frozen=True, tag="released"):
+    """The arm no longer has the award, and has nothing to report on it."""
+
+    award: Name
+    job: str = ""
+    arm: str = ""
+    number: Count = 0
+    """Number of the claim that released it, where arms allocate by consensus."""
+
+
+class Closed(msgspec.Struct, frozen=True, tag="closed"):
+    """An award has ended."""
+
+    award: Name
+    outcome: Literal["finished", "returned", "refused", "dropped"]
+    """refused: the arm did not accept it; dropped: its lease has expired."""
+    cycles: Count
+    """Done so far, by any arm."""
+    time_s: float
+    reason: str = ""
+    unsure: bool = False
+    """As in `fleet.bus.protocol.auction.Report`."""
+    job: str = ""
+    arm: str = ""
+    faulted: bool = False
+    """As in `fleet.bus.protocol.auction.Report`."""
+
+
+class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
+    """An arm says which spaces it takes; empty at home."""
+
+    arm: Name
+    space: tuple[Name, ...] = ()
+    """Names, without those of its open awards."""
+    time_s: float = 0.0
+    number: Count = 0
+    """Of the claim that says it, where arms allocate by consensus."""
+
+
+class SpaceCleared(msgspec.Struct, frozen=True, tag="space_cleared"):
+    """A person has freed all space of an absent arm."""
+
+    arm: Name
+    by: str = ""
+    time_s: float = 0.0
+
+
+TICK_S = 2.0
+"""Real seconds between two records of the fleet's time."""
+
+
+def put_aside(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
+    """Return what to do with a record of a journal that is not applied: append it to a file, and report it.
+
+    Args:
+        path: The file.
+        name: Of the arm or auctioneer.
+    """
+
+    def put(record: bytes, reason: str) -> tuple[()]:
+        begin = printable(record[:200].decode(errors="replace"))
+        _LOG.error("'%s': put a journal record aside in '%s': %s. It begins %s.", name, path, reason, begin)
+        try:
+            with path.open("ab") as file:
+                file.write(record + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise JournalError(
+                f"A record cannot be put aside in '{path}': {error.strerror}. Make room there."
+            ) from error
+        return ()
+
+    return put
+
+
+def own_records(journal: Journal[Record], name: str) -> Iterator[Record]:
+    """Yield the records of the journal of an arm or auctioneer, oldest first.
+
+    Raises:
+        JournalError: it is of another one, or damaged. Journals of earlier versions may name none.
+    """
+    for record in journal.records():
+        if isinstance(record, Started) and record.name not in ("", name):
+            raise JournalError(
+                f"Journal '{journal.path}' is of '{printable(record.name)}'; '{name}' needs its own. If journals were "
+                f"swapped or copied, bring that of '{name}' back. See Epochs in docs/bus/auctioneer.md before you "
+                "move one away."
+            )
+        yield record
+
+
+class CompactingJournal(Generic[Record]):
+    """Appends to a journal, and compacts it when it has grown."""
+
+    def __init__(self, journal: Journal[Record], state: JournalState[Record]) -> None:
+        """Prepare; `state` is that of the journal, and belongs to this object from now on."""
+        self._journal, self._state = journal, state
+
+    def append(self, *records: Record) -> None:
+        """Write records, as `Journal.append` does.
+
+        Raises:
+            JournalError: none of them is written.
+        """
+        self._journal.append(*records)
+        for record in records:
+            self._state.apply(record)
+        if self._journal.needs_compaction:
+            try:
+                self._journal.compact(*self._state.compact())
+            except JournalError as error:  # the records are written; the next ones are refused if it is serious
+                _LOG.error("%s", error)
+
+
+class TimeRecorder:
+    """Records fleet time, so that it continues after a restart and never runs backwards."""
+
+    def __init__(self, journal: Journal[Any], state: TimedState[Any], real_s: float) -> None:
+        """Compact the journal, which gave this state."""
+        self._journal, self._state, self._recorded_s = journal, state, real_s
+        journal.compact(*state.compact())
+
+    def start_s(self, speed: float) -> float:
+        """Return the fleet time to start with: after a restart, one that was certainly not read before."""
+        return self._state.time_s + TICK_S * speed if self._state.time_s else 0.0
+
+    def step(self, real_s: float, time_s: float) -> None:
+        """Record the fleet time every `TICK_S`, and compact the journal when it has grown.
+
+        Raises:
+            JournalError: the journal cannot be relied on any more.
+        """
+        if real_s < self._recorded_s + TICK_S:
+            return
+        self._recorded_s = real_s
+        records = (*self._state.checks_due(), ClockTick(time_s))
+        try:
+            self._journal.append(*records)
+        except JournalFull as error:
+            _LOG.error("Could not record the fleet's time: %s", error)
+        else:
+            for record in records:
+                self._state.apply(record)
+        if self._journal.needs_compaction:
+            self._journal.compact(*self._state.compact())

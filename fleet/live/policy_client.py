@@ -7,12 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.replies import Replies
-from fleet.bus.client.router import reachable
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES, ActReply, ActRequest, ArmObservation
+from fleet.bus.router import reachable
 from fleet.bus.security.tls import identified
 from fleet.errors import BusError, NoRouter, printable
 from fleet.observation import Observation

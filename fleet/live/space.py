@@ -2,7 +2,7 @@
 
 An arm takes the space of a plan from the moment that it is granted until the arm says that it is at home again, however
 long that takes: no lease and no timeout frees it. On the bus the space of a plan has a name that every participant
-computes from the plan (`fleet.planning.space.space_name`). A name that a fleet does not know may be anywhere.
+computes from the plan (`fleet.arm.space.space_name`). A name that a fleet does not know may be anywhere.
 """
 
 from collections.abc import Callable, Iterable, Mapping

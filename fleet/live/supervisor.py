@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from queue import Empty
 
-from fleet.bus.client.queue import Mailbox
+from fleet.bus.mailbox import Mailbox
 from fleet.errors import FleetError
 
 _LOG = logging.getLogger(__name__)

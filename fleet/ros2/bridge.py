@@ -11,13 +11,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from fleet.bus.client.client import BusClient
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, Quote, QuoteRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, MalformedMessage, State
 from fleet.errors import BusError, Refused
-from fleet.live.arm.auctioneer_client import WARNING_S, RateLimitedWarnings
-from fleet.live.arm.clock_sync import ClockSync
+from fleet.live.arm.node import WARNING_S, ClockSync, RateLimitedWarnings
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import Recent
 from fleet.robot import ThermalLimits

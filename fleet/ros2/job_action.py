@@ -19,7 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 from thermofleet_msgs.action import DoJob
 
-from fleet.bus.client.client import BusClient
+from fleet.bus.client import BusClient
 from fleet.bus.protocol.auction import SETTLED, JobSpec, JobStatus
 from fleet.live.job_client import JobClient
 from fleet.ros2.conversion import plain_name

@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import zenoh
 
-from fleet.bus.client.router import connect
+from fleet.bus.router import connect
 from fleet.errors import BusError
 from fleet.ros2.conversion import plain_name
 

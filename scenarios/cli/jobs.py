@@ -87,7 +87,7 @@ def list_command(endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = "", a
     """List the jobs of a fleet by name: state, arm, cycles and reason."""
     import time
 
-    from fleet.bus.client.client import BusClient
+    from fleet.bus.client import BusClient
     from fleet.live.monitor.snapshot import FleetListener
     from scenarios.cli.options import the_fleet
 
@@ -129,7 +129,7 @@ def settle_command(
 ) -> None:
     """Resolve a job with unknown outcome, after inspecting the cell."""
     from fleet.bus.protocol.operator import Settle
-    from scenarios.schema_errors import choose
+    from scenarios.spec.parse import choose
 
     _control([Settle(job, choose("outcome", outcome, Literal["done", "redo"]))], by, endpoint, fleet)
 

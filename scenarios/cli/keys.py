@@ -41,9 +41,8 @@ def keys_command(
     as_json: JsonOption = False,
 ) -> None:
     """Make, extend and show keys and certificates for mutual TLS."""
-    from fleet.bus.security.certificates import HERE
-    from fleet.bus.security.keyring import add as add_to
-    from fleet.bus.security.keyring import lifetimes, make
+    from fleet.bus.security.certificates import HERE, lifetimes, make
+    from fleet.bus.security.certificates import add as add_to
 
     if add and (scenario or extra):
         raise FleetError("--add extends the present keys; leave SCENARIO and --extra out.")
@@ -52,7 +51,7 @@ def keys_command(
     if extra and not scenario:
         raise FleetError("--extra is for new keys, so SCENARIO is needed; --add extends present ones.")
     if scenario:
-        from scenarios.load import load
+        from scenarios.spec.load import load
 
         chosen = load(scenario)
         more = [participant_of(text) for text in extra or ()]

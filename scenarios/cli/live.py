@@ -20,7 +20,7 @@ from scenarios.cli.options import (
     number,
 )
 from scenarios.cli.terminal import echo, out_console, say
-from scenarios.specs import PAGE_PORT, PORT, LiveSpec
+from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
 
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
@@ -95,7 +95,7 @@ def arm_command(
     endpoint: EndpointOption = ENDPOINT,
 ) -> None:
     """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
-    from scenarios.load import load
+    from scenarios.spec.load import load
 
     chosen = load(scenario)
     if (source == "log") != (file is not None):
@@ -128,7 +128,7 @@ def auctioneer_command(
 ) -> None:
     """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
     from scenarios.live.auctioneer import run_auctioneer
-    from scenarios.load import load
+    from scenarios.spec.load import load
 
     run_auctioneer(load(scenario), name, LiveSpec(**given), endpoint)
 
@@ -163,8 +163,7 @@ def router_command(
     ] = None,
 ) -> None:
     """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; it prints its endpoint once it listens."""
-    from fleet.bus.client.rate_limits import Limits
-    from fleet.bus.client.router import Router
+    from fleet.bus.router import Limits, Router
     from fleet.bus.security.tls import Tls
     from scenarios.cli.signals import until_stopped
 
@@ -191,7 +190,7 @@ def watch_command(
 ) -> None:
     """Watch a fleet until it has ended, or Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
     from scenarios.live.watch import watch
-    from scenarios.load import load
+    from scenarios.spec.load import load
 
     watch(endpoint, fleet, as_json=as_json, joints=joints, end_s=load(scenario).horizon_s if scenario else None)
 
@@ -216,7 +215,7 @@ def doctor_command(
     Exit code 0: healthy; 1: a fault was found, or no fleet; 2: the router cannot be reached.
     """
     from scenarios.live.doctor import diagnose
-    from scenarios.load import load
+    from scenarios.spec.load import load
 
     expected = tuple(arm.name for arm in load(scenario).arms) if scenario else ()
     healthy = diagnose(endpoint, fleet, seconds, auctioneer=auctioneer, expected=expected, as_json=as_json)
@@ -234,7 +233,7 @@ def record_command(
     ] = 60.0,
 ) -> None:
     """Record what arms and auctioneer publish: a journal, then Parquet parts; readable at once."""
-    from fleet.bus.client.client import BusClient
+    from fleet.bus.client import BusClient
     from fleet.live.policy_client import CONNECT_S
     from scenarios.cli.signals import until_stopped
     from scenarios.live.recorder import BACKLOG, record
@@ -259,7 +258,7 @@ def replay_command(
     speed: Annotated[float, number("Recorded seconds per real second.", 0, MAX_SPEED, above=True)] = 1.0,
 ) -> None:
     """Publish a run or a recording on the bus, in real time or at --speed."""
-    from fleet.bus.client.client import BusClient
+    from fleet.bus.client import BusClient
     from scenarios.cli.signals import until_stopped
     from scenarios.live.replayer import Replay
 
@@ -310,13 +309,13 @@ def gateway_command(
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM; with --page also a live page for browsers."""
     if scenario and not page:
         raise FleetError("--scenario is for --page: leave it out.")
-    from scenarios.live.http_server import run_gateway, scene_of
+    from scenarios.live.gateway import run_gateway, scene_of
 
     shown = None
     if page:
-        from scenarios.live.http_page import LivePage
-        from scenarios.load import load
+        from scenarios.live.gateway import LivePage
         from scenarios.show.replay import three_js
+        from scenarios.spec.load import load
 
         three_js()  # if it is missing, say so at once
         shown = LivePage(scene_of(load(scenario)) if scenario else None)
@@ -368,7 +367,7 @@ def ros2_command(
     ] = 10.0,
 ) -> None:
     """Connect a fleet and ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra ros2."""
-    from scenarios.schema_errors import choose
+    from scenarios.spec.parse import choose
 
     mode = choose("mode", mode, Literal["bridge", "listen", "jobs"])
     if (mode == "listen") != bool(topic):

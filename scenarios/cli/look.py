@@ -16,7 +16,7 @@ from fleet.robot import POSTURES, RATING, Cooling
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
 from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
-from scenarios.specs import Shot
+from scenarios.spec.options import Shot
 
 SMALLEST, LARGEST = 160, 3840
 """Width and height of a film, px."""
@@ -80,8 +80,8 @@ def show_command(
     elif scenario is None:
         _list_library(as_json)
     else:
-        from scenarios.load import load
-        from scenarios.show.describe import describe
+        from scenarios.show.layout import describe
+        from scenarios.spec.load import load
 
         chosen = load(scenario)
         if as_json:
@@ -112,7 +112,7 @@ def _show_hold(
 
 
 def _list_library(as_json: bool) -> None:
-    from scenarios.load import library, load
+    from scenarios.spec.load import library, load
 
     scenarios = {name: load(path) for name, path in library().items()}
     if as_json:
@@ -136,9 +136,9 @@ def layout_command(
     home. Exit code 2: there are problems.
     """
     from fleet.files import atomic_path
-    from scenarios.load import load
     from scenarios.result_folder import check_file, disk_errors
     from scenarios.show.layout import layout_report, layout_scene, layout_tables
+    from scenarios.spec.load import load
 
     chosen = load(scenario)
     if out is not None:
@@ -205,10 +205,10 @@ def view_command(
         raise FleetError(NO_DISPLAY)
     import numpy as np
 
-    from fleet.physics.cell_player import CellPlayer
-    from scenarios.load import load
+    from fleet.arm.cell import CellPlayer
     from scenarios.run.stored_run import read_run
     from scenarios.show.film import Film, show_heat
+    from scenarios.spec.load import load
 
     if (Path(what) / "run.json").exists():
         run = read_run(Path(what))
@@ -345,10 +345,10 @@ def report_command(
     """Write the report of a live recording, as `run` writes one of a simulated shift, or that of a run anew."""
     from fleet.files import atomic_path
     from scenarios.live.recording_report import recording_html
-    from scenarios.load import load
     from scenarios.result_folder import disk_errors
     from scenarios.run.run_folder import run_html
     from scenarios.run.stored_run import read_run
+    from scenarios.spec.load import load
 
     if (folder / "run.json").exists():
         path, run = out or folder / "report.html", read_run(folder)

@@ -14,13 +14,13 @@ from fleet.bus.protocol.keys import ENDPOINT as ENDPOINT
 from fleet.errors import NAME_RULE, FleetError, LogError, is_name, nearest, printable
 from fleet.fields import MAX_SEED, Option
 from scenarios.cli.from_fields import declared
-from scenarios.specs import RunSpec
+from scenarios.spec.options import RunSpec
 
 Number = TypeVar("Number", int, float, None)
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.prepare.randomisation import Randomisation
-    from scenarios.schema import Scenario
+    from scenarios.spec.schema import Scenario
     from twin.logs.recording import Recording
 
 
@@ -185,7 +185,7 @@ def the_fleet(name: str, endpoint: str) -> str:
     Raises:
         FleetError: there is no fleet, or there are several.
     """
-    from fleet.bus.client.discover import fleets_at
+    from fleet.bus.router import fleets_at
 
     if name:
         return name

@@ -16,7 +16,7 @@ from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, plain_table, print_json, progress_bar, say
-from scenarios.specs import RunSpec
+from scenarios.spec.options import RunSpec
 
 if TYPE_CHECKING:  # slow to import
     from fleet.events import Event
@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # slow to import
     from scenarios.progress import Progress
     from scenarios.run.metrics import Metrics
     from scenarios.run.shift import RunResult
-    from scenarios.schema import Scenario
+    from scenarios.spec.schema import Scenario
 
 DEMO_POLICY = "wsept"
 """The policy that the demo compares with `round_robin`."""
@@ -51,11 +51,11 @@ def run_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Run one shift of a scenario and record it."""
-    from scenarios.load import load, own_seed
     from scenarios.policy_loader import label, policy_of
     from scenarios.result_folder import check_free
     from scenarios.run.run_folder import RUN
     from scenarios.run.shift import summary
+    from scenarios.spec.load import load, own_seed
 
     chosen = load(scenario)
     given = {"seed": own_seed(scenario), **given}
@@ -68,7 +68,7 @@ def run_command(
     with ExitStack() as open_until_end:
         endpoint = None
         if listen:  # before the fleet connects, so that listeners miss no message
-            from fleet.bus.client.router import Router
+            from fleet.bus.router import Router
 
             endpoint = open_until_end.enter_context(Router(listen)).endpoint
         progress = open_until_end.enter_context(progress_bar())
@@ -98,10 +98,10 @@ def demo_command(
     seed: options.SeedOption = 20,
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
-    from scenarios.load import load
     from scenarios.result_folder import disk_errors
     from scenarios.run.shift import summary
     from scenarios.show.run_page import Side, pair_page
+    from scenarios.spec.load import load
 
     chosen = load("quickstart")
     results: dict[str, RunResult] = {}

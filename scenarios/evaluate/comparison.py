@@ -10,23 +10,15 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.evaluate.rollout import COUNTS, FIGURES, POSSIBLE, Outcome
-from scenarios.evaluate.scores import (
-    Normalised,
-    Scores,
-    Shift,
-    and_trainings,
-    normalised,
-    scores_of,
-)
-from scenarios.evaluate.statistics import fewest, unit
+from scenarios.evaluate.scores import Normalised, Scores, Shift, and_trainings, normalised, scores_of
+from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, fewest, figure_rows, figures_of, remarks, unit
 from scenarios.evaluate.study import Row, Study, suite_label
-from scenarios.evaluate.tables import HEAD, LEGEND, Figure, figure_rows, figures_of, remarks
 from scenarios.policy_loader import has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
-from scenarios.schema import Scenario
 from scenarios.show.table import Table
-from scenarios.specs import RISK, DifficultyName, RiskName
+from scenarios.spec.options import RISK, DifficultyName, RiskName
+from scenarios.spec.schema import Scenario
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.evaluate.references import Reference

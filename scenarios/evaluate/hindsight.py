@@ -10,12 +10,11 @@ import numpy as np
 
 from agents.policy import WAIT, Planner, Policy, only_choices
 from agents.schedules import LEAST_GAIN, Changes, Schedules, stack
-from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.reward import RewardWeights
+from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
+from fleet.env.allocation_v1 import actions_of
 from fleet.env.lookahead import CellSimulator, Lookahead
-from fleet.env.validation import actions_of
 from fleet.observation import Layout, Observation
 from scenarios.evaluate.rollout import UNLIMITED, DecisionLimit
 

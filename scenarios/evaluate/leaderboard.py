@@ -23,15 +23,15 @@ from scenarios.evaluate.rollout import COUNTS, DECISION_LIMIT_S, FIGURES, Outcom
 from scenarios.evaluate.runner import run_study
 from scenarios.evaluate.scores import Scores, Shift, normalised, ranked, references_of, score_cells, scores_of
 from scenarios.evaluate.study import CARD, Case, Key, Row, Study, suite_of
-from scenarios.load import SPLITS
 from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
 from scenarios.result_folder import disk_errors
-from scenarios.schema import SplitName
 from scenarios.show.table import markdown_table as table
-from scenarios.specs import RiskName
-from scenarios.suite.cells import JUDGED
+from scenarios.spec.load import SPLITS
+from scenarios.spec.options import RiskName
+from scenarios.spec.schema import SplitName
+from scenarios.suite.instances import JUDGED
 from scenarios.suite.splits import Row as Line
 from scenarios.suite.splits import cell_of_instance, instance, line_of, manifest
 

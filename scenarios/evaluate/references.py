@@ -30,17 +30,16 @@ from scenarios.evaluate.rollout import DECISION_LIMIT_S, DecisionLimit
 from scenarios.evaluate.sources import Fleets, plan_content
 from scenarios.evaluate.study import suite_of
 from scenarios.evaluate.upper_bound import Relaxation, upper_bound
-from scenarios.fault_price import weights_of
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import blaming, policy_at, policy_of
-from scenarios.prepare.fleet import Fleet, ShiftFactory
-from scenarios.prepare.known_cell import simulator_of_shift
+from scenarios.prepare.fleet import Fleet, ShiftFactory, simulator_of_shift
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
-from scenarios.scenario_hash import scenario_hash
-from scenarios.schema import Scenario
-from scenarios.specs import RISK, DifficultyName
+from scenarios.spec.jobs import weights_of
+from scenarios.spec.options import RISK, DifficultyName
+from scenarios.spec.parse import scenario_hash
+from scenarios.spec.schema import Scenario
 
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""
@@ -55,7 +54,7 @@ class Reference:
     instance: str
     """As `heat_wave/100`, or the name of an instance of a split."""
     scenario_hash: str
-    """Of what is no default in the scenario: `scenarios.scenario_hash`."""
+    """Of what is no default in the scenario: `scenarios.spec.parse`."""
     seed: int
     difficulty: str
     """Source of the scores of the policies that the search starts from."""
@@ -334,7 +333,7 @@ def cells(each: Reference) -> tuple[str, ...]:
 
 def reference_table(references: Sequence[Reference]) -> str:
     """The table for a page, as Markdown: every instance, and the mean of each scenario."""
-    from scenarios.show.table import markdown_table as table  # loads the live fleet
+    from scenarios.show.table import markdown_table as table
 
     lines: list[tuple[str, ...]] = []
     for scenario in dict.fromkeys(each.instance.rpartition("/")[0] for each in references):

@@ -16,17 +16,14 @@ import numpy as np
 from agents.policy import WAIT, Planner, Policy, only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import MemoryExchange
+from fleet.env.allocation_v1 import actions_of
 from fleet.env.lookahead import CellSimulator
-from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library, Obs
 from fleet.observation import Observation
-from scenarios.fault_price import weights_of
 from scenarios.policy_loader import OnBus, failure, policy_at
-from scenarios.prepare.fleet import Fleet
-from scenarios.prepare.known_cell import as_known, simulator_of
-from scenarios.run.batch import library_of
-from scenarios.run.heat_use import HeatUse
-from scenarios.run.outcome import common_figures
+from scenarios.prepare.fleet import Fleet, as_known, library_of, simulator_of
+from scenarios.run.metrics import HeatUse, common_figures
+from scenarios.spec.jobs import weights_of
 
 Array = np.ndarray
 

@@ -28,7 +28,7 @@ from scenarios.prepare.randomisation import Randomisation
 from scenarios.processes import MOST_DEATHS, LocalWorker, Queue, Worker, run_all
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.provenance import code_hash
-from scenarios.specs import RiskName
+from scenarios.spec.options import RiskName
 
 HERE_S = 5.0
 """About the time that a worker process takes to start. This process does work that takes no longer, but runs no code of

@@ -20,17 +20,17 @@ from fleet.errors import FleetError, nearest
 from fleet.motion import Plan
 from fleet.robot import JOINTS
 from scenarios.extras import require_extra
-from scenarios.job_stream import all_works, rehearsal_works, works_of
+from scenarios.prepare.arms import PlannedArm, plan_arms
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.prepare.planned_arm import PlannedArm, plan_arms
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Progress, quiet
-from scenarios.schema import Scenario
-from scenarios.specs import DifficultyName, RiskName
+from scenarios.spec.jobs import all_works, rehearsal_works, works_of
+from scenarios.spec.options import DifficultyName, RiskName
+from scenarios.spec.schema import Scenario
 
 if TYPE_CHECKING:  # need the extra `twin`
-    from twin.baselines.torque import TorqueRms
-    from twin.thermal.calibrated import CalibratedTwin
+    from twin.baselines import TorqueRms
+    from twin.thermal.thermal_twin import CalibratedTwin
 
 Array = np.ndarray
 
@@ -73,9 +73,9 @@ class PlannedFleet:
         Args:
             changes: Fields of the configuration with other values.
         """
-        from scenarios.prepare.calibrate_twins import calibrate_twins
-        from scenarios.prepare.train_twins import train_twins, training_seed
-        from twin.baselines.reconstruction import untrained_config
+        from scenarios.prepare.calibrate import calibrate_twins
+        from scenarios.prepare.twins import train_twins, training_seed
+        from twin.baselines import untrained_config
         from twin.vae.config import TwinConfig
 
         spec = self.scenario.twin
@@ -207,9 +207,8 @@ def _unweighted(planned: PlannedFleet, fleet: Fleet) -> Fleet:
 
 
 def _torque(planned: PlannedFleet) -> Fleet:
-    from scenarios.prepare.cool_motion import records, require_cool_plans
-    from scenarios.prepare.train_twins import exploration_records
-    from twin.baselines.torque import torque_over_known
+    from scenarios.prepare.twins import exploration_records, records, require_cool_plans
+    from twin.baselines import torque_over_known
 
     scenario, twins = planned.scenario, planned.calibrated(0, "torque")
 
@@ -222,7 +221,7 @@ def _torque(planned: PlannedFleet) -> Fleet:
 
 
 def _network(planned: PlannedFleet, risk: RiskName) -> Fleet:
-    from scenarios.prepare.calibrate_twins import calibrate_networks
+    from scenarios.prepare.calibrate import calibrate_networks
 
     heats = calibrate_networks(planned.scenario, planned.arms, planned.folder, planned.progress, risk=risk)
     fleet = planned.scored(heats)
@@ -233,7 +232,7 @@ def _network(planned: PlannedFleet, risk: RiskName) -> Fleet:
 
 
 def _random(planned: PlannedFleet, training: int) -> Fleet:
-    from scenarios.prepare.train_twins import training_seed
+    from scenarios.prepare.twins import training_seed
 
     return planned.scored([_Random(training_seed(planned.scenario, training))] * len(planned.arms))
 

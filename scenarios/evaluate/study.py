@@ -16,13 +16,13 @@ from fleet.seeding import child
 from scenarios.evaluate.rollout import DECISION_LIMIT_S, FIGURES, DecisionLimit, Outcome, TooSlow
 from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, plan_content
 from scenarios.evaluate.store import RowKind
-from scenarios.load import INSTANCE, SPLITS, library, load
 from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.run.provenance import code_hash
-from scenarios.scenario_hash import scenario_hash
-from scenarios.schema import Scenario
-from scenarios.specs import RISK, RiskName
+from scenarios.spec.load import INSTANCE, SPLITS, library, load
+from scenarios.spec.options import RISK, RiskName
+from scenarios.spec.parse import scenario_hash
+from scenarios.spec.schema import Scenario
 from scenarios.suite.splits import Instance, instance, split
 
 CARD = "study.json"

@@ -57,11 +57,11 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from scipy.sparse import csr_array, vstack
 
-from fleet.engine.reward import RewardWeights
+from fleet.engine.batch import RewardWeights
 from fleet.engine.state import World
-from fleet.motor import magnet_factor
+from fleet.heat.motor import magnet_factor
+from fleet.heat.thermal import HOUSING, WINDING, advance, node_heat
 from fleet.robot import JOINTS
-from fleet.thermal import HOUSING, WINDING, advance, node_heat
 
 Array = np.ndarray
 

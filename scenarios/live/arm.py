@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.replies import NoReply
+from fleet.bus.client import BusClient, NoReply
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.protocol.registry import STATE_HZ
@@ -21,31 +20,25 @@ from fleet.difficulty import Blind, DifficultyModel
 from fleet.errors import BusError, FleetError, InfeasibleJob, LogError, Refused
 from fleet.files import cache_folder
 from fleet.job import Work
-from fleet.live.arm.auctioneer_client import AuctioneerClient, WorkSource
-from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.body import Body
-from fleet.live.arm.config import ArmConfig
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor, ExecutorConfig
+from fleet.live.arm.body import Body, ReplayBody, SensorLog
 from fleet.live.arm.estimator import Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord
-from fleet.live.arm.node import ArmNode
-from fleet.live.arm.replay_body import ReplayBody, SensorLog
+from fleet.live.arm.node import ArmConfig, ArmNode, AuctioneerClient, WorkSource
 from fleet.live.clock import FleetClock
+from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
-from fleet.live.consensus.records import GrantRecord
-from fleet.live.journal import Journal
-from fleet.live.journal_upkeep import CompactingJournal, own_records, put_aside
+from fleet.live.journal import CompactingJournal, Journal, own_records, put_aside
 from fleet.motion import Plan
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, progress_bar
-from scenarios.live.allocation import live_fleet
-from scenarios.live.auctioneer import own_jobs, summary
+from scenarios.live.auctioneer import live_fleet, own_jobs, summary
 from scenarios.live.cell import cell_message, cell_space
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import arm_policy_of, scope_of
 from scenarios.progress import Progress
-from scenarios.schema import Scenario
-from scenarios.specs import LiveModel, LiveSpec, RiskName
+from scenarios.spec.options import LiveModel, LiveSpec, RiskName
+from scenarios.spec.schema import Scenario
 
 log = logging.getLogger(__name__)
 
@@ -157,9 +150,9 @@ def simulated_arm(
     Raises:
         FleetError: the scenario has no such arm.
     """
-    from fleet.live.arm.simulated_body import SimulatedBody  # loads the engine
+    from fleet.live.arm.body import SimulatedBody
+    from scenarios.prepare.arms import CellPlanner, air_offsets
     from scenarios.prepare.fleet import prepare_arm
-    from scenarios.prepare.planned_arm import CellPlanner, air_offsets
 
     arm = prepare_arm(scenario, name, difficulty=difficulty, risk=risk, cache=cache, progress=progress)
     index = scenario.index_of(name)

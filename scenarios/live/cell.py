@@ -6,6 +6,7 @@ from typing import Any  # plain values of JSON
 
 from msgspec.structs import replace
 
+from fleet.arm.space import arms_in_reach, space_name
 from fleet.bus.protocol.auction import MOST_JOBS
 from fleet.bus.protocol.cell import Cell, CellArm, CellFixture, CellKind, CellPlace, Limit, PlannedWork, Point
 from fleet.bus.protocol.messages import encode
@@ -13,11 +14,10 @@ from fleet.files import cache_folder
 from fleet.job import BOUNDS, Fixture, Place, Work
 from fleet.live.space import CellSpace
 from fleet.motion import Plan
-from fleet.planning.space import arms_in_reach, space_name
 from fleet.robot import RATING, Mount, Robot
-from scenarios.job_stream import all_works
 from scenarios.progress import Progress, quiet
-from scenarios.schema import Scenario
+from scenarios.spec.jobs import all_works
+from scenarios.spec.schema import Scenario
 
 MAX_BYTES = 60_000
 """Size of the message: a router may drop larger ones."""
@@ -32,7 +32,7 @@ JOB_FIELDS = ("payload_kg", "force_n", "dwell_s", "repetitions", "release_s", "d
 
 def cell_message(scenario: Scenario, auctioneer: str, *, cache: Path | None = None, progress: Progress = quiet) -> Cell:
     """Describe the cell of a scenario; plans are cached."""
-    from scenarios.prepare.planned_arm import plan_arms  # loads the planner
+    from scenarios.prepare.arms import plan_arms
 
     robots = [arm.robot() for arm in scenario.arms]
     planned = plan_arms(scenario, range(len(robots)), all_works(scenario), cache or cache_folder(), progress)
@@ -62,7 +62,7 @@ def described_model(cell: Cell, arms: Sequence[str]) -> dict[str, Any]:
     Raises:
         ValueError: it describes a cell that cannot be, or not all of these arms.
     """
-    from fleet.physics.cell_model import cell_model  # loads MuJoCo
+    from fleet.arm.cell import cell_model
 
     mounts = {arm.name: Mount(position_m=_xyz(arm.position_m), tilt_deg=_xyz(arm.tilt_deg)) for arm in cell.arms}
     if missing := [arm for arm in arms if arm not in mounts]:
@@ -86,8 +86,8 @@ def cell_space(scenario: Scenario, *, cache: Path | None = None, progress: Progr
 
     A plan for other work, which outsiders submitted, is not in it: it excludes all plans of arms within reach.
     """
-    from scenarios.prepare.fleet import space_of  # loads the planner
-    from scenarios.prepare.planned_arm import plan_arms
+    from scenarios.prepare.arms import plan_arms
+    from scenarios.prepare.fleet import space_of
 
     folder = cache or cache_folder()
     robots = [arm.robot() for arm in scenario.arms]

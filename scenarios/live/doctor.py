@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import msgspec
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.discover import fleets_at, other_versions
-from fleet.bus.client.replies import Replies
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
+from fleet.bus.router import fleets_at, other_versions
 from fleet.bus.security.tls import identified, why_not
 from fleet.errors import BusError
 from fleet.live.monitor.health import ClockProbe, HealthReport, check_health

@@ -16,9 +16,9 @@ from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.live.journals import folder_of, refuse_other_way
-from scenarios.load import load
 from scenarios.policy_loader import plans, scope_of
-from scenarios.specs import PAGE_PORT, PORT, LiveSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
 
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""
@@ -51,7 +51,7 @@ def parts_of(
     Returns:
         The auctioneer is None with a policy of scope `arm`.
     """
-    from fleet.bus.client.router import reached_at
+    from fleet.bus.router import reached_at
 
     own = f"{'tls' if tls else 'tcp'}/{reached_at(host or '127.0.0.1')}:{port}"
     address, spec = at or own, replace(spec, journal=folder / "journals")
@@ -188,7 +188,7 @@ def _check_page(tls: Path | None) -> None:
     """
     require_extra("gateway")
     require_extra("report")
-    from scenarios.live.http_server import TOKEN
+    from scenarios.live.gateway import TOKEN
 
     if tls is not None and not os.environ.get(TOKEN):
         raise FleetError(f"With --tls the page needs a token: set {TOKEN} to 16 or more random characters.")
@@ -214,7 +214,7 @@ def _check_place(arms: str, router: str, host: str, name: str, tls: Path | None)
     Raises:
         FleetError: two options contradict each other, or the endpoint of the router may not be used.
     """
-    from fleet.bus.client.router import reachable
+    from fleet.bus.router import reachable
 
     if router and not arms:
         raise FleetError("--router is for a part of a fleet; name the arms to start here: --arms NAME,NAME.")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fleet.errors import FleetError
 from scenarios.result_folder import disk_errors
-from scenarios.schema import Scenario
+from scenarios.spec.schema import Scenario
 
 
 def folder_of(folder: Path | None, fleet: str, scenario: Scenario) -> tuple[str, Path]:

@@ -21,8 +21,7 @@ import msgspec
 import pyarrow.parquet as pq
 from msgspec import structs
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.replies import Replies
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.cell import Cell, CellRequest

@@ -18,21 +18,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet.arm.cell import cell_model
 from fleet.bus.protocol.auction import ArmOffer, PlanQuote
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.operator import ALL_ARMS
 from fleet.errors import FleetError
 from fleet.events import EVENT_KINDS, Event
-from fleet.heat.insulation import arrhenius_rate, life_used
-from fleet.heat.tool_drift import most_drift_m, segment_temperatures
-from fleet.physics.cell_model import cell_model
+from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, segment_temperatures
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
 from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
 from scenarios.run.schedule import SAME_MOMENT_DIGITS
-from scenarios.schema import Scenario
 from scenarios.shift_records import Offer
+from scenarios.spec.schema import Scenario
 
 Array = np.ndarray
 

@@ -12,8 +12,7 @@ from typing import TypeVar
 import msgspec
 from rich.table import Table
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.replies import NoReply, Replies
+from fleet.bus.client import BusClient, NoReply, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     MOST_QUOTED,

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from fleet.bus.client.client import BusClient
+from fleet.bus.client import BusClient
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.cli.options import split_names, the_fleet

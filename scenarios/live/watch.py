@@ -12,9 +12,9 @@ from contextlib import ExitStack, contextmanager
 import msgspec
 from rich.live import Live
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.discover import fleets_at
+from fleet.bus.client import BusClient
 from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
+from fleet.bus.router import fleets_at
 from fleet.errors import NoRouter
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot, describe_status
 from scenarios.cli.options import the_fleet

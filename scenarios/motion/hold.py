@@ -12,11 +12,8 @@ import numpy as np
 from rich.table import Table
 
 from fleet.errors import FleetError, nearest
-from fleet.job import BOUNDS
-from fleet.motion import static_drive
-from fleet.motor import Motors, current, gen3_motors, thermal_data
-from fleet.robot import GEN3, JOINTS, RATING, Cooling, Robot, ThermalLimits
-from fleet.thermal import (
+from fleet.heat.motor import Motors, current, gen3_motors, thermal_data
+from fleet.heat.thermal import (
     HOUSING,
     NODES,
     WINDING,
@@ -28,7 +25,10 @@ from fleet.thermal import (
     steady_state,
     thermal_model,
 )
-from scenarios.motion.posture import parse_posture
+from fleet.job import BOUNDS
+from fleet.motion import static_drive
+from fleet.robot import GEN3, JOINTS, RATING, Cooling, Robot, ThermalLimits
+from scenarios.motion.recover import parse_posture
 
 Array = np.ndarray
 PerJoint = tuple[float, ...]
@@ -102,7 +102,7 @@ def hold(
             motor has.
         PostureError: the posture is unknown, or beyond a joint stop.
     """
-    from fleet.physics.models import ArmModel  # loads MuJoCo
+    from fleet.arm.model import ArmModel
 
     masses = (("payload", payload_kg, BOUNDS["payload_kg"].high), ("tool mass", tool_kg, RATING.temporary_kg))
     for name, value, most_kg in masses:

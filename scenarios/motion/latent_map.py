@@ -10,7 +10,7 @@ from matplotlib.patches import Ellipse
 
 from fleet.errors import FleetError
 from twin.vae.measures import Features
-from twin.verdict.rule import ANOMALOUS, UNCRITICAL, Rule
+from twin.verdict import ANOMALOUS, UNCRITICAL, Rule
 
 Array = np.ndarray
 

@@ -1,30 +1,327 @@
-"""Posture recovery: a warm arm that holds a payload moves to a nearby posture that its twin rates as easier.
+"""Search for an easier posture: candidates near a hold, ranked by the arm's twin and checked by its thermal model.
 
-`scenarios.motion.posture_search` proposes the posture. MuJoCo performs it here, and the same hold without recovery from
+Candidates are drawn near the latent of the hold (decoded to positions) and near the posture in joint space, then again
+around the best of them. They are ranked by the twin's one-sided torque error of the hottest measured motor. That score
+was chosen among nine by rank correlation (Spearman) with the true temperature after ten minutes, over candidates near
+ten holds of two arms:
+
+- the one-sided torque error of the hottest motor .95 to 1.00,
+- the paper's d of that motor .29 to .96,
+- the paper's d, the sum over all joints, −.34 to .52: most of it is novelty of the posture,
+- the largest torque over nominal 1.00: this baseline without a twin is better than every score of the twin.
+
+The thermal model then accepts a posture only if the hottest motor is predicted to cool, and no motor to become as warm
+as it was. The prediction needs housing temperatures, which have no sensor. If they equal the winding temperatures
+(`twin.thermal.thermal_twin.RcTwin.likely_start`), every posture is rejected. If all heat of a winding flows into its
+housing, they are 3 to 5 K too low, and some recoveries end warmer. Therefore the arm first measures for half a minute
+how fast its windings warm, which determines that heat flow.
+
+Posture recovery: a warm arm that holds a payload moves to a nearby posture that its twin rates as easier.
+
+`scenarios.motion.recover` proposes the posture. MuJoCo performs it here, and the same hold without recovery from
 the same temperatures. In both the arm first observes its motors for `Nearby.watch_s`.
+
+Postures as a person writes them: a name, or seven angles in degrees.
+
+One arm of a scenario with its twin and its cool motion, for generation and recovery.
+
+Write generated motion and recoveries atomically as folders; column names hold the units.
 """
 
+import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import repeat
+from pathlib import Path
+from typing import Any, Literal  # Any: values of the JSON card
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+import pyarrow.parquet as pq
 
+from fleet.arm.model import ArmModel
+from fleet.arm.random_motions import plan_motion
 from fleet.engine.world import Arm
-from fleet.errors import InfeasibleJob
+from fleet.errors import FleetError, InfeasibleJob, nearest
+from fleet.files import cache_folder
+from fleet.heat.motor import Motors
+from fleet.heat.thermal import (
+    HOUSING,
+    NODES,
+    WINDING,
+    ThermalModel,
+    drive_heat,
+    simulate_temperatures,
+    temperature_steps,
+)
 from fleet.job import BOUNDS, Fixture
-from fleet.motion import static_drive
-from fleet.physics.models import ArmModel
-from fleet.planning.random_motions import plan_motion
-from fleet.robot import JOINTS
-from fleet.thermal import NODES, WINDING, temperature_steps
-from scenarios.motion.generate import Verification
-from scenarios.motion.perform import Performance, perform
-from scenarios.motion.posture_search import Nearby, RecoveryError, Search, holding
+from fleet.motion import RATE_HZ, Plan, static_drive
+from fleet.robot import JOINTS, POSTURES
+from scenarios.motion.generate import Generated, Performance, Verification, bare_arm, perform
+from scenarios.prepare.arms import plan_arms
+from scenarios.prepare.twins import require_cool_plans, train_twins
+from scenarios.progress import Progress, quiet
+from scenarios.result_folder import ResultKind, new_folder
+from scenarios.spec.jobs import rehearsal_works
+from scenarios.spec.schema import Scenario
+from twin.vae.measures import Features
 from twin.vae.twin import Twin
+from twin.vae.window import PHASES
 
 Array = np.ndarray
+
+INSTANT_S = 0.02
+"""Duration of the first stop, one sample: the payload is grasped at its end, then the observation begins."""
+BEST = 10
+"""Number of candidates with a second search around them."""
+ROUNDS = 3
+"""Fixed-point iterations; the magnets weaken by only 0.1 % per kelvin of the housing, so they converge fast."""
+CLOSER = 0.3
+"""Size of the second search relative to the first."""
+
+
+class RecoveryError(FleetError):
+    """A posture recovery that is out of range or has no better posture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nearby:
+    """Limits and sampling of the search."""
+
+    joint_rad: float = 0.6
+    """Largest displacement of a joint."""
+    tool_m: float = 0.3
+    """Largest displacement of the tool."""
+    candidates: int = 600
+    """Postures drawn from each neighbourhood."""
+    latent_scale: float = 4.0
+    """Largest perturbation of the latent, in posterior standard deviations."""
+    cooling_k: float = 2.0
+    """Least predicted cooling of the hottest motor, because the prediction is not exact."""
+    watch_s: float = 30.0
+    """Observation time before the arm moves. Twice as long heats the motors longer; half as long doubles the housing
+    error of 0.2 K that 0.05 K of noise causes."""
+    speed: float = 0.5
+    """Share of the joint limits at which the arm moves."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 < value < np.inf:
+                raise ValueError(f"Nearby.{name} must be > 0 (got {value}).")
+        if self.speed > 1:
+            raise ValueError(f"Nearby.speed must be a share of the limits in (0, 1] (got {self.speed}).")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A posture near the hold."""
+
+    q: Array
+    """rad, [joint]."""
+    origin: str
+    """latent or joint space."""
+    tool_m: float
+    """Displacement of the tool."""
+    error: float
+    """One-sided torque error of the hottest motor, z units; it also ranks where the difficulty has saturated."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """Result of a search."""
+
+    candidate: Candidate
+    plan: Plan
+    """From home to the old posture while watching, to the new one for the rest of the time, and back."""
+    passed_over: dict[str, int]
+    """Easier candidates that were rejected, by reason."""
+    best_error: dict[str, float]
+    """Smallest one-sided torque error of the hottest motor by origin, in the first search."""
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Search for one arm that holds a payload."""
+
+    twin: Twin
+    model: ArmModel
+    known: Verification
+    """The arm's thermal parameters."""
+    near: Nearby
+    q: Array
+    """rad, [joint]."""
+    payload_kg: float
+    before_c: Array
+    """Winding temperatures as measured when the arm began to watch, [joint]."""
+    winding_c: Array
+    """As measured now, `Nearby.watch_s` later, [joint]."""
+    hold_s: float
+    """Remaining time of the hold."""
+
+    @property
+    def hottest(self) -> int:
+        """The hottest motor, index 0..6."""
+        return int(np.argmax(self.winding_c))
+
+    def best(self, rng: np.random.Generator) -> SearchResult:
+        """The easiest candidate that passes every check.
+
+        Raises:
+            RecoveryError: no candidate passes.
+        """
+        now = float(holding(self.twin, self.model, self.q[None], self.payload_kg).one_sided[0, self.hottest])
+        first = self._candidates(self._decoded(rng), "latent")
+        around = self.q + self.near.joint_rad * rng.uniform(-1.0, 1.0, (self.near.candidates, JOINTS))
+        first += self._candidates(around, "joint space")
+        leaders = sorted(first, key=lambda candidate: candidate.error)[:BEST]
+        ranked = sorted(first + self._refined(leaders, rng), key=lambda candidate: candidate.error)
+        passed_over = Counter[str]()
+        for candidate in ranked:
+            if candidate.error >= now:
+                break
+            plan = self._plan_or_reason(candidate.q)
+            if isinstance(plan, Plan):
+                return SearchResult(candidate, plan, dict(passed_over), _best_by_origin(first))
+            passed_over[plan] += 1
+        raise RecoveryError(self._failure(len(ranked), passed_over))
+
+    def _plan_or_reason(self, posture: Array) -> Plan | str:
+        """The plan of moving there and holding, or the reason of a rejection."""
+        if reason := self._thermal_objection(posture):
+            return reason
+        try:
+            return plan_motion(
+                self.model,
+                np.stack([self.q, self.q, posture]),
+                dwell_s=[INSTANT_S, self.near.watch_s, self.hold_s],
+                payload_kg=self.payload_kg,
+                speed=self.near.speed,
+                name="recovery",
+            )
+        except InfeasibleJob as error:
+            return error.reason.split(":")[0]
+
+    def _failure(self, count: int, passed_over: Counter[str]) -> str:
+        reasons = ", ".join(f"{reason} {times}" for reason, times in passed_over.most_common())
+        return (
+            f"No better posture near: of {count} within {self.near.joint_rad:g} rad per joint and "
+            f"{self.near.tool_m:g} m of the tool, {passed_over.total()} are easier for joint {self.hottest + 1}"
+            + (f", and all of them were rejected ({reasons})" if reasons else "")
+            + ". Allow more displacement, or put the payload down."
+        )
+
+    def _decoded(self, rng: np.random.Generator) -> Array:
+        """Postures decoded around the latent of this hold, or between the hold and those."""
+        mu, sigma = self.twin.posterior(_windows(self.twin, self.model, self.q[None], self.payload_kg))
+        count = self.near.candidates
+        scale = rng.uniform(0.0, self.near.latent_scale, (count, 1, 1))
+        latent = mu + scale * rng.standard_normal((count, *mu.shape[1:])) * sigma
+        decoded = self.twin.decode(latent.astype(np.float32))[..., 0].mean(axis=1)
+        away = decoded - self.q
+        endless = np.isinf(self.model.position_range).any(axis=1)
+        away -= np.where(endless, 2 * np.pi * np.round(away / (2 * np.pi)), 0.0)
+        return self.q + rng.uniform(0.0, 1.0, (count, 1)) * away
+
+    def _refined(self, leaders: list[Candidate], rng: np.random.Generator) -> list[Candidate]:
+        """Candidates near the easiest ones, including the border of the allowed range."""
+        refined: list[Candidate] = []
+        for leader in leaders:
+            step = CLOSER * self.near.joint_rad * rng.standard_normal((self.near.candidates // BEST + 1, JOINTS))
+            away = np.clip(leader.q + step - self.q, -self.near.joint_rad, self.near.joint_rad)
+            refined += self._candidates(self.q + away, leader.origin)
+        return refined
+
+    def _candidates(self, postures: Array, origin: str) -> list[Candidate]:
+        """Postures within the limits and joint stops, with the twin's score."""
+        low, high = self.model.position_range.T
+        here = self.model.tool_pose(self.q)[0]
+        turned = np.abs(postures - self.q).max(axis=1) <= self.near.joint_rad + 1e-9
+        postures = postures[turned & ((postures >= low) & (postures <= high)).all(axis=1)]
+        tool_m = np.array([np.linalg.norm(self.model.tool_pose(posture)[0] - here) for posture in postures])
+        kept = tool_m <= self.near.tool_m
+        if not kept.any():
+            return []
+        error = holding(self.twin, self.model, postures[kept], self.payload_kg).one_sided[:, self.hottest]
+        rows = zip(postures[kept], tool_m[kept].tolist(), error.tolist(), strict=True)
+        return [Candidate(q, origin, far, e) for q, far, e in rows]
+
+    def _thermal_objection(self, posture: Array) -> str | None:
+        """Reason why the predicted temperatures exclude a posture, or None."""
+        end_c = self._end_temperatures(posture)
+        if end_c[self.hottest] > self.before_c[self.hottest] - self.near.cooling_k:
+            return "would not cool"
+        return "another motor as hot" if end_c.max() >= self.before_c.max() else None
+
+    def _end_temperatures(self, posture: Array) -> Array:
+        """Predicted winding temperatures after the rest of the hold in this posture, °C, [joint]."""
+        known, tau = self.known, self.model.gravity_torque(posture, self.payload_kg)
+        simulated = simulate_temperatures(
+            static_drive(tau, known.motors),
+            [self.hold_s],
+            motors=known.motors,
+            thermal=known.thermal,
+            start_c=self._start_c,
+            ambient_c=known.ambient_c,
+        )
+        return simulated.end_c[0, WINDING]
+
+    @cached_property
+    def _start_c(self) -> Array:
+        """Estimated temperatures of the nodes, °C, [node]."""
+        known, tau = self.known, self.model.gravity_torque(self.q, self.payload_kg)
+        housing_c = housing_estimate(
+            self.before_c, self.winding_c, self.near.watch_s, tau, known.motors, known.thermal, known.ambient_c
+        )
+        return np.concatenate([self.winding_c, housing_c])
+
+
+def _best_by_origin(candidates: list[Candidate]) -> dict[str, float]:
+    origins = dict.fromkeys(candidate.origin for candidate in candidates)
+    return {origin: min(c.error for c in candidates if c.origin == origin) for origin in origins}
+
+
+def holding(twin: Twin, model: ArmModel, q: Array, payload_kg: float) -> Features:
+    """Twin features of standing in postures [posture, joint] with a payload, [posture, joint, part]."""
+    return twin.window_features(_windows(twin, model, q, payload_kg))
+
+
+def _windows(twin: Twin, model: ArmModel, q: Array, payload_kg: float) -> Array:
+    """Windows of standing still, [posture, time, joint, channel]."""
+    tau = np.stack([model.gravity_torque(posture, payload_kg) for posture in q])
+    return np.repeat(np.stack([q, np.zeros_like(q), tau], axis=-1)[:, None], twin.config.window, axis=1)
+
+
+def housing_estimate(
+    before_c: Array,
+    winding_c: Array,
+    watched_s: float,
+    tau: Array,
+    motors: Motors,
+    thermal: ThermalModel,
+    ambient_c: float,
+) -> Array:
+    """Housing temperatures of an arm that holds `tau` N·m, °C, [joint], from two readings of its windings.
+
+    Heat that a winding does not store flows into its housing, C Tw' = P − (Tw − Th) / R, averaged over the time between
+    the readings. The result is never below the ambient temperature. It neglects the housing's drift and the curvature
+    of the winding temperature, some tenths of a kelvin. Readings rounded to 1 K would cause 2 K over half a minute.
+
+    Args:
+        before_c: Winding temperatures at the first reading, °C, [joint].
+        winding_c: The same `watched_s` later.
+    """
+    mean_c = 0.5 * (before_c + winding_c)
+    conductance = -np.diagonal(thermal.laplacian[WINDING, HOUSING])
+    kept_w = thermal.capacity[WINDING] * (winding_c - before_c) / watched_s
+    load, housing_c = static_drive(tau, motors), mean_c
+    for _ in range(ROUNDS):
+        loss_w = drive_heat(np.concatenate([mean_c, housing_c]), load.current_sq, load.friction_w, motors)[WINDING]
+        housing_c = np.maximum(mean_c - (loss_w - kept_w) / conductance, ambient_c)
+    return housing_c
+
 
 MOST_PAYLOAD_KG = 4.5
 """Kinova's rating of a Gen3 without gripper: 4.5 kg at full reach for a while (user guide, technical
@@ -200,3 +497,209 @@ def hold_until(
         f"Arm '{arm.robot.name}' does not get warm: holding {payload_kg:g} kg there for {most_s / 60:g} min heats its "
         f"hottest motor to {temp_c[WINDING].max():.1f} °C, less than {until_c:g} °C. There is nothing to recover from."
     )
+
+
+class PostureError(FleetError):
+    """A posture that cannot be read, or that is beyond a joint stop; says what is allowed."""
+
+
+def parse_posture(text: str, position_range: Array | None = None) -> Array:
+    """Joint positions, rad, [joint], of a posture's name or of seven comma-separated angles in degrees.
+
+    Args:
+        position_range: Lowest and highest joint position, rad, [joint, 2]; not checked if not given.
+
+    Raises:
+        PostureError: unknown name, not seven numbers, or a joint beyond its stop.
+    """
+    if text in POSTURES:
+        return np.array(POSTURES[text])
+    try:
+        degrees = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        hint = nearest(text, POSTURES).removesuffix(".")
+        raise PostureError(f"No posture '{text}'{hint}, or {JOINTS} comma-separated angles in degrees.") from None
+    if degrees.shape != (JOINTS,) or not np.all(np.isfinite(degrees)):
+        raise PostureError(f"A posture is a name or {JOINTS} comma-separated angles in degrees (got '{text}').")
+    if position_range is not None:
+        low, high = np.rad2deg(position_range).T
+        for j in np.flatnonzero((degrees < low) | (degrees > high)):
+            raise PostureError(f"Joint {j + 1} turns from {low[j]:.1f} to {high[j]:.1f} degrees (got {degrees[j]:g}).")
+    return np.deg2rad(degrees)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownArm:
+    """An arm, its twin, and its motions that stay cool over the horizon of a rehearsal."""
+
+    arm: Arm
+    twin: Twin
+    sources: tuple[Plan, ...]
+    verification: Verification
+    """With a nominal Gen3's thermal parameters, at the rehearsal's ambient temperature, horizon and limit."""
+
+
+def known_arm(
+    scenario: Scenario,
+    name: str | None = None,
+    *,
+    twin: Twin | None = None,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> KnownArm:
+    """An arm of a scenario by name; without one, the first.
+
+    Args:
+        twin: Its twin; by default that with which the arm works in the scenario's fleet, trained or from the cache.
+
+    Raises:
+        FleetError: no such arm, a twin of another arm, or no motion of this arm stays cool.
+    """
+    name = scenario.arms[0].name if name is None else name
+    index = scenario.index_of(name)
+    if twin is not None and twin.arm != name:
+        raise FleetError(f"This is the twin of arm '{twin.arm}', not of '{name}'; give the one that belongs to it.")
+    folder = cache or cache_folder()
+    (planned,) = plan_arms(scenario, [index], rehearsal_works(scenario), folder, progress)
+    robot, motors, thermal = planned.hardware
+    if twin is None:
+        (twin,) = train_twins(scenario, [planned], folder, progress)
+    sources = require_cool_plans(planned.all_plans, planned.hardware, scenario)
+    spec = scenario.twin
+    verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
+    return KnownArm(bare_arm(robot, motors, thermal), twin, sources, verification)
+
+
+Format = Literal["parquet", "csv"]
+
+GENERATED = ResultKind(
+    name="generation", card="generated.json", files=("generated.json", "motion_*.parquet", "motion_*.csv")
+)
+"""One table per motion, and a card with sources and rejections."""
+RECOVERY = ResultKind(
+    name="recovery", card="recovery.json", files=("recovery.json", "recovery.parquet", "recovery.csv")
+)
+"""Temperatures with and without recovery, and a card with the postures."""
+
+
+def save_generated(made: Generated, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
+    """Write `motion_000` and so on, and `generated.json`.
+
+    Raises:
+        FleetError: `out` cannot be written, or holds something that is not ours to replace.
+    """
+    with new_folder(out, GENERATED, overwrite=overwrite) as folder:
+        for i, motion in enumerate(made.motions):
+            _write(motion_table(motion.plan), folder / f"motion_{i:03d}.{format}")
+        _write_card(generated_summary(made, format), folder / GENERATED.card)
+
+
+def save_recovery(recovery: Recovery, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
+    """Write `recovery.parquet` (or .csv) and `recovery.json`.
+
+    Raises:
+        FleetError: `out` cannot be written, or holds something that is not ours to replace.
+    """
+    with new_folder(out, RECOVERY, overwrite=overwrite) as folder:
+        _write(recovery_table(recovery), folder / f"recovery.{format}")
+        _write_card(recovery_summary(recovery), folder / RECOVERY.card)
+
+
+def motion_table(plan: Plan) -> pa.Table:
+    """A plan as one row per sample: time_s, phase, payload_kg, q_1_rad …, qd_1_rad_s …, tau_1_nm …"""
+    profile = np.concatenate([phase.profile for phase in plan.phases])
+    lengths = [len(phase.profile) for phase in plan.phases]
+    return pa.table(
+        {
+            "time_s": np.arange(len(profile)) / RATE_HZ,
+            "phase": np.repeat(PHASES, lengths),
+            "payload_kg": np.concatenate([phase.payload_kg for phase in plan.phases]),
+            **_by_joint("q", "_rad", profile[:, 0]),
+            **_by_joint("qd", "_rad_s", profile[:, 1]),
+            **_by_joint("tau", "_nm", profile[:, 2]),
+        }
+    )
+
+
+def recovery_table(recovery: Recovery) -> pa.Table:
+    """Winding temperatures as one row per moment: time_s, without_1_c …, with_1_c …"""
+    temperatures = {**_by_joint("without", "_c", recovery.without_c), **_by_joint("with", "_c", recovery.with_c)}
+    return pa.table({"time_s": recovery.time_s, **temperatures})
+
+
+def _by_joint(name: str, unit: str, values: Array) -> dict[str, Array]:
+    """Columns `name_1unit` … of values [row, joint]."""
+    return {f"{name}_{j + 1}{unit}": values[:, j] for j in range(JOINTS)}
+
+
+def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, Any]:
+    """Motions, sources and rejections as plain values."""
+    return {
+        "status": "finished",
+        "arm": made.arm,
+        "twin": made.twin_version,
+        "s": made.s,
+        "seed": made.seed,
+        "asked": made.asked,
+        "handed_out": len(made.motions),
+        "rejected": dict(made.rejected),
+        "truly_cool": made.truly_cool,
+        **{name: getattr(made.verification, name) for name in ("cool_c", "margin_k", "horizon_s", "ambient_c")},
+        "rate_hz": RATE_HZ,
+        "motions": [
+            {
+                "file": f"motion_{i:03d}.{format}",
+                "source": {
+                    "kind": motion.source.work.kind,
+                    "places": list(motion.source.work.stations),
+                    "elbow": motion.source.elbow,
+                    "speed": motion.source.speed,
+                },
+                "payload_kg": motion.source.work.payload_kg,
+                "duration_s": motion.plan.duration_s(1),
+                "distance_rad": motion.distance_rad,
+                "distance_z": motion.distance_z,
+                "predicted_peak_c": float(motion.predicted_c.max()),
+                "true_peak_c": float(motion.peak_c.max()),
+                "tracking_error_rad": motion.error_rad,
+            }
+            for i, motion in enumerate(made.motions)
+        ],
+    }
+
+
+def recovery_summary(recovery: Recovery) -> dict[str, Any]:
+    """The recovery as plain values; joints are counted from one."""
+    return {
+        "status": "finished",
+        "arm": recovery.arm,
+        "twin": recovery.twin_version,
+        "payload_kg": recovery.payload_kg,
+        "hottest_joint": recovery.hottest + 1,
+        "q_before_rad": recovery.q_before.tolist(),
+        "q_after_rad": recovery.q_after.tolist(),
+        "origin": recovery.origin,
+        "most_moved_rad": float(np.abs(recovery.moved_rad).max()),
+        "tool_moved_m": recovery.tool_m,
+        "difficulty_before": recovery.difficulty_before.tolist(),
+        "difficulty_after": recovery.difficulty_after.tolist(),
+        "best_error": recovery.best_error,
+        "passed_over": recovery.passed_over,
+        "start_c": float(recovery.with_c[0, recovery.hottest]),
+        "end_with_c": float(recovery.with_c[-1, recovery.hottest]),
+        "end_without_c": float(recovery.without_c[-1, recovery.hottest]),
+        "cooled_k": recovery.cooled_k,
+        "spared_k": recovery.spared_k,
+        "tracking_error_rad": recovery.error_rad,
+    }
+
+
+def _write(table: pa.Table, path: Path) -> None:
+    if path.suffix == ".csv":
+        pc.write_csv(table, path)
+    else:
+        pq.write_table(table, path)
+
+
+def _write_card(card: dict[str, Any], path: Path) -> None:
+    path.write_text(json.dumps(card, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -12,7 +12,7 @@ from pettingzoo.utils import wrappers
 
 from fleet.env.allocation_v1 import VERSION, AllocationEnv, InTurns
 from scenarios.prepare.fleet import make_env
-from scenarios.schema import Scenario
+from scenarios.spec.schema import Scenario
 
 NAME = f"thermofleet/{VERSION}"
 

@@ -21,7 +21,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array, vstack
 
 from fleet.engine.state import World
-from fleet.thermal import WINDING, drive_heat
+from fleet.heat.thermal import WINDING, drive_heat
 
 Array = np.ndarray
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from fleet.errors import ScenarioError
 from fleet.seeding import child
-from scenarios.parse import override, plain_values
-from scenarios.schema import Ambient, Scenario
+from scenarios.spec.parse import override, plain_values
+from scenarios.spec.schema import Ambient, Scenario
 
 MOST_ARRIVALS = 100.0
 """Largest factor on the rate of arrivals, which bounds the memory of the queue."""
@@ -110,7 +110,7 @@ def randomisation_of(given: object) -> Randomisation:
         ScenarioError: something else was given.
     """
     if not isinstance(given, Randomisation | None):
-        raise ScenarioError(f"randomise must be a scenarios.run.batch.Randomisation (got {given!r}).")
+        raise ScenarioError(f"randomise must be a scenarios.prepare.fleet.Randomisation (got {given!r}).")
     return given or Randomisation()
 
 

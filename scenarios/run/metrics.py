@@ -1,8 +1,21 @@
-"""Metrics of one shift."""
+"""Metrics of one shift.
 
+What the heat of a shift does: insulation life that is used, drift of the tool points, surfaces too hot to touch.
+
+From the end of a shift to its metrics.
+"""
+
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+
+from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, State, World
+from fleet.events import Event
+from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, seconds_above, segment_temperatures, surface_c
+from fleet.heat.thermal import HOUSING, WINDING
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,14 +59,14 @@ class Metrics:
     heat_gini: float
     """Gini coefficient of the arms' shares of that heat: 0 all equal, near 1 one arm has all."""
     insulation_ppb: dict[str, float]
-    """Of each arm: billionths of the rated life that its most aged winding used; see `fleet.heat.insulation`."""
+    """Of each arm: billionths of the rated life that its most aged winding used; see `fleet.heat.effects`."""
     tool_drift_mm: dict[str, float]
     """Of each arm: the most that heat moved its tool point since the beginning of the shift, if it is stretched; see
-    `fleet.heat.tool_drift`."""
+    `fleet.heat.effects`."""
     hot_surface_min: float
     """Sum over arms of the time with a surface above the burn threshold of the scenario's `people.contact_s`."""
     surface_c: dict[str, float]
-    """Hottest surface of each arm that can be touched; see `fleet.heat.touch`."""
+    """Hottest surface of each arm that can be touched; see `fleet.heat.effects`."""
     messages: int
     """Messages delivered to a peer."""
     lost_claims: int
@@ -74,3 +87,123 @@ def gini(shares: np.ndarray) -> float:
     if mean == 0:
         return 0.0
     return float(np.abs(shares[:, None] - shares[None, :]).mean() / (2 * mean))
+
+
+Array = np.ndarray
+
+
+class HeatUse:
+    """Sums over the recorded temperatures of a shift, with any leading axes.
+
+    Args:
+        temp_c: Temperatures at the beginning, °C, [..., arm, node]. The tool points are calibrated there.
+        burn_c: Temperature above which a surface is too hot to touch.
+    """
+
+    def __init__(self, temp_c: Array, burn_c: float) -> None:
+        self._burn_c, self._surface_c = burn_c, surface_c(temp_c)
+        self.surface_c = self._surface_c.copy()
+        """Hottest surface of each arm so far, °C, [..., arm]."""
+        self._hot_s = np.zeros_like(self._surface_c)
+        self._start_c = segment_temperatures(temp_c[..., HOUSING])
+        self._rate = arrhenius_rate(temp_c[..., WINDING])
+        self._used = np.zeros_like(self._rate)
+        self._drift_m = np.zeros(self._rate.shape[:-1])
+
+    def add(self, temp_c: Array, dt_s: float) -> None:
+        """Take the temperatures `dt_s` later, °C, [..., arm, node]."""
+        rate = arrhenius_rate(temp_c[..., WINDING])
+        self._used += life_used(self._rate, rate, dt_s)
+        self._rate = rate
+        rise_k = segment_temperatures(temp_c[..., HOUSING]) - self._start_c
+        np.maximum(self._drift_m, most_drift_m(rise_k), out=self._drift_m)
+        now_c = surface_c(temp_c)
+        self._hot_s += seconds_above(self._surface_c, now_c, self._burn_c, dt_s)
+        np.maximum(self.surface_c, now_c, out=self.surface_c)
+        self._surface_c = now_c
+
+    @property
+    def insulation_ppb(self) -> Array:
+        """Billionths of the rated life that the most aged winding of each arm used, [..., arm]."""
+        return 1e9 * self._used.max(axis=-1)
+
+    @property
+    def tool_drift_mm(self) -> Array:
+        """The most that the tool point of the stretched arm drifted, mm, [..., arm]."""
+        return 1e3 * self._drift_m
+
+    @property
+    def hot_surface_min(self) -> Array:
+        """Time with a surface too hot to touch, min, [..., arm]."""
+        return self._hot_s / 60.0
+
+
+def metrics_of(
+    world: World,
+    state: State,
+    heat: HeatUse,
+    events: Sequence[Event],
+    messages: int,
+    *,
+    finds_contacts: bool = False,
+) -> Metrics:
+    """Metrics of env 0 at the time of `state`.
+
+    Args:
+        heat: Of the whole shift, [arm].
+        finds_contacts: Whether the plant looks for contacts.
+    """
+    time_s = float(state.tick[0] * world.dt_s)
+    jobs = slice(int(world.jobs.exists[0].sum()))
+    release_s, due_s, value = (column[0, jobs] for column in (world.jobs.release_s, world.jobs.due_s, world.jobs.value))
+    finished_s = state.finished_s[0, jobs][state.status[0, jobs] == DONE]
+    late_s = np.maximum(finished_s - due_s[state.status[0, jobs] == DONE], 0.0)
+    released = release_s <= time_s
+    release = dict(zip(world.jobs.names[0], release_s.tolist(), strict=True))
+    first_award: dict[str, float] = {}
+    for event in events:
+        if event.kind == "award":
+            first_award.setdefault(event.job, event.time_s)
+    waits = [at_s - release[job] for job, at_s in first_award.items()]
+    return Metrics(
+        **common_figures(state, 0, value, due_s, world.dt_s),
+        jobs=int(released.sum()),
+        given_up=int((state.status[0, jobs] == GIVEN_UP).sum()),
+        expired=int((state.status[0, jobs] == EXPIRED).sum()),
+        moved_home=sum(event.kind == "moved" for event in events),
+        value_offered=float(value[released].sum()),
+        tardiness_min=float(late_s.sum() / 60.0),
+        mean_wait_s=math.fsum(waits) / len(waits) if waits else 0.0,
+        makespan_s=float(finished_s.max(initial=0.0)),
+        jobs_per_hour=float(len(finished_s) / (time_s / 3600.0)) if time_s else 0.0,
+        peak_c=dict(zip(world.arms, state.peak_c[0].tolist(), strict=True)),
+        utilisation=float(state.busy_s[0].sum() / (time_s * len(world.arms))) if time_s else 0.0,
+        energy_wh=float(state.energy_j[0].sum() / 3600.0),
+        heat_gini=gini(state.energy_j[0]),
+        insulation_ppb=dict(zip(world.arms, heat.insulation_ppb.tolist(), strict=True)),
+        tool_drift_mm=dict(zip(world.arms, heat.tool_drift_mm.tolist(), strict=True)),
+        hot_surface_min=float(heat.hot_surface_min.sum()),
+        surface_c=dict(zip(world.arms, heat.surface_c.tolist(), strict=True)),
+        messages=messages,
+        contacts=sum(event.kind == "contact" for event in events) if finds_contacts else None,
+        lost_claims=sum(event.kind == "lost" for event in events),
+        illegal_actions=int(state.illegal[0].sum()),
+    )
+
+
+def common_figures(state: State, env: int, value: Array, due_s: Array, dt_s: float) -> dict[str, Any]:
+    """The figures that metrics of a run and of a comparison share, by name (Any: numbers).
+
+    Args:
+        value, due_s: Of each job of this env, [job].
+    """
+    done = state.status[env, : len(value)] == DONE
+    time_s, lost_s = float(state.tick[env] * dt_s), state.lost_s[env]
+    return {
+        "finished": int(done.sum()),
+        "value": float(value[done].sum()),
+        "on_time": int((state.finished_s[env, : len(value)][done] <= due_s[done]).sum()),
+        "faults": int(state.faults[env].sum()),
+        "above_warning_min": float(state.above_warning_s[env].sum() / 60.0),
+        "availability": float(1.0 - lost_s.sum() / (time_s * len(lost_s))) if time_s else 1.0,
+    }

@@ -10,16 +10,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from fleet.arm.cell import cell_model
 from fleet.env.allocation_v1 import VERSION
 from fleet.errors import FleetError
 from fleet.events import Event
-from fleet.physics.cell_model import cell_model
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
 from scenarios.result_folder import ResultKind, disk_errors
 from scenarios.run.shift import RUN_FORMAT, RunResult, summary
-from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer
+from scenarios.spec.schema import Scenario
 
 FILES = ("run.json", "telemetry.parquet", "events.parquet", "jobs.parquet", "offers.parquet", "report.html")
 ROWS_AT_ONCE = 10_000

@@ -12,23 +12,19 @@ from agents.policy import only_choices
 from fleet.bus.exchange.channel import PERFECT
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
-from fleet.env.allocation_v1 import VERSION, AllocationEnv
-from fleet.env.validation import actions_of
+from fleet.env.allocation_v1 import VERSION, AllocationEnv, actions_of
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
 from scenarios.policy_loader import OnBus, blaming, policy_at
-from scenarios.prepare.fleet import Fleet, env_of
-from scenarios.prepare.known_cell import let_plan
+from scenarios.prepare.fleet import Fleet, env_of, let_plan
 from scenarios.progress import Progress, quiet
-from scenarios.run.heat_use import HeatUse
-from scenarios.run.metrics import Metrics
-from scenarios.run.outcome import metrics_of
+from scenarios.run.metrics import HeatUse, Metrics, metrics_of
 from scenarios.run.provenance import code_hash, provenance
-from scenarios.scenario_hash import scenario_hash
-from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
-from scenarios.specs import RunSpec
+from scenarios.spec.options import RunSpec
+from scenarios.spec.parse import scenario_hash
+from scenarios.spec.schema import Scenario
 
 RUN_FORMAT = 6
 """Raised when run.json or the columns of the recordings change so that an earlier version cannot be read."""

@@ -18,8 +18,8 @@ from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
 from scenarios.run.run_folder import UNITS, check_format
 from scenarios.run.schedule import Schedule, payloads, schedule
-from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer
+from scenarios.spec.schema import Scenario
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from rich.text import Text
 
 from scenarios.evaluate.comparison import Comparison, Failed
 from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
-from scenarios.evaluate.statistics import LEVEL, Interval, profile
-from scenarios.evaluate.tables import LEGEND
+from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, plain
 from scenarios.show.table import Column, Table

@@ -7,15 +7,15 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from fleet.env.render.heat import heat_colour, heat_marks
+from fleet.arm.cell import CellCamera, CellPlayer
+from fleet.env.render.picture import heat_colour, heat_marks
 from fleet.errors import FleetError, install, visible
-from fleet.physics.cell_player import CellCamera, CellPlayer
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES
 from scenarios.run.stored_run import StoredRun
 from scenarios.show.moments import motor_spheres
 from scenarios.show.words import clock
-from scenarios.specs import Shot
+from scenarios.spec.options import Shot
 
 Array = np.ndarray
 

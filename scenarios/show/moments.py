@@ -8,9 +8,9 @@ from typing import Any  # plain values of a cell model
 
 import numpy as np
 
-from fleet.env.render.heat import heat_colour, heat_marks
+from fleet.arm.cell import cell_model
+from fleet.env.render.picture import heat_colour, heat_marks
 from fleet.job import payload_radius_m
-from fleet.physics.cell_model import cell_model
 from fleet.robot import ThermalLimits
 from scenarios.run.stored_run import StoredRun
 from scenarios.show.replay import HEAT_STEP_S

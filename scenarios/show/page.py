@@ -10,9 +10,8 @@ from typing import Any  # values of JSON
 from markupsafe import Markup
 
 from fleet.errors import visible
-from scenarios.show.html import render, static
 from scenarios.show.replay import compressed, three_js
-from scenarios.show.table import Table
+from scenarios.show.table import Table, render, static
 
 Figure = Mapping[str, Any]
 """`data` and `layout` in Plotly's schema: a plain dict, because Plotly's own objects take longer than a report."""
@@ -107,7 +106,7 @@ class Replay:
     """A shift to be played in 3-D."""
 
     model: Mapping[str, Any]
-    """`fleet.physics.cell_model.cell_model`."""
+    """`fleet.arm.cell.cell_model`."""
     playback: str
     """`scenarios.show.replay.packed`."""
     unit_s: float

@@ -1,14 +1,24 @@
-"""One table for the terminal, pages, notebooks and documents."""
+"""One table for the terminal, pages, notebooks and documents.
+
+HTML from the templates of this folder: every text is escaped, and control characters are shown.
+"""
 
 import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib.resources import files
 from typing import TYPE_CHECKING
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from fleet.errors import visible
+
 if TYPE_CHECKING:
-    from markupsafe import Markup
     from rich.console import Group
+
 
 MOST_LABEL = 40
 """Characters of a row's label on the terminal, so that a long name leaves room for the figures."""
@@ -136,7 +146,6 @@ class Table:
             moments: Of each row.
             key: With one, a field above the table filters its rows.
         """
-        from scenarios.show.html import render
 
         classes = " ".join([*(["numbers"] if self.numbers else []), *style.split()])
         return render("table.html", table=self, style=classes, kinds=kinds, moments=moments, key=key)
@@ -168,3 +177,26 @@ class Table:
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table of texts in Markdown."""
     return Table(head=tuple(head), rows=tuple(map(tuple, rows))).markdown()
+
+
+def render(template: str, **values: object) -> Markup:
+    """The text of a template; the same values give the same text."""
+    return Markup(_environment().get_template(template).render(values))
+
+
+@cache
+def static(name: str) -> str:
+    """A file of `static`."""
+    return files("scenarios.show").joinpath("static", name).read_text(encoding="utf-8")
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("scenarios.show"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: visible(value, "\n") if type(value) is str else value,  # not of Markup
+    )

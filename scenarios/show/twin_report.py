@@ -18,30 +18,36 @@ import numpy as np
 from joblib import cpu_count, delayed
 from sklearn.metrics import roc_auc_score
 
+from fleet.arm.random_motions import random_jobs
 from fleet.errors import FleetError
 from fleet.motion import CHANNELS, RATE_HZ, Plan
-from fleet.planning.random_motions import random_jobs
-from scenarios.job_stream import rehearsal_works
-from scenarios.prepare.cool_motion import cold_peaks, records, require_cool_plans
-from scenarios.prepare.planned_arm import plan_arms
-from scenarios.prepare.train_twins import exploration_records, train_or_load, train_twins, training_seed
-from scenarios.prepare.twin_folder import LOG_INPUT
+from scenarios.prepare.arms import plan_arms
+from scenarios.prepare.twins import (
+    LOG_INPUT,
+    cold_peaks,
+    exploration_records,
+    records,
+    require_cool_plans,
+    train_or_load,
+    train_twins,
+    training_seed,
+)
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
-from scenarios.schema import Scenario
 from scenarios.show.page import AXIS, LAYOUT, Chart, Section, sections_page
 from scenarios.show.table import Table
-from twin.baselines.reconstruction import untrained_config
-from twin.logs.recording import Recording
-from twin.logs.resampling import stretches
+from scenarios.spec.jobs import rehearsal_works
+from scenarios.spec.schema import Scenario
+from twin.baselines import untrained_config
+from twin.logs.recording import Recording, stretches
 from twin.training_data import cool_stretches
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU, Calibration, Features
 from twin.vae.train import train
 from twin.vae.twin import Twin
 from twin.vae.window import cut, cut_jobs, draw_windows, resample, starts, windows_of
-from twin.verdict.log_features import log_windows
+from twin.verdict import log_windows
 
 Array = np.ndarray
 Cells = dict[tuple[int, int], list[dict[str, Any]]]
@@ -63,7 +69,7 @@ QUANTILES = {"lowerfence": 5, "q1": 25, "median": 50, "q3": 75, "upperfence": 95
 COOL, BETWEEN, HOT = 0, 1, 2
 """Kinds of jobs and windows."""
 TEST_JOBS = 5
-"""Spawn key, different from those of `scenarios.prepare.train_twins` and `calibrate_twins` for the same arm."""
+"""Spawn key, different from those of `scenarios.prepare.twins` and `calibrate_twins` for the same arm."""
 LOADED_JOINT = 1
 """The joint whose temperature divides logs into cool and hot, index 0..6: joint 2 carries a standing arm."""
 LOG_HOT_C = 40.0
@@ -221,8 +227,7 @@ def scenario_subjects(
     Raises:
         FleetError: no motion of the arm stays cool.
     """
-    from scenarios.motion.generate import GenerationError, Verification, generate  # MuJoCo, which logs do not need
-    from scenarios.motion.perform import bare_arm
+    from scenarios.motion.generate import GenerationError, Verification, bare_arm, generate
 
     spec = scenario.twin
     (planned,) = plan_arms(scenario, [arm], rehearsal_works(scenario), folder, progress)

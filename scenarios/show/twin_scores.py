@@ -9,17 +9,15 @@ import numpy as np
 
 from fleet.files import cache_folder
 from fleet.motion import Plan
-from scenarios.job_stream import all_works
-from scenarios.prepare.planned_arm import plan_arms
+from scenarios.prepare.arms import plan_arms
 from scenarios.progress import Progress, quiet
-from scenarios.schema import Scenario
 from scenarios.show.table import Column, Table
-from twin.logs.recording import Recording
-from twin.logs.resampling import Stretch
+from scenarios.spec.jobs import all_works
+from scenarios.spec.schema import Scenario
+from twin.logs.recording import Recording, Stretch
 from twin.vae.measures import Features, Measures
 from twin.vae.twin import Twin
-from twin.verdict.log_features import log_features, log_windows
-from twin.verdict.rule import Rule, word
+from twin.verdict import Rule, log_features, log_windows, word
 
 Array = np.ndarray
 Cell = str | float | None
@@ -49,7 +47,7 @@ def log_rows(twin: Twin, recordings: Sequence[Recording]) -> list[Row]:
     """One row of mean scores per recording.
 
     Raises:
-        FleetError: as `twin.verdict.log_features.log_windows`.
+        FleetError: as `twin.verdict.log_windows`.
     """
     return [_log_row(twin, recording) for recording in recordings]
 

@@ -9,14 +9,12 @@ import sys
 from pathlib import Path
 
 from fleet.job import Job
-from scenarios.job_stream import works_of
 from scenarios.prepare.fleet import prepare, world_of
 from scenarios.prepare.load_factor import load_factor
-from scenarios.schema import SPLITS, JobStream
-from scenarios.suite.axes import Axes, scenario_of
-from scenarios.suite.cells import CELLS, Cell
+from scenarios.spec.jobs import works_of
+from scenarios.spec.schema import SPLITS, JobStream
+from scenarios.suite.instances import CELLS, TRADES, Axes, Cell, scenario_of
 from scenarios.suite.splits import drawn_rows, line_of
-from scenarios.suite.trades import TRADES
 
 FOLDER = Path(__file__).parent
 PLAIN = Axes(

@@ -11,12 +11,10 @@ import numpy as np
 
 from fleet.errors import ScenarioError
 from fleet.seeding import shift_seeds
-from scenarios.job_stream import draw_jobs
-from scenarios.scenario_hash import hash_of, scenario_hash
-from scenarios.schema import SPLITS, Scenario, SplitName
-from scenarios.schema_errors import choose
-from scenarios.suite.axes import Axes, draw_axes, scenario_of
-from scenarios.suite.cells import CELLS, Cell
+from scenarios.spec.jobs import draw_jobs
+from scenarios.spec.parse import choose, hash_of, scenario_hash
+from scenarios.spec.schema import SPLITS, Scenario, SplitName
+from scenarios.suite.instances import CELLS, Axes, Cell, draw_axes, scenario_of
 
 SUITE = 17
 """Seed of all draws of the suite."""
@@ -44,7 +42,7 @@ class Row:
     axes: Axes
     seed: int
     scenario: str
-    """Hash of the scenario, see `scenarios.scenario_hash`."""
+    """Hash of the scenario, see `scenarios.spec.parse`."""
     jobs: str
     """Hash of the drawn jobs, see `jobs_content`."""
     count: int

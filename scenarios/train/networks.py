@@ -9,27 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from agents.learned.imitation import imitate
+from agents.learned.evolution import CURVE, TrainingLength, TrainingLog, read_log
 from agents.learned.policy import save_policy
-from agents.learned.ppo import PpoConfig, Trainer
-from agents.learned.training_log import CURVE, TrainingLength, TrainingLog, read_log
-from fleet.engine.reward import RewardWeights
+from agents.learned.ppo import PpoConfig, Trainer, imitate
+from fleet.engine.batch import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
-from fleet.env.validation import actions_of
+from fleet.env.allocation_v1 import actions_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.files import atomic_path
 from scenarios.evaluate.rollout import Act, acts_of, known_in, rollout
-from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at, policy_of
-from scenarios.prepare.fleet import prepare
+from scenarios.prepare.fleet import library_of, prepare
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Count, Progress, quiet
-from scenarios.run.batch import library_of
-from scenarios.scenario_hash import scenario_hash
-from scenarios.schema import Scenario
-from scenarios.specs import RISK, DifficultyName, RiskName
-from scenarios.train.folder import NETWORK_STATE, check_folder, holds_training, skip_complete, write_card
-from scenarios.train.instances import Ground
+from scenarios.spec.jobs import weights_of
+from scenarios.spec.options import RISK, DifficultyName, RiskName
+from scenarios.spec.parse import scenario_hash
+from scenarios.spec.schema import Scenario
+from scenarios.train.instances import NETWORK_STATE, Ground, check_folder, holds_training, skip_complete, write_card
 
 Array = np.ndarray
 

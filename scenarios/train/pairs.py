@@ -7,12 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.learned.evolution import Evolution, EvolutionConfig
-from agents.learned.training_log import CURVE, TrainingLength, TrainingLog, read_log
-from agents.pair_scores import PARAMETERS, first_parameters, save_pairs
+from agents.learned.evolution import CURVE, Evolution, EvolutionConfig, TrainingLength, TrainingLog, read_log
+from agents.pairs import PARAMETERS, first_parameters, save_pairs
 from fleet.files import atomic_path
-from scenarios.train.folder import PAIRS_STATE, check_folder, holds_training, skip_complete, write_card
-from scenarios.train.instances import Ground, rewards
+from scenarios.train.instances import (
+    PAIRS_STATE,
+    Ground,
+    check_folder,
+    holds_training,
+    rewards,
+    skip_complete,
+    write_card,
+)
 
 Array = np.ndarray
 
@@ -59,7 +65,7 @@ def train_pairs(
 ) -> TrainedPairs:
     """Write into a folder the parameters with the best validation as a policy, the last state, and the curves.
 
-    Iteration 0 is `agents.pair_scores.first_parameters`, the teacher is `wsept`. Ctrl-C ends the training early and
+    Iteration 0 is `agents.pairs.first_parameters`, the teacher is `wsept`. Ctrl-C ends the training early and
     keeps its result; before the end of the validation of iteration 0 there is none.
 
     Args:

@@ -11,7 +11,7 @@ import pytest
 from fleet.errors import FleetError
 from scenarios.evaluate.runner import run_study
 from scenarios.evaluate.study import Case, Row, Study
-from scenarios.load import load
+from scenarios.spec.load import load
 from tests.own_policies import IDLE
 from tests.waiting import wait_until
 

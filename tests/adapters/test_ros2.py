@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, JobStatus, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.router import Router
 from fleet.ros2.cdr import (
     DIAGNOSTICS,
     JOINT_STATE,

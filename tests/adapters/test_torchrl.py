@@ -11,7 +11,7 @@ from torchrl.envs import RewardSum, TransformedEnv, check_env_specs
 from torchrl.modules import MaskedCategorical
 from torchrl.objectives.value import GAE
 
-from fleet.engine.reward import TERMS
+from fleet.engine.batch import TERMS
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv
 

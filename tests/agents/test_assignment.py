@@ -8,10 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.assignment import matching
-from agents.costs import RISK, quickest, thermal
 from agents.registry import RULES, make_policy
-from agents.rules import cheapest_pairs
+from agents.rules import RISK, cheapest_pairs, matching, quickest, thermal
 from fleet.observation import LONG_S, Layout, Observation
 from tests.profiles import examples
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.consensus import NOBODY, Belief, agree, bid, merge
+from agents.auction import NOBODY, Belief, agree, bid, merge
 from tests.profiles import examples
 
 FEW = st.sampled_from([0.0, 0.5, 1.0, 1.5, 2.0, np.inf])

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.heat_guards import FuzzySpeed, GuardedArm, GuardedFleet, Shutdown, TorqueLimiter
+from agents.heat import FuzzySpeed, GuardedArm, GuardedFleet, Shutdown, TorqueLimiter
 from agents.policy import WAIT, for_all_arms
 from agents.registry import RULES, WRAPPERS
+from fleet.arm.model import ArmModel
 from fleet.env.allocation_v1 import parallel_env
 from fleet.errors import FleetError
 from fleet.observation import Layout, Observation
-from fleet.physics.models import ArmModel
 from fleet.robot import POSTURES, RATING, Mount, Robot
 from scenarios.policy_loader import arm_policy_of, label, policy_of, scope_of
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.heat_rules import Wsept
+from agents.heat import Wsept
 from agents.pairs import Worth, worth_per_second
 from agents.policy import WAIT
 from agents.registry import make_policy

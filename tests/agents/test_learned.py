@@ -10,11 +10,19 @@ import torch
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from agents.learned.config import NetworkSize
-from agents.learned.features import sets_of
-from agents.learned.imitation import imitate
-from agents.learned.network import Actor, Critic, masked
-from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, draw, load_policy, save_policy
-from agents.learned.ppo import Chooser, PpoConfig, Trainer, advantages
+from agents.learned.policy import (
+    CARD,
+    WEIGHTS,
+    Actor,
+    Critic,
+    LearnedPolicy,
+    draw,
+    load_policy,
+    masked,
+    save_policy,
+    sets_of,
+)
+from agents.learned.ppo import Chooser, PpoConfig, Trainer, advantages, imitate
 from fleet.engine.batch import Shift, shifts_of
 from fleet.engine.tables import tables_of
 from fleet.env.adapters.torchrl import TorchRLEnv

@@ -7,21 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.mpc import Mpc
+from agents.planners import Mpc
 from agents.policy import EveryArm, Local, Planner
 from agents.registry import RULES, make_policy
 from agents.schedules import Schedules
-from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.reward import RewardWeights
+from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.tables import tables_of
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.errors import FleetError
 from fleet.observation import Layout
 from fleet.robot import ThermalLimits
 from scenarios.evaluate.hindsight import ShiftSimulator
-from scenarios.live.allocation import central_allocation
-from scenarios.load import load
+from scenarios.live.auctioneer import central_allocation
 from scenarios.policy_loader import policy_of, without_simulator
+from scenarios.spec.load import load
 from tests.exhaustive import optimum
 
 HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)

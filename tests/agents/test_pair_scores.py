@@ -6,18 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.heat_rules import Wsept
+from agents.heat import Wsept
 from agents.learned.evolution import Evolution, EvolutionConfig
-from agents.pair_scores import (
-    PAIRS,
-    PAIRS_CARD,
-    PARAMETERS,
-    PairPolicy,
-    load_pairs,
-    save_pairs,
-    scores,
-)
-from agents.pairs import Worth
+from agents.pairs import PAIRS, PAIRS_CARD, PARAMETERS, PairPolicy, Worth, load_pairs, save_pairs, scores
 from fleet.errors import CheckpointError
 from fleet.observation import FIELDS, LONG_S, Layout, Observation
 from scenarios.policy_loader import policy_of, scope_of

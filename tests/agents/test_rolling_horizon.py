@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
+from agents.planners import NONE, RollingHorizon, Sequences, pack
 from agents.policy import WAIT
-from agents.rolling_horizon import NONE, RollingHorizon, Sequences, pack
 from fleet.observation import Layout, Observation
 from tests.profiles import examples
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import zenoh
 
-from fleet.bus.client.router import Router, open_client
-from fleet.bus.exchange.protocol import Broadcast, PeerView
+from fleet.bus.exchange.memory import Broadcast, PeerView
+from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import of_arms
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 from tests.waiting import PATIENCE_S
 

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from fleet.bus.security import certificates
 from fleet.bus.security.access_control import ROSTER, Participant, Role, Roster, of_arms, read_roster
-from fleet.bus.security.certificates import LONGEST_DAYS, check, issue, new_authority, read
-from fleet.bus.security.keyring import add, lifetimes, make
+from fleet.bus.security.certificates import LONGEST_DAYS, add, check, issue, lifetimes, make, new_authority, read
 from fleet.errors import BusError
 
 ARMS = ("arm_0", "arm 2+*@")

@@ -12,16 +12,15 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
 from docs.tables import fill_tables, main
-from fleet.bus.client.client import BusClient
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import auction as trade
 from fleet.bus.protocol import keys, messages
 from fleet.bus.protocol.auction import JobSpec
-from fleet.bus.protocol.contract import asyncapi, descriptions, schema_document
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES, asyncapi, descriptions, schema_document
 from fleet.bus.protocol.messages import MalformedMessage
 from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
 from fleet.events import EVENT_KINDS, MEANINGS
-from fleet.live.arm.simulated_body import _REPORTED
+from fleet.live.arm.body import _REPORTED
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = schema_document()

@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet.bus.client.rate_limits import Limits
-from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol import keys
+from fleet.bus.router import Limits, Router, open_client
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 from tests.waiting import PATIENCE_S
 

@@ -8,12 +8,11 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus.client.client import MOST_REPLIES, BusClient, Refused
-from fleet.bus.client.replies import Replies
-from fleet.bus.client.router import Router
+from fleet.bus.client import MOST_REPLIES, BusClient, Refused, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, ArmEvent, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, decode, encode, encoding
+from fleet.bus.router import Router
 from fleet.errors import BusError
 from tests.waiting import PATIENCE_S, serve_until
 

@@ -8,8 +8,8 @@ from queue import Empty
 
 import pytest
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.queue import Mailbox
+from fleet.bus.client import BusClient
+from fleet.bus.mailbox import Mailbox
 from fleet.live.supervisor import Supervisor
 from tests.waiting import PATIENCE_S
 

@@ -9,8 +9,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.protocol import UNHEARD, PeerView
+from fleet.bus.exchange.memory import UNHEARD, MemoryExchange, PeerView
 from fleet.errors import BusError
 from tests.profiles import examples
 

@@ -12,15 +12,13 @@ import zenoh
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.rate_limits import Limits
-from fleet.bus.client.router import Router, open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
+from fleet.bus.router import Limits, Router, open_client
 from fleet.bus.security import certificates
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.certificates import issue
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from tests.waiting import PATIENCE_S, PAUSE, serve_until, wait_until

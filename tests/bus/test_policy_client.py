@@ -14,14 +14,13 @@ import pytest
 import zenoh
 from jsonschema import Draft202012Validator
 
-from fleet.bus.client.rate_limits import Limits
-from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import decode, encoding
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES, ActReply, ActRequest
+from fleet.bus.router import Limits, Router, open_client
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from fleet.live.policy_client import PolicyClient

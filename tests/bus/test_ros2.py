@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zenoh.ext import Int64, z_deserialize
 
-from fleet.bus.client.router import Router
+from fleet.bus.router import Router
 from fleet.errors import BusError
 from fleet.ros2.conversion import plain_name
 from fleet.ros2.node import (

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router, loopback, open_client, reachable
+from fleet.bus.client import BusClient
+from fleet.bus.router import Router, loopback, open_client, reachable
 from fleet.bus.security.tls import Tls, identified
 from fleet.errors import BusError, NoRouter, is_name
 from tests.waiting import PATIENCE_S

@@ -14,8 +14,7 @@ import pytest
 import zenoh
 from zenoh import ext
 
-from fleet.bus.client.client import BusClient, Refused
-from fleet.bus.client.replies import Replies
+from fleet.bus.client import BusClient, Refused, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,

@@ -7,11 +7,10 @@ from contextlib import suppress
 import pytest
 import zenoh
 
-from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol import keys
+from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.certificates import issue
-from fleet.bus.security.keyring import add, make
+from fleet.bus.security.certificates import add, issue, make
 from fleet.bus.security.tls import Tls
 from tests.waiting import PATIENCE_S
 

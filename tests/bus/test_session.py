@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import zenoh
 
-from fleet.bus.client.router import Router, open_client
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.protocol import Exchange
+from fleet.bus.exchange.memory import Exchange, MemoryExchange
 from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, check_name, decode, encode, encoding
+from fleet.bus.router import Router, open_client
 from fleet.errors import BusError
 from tests.waiting import PATIENCE_S
 
@@ -179,7 +178,7 @@ def test_a_process_ends_however_it_leaves_the_exchange(ending):
     """A Zenoh session that is not closed keeps a process from ending."""
     program = f"""
 import numpy as np
-from fleet.bus.exchange.protocol import Broadcast
+from fleet.bus.exchange.memory import Broadcast
 from fleet.bus.exchange.zenoh import ZenohExchange
 bus = ZenohExchange(["a", "b"], "f", timeout_s=30.0)
 one = np.ones((2, 1))

@@ -11,14 +11,12 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.discover import fleets_at
-from fleet.bus.client.router import Router, open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Clock, ClockRequest
+from fleet.bus.router import Router, fleets_at, open_client
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.certificates import issue
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from tests.waiting import PATIENCE_S

@@ -5,7 +5,7 @@ import pytest
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import MemoryExchange
-from fleet.engine.reward import RewardWeights
+from fleet.engine.batch import RewardWeights
 from fleet.engine.shift import Episode, ShiftRunner
 from fleet.motion import Drive
 from fleet.robot import ThermalLimits

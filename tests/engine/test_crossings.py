@@ -15,9 +15,9 @@ from fleet.engine.shift import Stepped, open_jobs, step
 from fleet.engine.state import DONE, WAITING, World, initial
 from fleet.engine.tables import tables_of
 from fleet.events import Event
+from fleet.heat.thermal import NODES, WINDING
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE
-from fleet.thermal import NODES, WINDING
 
 DT_S, AMBIENT_C = 10.0, 25.0
 

@@ -6,9 +6,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from fleet.engine.state import World, initial
-from fleet.motor import gen3_motors, thermal_data
+from fleet.heat.motor import gen3_motors, thermal_data
+from fleet.heat.thermal import WINDING, gen3_network, thermal_model
 from fleet.robot import JOINTS, ThermalLimits
-from fleet.thermal import WINDING, gen3_network, thermal_model
 from tests.engine.play import DT_S, play
 
 

@@ -14,8 +14,8 @@ from fleet.engine.state import DONE, WAITING, State, World
 from fleet.env.allocation_v1 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import JOINTS
-from scenarios.parse import parse_scenario
-from scenarios.schema import Scenario
+from scenarios.spec.parse import parse_scenario
+from scenarios.spec.schema import Scenario
 
 Trace = list[tuple[Any, ...]]
 

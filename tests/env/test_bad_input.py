@@ -8,8 +8,7 @@ import pytest
 
 from fleet.env import allocation_v1
 from fleet.errors import ScenarioError
-from scenarios.prepare.fleet import make_env
-from scenarios.run.batch import Randomisation, make_batch
+from scenarios.prepare.fleet import Randomisation, make_batch, make_env
 
 NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array([1, 2]), np.array(3.0))
 

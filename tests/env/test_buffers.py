@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from fleet.env.buffers import Shelf
+from fleet.env.vector import Shelf
 
 
 def test_referenced_arrays_are_never_reused() -> None:
@@ -39,7 +39,7 @@ def test_released_arrays_are_reused() -> None:
 TURNOVER = """
 import resource, sys
 import numpy as np
-from fleet.env.buffers import keep_pages
+from fleet.env.vector import keep_pages
 if sys.argv[1] == "kept":
     assert keep_pages()
 for _ in range(2):

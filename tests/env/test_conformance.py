@@ -18,7 +18,7 @@ from pettingzoo.test import (
     state_test,
 )
 
-from fleet.engine.reward import TERMS
+from fleet.engine.batch import TERMS
 from fleet.env import allocation_v1
 
 HOT = {"arms": 3, "ambient_c": 38.0}

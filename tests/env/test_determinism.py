@@ -14,7 +14,7 @@ import pytest
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.env.allocation_v1 import Episode, parallel_env
-from fleet.motor import gen3_motors
+from fleet.heat.motor import gen3_motors
 from fleet.robot import ThermalLimits
 
 COPIES: dict[str, Callable[[Any], Any]] = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "copy": copy.deepcopy}

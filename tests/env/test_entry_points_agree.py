@@ -8,15 +8,14 @@ import pytest
 from fleet.engine.state import DONE, State, World
 from fleet.engine.tables import Tables
 from fleet.env.vector import BatchEnv
+from fleet.heat.thermal import WINDING
 from fleet.offered_plans import PLANS
 from fleet.robot import JOINTS, ThermalLimits
-from fleet.thermal import WINDING
-from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_of
-from scenarios.prepare.fleet import Fleet, env_of, prepare
-from scenarios.run.batch import library_of
+from scenarios.prepare.fleet import Fleet, env_of, library_of, prepare
 from scenarios.run.shift import RunResult, run
-from scenarios.specs import RunSpec
+from scenarios.spec.jobs import weights_of
+from scenarios.spec.options import RunSpec
 
 SEED = 2
 

@@ -7,12 +7,11 @@ from typing import Any
 import pytest
 
 from docs.tables import fill_tables, main
-from fleet.engine.reward import TERMS
+from fleet.engine.batch import TERMS
 from fleet.observation import FIELDS, Layout
-from scenarios.parse import override
-from scenarios.prepare.fleet import make_env
-from scenarios.run.batch import make_batch
-from scenarios.schema import RewardSpec
+from scenarios.prepare.fleet import make_batch, make_env
+from scenarios.spec.parse import override
+from scenarios.spec.schema import RewardSpec
 
 PAGE = Path(__file__).parents[2] / "docs" / "env.md"
 TEXT = PAGE.read_text(encoding="utf-8")

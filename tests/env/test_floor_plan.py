@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.env.render.floor_plan import SMALLEST, floor_plan, text_width
-from fleet.env.render.scene import Cell, MountKind, grid_cell
+from fleet.env.render.floor_plan import SMALLEST, Cell, MountKind, floor_plan, grid_cell, text_width
 from fleet.job import Fixture
 from fleet.robot import JOINTS, rotation
 from tests.profiles import examples

@@ -6,9 +6,8 @@ from scipy.spatial import KDTree
 
 from fleet.errors import ScenarioError
 from scenarios.cell_layout import cell_of, near_of
-from scenarios.load import load
-from scenarios.prepare.fleet import make_env
-from scenarios.run.batch import make_batch
+from scenarios.prepare.fleet import make_batch, make_env
+from scenarios.spec.load import load
 
 
 @pytest.mark.parametrize("name", ["quickstart", "heat_wave"])

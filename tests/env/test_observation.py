@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit
 
+from fleet.engine.batch import RewardWeights
 from fleet.engine.profile_plant import sensor_noise
-from fleet.engine.reward import RewardWeights
 from fleet.engine.shift import Episode, ShiftRunner
 from fleet.engine.state import State, World
 from fleet.observation import FIELDS, Layout, Observation

@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.protocol import UNHEARD, PeerView
+from fleet.bus.exchange.memory import UNHEARD, MemoryExchange, PeerView
 from fleet.difficulty import KNOWN, Difficulty, Forecast
-from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.peers import broadcast, write_peers
-from fleet.engine.reward import RewardWeights
-from fleet.engine.shift import Episode
+from fleet.engine.batch import Engine, RewardWeights, shifts_of
+from fleet.engine.shift import Episode, broadcast, write_peers
 from fleet.engine.state import State, World, initial
 from fleet.engine.tables import tables_of
 from fleet.env.allocation_v1 import parallel_env
 from fleet.env.vector import BatchEnv
+from fleet.heat.motor import gen3_motors
 from fleet.motion import Plan
-from fleet.motor import gen3_motors
 from fleet.observation import LONG_S, Layout, Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING

@@ -8,10 +8,20 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fleet.env.render.floor_plan import LARGEST, NORMAL, FloorPlan, Pixel, floor_plan, shortened, text_width
-from fleet.env.render.heat import heat_colour
-from fleet.env.render.picture import Picture, legend_ends, legend_row, time_left
-from fleet.env.render.scene import Cell, QueuedJob, Scene, grid_cell
+from fleet.env.render.floor_plan import (
+    LARGEST,
+    NORMAL,
+    Cell,
+    FloorPlan,
+    Pixel,
+    QueuedJob,
+    Scene,
+    floor_plan,
+    grid_cell,
+    shortened,
+    text_width,
+)
+from fleet.env.render.picture import Picture, heat_colour, legend_ends, legend_row, time_left
 from fleet.job import Fixture
 from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED, IDLE, WORKING

@@ -15,11 +15,10 @@ from fleet.engine.world import Space
 from fleet.env.vector import BatchEnv, Library
 from fleet.motion import Plan
 from scenarios.evaluate.rollout import outcomes
-from scenarios.job_stream import draw_jobs
-from scenarios.prepare.fleet import Fleet, make_env, prepare
-from scenarios.run.batch import Randomisation, library_of, make_batch
+from scenarios.prepare.fleet import Fleet, Randomisation, library_of, make_batch, make_env, prepare
 from scenarios.run.shift import run
-from scenarios.specs import RunSpec
+from scenarios.spec.jobs import draw_jobs
+from scenarios.spec.options import RunSpec
 from tests.profiles import examples
 
 SEED = 30

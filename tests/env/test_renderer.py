@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fleet.engine.state import initial
-from fleet.env.render.renderer import Renderer
+from fleet.env.render.picture import Renderer
 from fleet.errors import FleetError
 
 BLACK = np.zeros((240, 320, 3), np.uint8)
@@ -55,7 +55,7 @@ def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
 
 def test_matplotlib_is_loaded_for_frames_alone() -> None:
     code = (
-        "import sys; import fleet.env.allocation_v1, fleet.env.render.renderer; "
+        "import sys; import fleet.env.allocation_v1, fleet.env.render.picture; "
         "print([m for m in ('matplotlib', 'PIL', 'torch', 'mujoco', 'zenoh', 'tkinter') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)

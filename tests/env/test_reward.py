@@ -5,7 +5,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from fleet.engine.reward import TERMS, RewardWeights
+from fleet.engine.batch import TERMS, RewardWeights
 from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
 from fleet.robot import ThermalLimits
 

@@ -5,7 +5,7 @@ import pytest
 
 from fleet.engine.shift import step
 from fleet.engine.state import initial
-from fleet.env.render.scene import QueuedJob, grid_cell, mount_kind, scene_of
+from fleet.env.render.floor_plan import QueuedJob, grid_cell, mount_kind, scene_of
 from fleet.robot import JOINTS, Mount
 from fleet.telemetry import IDLE, WORKING
 

@@ -4,8 +4,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
+from fleet.bus.router import Router
 
 
 @pytest.fixture(autouse=True)

@@ -6,8 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -29,6 +28,7 @@ from fleet.bus.protocol.auction import (
     StatusRequest,
 )
 from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.bus.router import Router
 from tests.examples.programs import program, running, started
 from tests.waiting import PATIENCE_S, serve_until
 

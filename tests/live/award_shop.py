@@ -3,8 +3,7 @@
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import Award, JobSpec, Lease
-from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.journal_records import ArmHistory
+from fleet.live.arm.awards import ArmHistory, AwardExecutor, ExecutorConfig
 from tests.live.disk import Disk
 
 JOB = JobSpec(name="j", kind="hold", places=("p",), repetitions=3)

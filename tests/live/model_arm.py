@@ -15,7 +15,7 @@ from fleet.bus.protocol.auction import (
     QuoteRequest,
     Report,
 )
-from fleet.live.auction.round import Assignment, Timing
+from fleet.live.auction.rounds import Assignment, Timing
 
 VALID_S = 2.0
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.5, ack_s=0.5, max_jobs=8)

@@ -28,11 +28,10 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.operator import Cancel, ClearRequest, Controlled, ControlRequest, Settle
 from fleet.errors import JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord
-from fleet.live.auction.round import Allocate, Timing
-from fleet.live.journal_records import Closed, Started
+from fleet.live.auction.rounds import Allocate, SendAward, Timing
+from fleet.live.journal import Closed, Started
 from fleet.live.space import Excludes, no_conflicts
 from tests.live.model_arm import TIMING, ModelArm, first_come
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -28,20 +27,17 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ResetReply, ResetRequest
+from fleet.bus.router import Router
 from fleet.errors import InfeasibleJob
+from fleet.heat.thermal import WINDING
 from fleet.job import Place
-from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.config import ArmConfig
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor, ExecutorConfig, FaultCleared
+from fleet.live.arm.body import ReplayBody, SensorLog, SimulatedBody
 from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, FaultCleared
-from fleet.live.arm.node import ArmNode
-from fleet.live.arm.planning import PLANNING_S
-from fleet.live.arm.replay_body import ReplayBody, SensorLog
-from fleet.live.arm.simulated_body import SimulatedBody
+from fleet.live.arm.node import PLANNING_S, ArmConfig, ArmNode
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
 from fleet.robot import ThermalLimits
-from fleet.thermal import WINDING
 from tests.waiting import PATIENCE_S
 
 LIMITS = ThermalLimits()

@@ -16,7 +16,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.operator import Cancel, ControlRequest, Pause
 from fleet.errors import JournalFull, Refused
-from fleet.live.auction.round import Assignment
+from fleet.live.auction.rounds import Assignment
 
 
 @pytest.fixture

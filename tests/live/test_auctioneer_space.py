@@ -6,7 +6,7 @@ from fleet.bus.protocol.auction import Award, JobSpec, Lease, QuoteRequest, Repo
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import Refused
-from fleet.live.journal_records import SpaceTaken
+from fleet.live.journal import SpaceTaken
 from fleet.live.space import ANYWHERE
 
 

@@ -4,8 +4,7 @@ import pytest
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import Lease, Receipt
-from fleet.live.arm.award_executor import CLOCK_DRIFT, ExecutorConfig
-from fleet.live.arm.journal_records import ArmHistory
+from fleet.live.arm.awards import CLOCK_DRIFT, ArmHistory, ExecutorConfig
 from tests.live.award_shop import JOB, LEASE_S, OTHER, VALID_S, award_on, finished, quoted, shop, taken
 from tests.live.disk import Disk
 

@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import Lease, Receipt
-from fleet.live.arm.award_executor import AwardExecutor
-from fleet.live.arm.journal_records import MAX_PAST_AWARDS, ArmHistory, ArmRecord, Started
+from fleet.live.arm.awards import MAX_PAST_AWARDS, ArmHistory, ArmRecord, AwardExecutor, Started
 from fleet.live.journal import Journal
 from tests.live.award_shop import LEASE_S, finished, shop, taken
 from tests.live.disk import Disk

@@ -8,10 +8,10 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from fleet.env.allocation_v1 import Episode, parallel_env
-from fleet.live.arm.simulated_body import MAX_STEPS, SimulatedBody
+from fleet.heat.thermal import WINDING
+from fleet.live.arm.body import MAX_STEPS, SimulatedBody
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED
-from fleet.thermal import WINDING
 
 DT_S = 10.0
 LIMITS = ThermalLimits()

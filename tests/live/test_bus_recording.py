@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cancel, ControlRequest, Operation
+from fleet.bus.router import Router
 from fleet.errors import FleetError
 from scenarios.live.recorder import Recorder, lock_folder, record
 from scenarios.live.recording import CARD, JOURNAL, part_files, read_card, read_parts, states

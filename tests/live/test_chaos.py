@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from fleet.bus.protocol.auction import Award, JobSpec
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted
-from fleet.live.journal import Journal
-from fleet.live.journal_records import Closed
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted
+from fleet.live.journal import Closed, Journal
 
 CAMPAIGN = Path(__file__).parents[2] / "benchmarks" / "chaos"
 

@@ -7,11 +7,11 @@ from scipy.integrate import solve_ivp
 from fleet.bus.protocol.auction import JobSpec
 from fleet.difficulty import Blind, Difficulty, known_temperatures
 from fleet.errors import InfeasibleJob
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import WINDING, drive_heat, gen3_network, thermal_model
 from fleet.job import Place
 from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
 from fleet.motion import drive
-from fleet.motor import gen3_motors
-from fleet.thermal import WINDING, drive_heat, gen3_network, thermal_model
 
 PLACES = {"bench": Place(name="bench", position_m=(0.5, 0.0, 0.2))}
 WARM_C = np.full(7, 31.0)

@@ -10,15 +10,13 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobSpec, Report, Submission
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, JobOutcome
 from fleet.job import reason_to_give_up
-from fleet.live.arm.award_executor import AwardExecutor
-from fleet.live.arm.journal_records import ArmHistory
+from fleet.live.arm.awards import ArmHistory, AwardExecutor
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.ledger import MAX_SETTLED, Ledger
 from fleet.live.auction.records import AuctionRecord, Awarded
-from fleet.live.consensus.granter import Granter
-from fleet.live.consensus.records import GrantRecord
-from fleet.live.consensus.register import Register
-from fleet.live.journal_records import Closed, JobsAccepted
+from fleet.live.consensus.grants import Granter
+from fleet.live.consensus.jobs import GrantRecord, Register
+from fleet.live.journal import Closed, JobsAccepted
 
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=9)
 NEXT = JobSpec(name="k", kind="hold", places=("x",), after=("j",))
@@ -150,7 +148,7 @@ def test_only_the_current_job_of_a_faulted_arm_counts_and_a_restart_keeps_it(liv
 def live_awards():
     """An arm with two awards, and its disk."""
     from fleet.bus.protocol.auction import Award
-    from fleet.live.arm.award_executor import ExecutorConfig
+    from fleet.live.arm.awards import ExecutorConfig
 
     disk: list = []
     executor = AwardExecutor(

@@ -5,9 +5,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from fleet.bus.client.client import BusClient, Refused
-from fleet.bus.client.replies import NoReply
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient, NoReply, Refused
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Admission,
@@ -20,6 +18,7 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.operator import Controlled, ControlRequest
+from fleet.bus.router import Router
 from fleet.live import job_client
 from fleet.live.job_client import JobClient
 from tests.waiting import serve_until

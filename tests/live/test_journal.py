@@ -15,12 +15,9 @@ from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.bus.protocol.messages import encode
 from fleet.errors import FleetError, JournalError, JournalFull
 from fleet.live import journal
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted, JobsFinished, ReportReceived
-from fleet.live.consensus.records import GrantRecord
-from fleet.live.consensus.register import Register
-from fleet.live.journal import Journal
-from fleet.live.journal_records import Closed, CommitPermitted
-from fleet.live.journal_upkeep import CompactingJournal, TimeRecorder
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, JobsFinished, ReportReceived
+from fleet.live.consensus.jobs import GrantRecord, Register
+from fleet.live.journal import Closed, CommitPermitted, CompactingJournal, Journal, TimeRecorder
 from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]
@@ -128,7 +125,7 @@ def test_a_journal_is_open_in_one_process_at_a_time(tmp_path):
     program = f"""
 from pathlib import Path
 from fleet.live.journal import Journal
-from fleet.live.journal_records import Closed, CommitPermitted
+from fleet.live.journal import Closed, CommitPermitted
 from msgspec import Struct
 from fleet.errors import JournalError
 try:
@@ -192,7 +189,7 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from test_journal import KIND, Text
 from fleet.errors import JournalFull
 from fleet.live.journal import Journal
-from fleet.live.journal_records import Closed, CommitPermitted
+from fleet.live.journal import Closed, CommitPermitted
 with Journal(Path({str(tmp_path / "j")!r}), KIND) as journal:
     journal.append(Text("kept"))
     resource.setrlimit(resource.RLIMIT_FSIZE, (journal.path.stat().st_size + 10,) * 2)

@@ -15,13 +15,11 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
 from fleet.errors import JournalError, Refused
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted, ReportReceived
-from fleet.live.auction.control import objection
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, ReportReceived
+from fleet.live.auction.auctioneer import objection
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, Awarded, Operated, salvage
-from fleet.live.journal import Journal
-from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted, Progress, Started
-from fleet.live.journal_upkeep import put_aside
+from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted, Journal, Progress, Started, put_aside
 from tests.profiles import examples
 
 KINDS = ("deleted", "doubled", "repeated at the end", "changed")

@@ -3,15 +3,14 @@
 import pytest
 
 from fleet.errors import JournalError
-from fleet.live.arm.journal_records import ArmRecord
+from fleet.live.arm.awards import ArmRecord
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord
+from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
-from fleet.live.consensus.records import GrantRecord
-from fleet.live.journal import Journal
-from fleet.live.journal_records import Started
+from fleet.live.journal import Journal, Started
 from scenarios.live.arm import restart_history
 from tests.live.council.test_council_poison import Arm
 from tests.live.test_poison import Wire

@@ -11,33 +11,29 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from fleet.arm.space import plan_key, space_name
 from fleet.bus.protocol.auction import Award, QuoteRequest, Submission
 from fleet.bus.protocol.consensus import Bid, JobOutcome
 from fleet.bus.protocol.messages import State
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.env.allocation_v1 import Episode, parallel_env
 from fleet.errors import InfeasibleJob
-from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.config import ArmConfig
+from fleet.heat.motor import gen3_motors
+from fleet.live.arm.awards import ArmHistory, AwardExecutor, ExecutorConfig
+from fleet.live.arm.body import SimulatedBody
 from fleet.live.arm.estimator import Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory
-from fleet.live.arm.node import ArmNode
-from fleet.live.arm.simulated_body import SimulatedBody
+from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.round import Timing
-from fleet.live.consensus.granter import Granter
+from fleet.live.auction.rounds import SendAward, Timing
+from fleet.live.consensus.grants import Granter
+from fleet.live.consensus.jobs import Grant, Register
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
-from fleet.live.consensus.register import Grant, Register
 from fleet.live.space import CellSpace
-from fleet.motor import gen3_motors
 from fleet.observation import FIELDS, Observation
-from fleet.planning.space import plan_key, space_name
 from fleet.robot import JOINTS, ThermalLimits
-from scenarios.live.allocation import CentralAllocation
-from scenarios.live.auctioneer import job_spec
+from scenarios.live.auctioneer import CentralAllocation, job_spec
 
 MAY_DIFFER = {
     "last_award": "a live fleet counts rounds, and there is a round only when a job can begin",

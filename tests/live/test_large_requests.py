@@ -5,10 +5,10 @@ import time
 import msgspec
 import pytest
 
-from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, Submission
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
+from fleet.bus.router import Limits
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.ledger import Ledger
 

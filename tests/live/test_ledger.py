@@ -10,9 +10,16 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobSpec
 from fleet.live.auction.job_rules import admit
 from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.past_jobs import PastJobs
-from fleet.live.auction.records import AuctionRecord, Awarded, ContactLost, ContactRegained, Expired, ShiftEnded
-from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted
+from fleet.live.auction.records import (
+    AuctionRecord,
+    Awarded,
+    ContactLost,
+    ContactRegained,
+    Expired,
+    PastJobs,
+    ShiftEnded,
+)
+from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted
 from tests.profiles import examples
 
 

@@ -16,8 +16,9 @@ import pytest
 from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
-from fleet.bus.client.client import AnotherReplies
-from fleet.bus.client.replies import Replies
+from fleet.arm.planner import Planner
+from fleet.arm.trajectory import check_time
+from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol.auction import (
     Ack,
     Award,
@@ -34,27 +35,21 @@ from fleet.bus.protocol.auction import (
     StatusRequest,
     Submission,
 )
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode
 from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import Refused
 from fleet.job import Place
-from fleet.live.arm.award_executor import AwardExecutor
-from fleet.live.arm.config import ArmConfig
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, AwardExecutor
+from fleet.live.arm.body import SimulatedBody
 from fleet.live.arm.estimator import MAX_BYTES, Estimator, NominalPeaks, _size
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted
-from fleet.live.arm.node import ArmNode
-from fleet.live.arm.planning import PlanningThread
-from fleet.live.arm.simulated_body import SimulatedBody
+from fleet.live.arm.node import ArmConfig, ArmNode, PlanningThread
 from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.round import Assignment
+from fleet.live.auction.rounds import Assignment
 from fleet.live.clock import FleetClock
-from fleet.live.journal import Journal
-from fleet.live.journal_upkeep import put_aside
+from fleet.live.journal import Journal, put_aside
 from fleet.motion import Plan
-from fleet.planning.planner import Planner
-from fleet.planning.time_limit import check_time
 from fleet.robot import ThermalLimits
 from tests.profiles import examples
 

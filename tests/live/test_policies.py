@@ -16,11 +16,11 @@ from fleet.bus.protocol.messages import State
 from fleet.env.allocation_v1 import parallel_env
 from fleet.errors import BusError
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.round import Assignment, Bidding, Choice, offers_of, resolve_claims
+from fleet.live.auction.rounds import Assignment, Bidding, Choice, offers_of, resolve_claims
 from fleet.observation import FIELDS, LONG_S, Observation
 from fleet.offered_plans import PLANS
 from fleet.robot import ThermalLimits
-from scenarios.live.allocation import CentralAllocation
+from scenarios.live.auctioneer import CentralAllocation
 from tests.profiles import examples
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central" and not rule.plans]

@@ -17,7 +17,7 @@ CLI = "from scenarios.cli.main import main; main()"
 PUBLISHER = """
 import json, sys, time
 from pathlib import Path
-from fleet.bus.client.client import BusClient
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobStatus, Result
 

@@ -14,7 +14,7 @@ from msgspec import structs
 
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Settle
 from fleet.errors import FleetError

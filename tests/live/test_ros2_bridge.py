@@ -9,10 +9,10 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh.ext import Int64, z_deserialize
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router, open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.bus.router import Router, open_client
 from fleet.ros2 import bridge as ros2_bridge
 from fleet.ros2.bridge import Bridge
 from fleet.ros2.node import Node

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router, open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, Clock, ClockRequest, JobSpec, Quote, QuoteRequest
 from fleet.bus.protocol.messages import Info, MalformedMessage, State
+from fleet.bus.router import Router, open_client
 from fleet.errors import BusError
 from fleet.live.clock import FleetClock
 from fleet.ros2.bridge import FRESH_S, WARM_S, ArmReadings, Follower

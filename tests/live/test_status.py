@@ -6,7 +6,7 @@ import pytest
 
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
-from fleet.live.auction.round import planned_jobs
+from fleet.live.auction.rounds import planned_jobs
 
 
 def job(name: str, repetitions: int = 6, **more) -> JobSpec:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.bus.client.router import Router
+from fleet.bus.router import Router
 from tests import commands
 
 ROOT = Path(__file__).parents[2]

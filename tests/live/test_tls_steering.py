@@ -9,12 +9,11 @@ import pytest
 from msgspec.structs import replace
 from typer.testing import CliRunner
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router, open_client
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobStatus
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import encode, encoding
 from fleet.bus.protocol.operator import (
     Cancel,
@@ -29,8 +28,9 @@ from fleet.bus.protocol.operator import (
     Resume,
     Settle,
 )
+from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.keyring import make
+from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from scenarios.cli.main import app

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from benchmarks.paper.subjects import TooFewJobs, alarm_threshold, raised
-from twin.conformal import p_value, rate_interval
+from twin.vae.measures import p_value, rate_interval
 
 
 @pytest.mark.parametrize("draw", ["normal", "exponential", "coarse"])

@@ -23,12 +23,12 @@ from benchmarks.paper.cooling import (
     motor_rows,
     published,
 )
-from fleet.motor import thermal_data
+from fleet.heat.motor import thermal_data
+from fleet.heat.thermal import HOUSING, WINDING, gen3_network, housing, node_heat, thermal_model
 from fleet.robot import JOINTS, ThermalLimits
-from fleet.thermal import HOUSING, WINDING, gen3_network, housing, node_heat, thermal_model
 from scenarios.evaluate.rollout import outcomes
-from scenarios.load import load, override
 from scenarios.prepare.fleet import prepare
+from scenarios.spec.load import load, override
 
 ALPHA = 0.00393
 FROM_STILL_AIR = {"no_interface": 1.0, "forced_air": 2.5, "forced_water": 6.0, "immersion": 6.0}

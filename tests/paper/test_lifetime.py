@@ -45,10 +45,10 @@ from benchmarks.paper.transfer import (
     equal_quality,
     transfer_tables,
 )
-from fleet.motor import gen3_motors
-from fleet.thermal import gen3_network, thermal_model
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import gen3_network, thermal_model
 from scenarios.motion.generate import Verification
-from scenarios.prepare.cool_motion import records
+from scenarios.prepare.twins import records
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.window import cut_jobs, windows_of

@@ -14,9 +14,9 @@ from benchmarks.paper.quality import (
 )
 from benchmarks.paper.subjects import CARRIER, Jobs, detection, jobs_of, make_study
 from fleet.errors import FleetError
+from fleet.heat.thermal import NODES
 from fleet.motion import CHANNELS
-from fleet.thermal import NODES
-from scenarios.prepare.simulated_logs import identify_from_work
+from scenarios.prepare.identify import identify_from_work
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.config import TwinConfig
 from twin.vae.window import Scaler, cut_jobs, windows_of

@@ -4,8 +4,8 @@ import numpy as np
 
 from benchmarks.paper.saturation import _plans, _true_peak, reliability_rows
 from fleet.events import Event
-from scenarios.load import load
-from scenarios.prepare import train_twins
+from scenarios.prepare import twins
+from scenarios.spec.load import load
 from twin.vae.measures import PARTS, Features
 
 
@@ -21,7 +21,7 @@ class Plain:
 
 def test_p_and_peaks_come_true_in_the_shift(monkeypatch) -> None:
     monkeypatch.setattr(
-        train_twins, "train_twins", lambda scenario, planned, folder, progress, seed: [Plain()] * len(planned)
+        twins, "train_twins", lambda scenario, planned, folder, progress, seed: [Plain()] * len(planned)
     )
     ((key, row),) = reliability_rows(load("heat_wave"), (10_000, 10_001), 1, "rc", {"key": "wspt"}, ["key"])
     assert (key, row["policy"]) == ("key", "wspt")

@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.subjects import Study, make_study
+from fleet.heat.thermal import WINDING
 from fleet.robot import JOINTS
-from fleet.thermal import WINDING
-from scenarios.prepare.simulated_logs import AIR_SD_K, own_logs
-from twin.logs.heat_log import heat_logs
-from twin.thermal.identify import identify
-from twin.thermal.least_squares import Noise, Problem
-from twin.thermal.parameters import ParameterVector
-from twin.thermal.result import HeatModel, nominal_heat_model
+from scenarios.prepare.identify import AIR_SD_K, own_logs
+from twin.logs.recording import heat_logs
+from twin.thermal.identify import HeatModel, Noise, ParameterVector, Problem, identify, nominal_heat_model
 from twin.thermal.thermal_twin import RcTwin
 
 

@@ -8,14 +8,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from benchmarks.paper.subjects import Study, make_study
+from fleet.arm.model import ArmModel
 from fleet.difficulty import SETTLING_S
 from fleet.errors import FleetError
+from fleet.heat.thermal import HOUSING, NODES, WINDING, ThermalSpread, drive_heat
 from fleet.motion import drive
-from fleet.physics.models import ArmModel
 from fleet.robot import JOINTS, ThermalLimits
-from fleet.thermal import HOUSING, NODES, WINDING, ThermalSpread, drive_heat
-from scenarios.prepare.simulated_history import past_jobs
-from twin.thermal.parameters import HeatModel
+from scenarios.prepare.calibrate import past_jobs
+from twin.thermal.identify import HeatModel
 
 SEED = np.random.SeedSequence(11)
 SIZES: dict[str, Any] = {"train": 12, "reference": 10, "test": 60, "novel": 12}
@@ -104,7 +104,7 @@ def test_held_out_jobs_do_not_depend_on_how_many_are_learned_from(study):
 
 
 def test_no_spread_is_the_nominal_arm():
-    from fleet.motor import gen3_motors
+    from fleet.heat.motor import gen3_motors
 
     nominal = make_study(SEED, train=0, reference=0, test=1, novel=0, spread=ThermalSpread())
     assert np.array_equal(nominal.motors.idle_w, gen3_motors().idle_w)

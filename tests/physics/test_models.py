@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from fleet.arm.cell import cell_model
+from fleet.arm.model import MESH_OF_GEOM, ArmModel, build_cell
 from fleet.errors import FleetError
 from fleet.job import Place
-from fleet.physics.cell_model import cell_model
-from fleet.physics.meshes import MESH_OF_GEOM
-from fleet.physics.models import ArmModel, build_cell
 from fleet.robot import GEN3, POSTURES, Mount, Robot, rotation
 from tests.profiles import examples
 

@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from fleet.physics.models import ArmModel, build_cell
-from fleet.planning.clearance import clearance, conflict, segment_distance
-from fleet.planning.sweep import Capsules
+from fleet.arm.model import ArmModel, build_cell
+from fleet.arm.space import Capsules, clearance, conflict, segment_distance
 from fleet.robot import Mount, Robot
 
 ROUND = ("shoulder", "half_arm_1", "half_arm_2", "forearm", "wrist_1", "wrist_2")

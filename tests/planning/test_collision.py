@@ -6,15 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from fleet.arm.cell import ContactFinder
+from fleet.arm.kinematics import InverseKinematics, Pose
+from fleet.arm.model import ArmModel, build_cell, links_of
+from fleet.arm.planner import Planner
+from fleet.arm.trajectory import GAP_M, CollisionChecker, straight_line
 from fleet.errors import InfeasibleJob
 from fleet.job import KINDS, Fixture, Place, Work, payload_radius_m
 from fleet.motion import RATE_HZ
-from fleet.physics.contacts import ContactFinder
-from fleet.physics.models import ArmModel, build_cell, links_of
-from fleet.planning.collision import GAP_M, CollisionChecker
-from fleet.planning.kinematics import InverseKinematics, Pose
-from fleet.planning.planner import Planner
-from fleet.planning.trajectory import straight_line
 from fleet.robot import POSTURES, Robot, rotation
 
 ROBOT = Robot(name="arm")

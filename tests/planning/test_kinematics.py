@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.physics.gen3 import ELBOW_ANGLES_DEG
-from fleet.physics.models import ArmModel
-from fleet.planning.kinematics import InverseKinematics, Pose, Unreachable
+from fleet.arm.kinematics import InverseKinematics, Pose, Unreachable
+from fleet.arm.model import ELBOW_ANGLES_DEG, ArmModel
 from fleet.robot import Mount, Robot, rotation
 
 DOWN = rotation((180.0, 0.0, 0.0))

@@ -14,13 +14,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet.arm.model import ArmModel
+from fleet.arm.plan_cache import CachedPlanner, LoadedPlans
+from fleet.arm.planner import Planner
+from fleet.arm.trajectory import PlanningTimeout, check_time, time_limit
 from fleet.errors import InfeasibleJob
 from fleet.job import KINDS, Fixture, Place, Work
 from fleet.motion import Plan
-from fleet.physics.models import ArmModel
-from fleet.planning.plan_cache import CachedPlanner, LoadedPlans
-from fleet.planning.planner import Planner
-from fleet.planning.time_limit import PlanningTimeout, check_time, time_limit
 from fleet.robot import Mount, Robot, rotation
 
 ROBOT = Robot(name="floor")
@@ -196,7 +196,7 @@ def test_the_least_recently_used_plans_leave_a_full_cache(tmp_path, monkeypatch)
 
     use(1.0)
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
-    monkeypatch.setattr("fleet.planning.plan_cache.MAX_CACHE_BYTES", int(3.5 * size))
+    monkeypatch.setattr("fleet.arm.plan_cache.MAX_CACHE_BYTES", int(3.5 * size))
     for payload_kg in (1.1, 1.2, 1.0, 1.3):
         use(payload_kg)
         assert sum(path.stat().st_size for path in tmp_path.glob("*.npz")) <= 3.5 * size
@@ -235,7 +235,7 @@ def test_the_time_is_checked_in_every_part_of_a_plan(monkeypatch):
         clock[0] += 1.0
         return clock[0]
 
-    monkeypatch.setattr("fleet.planning.time_limit.thread_time", tick)
+    monkeypatch.setattr("fleet.arm.trajectory.thread_time", tick)
     planner = Planner(ROBOT, elbows=2)
     with time_limit(1e6):
         planner.plan(WORKS["pick_place"])

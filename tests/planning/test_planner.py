@@ -10,13 +10,13 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from fleet.arm.kinematics import InverseKinematics, Pose, Unreachable, angle_between, nearest_turn
+from fleet.arm.model import ArmModel
+from fleet.arm.planner import Planner
+from fleet.arm.trajectory import CollisionChecker
 from fleet.errors import InfeasibleJob
 from fleet.job import KINDS, Place, Work
 from fleet.motion import RATE_HZ, Plan
-from fleet.physics.models import ArmModel
-from fleet.planning.collision import CollisionChecker
-from fleet.planning.kinematics import InverseKinematics, Pose, Unreachable, angle_between, nearest_turn
-from fleet.planning.planner import Planner
 from fleet.robot import GEN3, POSTURES, Mount, Robot, rotation
 from tests.profiles import examples
 

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from fleet.arm import random_motions as module
+from fleet.arm.model import ArmModel
+from fleet.arm.random_motions import light_jobs, plan_motion, random_jobs
 from fleet.errors import FleetError, InfeasibleJob
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import NODES, gen3_network, thermal_model
 from fleet.motion import RATE_HZ
-from fleet.motor import gen3_motors
-from fleet.physics.models import ArmModel
-from fleet.planning import random_motions as module
-from fleet.planning.random_motions import light_jobs, plan_motion, random_jobs
 from fleet.robot import GEN3, JOINTS, Mount, Robot, angles_deg, rotation
-from fleet.thermal import NODES, gen3_network, thermal_model
-from scenarios.prepare.oracle import peaks
+from scenarios.prepare.arms import peaks
 
 NEAR = np.array([0.3, 0.1, np.pi, -2.1, 0.1, 0.9, 1.5])
 FAR = np.array([-0.3, 1.0, np.pi, -0.7, 0.0, 0.9, 1.5])

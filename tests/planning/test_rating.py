@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.arm.model import ArmModel
+from fleet.arm.plan_cache import CachedPlanner
+from fleet.arm.planner import Planner
 from fleet.errors import InfeasibleJob
 from fleet.job import Place, Work
-from fleet.physics.models import ArmModel
-from fleet.planning.plan_cache import CachedPlanner
-from fleet.planning.planner import Planner
 from fleet.robot import JOINTS, POSTURES, RATING, Robot
 from scenarios.motion.hold import hold
 

@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from fleet.arm import space
+from fleet.arm.model import build_cell
+from fleet.arm.planner import Planner
+from fleet.arm.space import collisions_of_homes, conflicts_with_homes, space_table
 from fleet.job import Place, Work
-from fleet.physics.models import build_cell
-from fleet.planning import space
-from fleet.planning.planner import Planner
-from fleet.planning.space import collisions_of_homes, conflicts_with_homes, space_table
 from fleet.robot import Mount, Robot
 
 MARGIN_M = 0.02

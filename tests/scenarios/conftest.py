@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from agents.registry import make_policy
-from fleet.bus.client.router import Router
-from fleet.motor import gen3_motors
-from fleet.planning.random_motions import random_jobs
+from fleet.arm.random_motions import random_jobs
+from fleet.bus.router import Router
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import NODES, ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.robot import Robot
-from fleet.thermal import NODES, ThermalSpread, gen3_network, spread_motors, thermal_model
 from scenarios.cli.main import main
 from scenarios.cli.terminal import progress_bar
-from scenarios.motion.perform import bare_arm
-from scenarios.prepare.cool_motion import records
-from scenarios.prepare.oracle import peaks
+from scenarios.motion.generate import bare_arm
+from scenarios.prepare.arms import peaks
+from scenarios.prepare.twins import records
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 

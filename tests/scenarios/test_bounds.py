@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.registry import RULES
-from fleet.engine.reward import RewardWeights
+from fleet.engine.batch import RewardWeights
 from fleet.env.random_actions import random_legal
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
@@ -20,11 +20,11 @@ from scenarios.evaluate.references import Task, load_references, reference, refe
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.scores import split_file
 from scenarios.evaluate.upper_bound import HeatBudget, Relaxation, upper_bound
-from scenarios.fault_price import weights_of
-from scenarios.parse import parse_scenario
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare
-from scenarios.schema import SPLITS
+from scenarios.spec.jobs import weights_of
+from scenarios.spec.parse import parse_scenario
+from scenarios.spec.schema import SPLITS
 from scenarios.suite.splits import instance, manifest
 from tests.exhaustive import optimum
 

@@ -8,11 +8,11 @@ import pytest
 
 from fleet.motion import drive
 from fleet.robot import ThermalLimits
-from scenarios.load import load
-from scenarios.prepare.calibrate_twins import calibrate_twins, simulate_past
-from scenarios.prepare.planned_arm import PlannedArm, air_offsets, hardware_of
+from scenarios.prepare.arms import PlannedArm, air_offsets, hardware_of
+from scenarios.prepare.calibrate import calibrate_twins, simulate_past
 from scenarios.progress import quiet
-from twin.thermal.result import nominal_heat_model
+from scenarios.spec.load import load
+from twin.thermal.identify import nominal_heat_model
 from twin.vae.measures import PARTS, Features
 
 

@@ -7,7 +7,7 @@ import pytest
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.errors import FleetError
 from scenarios.cli.options import channel_of
-from scenarios.load import load
+from scenarios.spec.load import load
 
 QUICK = ("--difficulty", "blind", "--policy", "least_difficulty")
 HARD = ("--topology", "line", "--delay-s", 20, "--jitter-s", 5, "--loss", 0.2, "--partition", "30:60:left|right")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.load import library
 from scenarios.run.run_folder import FILES
+from scenarios.spec.load import library
 from tests.commands import REAL
 
 QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")

@@ -12,9 +12,9 @@ from rich.console import Console
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.evaluate.comparison import FIGURES, HEADINGS, Comparison, compare
-from scenarios.evaluate.tables import Figure
-from scenarios.load import load
-from scenarios.schema import Scenario
+from scenarios.evaluate.statistics import Figure
+from scenarios.spec.load import load
+from scenarios.spec.schema import Scenario
 
 POLICIES = ("random", "round_robin")
 

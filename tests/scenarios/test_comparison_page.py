@@ -20,9 +20,9 @@ from scenarios.evaluate.comparison import comparisons, scores_over_all
 from scenarios.evaluate.rollout import FIGURES, Outcome
 from scenarios.evaluate.scores import Shift
 from scenarios.evaluate.study import Case, Key, Row, Study
-from scenarios.load import load
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
+from scenarios.spec.load import load
 
 REWARD = {"wspt": 10.0, "wsept": 14.0, "fifo": 6.0}
 

@@ -7,13 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from fleet.errors import FleetError
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import NODES, WINDING, drive_heat, gen3_network, thermal_model
 from fleet.motion import drive
-from fleet.motor import gen3_motors
 from fleet.robot import Robot
-from fleet.thermal import NODES, WINDING, drive_heat, gen3_network, thermal_model
-from scenarios.load import library, load
-from scenarios.prepare.cool_motion import cold_peaks, cool_plans, require_cool_plans
-from scenarios.prepare.planned_arm import ArmHardware
+from scenarios.prepare.arms import ArmHardware
+from scenarios.prepare.twins import cold_peaks, cool_plans, require_cool_plans
+from scenarios.spec.load import library, load
 
 HARDWARE = ArmHardware(Robot(name="arm_0"), gen3_motors(), thermal_model(gen3_network()))
 PAYLOADS_KG = (0.0, 1.0, 2.0, 3.0, 4.0)

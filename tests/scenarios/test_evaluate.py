@@ -11,12 +11,12 @@ from agents.policy import WAIT
 from agents.registry import RULES
 from fleet.bus.exchange.channel import PERFECT, Channel
 from scenarios.evaluate.rollout import FIGURES, Outcome, outcomes
-from scenarios.load import load
-from scenarios.parse import parse_scenario
 from scenarios.policy_loader import PolicyFailed, policy_of
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.shift import run
-from scenarios.specs import RunSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import RunSpec
+from scenarios.spec.parse import parse_scenario
 
 SEEDS = (0, 3, 12)
 LATE = Channel(delay_s=25.0, loss=0.3)

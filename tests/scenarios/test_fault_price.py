@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from fleet.motor import gen3_motors
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import NODES, WINDING, gen3_network, node_heat, thermal_model
 from fleet.robot import ThermalLimits
 from fleet.seeding import shift_seeds
-from fleet.thermal import NODES, WINDING, gen3_network, node_heat, thermal_model
-from scenarios.fault_price import downtime_s, fault_price, weights_of
-from scenarios.job_stream import JobSampler
-from scenarios.load import load
-from scenarios.schema import Ambient, RewardSpec
+from scenarios.spec.jobs import JobSampler, downtime_s, fault_price, weights_of
+from scenarios.spec.load import load
+from scenarios.spec.schema import Ambient, RewardSpec
 
 
 @pytest.mark.parametrize(("power_off", "ambient_c"), [(True, 30.0), (False, 15.0)])

@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import pytest
 
+from fleet.arm.cell import ContactFinder
 from fleet.errors import ScenarioError
 from fleet.events import Event
 from fleet.job import Fixture
-from fleet.physics.contacts import ContactFinder
 from scenarios.cell_layout import cell_of
 from scenarios.cli.run import metrics_table
-from scenarios.load import load
-from scenarios.parse import override
 from scenarios.prepare.fleet import prepare
 from scenarios.run.shift import run
-from scenarios.schema import Scenario
-from scenarios.specs import RunSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import RunSpec
+from scenarios.spec.parse import override
+from scenarios.spec.schema import Scenario
 
 
 @pytest.fixture

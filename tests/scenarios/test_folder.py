@@ -8,11 +8,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.run_folder import FILES, event_table, telemetry_table, write
 from scenarios.run.shift import RunResult, run
-from scenarios.specs import RunSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import RunSpec
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ from fleet.fields import check, option, options_of
 from fleet.robot import ThermalLimits
 from scenarios.cli.from_fields import From, Given, flags_of, with_fields
 from scenarios.cli.main import COMMANDS, GROUPS, MOVED, load_command
-from scenarios.live.http_app import ROLES
-from scenarios.specs import PORT, LiveSpec, RunSpec, Shot
+from scenarios.live.gateway import ROLES
+from scenarios.spec.options import PORT, LiveSpec, RunSpec, Shot
 
 
 @dataclass(frozen=True, kw_only=True)

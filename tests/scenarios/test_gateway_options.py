@@ -5,8 +5,7 @@ import re
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.live.http_app import check_token, read_tokens
-from scenarios.live.http_server import check
+from scenarios.live.gateway import check, check_token, read_tokens
 
 PLAIN, SECURE = "tcp/127.0.0.1:7447", "tls/127.0.0.1:7447"
 

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import scenarios.motion.generate as module
+from fleet.heat.thermal import NODES, WINDING
 from fleet.job import Place, Work
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3
-from fleet.thermal import NODES, WINDING
-from scenarios.motion.generate import GenerationError, Verification, generate
-from scenarios.motion.perform import perform
+from scenarios.motion.generate import GenerationError, Verification, generate, perform
 from twin.vae.generate import vary
 
 

@@ -52,7 +52,7 @@ def test_afterwards_ctrl_c_is_as_it_was(thermofleet, small_toml, tmp_path):
 def test_ctrl_c_while_planning_writes_nothing_and_keeps_the_plans(
     thermofleet, small_toml, tmp_path, monkeypatch, plans
 ):
-    from fleet.planning.planner import Planner
+    from fleet.arm.planner import Planner
 
     made = 0
     plan = Planner.plan

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenarios.job_stream import all_works, draw_jobs, rehearsal_works, works_of
-from scenarios.load import load
-from scenarios.schema import ArrivalSpec, Scenario
+from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
+from scenarios.spec.load import load
+from scenarios.spec.schema import ArrivalSpec, Scenario
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.load import load
 from scenarios.motion.generate import peak_of
-from scenarios.motion.known_arm import known_arm
-from scenarios.parse import override
+from scenarios.motion.recover import known_arm
+from scenarios.spec.load import load
+from scenarios.spec.parse import override
 
 LEFT: Any = SimpleNamespace(arm="left")
 

@@ -10,12 +10,12 @@ import pytest
 
 from fleet.errors import FleetError, ScenarioError
 from scenarios.cli.main import main
-from scenarios.job_stream import all_works
-from scenarios.load import library, load
-from scenarios.parse import parse_scenario
 from scenarios.prepare.fleet import prepare, prepare_arm
-from scenarios.schema import Ambient
 from scenarios.show.layout import layout_report
+from scenarios.spec.jobs import all_works
+from scenarios.spec.load import library, load
+from scenarios.spec.parse import parse_scenario
+from scenarios.spec.schema import Ambient
 
 
 @pytest.fixture

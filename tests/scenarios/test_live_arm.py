@@ -12,19 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.arm.model import ArmModel
+from fleet.arm.plan_cache import rest_torque
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, Quote, QuoteRequest
 from fleet.bus.protocol.messages import Info, State
+from fleet.bus.router import Router
 from fleet.errors import BusError, FleetError, LogError
-from fleet.physics.models import ArmModel
-from fleet.planning.plan_cache import rest_torque
 from scenarios.live.arm import ambient_of, replayed_arm, simulated_arm, wait_for_name
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.progress import quiet
-from scenarios.schema import Ambient
+from scenarios.spec.load import load
+from scenarios.spec.schema import Ambient
 from tests import commands
 from tests.waiting import PATIENCE_S
 from twin.logs.reader import read
@@ -240,7 +240,7 @@ import sys
 from pathlib import Path
 from scenarios.progress import quiet
 from scenarios.live.arm import simulated_arm
-from scenarios.load import load
+from scenarios.spec.load import load
 made = simulated_arm(load("quickstart"), "arm_0", "blind", 0, quiet, Path({str(tmp_path)!r}))
 made.body(0.0, 0.1).advance(1.0)
 print(*sys.modules)

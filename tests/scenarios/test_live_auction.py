@@ -20,8 +20,8 @@ from fleet.job import Job, Place, Work
 from scenarios.live import auctioneer as live_auction
 from scenarios.live.auctioneer import job_spec, own_jobs
 from scenarios.live.journals import refuse_other_way
-from scenarios.load import load
 from scenarios.prepare.fleet import make_env
+from scenarios.spec.load import load
 from tests import commands
 from tests.waiting import PATIENCE_S
 

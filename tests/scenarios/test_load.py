@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.errors import ScenarioError
-from scenarios.load import library, load, own_seed
-from scenarios.parse import override, parse_scenario
+from scenarios.spec.load import library, load, own_seed
+from scenarios.spec.parse import override, parse_scenario
 
 FILE = Path("heat.toml")
 

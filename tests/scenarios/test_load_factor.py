@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.thermal import WINDING, drive_heat, gen3_network, thermal_model
+from fleet.heat.thermal import WINDING, drive_heat, gen3_network, thermal_model
 from scenarios.prepare.load_factor import LoadFactor, load_factor
 
 TICKS = 60

@@ -7,12 +7,11 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 import pytest
 
-import scenarios.motion.motion_files as module
+import scenarios.motion.recover as module
 from fleet.errors import FleetError
 from fleet.motion import RATE_HZ
 from scenarios.motion.generate import Verification, generate
-from scenarios.motion.motion_files import save_generated, save_recovery
-from scenarios.motion.recover import Recovery
+from scenarios.motion.recover import Recovery, save_generated, save_recovery
 
 
 @pytest.fixture(scope="module")

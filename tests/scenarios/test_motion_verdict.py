@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from scenarios.prepare.twin_folder import train_log
+from scenarios.prepare.twins import train_log
 from twin.logs.recording import Recording
 from twin.training_data import cool_stretches
-from twin.vae.config import TwinConfig
-from twin.vae.training_key import hash_records
-from twin.verdict.log_features import log_features
+from twin.vae.config import TwinConfig, hash_records
+from twin.verdict import log_features
 
 RATE_HZ = 2.0
 TINY = TwinConfig(

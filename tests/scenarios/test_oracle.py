@@ -10,11 +10,11 @@ from fleet.difficulty import KNOWN
 from fleet.engine.shift import step
 from fleet.engine.state import initial
 from fleet.engine.world import warm_start
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import WINDING, drive_heat, gen3_network, steady_state, thermal_model
 from fleet.motion import Plan, drive
-from fleet.motor import gen3_motors
 from fleet.robot import ThermalLimits
-from fleet.thermal import WINDING, drive_heat, gen3_network, steady_state, thermal_model
-from scenarios.prepare.oracle import Oracle, peaks
+from scenarios.prepare.arms import Oracle, peaks
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
 FEARLESS = ThermalLimits(warning_c=900.0, error_c=1000.0)

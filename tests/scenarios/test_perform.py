@@ -5,20 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet.arm.model import ArmModel
+from fleet.arm.random_motions import plan_motion, random_jobs
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import NODES, gen3_network, thermal_model
 from fleet.motion import RATE_HZ, Phase
-from fleet.motor import gen3_motors
-from fleet.physics.models import ArmModel
-from fleet.planning.random_motions import plan_motion, random_jobs
 from fleet.robot import Robot
-from fleet.thermal import NODES, gen3_network, thermal_model
-from scenarios.motion.perform import bare_arm, perform
-from scenarios.prepare.oracle import peaks
+from scenarios.motion.generate import bare_arm, perform
+from scenarios.prepare.arms import peaks
 
 ROBOT = Robot(name="arm", tool_kg=0.9)
 ARM = bare_arm(ROBOT, gen3_motors(), thermal_model(gen3_network()))
 MODEL = ArmModel(ROBOT)
 STIFFNESS = np.array([2000.0] * 4 + [500.0] * 3)
-"""Of the servos, N·m/rad (fleet/physics/assets/gen3.xml)."""
+"""Of the servos, N·m/rad (fleet/arm/assets/gen3.xml)."""
 COLD_C = np.full(NODES, 23.0)
 REACHING = np.array([0.3, 0.8, np.pi, -1.2, 0.0, 0.9, 1.57])
 

@@ -16,18 +16,18 @@ import numpy as np
 import pytest
 import zenoh
 
-from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol.messages import encoding
 from fleet.bus.protocol.policy import ActRequest
+from fleet.bus.router import Router, open_client
 from fleet.errors import BusError, FleetError
 from scenarios.evaluate import runner
 from scenarios.evaluate.rollout import outcomes, play
 from scenarios.evaluate.study import Case, Study, policy_hash
-from scenarios.load import load
 from scenarios.policy_loader import is_built_in, is_on_bus, label, policy_of, scope_of, source_of
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.shift import run
-from scenarios.specs import RunSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import RunSpec
 from tests import commands
 from tests.bus.test_policy_client import KEY, seen
 from tests.examples.programs import ROOT, running, started

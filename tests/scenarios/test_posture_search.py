@@ -6,10 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import spearmanr
 
-from fleet.motion import static_drive
-from fleet.motor import gen3_motors, reference_current
-from fleet.physics.models import ArmModel
-from fleet.thermal import (
+from fleet.arm.model import ArmModel
+from fleet.heat.motor import gen3_motors, reference_current
+from fleet.heat.thermal import (
     HOUSING,
     WINDING,
     advance,
@@ -19,7 +18,8 @@ from fleet.thermal import (
     steady_state,
     thermal_model,
 )
-from scenarios.motion.posture_search import Nearby, holding, housing_estimate
+from fleet.motion import static_drive
+from scenarios.motion.recover import Nearby, holding, housing_estimate
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
 Q = np.deg2rad([0.0, 60.0, 180.0, -60.0, 0.0, 55.0, 90.0])

@@ -11,10 +11,10 @@ from scenarios.evaluate import runner
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.store import read_rows
 from scenarios.evaluate.study import SHIFTS, Case, Study
-from scenarios.load import load
-from scenarios.parse import override
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.randomisation import Randomisation
+from scenarios.spec.load import load
+from scenarios.spec.parse import override
 
 VARIED = Randomisation(ambient_k=(-5.0, 15.0), arrivals=(0.5, 2.0), variants=[{"spread": {"scale": 2.0, "seed": 9}}])
 BLIND = ("--policies", "random,round_robin", "--difficulty", "blind", "--seeds", 2, "--workers", 1)

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet.arm.model import ArmModel
 from fleet.job import Fixture
-from fleet.physics.models import ArmModel
 from scenarios.motion.generate import Verification
-from scenarios.motion.posture_search import Nearby, RecoveryError
-from scenarios.motion.recover import TICK_S, hold_until, recover
-from twin.vae.checkpoint import save
+from scenarios.motion.recover import TICK_S, Nearby, RecoveryError, hold_until, recover
+from twin.vae.twin import save
 
 HOLDS = {
     "reaching": ((0.0, 60.0, 180.0, -30.0, 0.0, 55.0, 90.0), 3.0, 57.0),

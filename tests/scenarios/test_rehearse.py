@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet.arm.model import ArmModel
+from fleet.arm.random_motions import light_jobs
 from fleet.errors import FleetError
-from fleet.motor import gen3_motors
-from fleet.physics.models import ArmModel
-from fleet.planning.random_motions import light_jobs
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import gen3_network, thermal_model
 from fleet.robot import Mount, Robot
-from fleet.thermal import gen3_network, thermal_model
-from scenarios.load import library, load
-from scenarios.prepare import model_cache
-from scenarios.prepare import train_twins as rehearse
-from scenarios.prepare.cool_motion import cool_plans, records, require_cool_plans
-from scenarios.prepare.planned_arm import ArmHardware, PlannedArm
+from scenarios.prepare import twins
+from scenarios.prepare import twins as rehearse
+from scenarios.prepare.arms import ArmHardware, PlannedArm
+from scenarios.prepare.twins import cool_plans, records, require_cool_plans
+from scenarios.spec.load import library, load
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 
@@ -60,7 +60,7 @@ def test_a_fleet_that_gets_hot_at_everything_is_told_what_to_change(plans, scena
 
 
 def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, tmp_path, tiny, monkeypatch):
-    monkeypatch.setattr(model_cache, "cpu_count", lambda: 1)
+    monkeypatch.setattr(twins, "cpu_count", lambda: 1)
     told = []
     first = rehearse.train_twins(scenario, arms(2, plans), tmp_path, lambda *tell: told.append(tell))
     assert told[-1] == ("training", 1.0)
@@ -69,7 +69,7 @@ def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, t
     def never(*_args, **_more):
         raise AssertionError("trained again")
 
-    monkeypatch.setattr(model_cache, "worker_processes", never)
+    monkeypatch.setattr(twins, "worker_processes", never)
     again = rehearse.train_twins(scenario, arms(2, plans), tmp_path, silent)
     assert [t.version for t in again] == [t.version for t in first]
     other = replace(scenario, twin=replace(scenario.twin, cool_c=200.0))  # hot motion is in the records as well
@@ -79,7 +79,7 @@ def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, t
 
 def test_twins_do_not_depend_on_how_many_work(plans, scenario, tmp_path, tiny, monkeypatch):
     both = rehearse.train_twins(scenario, arms(2, plans), tmp_path / "two", silent)
-    monkeypatch.setattr(model_cache, "cpu_count", lambda: 1)
+    monkeypatch.setattr(twins, "cpu_count", lambda: 1)
     alone = rehearse.train_twins(scenario, arms(2, plans), tmp_path / "one", silent)
     assert [t.version for t in both] == [t.version for t in alone]
 

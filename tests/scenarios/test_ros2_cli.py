@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
+from fleet.bus.router import Router
 from scenarios.cli.main import main
 from tests import commands
 from tests.waiting import PATIENCE_S

@@ -14,15 +14,15 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from fleet.bus.client.router import open_client
 from fleet.bus.protocol import keys
+from fleet.bus.router import open_client
 from fleet.bus.security.access_control import Participant
 from fleet.bus.security.certificates import issue
 from fleet.bus.security.tls import Tls, identified
-from fleet.live.arm.journal_records import ArmRecord, Closed
+from fleet.live.arm.awards import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
-from scenarios.specs import LiveSpec
+from scenarios.spec.options import LiveSpec
 from tests import commands
 from tests.waiting import PATIENCE_S, wait_until
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from agents.registry import RULES
-from scenarios.load import load
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.shift import RunResult, run, summary
-from scenarios.scenario_hash import scenario_hash
-from scenarios.specs import RunSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import RunSpec
+from scenarios.spec.parse import scenario_hash
 
 TICKS = 18
 

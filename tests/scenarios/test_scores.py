@@ -10,7 +10,7 @@ from scenarios.evaluate.rollout import FIGURES, Outcome
 from scenarios.evaluate.scores import normalised, references_of, scores_of
 from scenarios.evaluate.statistics import interval
 from scenarios.evaluate.study import Case, Key, Row
-from scenarios.load import load
+from scenarios.spec.load import load
 
 SHIFTS = [("test/0000", 7), ("test/0001", 8), ("test/0002", 9)]
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from fleet.bus.client.client import BusClient
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Admission,

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 
 from fleet.errors import ScenarioError
-from scenarios.job_stream import all_works
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.load_factor import load_factor
-from scenarios.scenario_hash import scenario_content
-from scenarios.schema import SPLITS, BusSpec, Scenario
-from scenarios.suite.axes import BUSES, DUE, Axes, scenario_of
-from scenarios.suite.cells import CELLS, layout
-from scenarios.suite.layouts import layout_of
+from scenarios.spec.jobs import all_works
+from scenarios.spec.load import load
+from scenarios.spec.parse import scenario_content
+from scenarios.spec.schema import SPLITS, BusSpec, Scenario
+from scenarios.suite.instances import BUSES, CELLS, DUE, Axes, layout, layout_of, scenario_of
 from scenarios.suite.splits import cell_of_instance, drawn_rows, instance, manifest, split
 
 PLAIN = Axes(

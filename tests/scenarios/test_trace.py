@@ -14,13 +14,13 @@ from scenarios.cli.look import last_folder
 from scenarios.cli.main import main
 from scenarios.cli.terminal import out_console
 from scenarios.live.recorder import Recorder
-from scenarios.load import load
 from scenarios.prepare.fleet import prepare
 from scenarios.run.provenance import code_hash
 from scenarios.run.run_folder import write
 from scenarios.run.shift import run
 from scenarios.show.trace import NOT_RECORDED, rows_of, thread_of, thread_table
-from scenarios.specs import RunSpec
+from scenarios.spec.load import load
+from scenarios.spec.options import RunSpec
 
 JOBS = ("a", "b")
 LOG = [

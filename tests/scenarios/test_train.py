@@ -4,15 +4,15 @@ import json
 
 import pytest
 
+from agents.learned.evolution import LOG
 from agents.learned.policy import load_policy
 from agents.learned.ppo import PpoConfig
-from agents.learned.training_log import LOG
 from fleet.errors import FleetError
 from scenarios.cli.main import main
-from scenarios.load import load
-from scenarios.parse import override
 from scenarios.policy_loader import label, policy_of
-from scenarios.train.folder import NETWORK_STATE
+from scenarios.spec.load import load
+from scenarios.spec.parse import override
+from scenarios.train.instances import NETWORK_STATE
 from scenarios.train.networks import CURVE, VALIDATION_SEED, TrainingPlan, train
 
 SMALL = {"horizon_s": 300.0}

@@ -7,23 +7,20 @@ from itertools import chain, repeat
 import numpy as np
 import pytest
 
-from agents.learned.evolution import EvolutionConfig
+from agents.learned.evolution import LOG, EvolutionConfig, TrainingLength
 from agents.learned.ppo import PpoConfig
-from agents.learned.training_log import LOG, TrainingLength
-from agents.pair_scores import PAIRS_CARD, PARAMETERS, first_parameters
-from agents.pairs import Worth
+from agents.pairs import PAIRS_CARD, PARAMETERS, Worth, first_parameters
 from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.evaluate.rollout import outcomes
-from scenarios.load import load
-from scenarios.parse import override
 from scenarios.policy_loader import scope_of
 from scenarios.prepare.fleet import prepare
+from scenarios.spec.load import load
+from scenarios.spec.parse import override
 from scenarios.suite.splits import Instance, instance
 from scenarios.train import instances as suite_batches
 from scenarios.train import pairs
-from scenarios.train.folder import PAIRS_STATE, TRAINING, holds_training
-from scenarios.train.instances import ground_of, rewards
+from scenarios.train.instances import PAIRS_STATE, TRAINING, ground_of, holds_training, rewards
 from scenarios.train.networks import Judge, TrainingPlan, train_on_split
 from scenarios.train.pairs import CURVE, PairPlan, train_pairs, validation
 

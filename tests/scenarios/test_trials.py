@@ -10,21 +10,21 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from agents.pair_scores import PARAMETERS, save_pairs
+from agents.pairs import PARAMETERS, save_pairs
 from fleet.errors import FleetError
 from scenarios.evaluate import runner, sources
 from scenarios.evaluate.comparison import comparison_of, comparisons
 from scenarios.evaluate.rollout import FIGURES, outcomes
 from scenarios.evaluate.store import RESULTS, opened, read_rows
 from scenarios.evaluate.study import SHIFTS, Case, Key, Row, Study, Unit, policy_hash, seeds_of_instance
-from scenarios.load import load
-from scenarios.parse import override
 from scenarios.prepare import fleet as preparing
+from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.fleet import prepare
-from scenarios.prepare.planned_arm import plan_arms
 from scenarios.processes import Queue
-from scenarios.schema import Scenario
 from scenarios.show.comparison_page import result_text
+from scenarios.spec.load import load
+from scenarios.spec.parse import override
+from scenarios.spec.schema import Scenario
 from tests.own_policies import IDLE
 
 BAD = (

@@ -10,9 +10,9 @@ import pytest
 
 from scenarios.cli.main import main
 from scenarios.show.twin_report import Size
-from twin.vae.checkpoint import load
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU
+from twin.vae.twin import load
 
 TINY = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "--allow-collapse")
 RATE_HZ = 2.0
@@ -92,7 +92,7 @@ def test_ctrl_c_while_learning_a_log_promises_nothing(thermofleet, logs, tmp_pat
     def interrupted(*_args, **_more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenarios.prepare.twin_folder.train", interrupted)
+    monkeypatch.setattr("scenarios.prepare.twins.train", interrupted)
     said = thermofleet("twin", "train", "--log", logs / "cool", *TINY, "--out", tmp_path / "twins")
     assert said.code == 130
     assert said.err.splitlines()[-1] == "Interrupted while learning the log: nothing was written."

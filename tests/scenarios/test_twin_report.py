@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleet.arm.random_motions import random_jobs
 from fleet.errors import FleetError
 from fleet.motion import RATE_HZ
-from fleet.planning.random_motions import random_jobs
 from fleet.robot import Robot
-from scenarios.load import load
-from scenarios.prepare.planned_arm import hardware_of
-from scenarios.prepare.simulated_logs import own_logs
+from scenarios.prepare.arms import hardware_of
+from scenarios.prepare.identify import own_logs
 from scenarios.show import twin_report as report
 from scenarios.show.table import Table
+from scenarios.spec.load import load
 from twin.logs.recording import Recording
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU

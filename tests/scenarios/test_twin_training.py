@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import pytest
 
-from scenarios.job_stream import rehearsal_works
-from scenarios.load import load
-from scenarios.motion.known_arm import known_arm
-from scenarios.parse import override
-from scenarios.prepare.planned_arm import plan_arms
-from scenarios.prepare.train_twins import train_twin, train_twins
-from scenarios.prepare.twin_folder import quality, train_arms
+from scenarios.motion.recover import known_arm
+from scenarios.prepare.arms import plan_arms
+from scenarios.prepare.twins import quality, train_arms, train_twin, train_twins
 from scenarios.progress import quiet
-from scenarios.schema import Scenario
+from scenarios.spec.jobs import rehearsal_works
+from scenarios.spec.load import load
+from scenarios.spec.parse import override
+from scenarios.spec.schema import Scenario
 from twin.vae.config import TwinConfig
 from twin.vae.twin import Twin
 
@@ -30,7 +29,7 @@ def scenario(small_toml, plans, monkeypatch) -> Scenario:
 def fleet(scenario, monkeypatch, plans) -> list[Twin]:
     """The twins with which the scenario's fleet works."""
     monkeypatch.setattr(TwinConfig, "quick", classmethod(lambda cls: TINY))
-    monkeypatch.setattr("scenarios.prepare.model_cache.cpu_count", lambda: 1)
+    monkeypatch.setattr("scenarios.prepare.twins.cpu_count", lambda: 1)
     planned = plan_arms(scenario, range(2), rehearsal_works(scenario), plans, quiet)
     return train_twins(scenario, planned, plans, quiet)
 
@@ -52,7 +51,7 @@ def test_the_twins_of_the_fleet_are_not_trained_again(scenario, fleet, monkeypat
     def never(*_args, **_more):
         raise AssertionError("trained again")
 
-    monkeypatch.setattr("scenarios.prepare.train_twins.train_twin", never)
+    monkeypatch.setattr("scenarios.prepare.twins.train_twin", never)
     kept = train_arms(scenario, [0, 1], TINY)
     assert [quality(twin) for twin in kept] == [quality(twin) for twin in fleet]
     with pytest.raises(AssertionError, match="trained again"):
@@ -67,7 +66,7 @@ def test_what_is_trained_by_hand_is_kept_by_its_seed_and_that_of_its_exploration
         trained.append(more["arm"].index)
         return train_twin(*args, **more)
 
-    monkeypatch.setattr("scenarios.prepare.train_twins.train_twin", counted)
+    monkeypatch.setattr("scenarios.prepare.twins.train_twin", counted)
     (again,) = train_arms(scenario, [1], TINY, seed=6)
     assert (again.version, trained) == (first.version, [])
     # Arms of one body and one plan, but other exploration: weights of seed 6 are not those of scenario 6.

@@ -5,7 +5,7 @@ import pytest
 from fleet.events import Event
 from scenarios.run.schedule import schedule
 from scenarios.shift_records import Offer
-from scenarios.show.verdict import verdict
+from scenarios.show.run_page import verdict
 
 ARMS = ("hot", "cool")
 MIN = 60.0

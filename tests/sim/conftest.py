@@ -7,18 +7,18 @@ import mujoco
 import numpy as np
 import pytest
 
+from fleet.arm.model import ArmModel
+from fleet.arm.planner import Planner
+from fleet.arm.plant import MujocoPlant
 from fleet.difficulty import Blind
 from fleet.engine.profile_plant import ProfilePlant, recorded_noise, telemetry_of
 from fleet.engine.shift import step
 from fleet.engine.state import initial
 from fleet.engine.world import Arm, build_world
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import gen3_network, thermal_model
 from fleet.job import Job, Place, Work
-from fleet.motor import gen3_motors
-from fleet.physics.models import ArmModel
-from fleet.physics.mujoco_plant import MujocoPlant
-from fleet.planning.planner import Planner
 from fleet.robot import Mount, Robot, ThermalLimits
-from fleet.thermal import gen3_network, thermal_model
 
 ROBOTS = (
     Robot(name="floor"),

@@ -6,14 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from fleet.arm.cell import APART_S, ContactFinder
+from fleet.arm.model import build_cell, links_of
+from fleet.arm.planner import Planner
+from fleet.arm.plant import STRIDE, TIMESTEP_S, MujocoPlant
 from fleet.engine.shift import step
 from fleet.engine.state import initial
 from fleet.job import Fixture, Place, Work, payload_radius_m
 from fleet.offered_plans import PLANS
-from fleet.physics.contacts import APART_S, ContactFinder
-from fleet.physics.models import build_cell, links_of
-from fleet.physics.mujoco_plant import STRIDE, TIMESTEP_S, MujocoPlant
-from fleet.planning.planner import Planner
 from fleet.robot import POSTURES, Mount, Robot
 
 ONE = Robot(name="one")

@@ -8,16 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet.arm.model import ArmModel, build_cell, gen3_xml, set_payload_balls
+from fleet.arm.plant import STRIDE, TIMESTEP_S, MujocoPlant, control, load_hands, reference, still
 from fleet.engine.profile_plant import sample
 from fleet.engine.shift import step
 from fleet.engine.state import initial
 from fleet.errors import FleetError
 from fleet.job import KINDS
 from fleet.motion import RATE_HZ, Phase, Plan
-from fleet.physics.gen3 import gen3_xml
-from fleet.physics.models import ArmModel, build_cell, set_payload_balls
-from fleet.physics.mujoco_plant import STRIDE, TIMESTEP_S, MujocoPlant, load_hands
-from fleet.physics.servo_control import control, reference, still
 from fleet.robot import GEN3
 from fleet.telemetry import FAULTED, WORKING
 

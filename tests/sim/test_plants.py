@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.arm.plant import MujocoPlant
 from fleet.engine.profile_plant import sample, sample_row
+from fleet.heat.motor import gen3_motors
 from fleet.job import KINDS
 from fleet.motion import RATE_HZ
-from fleet.motor import gen3_motors
-from fleet.physics.mujoco_plant import MujocoPlant
 from fleet.telemetry import FAULTED, IDLE
 from scenarios.prepare.fleet import make_env
-from scenarios.schema import ArmSpec, ArrivalSpec, JobStream, Planning, Scenario
+from scenarios.spec.schema import ArmSpec, ArrivalSpec, JobStream, Planning, Scenario
 
 # The profile plant
 

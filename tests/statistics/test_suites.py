@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from fleet.errors import FleetError
-from scenarios.evaluate.marl_eval import to_marl_eval
+from scenarios.evaluate.scores import to_marl_eval
 from scenarios.evaluate.statistics import aggregates, by_group, improvement, interval, profile
 
 THRESHOLDS = np.linspace(0.0, 1.0, 5)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from scenarios.evaluate.statistics import holm, interval, paired
-from scenarios.evaluate.tables import EQUAL, figure_rows, figures_of, remarks
+from scenarios.evaluate.statistics import EQUAL, figure_rows, figures_of, holm, interval, paired, remarks
 
 
 @pytest.fixture

@@ -8,8 +8,7 @@ import pytest
 
 from benchmarks.paper.quality import collapsed_config
 from fleet.motion import Phase
-from twin.baselines.reconstruction import untrained_config
-from twin.baselines.torque import TorqueRms, torque_over_known
+from twin.baselines import TorqueRms, torque_over_known, untrained_config
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.window import cut_jobs

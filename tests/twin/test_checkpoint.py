@@ -7,8 +7,8 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from fleet.errors import CheckpointError
-from twin.vae.checkpoint import CARD, WEIGHTS, load, save
 from twin.vae.train import train
+from twin.vae.twin import CARD, WEIGHTS, load, save
 
 
 @pytest.fixture

@@ -11,16 +11,17 @@ from sklearn.metrics import roc_auc_score
 
 from fleet.difficulty import KNOWN
 from tests.profiles import examples
-from twin.saturation.fit import (
+from twin.p_saturation import (
     LEAST_JOBS,
     LEAST_OF_EACH,
     Experience,
     NotEnoughExperience,
+    brier,
     fit_saturation,
     logistic,
     monotone_curve,
+    reliability,
 )
-from twin.saturation.reliability import brier, reliability
 from twin.vae.measures import PARTS, Features
 
 

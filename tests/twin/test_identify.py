@@ -5,16 +5,32 @@ import pytest
 
 from benchmarks.paper.real_logs import held_out_errors, rms
 from fleet.errors import CheckpointError, IdentificationError
-from fleet.motor import friction_heat, gen3_motors, reference_current
+from fleet.heat.motor import friction_heat, gen3_motors, reference_current
+from fleet.heat.thermal import (
+    HOUSING,
+    NODES,
+    WINDING,
+    ThermalSpread,
+    drive_heat,
+    gen3_network,
+    spread_motors,
+    thermal_model,
+)
 from fleet.robot import JOINTS
-from fleet.thermal import HOUSING, NODES, WINDING, ThermalSpread, drive_heat, gen3_network, spread_motors, thermal_model
-from twin.logs.heat_log import heat_logs
-from twin.logs.recording import Recording
+from twin.logs.recording import Recording, heat_logs
 from twin.thermal.checkpoint import CARD, load, load_twin, save
-from twin.thermal.identify import identify
-from twin.thermal.least_squares import Noise, Problem, linear_temperatures, noise_of
-from twin.thermal.parameters import PRIOR_SD, THERMAL, HeatModel, ParameterVector
-from twin.thermal.result import nominal_heat_model
+from twin.thermal.identify import (
+    PRIOR_SD,
+    THERMAL,
+    HeatModel,
+    Noise,
+    ParameterVector,
+    Problem,
+    identify,
+    linear_temperatures,
+    noise_of,
+    nominal_heat_model,
+)
 from twin.thermal.thermal_twin import RcTwin
 
 AIR_C = 22.0

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.profiles import examples
-from twin.vae.checkpoint import save
 from twin.vae.config import TwinConfig
 from twin.vae.inference import Networks, decode, posterior, reconstruct
 from twin.vae.model import build, weights_of
+from twin.vae.twin import save
 
 configs = st.builds(
     TwinConfig,
@@ -83,7 +83,7 @@ def test_a_saved_twin_scores_without_torch(twin, plan, tmp_path):
     save(twin, tmp_path)
     (tmp_path / "plan.pickle").write_bytes(pickle.dumps(plan))
     source = (
-        "import pathlib, pickle, sys; from twin.vae.checkpoint import load; folder = pathlib.Path(sys.argv[1]); "
+        "import pathlib, pickle, sys; from twin.vae.twin import load; folder = pathlib.Path(sys.argv[1]); "
         "score = load(folder).score(pickle.loads((folder / 'plan.pickle').read_bytes()), 3); "
         "print(score.total, 'torch' in sys.modules)"
     )

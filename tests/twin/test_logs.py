@@ -16,14 +16,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.arm.model import ArmModel
 from fleet.errors import LogError
-from fleet.physics.models import ArmModel
 from fleet.robot import Robot
 from fleet.telemetry import Telemetry
 from scenarios.run.run_folder import telemetry_table
-from twin.logs.reader import read, read_folder
+from twin.logs.reader import read, read_folder, time_damage
 from twin.logs.recording import READINGS
-from twin.logs.table import time_damage
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 GEN3 = ["Time (s)", *(f"{g}_{j}" for g in ("Pos", "Temp", "Torque", "Current", "Velocity") for j in range(7))]

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
-from twin.vae.loss import active_units, collapsed, kl, negative_elbo, reconstruction
+from twin.vae.model import active_units, collapsed, kl, negative_elbo, reconstruction
 
 DRAW = torch.Generator().manual_seed(0)
 

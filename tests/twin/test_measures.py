@@ -10,7 +10,6 @@ from scipy.spatial.distance import mahalanobis
 
 from fleet.errors import CheckpointError
 from fleet.motion import Phase
-from twin.vae.checkpoint import CARD, load, save
 from twin.vae.measures import (
     LEAST_VARIANCE,
     PARTS,
@@ -22,6 +21,7 @@ from twin.vae.measures import (
     measures_of,
     score_of,
 )
+from twin.vae.twin import CARD, load, save
 from twin.vae.window import cut, cut_jobs, resample
 
 errors = st.floats(0.0, 20.0)

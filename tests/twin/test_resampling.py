@@ -5,8 +5,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from twin.logs.recording import CONTINUOUS, Recording
-from twin.logs.resampling import at_rate, stretches
+from twin.logs.recording import CONTINUOUS, Recording, at_rate, stretches
 
 JOINTS = 7
 rates = st.floats(0.2, 60.0)

@@ -11,16 +11,8 @@ from hypothesis import strategies as st
 
 from fleet.difficulty import KNOWN
 from fleet.errors import CheckpointError
-from twin.saturation.model import (
-    FILE,
-    SaturationModel,
-    evidence_of,
-    load_saturation,
-    save_saturation,
-)
-from twin.thermal.calibrated import CalibratedTwin
-from twin.thermal.risk import PeakCurve
-from twin.thermal.thermal_twin import RcTwin
+from twin.p_saturation import FILE, SaturationModel, evidence_of, load_saturation, save_saturation
+from twin.thermal.thermal_twin import CalibratedTwin, PeakCurve, RcTwin
 from twin.vae.measures import PARTS, Features
 
 MODEL = SaturationModel(

@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from twin.vae.cell import tanh
 from twin.vae.config import TwinConfig
-from twin.vae.loss import negative_elbo
-from twin.vae.model import build
-from twin.vae.run import Run
-from twin.vae.side_by_side import SideBySide
-from twin.vae.train import Motion, train, train_all
+from twin.vae.inference import tanh
+from twin.vae.model import build, negative_elbo
+from twin.vae.train import Motion, Run, SideBySide, train, train_all
 
 
 def drawn(seed: int, *shape: int) -> torch.Tensor:

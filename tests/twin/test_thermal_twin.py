@@ -5,10 +5,8 @@ import pytest
 from scipy.stats import norm
 
 from fleet.difficulty import SETTLING_S, known_temperatures
-from fleet.motion import RATE_HZ, drive, drives
-from fleet.motor import friction_heat, reference_current
-from fleet.robot import JOINTS
-from fleet.thermal import (
+from fleet.heat.motor import friction_heat, reference_current
+from fleet.heat.thermal import (
     HOUSING,
     NODES,
     WINDING,
@@ -19,19 +17,14 @@ from fleet.thermal import (
     spread_motors,
     steady_state,
 )
-from scenarios.prepare.oracle import peaks
-from twin.logs.heat_log import heat_logs
-from twin.logs.recording import Recording
-from twin.saturation.fit import NotEnoughExperience
-from twin.saturation.reliability import brier, reliability
+from fleet.motion import RATE_HZ, drive, drives
+from fleet.robot import JOINTS
+from scenarios.prepare.arms import peaks
+from twin.logs.recording import Recording, heat_logs
+from twin.p_saturation import NotEnoughExperience, brier, reliability
 from twin.thermal.checkpoint import load_twin, save
-from twin.thermal.forecast import continued_peaks, planned_peaks
-from twin.thermal.identify import identify
-from twin.thermal.kalman import filter_log
-from twin.thermal.parameters import HeatModel
-from twin.thermal.result import nominal_heat_model
-from twin.thermal.risk import PeakCurve, fit_curve
-from twin.thermal.thermal_twin import RcTwin
+from twin.thermal.identify import HeatModel, identify, nominal_heat_model
+from twin.thermal.thermal_twin import PeakCurve, RcTwin, continued_peaks, filter_log, fit_curve, planned_peaks
 
 AIR_C = 22.0
 FULL_REACH_NM = np.array([0.0, 50.1, 0.0, 21.3, 0.0, 1.0, 0.0])

@@ -7,10 +7,8 @@ import pytest
 import torch
 
 from fleet.errors import FleetError
-from twin.vae.config import TwinConfig
-from twin.vae.run import Run
-from twin.vae.train import CollapsedPosterior, Diverged, train
-from twin.vae.training_key import hash_records, seed_text, training_key
+from twin.vae.config import TwinConfig, hash_records, seed_text, training_key
+from twin.vae.train import CollapsedPosterior, Diverged, Run, train
 
 SEED = np.random.SeedSequence(11)
 

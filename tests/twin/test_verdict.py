@@ -5,10 +5,8 @@ import pytest
 from scipy.stats import beta, kstest
 
 from fleet.errors import FleetError
-from twin.conformal import allowed, fewest, largest_p_value, p_value, rate_interval
-from twin.vae.measures import Features
-from twin.verdict.log_features import log_features, log_windows
-from twin.verdict.rule import NoGuarantee, Rule
+from twin.vae.measures import Features, allowed, fewest, largest_p_value, p_value, rate_interval
+from twin.verdict import NoGuarantee, Rule, log_features, log_windows
 
 
 @pytest.mark.parametrize(("count", "alpha"), [(64, 0.05), (100, 0.05), (39, 0.2)])

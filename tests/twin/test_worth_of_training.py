@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from sklearn.metrics import roc_auc_score
 
-from twin.baselines.reconstruction import untrained_config
+from twin.baselines import untrained_config
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.twin import Twin

@@ -46,7 +46,7 @@ def test_the_cell_takes_the_recorded_postures_and_heat(run_folder: Path) -> None
 SEEN = """
 import sys, numpy as np
 from pathlib import Path
-from fleet.physics.cell_player import CellCamera
+from fleet.arm.cell import CellCamera
 from scenarios.run.stored_run import read_run
 from scenarios.show.film import Film
 run = read_run(Path(sys.argv[1]))

@@ -1,17 +1,392 @@
-"""Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet."""
+"""The numbers of a log as a table, and its damaged lines.
 
+Read a CSV log, plain or gzip, as a table of numbers with a list of its damaged lines.
+
+The two CSV formats of logs: their columns, units, and conversion to SI.
+
+The telemetry.parquet of a run as one table per arm.
+
+Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet.
+"""
+
+import gzip
 import logging
+import zlib
+from bisect import bisect_left
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import groupby
+from math import isfinite
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from fleet.errors import LogError
-from twin.logs.csv_table import read_csv
-from twin.logs.formats import PLAIN, channels, check_columns, format_of, implausible_readings
-from twin.logs.parquet import read_arms
-from twin.logs.recording import Recording
-from twin.logs.table import Damage, Table, damage_summary, time_damage
+from fleet.robot import JOINTS
+from twin.logs.recording import CONTINUOUS, READINGS, Recording
+
+Array = np.ndarray
+
+MOST_SENTENCES = 20
+"""Most sentences about one file; further ones are counted."""
+STRAY_ROWS = 3
+"""Longest run of rows with wrong times; a longer one is a clock that was reset."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """An unusable line, or row of a parquet file."""
+
+    line: int
+    """From 1."""
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The numbers of one arm's log as written."""
+
+    names: tuple[str, ...]
+    """Column names."""
+    values: Array
+    """Finite, [row, column]."""
+    where: Array
+    """Line in the file of each row, from 1, [row]."""
+    damage: tuple[Damage, ...]
+    """Unusable lines."""
+    broken: tuple[str, ...] = ()
+    """Damage of the whole file."""
+
+
+def time_damage(time_s: Array, where: Array) -> list[Damage]:
+    """The fewest rows to drop so that time increases strictly.
+
+    Args:
+        time_s: [row].
+        where: Line of each row, [row].
+
+    Raises:
+        ValueError: the clock was reset, so the file holds several recordings.
+    """
+    if (np.diff(time_s) > 0).all():
+        return []
+    keep = _longest_increasing(time_s)
+    damage: list[Damage] = []
+    for kept, group in groupby(range(len(time_s)), key=keep.__getitem__):
+        rows = [] if kept else list(group)
+        if len(rows) > STRAY_ROWS:
+            start = next(row for row in range(1, len(time_s)) if time_s[row] <= time_s[row - 1])
+            raise ValueError(
+                f"time starts again at line {where[start]} ({time_s[start - 1]:.10g} s, then {time_s[start]:.10g} s): "
+                "the file holds several recordings; split it."
+            )
+        damage += [Damage(int(where[row]), _time_reason(time_s, row)) for row in rows]
+    return damage
+
+
+def _time_reason(time_s: Array, row: int) -> str:
+    beside = time_s[row - 1] if row else time_s[1]
+    how = "repeats" if time_s[row] == beside else "runs backwards" if row and time_s[row] < beside else "jumps ahead"
+    return f"time {how}: {time_s[row]:.10g} s beside {beside:.10g} s"
+
+
+def _longest_increasing(values: Array) -> Array:
+    """Mask of a longest strictly increasing subsequence (patience sorting); of several, the first."""
+    tops: list[float] = []
+    at: list[int] = []
+    previous = np.full(len(values), -1)
+    # The algorithm finds the last of several, so it runs on the reversed values.
+    for i, value in enumerate((-values[::-1]).tolist()):
+        pile = bisect_left(tops, value)
+        previous[i] = at[pile - 1] if pile else -1
+        tops[pile : pile + 1], at[pile : pile + 1] = [value], [i]
+    keep = np.zeros(len(values), dtype=bool)
+    i = at[-1]
+    while i >= 0:
+        keep[i] = True
+        i = previous[i]
+    return keep[::-1]
+
+
+def out_of_range(values: Array, where: Array, bounds: tuple[float, float], reason: str) -> list[Damage]:
+    """Rows with a reading outside the bounds.
+
+    Args:
+        values: [row, joint].
+        where: Line of each row, [row].
+        reason: Template with {value} and {joint}, counted from 1.
+    """
+    outside = (values < bounds[0]) | (values > bounds[1])
+    rows = np.flatnonzero(outside.any(axis=1))
+    joints = outside[rows].argmax(axis=1)
+    return [
+        Damage(int(where[row]), reason.format(value=values[row, joint], joint=joint + 1))
+        for row, joint in zip(rows, joints, strict=True)
+    ]
+
+
+def damage_summary(damage: Sequence[Damage]) -> tuple[str, ...]:
+    """One sentence per run of lines with the same reason, `line 40: …` or `lines 40 to 52: …`."""
+    ordered = sorted(damage, key=lambda d: d.line)
+    sentences: list[str] = []
+    for _, group in groupby(enumerate(ordered), key=lambda pair: (pair[1].line - pair[0], _kind(pair[1].reason))):
+        some = [d for _, d in group]
+        lines = f"line {some[0].line}" if len(some) == 1 else f"lines {some[0].line} to {some[-1].line}"
+        sentences.append(f"{lines}: {some[0].reason}")
+    if len(sentences) > MOST_SENTENCES:
+        more = len(sentences) - MOST_SENTENCES
+        sentences[MOST_SENTENCES:] = [f"and {more} more damaged place{'s' * (more > 1)}"]
+    return tuple(sentences)
+
+
+def _kind(reason: str) -> str:
+    return "".join(c for c in reason.partition(":")[0] if not c.isdigit())
+
+
+_GZIP = b"\x1f\x8b"
+
+
+def read_csv(path: Path) -> Table:
+    """The numbers of all good lines after the header; blank lines are ignored.
+
+    Raises:
+        LogError: the file cannot be opened, is empty, ends in .gz without gzip data, or has no header.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
+    broken = None
+    if data.startswith(_GZIP):
+        data, broken = _decompress(data)
+    elif data and path.suffix == ".gz":
+        raise LogError(str(path), None, "ends in .gz but holds no gzip data; was it unpacked or downloaded as a page?")
+    if not data.strip():
+        raise LogError(str(path), None, f"holds no text ({broken})." if broken else "is empty.")
+    header, *lines = data.split(b"\n")
+    names = _header(path, header)
+    rows: list[list[float]] = []
+    where: list[int] = []
+    damage: list[Damage] = []
+    for line, raw in enumerate(lines, start=2):
+        if not raw.strip():
+            continue
+        try:
+            if line == len(lines) + 1:
+                # The last number may have lost digits even if all fields are present.
+                raise ValueError(f"the {'gzip data end' if broken else 'file ends'} in the middle of this line")
+            rows.append(_numbers(raw, len(names)))
+            where.append(line)
+        except ValueError as error:
+            damage.append(Damage(line, str(error)))
+    values = np.array(rows, dtype=float).reshape(-1, len(names))
+    return Table(names, values, np.array(where, dtype=int), tuple(damage), (broken,) if broken else ())
+
+
+def _decompress(data: bytes) -> tuple[bytes, str | None]:
+    """Content of a gzip file up to its first damage, and the damage."""
+    try:
+        return gzip.decompress(data), None
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        reason = "cut off" if isinstance(error, EOFError) else f"damaged: {error}"
+    stream, parts = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16), list[bytes]()
+    with suppress(zlib.error):
+        # Byte by byte, because a damaged piece returns nothing, not even what precedes the damage.
+        for i in range(len(data)):
+            parts.append(stream.decompress(data[i : i + 1]))
+    return b"".join(parts), f"the gzip data are {reason}"
+
+
+def _header(path: Path, line: bytes) -> tuple[str, ...]:
+    try:
+        names = tuple(name.strip().strip('"') for name in line.decode("utf-8-sig").split(","))
+    except UnicodeDecodeError as error:
+        reason = f"is not text in UTF-8 (byte {error.start}); save it as CSV in UTF-8."
+        raise LogError(str(path), 1, reason) from error
+    if double := sorted({name for name in names if names.count(name) > 1}):
+        raise LogError(str(path), 1, f"names the column '{double[0]}' twice.")
+    return names
+
+
+def _numbers(raw: bytes, columns: int) -> list[float]:
+    """Raises ValueError with the reason if the line has no such numbers."""
+    try:
+        cells = raw.decode("utf-8").split(",")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"is not text in UTF-8 (byte {error.start} of the line)") from error
+    if len(cells) != columns:
+        raise ValueError(f"{len(cells)} fields where the header has {columns}")
+    numbers: list[float] = []
+    for column, cell in enumerate(cells, start=1):
+        try:
+            numbers.append(float(cell))
+        except ValueError:
+            raise ValueError(f"field {column}, '{cell.strip()[:24]}', is not a number") from None
+        if not isfinite(numbers[-1]):
+            raise ValueError(f"field {column} is {cell.strip()}, not a finite number")
+    return numbers
+
+
+TEMP_RANGE_C = (-40.0, 200.0)
+"""Range of a motor's temperature sensor; values outside are faults or kelvin."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """Column names and units of a CSV format."""
+
+    name: str
+    time: str
+    """Column of the time, s."""
+    groups: tuple[str, ...]
+    """Prefix of the column names of each of `READINGS`."""
+    factors: tuple[float, ...]
+    """Factor of each group to SI and our signs."""
+    turns: bool
+    """Whether angles run from 0° to 360°, so that −0.1° reads 359.9°."""
+    first_joint: int
+    required: int
+    """Number of required groups; of the others, all joints or none."""
+
+    def columns(self, group: str, joints: int = JOINTS) -> list[str]:
+        """Column names of a group, joint by joint."""
+        return [f"{group}_{self.first_joint + j}" for j in range(joints)]
+
+
+GEN3 = Format(
+    name="Gen3 log",
+    time="Time (s)",
+    groups=("Pos", "Velocity", "Torque", "Current", "Temp"),
+    # The drive reports the torque that the joint feels: against gravity_torque of the model its slope is −1 over the
+    # 34 logs (docs/logs.md), while the current has the sign of the torque that the motor makes.
+    factors=(np.pi / 180, np.pi / 180, -1.0, 1.0, 1.0),
+    turns=True,
+    first_joint=0,
+    required=5,
+)
+PLAIN = Format(
+    name="plain log",
+    time="time_s",
+    groups=READINGS,
+    factors=(1.0,) * len(READINGS),
+    turns=False,
+    first_joint=1,
+    required=3,
+)
+
+
+def format_of(names: Sequence[str]) -> Format:
+    """The format with this time column.
+
+    Raises:
+        ValueError: there is no time column of a known format.
+    """
+    for layout in (GEN3, PLAIN):
+        if layout.time in names:
+            return layout
+    hint = " Columns are separated by commas, numbers have a decimal point." if any(";" in n for n in names) else ""
+    raise ValueError(
+        f"is not a log: its first line begins with '{','.join(names)[:40]}', where a Gen3 log has '{GEN3.time}' "
+        f"and a plain one '{PLAIN.time}'.{hint}"
+    )
+
+
+def check_columns(layout: Format, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The groups of a format that a log has, and its columns that belong to no group.
+
+    Raises:
+        ValueError: columns are missing, or the arm has another number of joints.
+    """
+    of_group = [name.rpartition("_")[0] for name in names if name.rpartition("_")[2].isdigit()]
+    counts = {group: of_group.count(group) for group in layout.groups}
+    groups = [g for i, g in enumerate(layout.groups) if i < layout.required or counts[g]]
+    joints = {counts[g] if set(layout.columns(g, counts[g])) <= set(names) else 0 for g in groups}
+    if len(joints) == 1 and joints not in ({JOINTS}, {0}):
+        raise ValueError(f"has {joints.pop()} joints; only logs of a Gen3, which has {JOINTS}, can be read.")
+    wanted = [layout.time, *(column for g in groups for column in layout.columns(g))]
+    missing = [column for column in wanted if column not in names]
+    if missing:
+        raise ValueError(f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} of a {layout.name}.")
+    return groups, [name for name in names if name not in wanted]
+
+
+def channels(layout: Format, groups: Sequence[str], table: Table) -> dict[str, Array]:
+    """The groups of a table in SI with our signs, each [row, joint]; a Gen3's angles within half a turn of zero."""
+    readings: dict[str, Array] = {}
+    for channel, group, factor in zip(READINGS, layout.groups, layout.factors, strict=True):
+        if group in groups:
+            readings[channel] = (
+                table.values[:, [table.names.index(column) for column in layout.columns(group)]] * factor
+            )
+    if layout.turns:
+        readings["q"] = (readings["q"] + np.pi) % (2 * np.pi) - np.pi
+    return readings
+
+
+def implausible_readings(layout: Format, readings: dict[str, Array], where: Array) -> list[Damage]:
+    """Rows with readings that no Gen3 can have, mostly because of another unit.
+
+    Args:
+        readings: Channels in SI, [row, joint].
+        where: Line of each row, [row].
+    """
+    damage: list[Damage] = []
+    if not layout.turns:
+        # Beyond half a turn a joint with end stops has passed them.
+        q = np.where(np.isin(np.arange(JOINTS), CONTINUOUS), 0.0, readings["q"])
+        reason = "joint {joint} at {value:.5g} is beyond its stops; q is in rad"
+        damage += out_of_range(q, where, (-np.pi, np.pi), reason)
+    if "temp_c" in readings:
+        reason = "joint {joint} at {value:.5g} is not a motor temperature in °C"
+        damage += out_of_range(readings["temp_c"], where, TEMP_RANGE_C, reason)
+    return damage
+
+
+ARM, MODE = "arm", "mode"
+"""Text columns: the arm's name and its mode."""
+
+
+def read_arms(path: Path) -> dict[str, Table]:
+    """The readings of every arm, in the order of their first rows; the line of a row is its number in the file.
+
+    Raises:
+        LogError: the file is not a complete parquet file, a row names no arm, or a column is not numeric.
+    """
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise LogError(str(path), None, f"is not a complete parquet file ({str(error).splitlines()[0]}).") from error
+    if ARM not in table.column_names or len(table.column_names) == 1:
+        missing = "time_s" if ARM in table.column_names else ARM
+        raise LogError(str(path), None, f"lacks the column {missing} of a telemetry.parquet.")
+    if not table.num_rows:
+        raise LogError(str(path), None, "holds no rows.")
+    names = tuple(name for name in table.column_names if name not in (ARM, MODE))
+    values = np.column_stack([_parquet_numbers(path, name, table[name]) for name in names])
+    arms = np.array(table[ARM].cast(pa.string()).to_pylist(), dtype=object)
+    if None in arms:
+        raise LogError(str(path), arms.tolist().index(None) + 1, "names no arm.")
+    finite = np.isfinite(values)
+    good = finite.all(axis=1)
+
+    def of_arm(arm: str) -> Table:
+        rows, bad = np.flatnonzero((arms == arm) & good), np.flatnonzero((arms == arm) & ~good)
+        damage = [Damage(int(i) + 1, f"{names[finite[i].argmin()]} is missing or not a finite number") for i in bad]
+        return Table(names, values[rows], rows + 1, tuple(damage))
+
+    return {arm: of_arm(arm) for arm in dict.fromkeys(arms.tolist())}
+
+
+def _parquet_numbers(path: Path, name: str, column: pa.ChunkedArray) -> Array:
+    try:
+        return column.cast(pa.float64()).to_numpy()
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        raise LogError(str(path), None, f"the column {name} holds {column.type}, not numbers.") from error
+
 
 Damaged = Literal["refuse", "skip"]
 """Treatment of a file that has unusable lines."""

@@ -10,15 +10,13 @@ import networkx as nx
 import numpy as np
 
 from fleet.errors import CheckpointError
-from fleet.motor import Motors
+from fleet.heat.motor import Motors
+from fleet.heat.thermal import thermal_model
 from fleet.robot import JOINTS
-from fleet.thermal import thermal_model
 from twin.json_file import check_version, read_card, write_card
-from twin.logs.heat_log import CurrentSource
-from twin.thermal.parameters import HeatModel
-from twin.thermal.result import Identified, Parameter
-from twin.thermal.risk import PeakCurve
-from twin.thermal.thermal_twin import RcTwin
+from twin.logs.recording import CurrentSource
+from twin.thermal.identify import HeatModel, Identified, Parameter
+from twin.thermal.thermal_twin import PeakCurve, RcTwin
 
 FORMAT = 2
 CARD, CURVE = "rc.json", "saturation_curve.json"

@@ -1,4 +1,14 @@
-"""Identification of an arm's thermal network from its logs, with 95 % intervals.
+"""Identifiable parameters of an arm's thermal network: names, priors, and conversion to a network.
+
+Least squares of thermal parameters through the exact step; start temperatures and ambient offset are eliminated.
+
+With the copper's resistance taken at the measured winding temperature the network is linear in its temperatures. So
+those at the start of a log, and the offset of the ambient temperature, follow by linear least squares for any
+parameters (variable projection: Golub & Pereyra 1973; Jacobian in Kaufman's form, whose gradient is exact).
+
+The result of an identification: parameters, intervals and residuals.
+
+Identification of an arm's thermal network from its logs, with 95 % intervals.
 
 Nonlinear least squares through the exact step, with log-normal priors around a nominal arm. The ambient temperature is
 given: motor temperatures alone do not distinguish it from idle heat. An error of two kelvin changes idle heat and
@@ -7,23 +17,449 @@ some 6 %; predictions in the same room hardly change.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
+import msgspec
+import networkx as nx
 import numpy as np
 from scipy.optimize import least_squares
 
 from fleet.errors import IdentificationError
-from fleet.motor import thermal_data
-from fleet.robot import JOINTS
-from fleet.thermal import HOUSING
-from twin.logs.heat_log import STEP_S, HeatLog, heat_logs, source_of
-from twin.logs.recording import READINGS, Recording
-from twin.thermal.least_squares import Noise, Problem, noise_of
-from twin.thermal.parameters import PRIOR_SD, HeatModel, ParameterVector
-from twin.thermal.result import AMBIENT_C, Identified, Parameter, nominal_heat_model
+from fleet.heat.motor import Motors, copper_loss, gen3_motors, magnet_factor, thermal_data
+from fleet.heat.thermal import (
+    HOUSING,
+    NODES,
+    WINDING,
+    ThermalModel,
+    gen3_network,
+    housing,
+    modal_model,
+    node_heat,
+    thermal_model,
+    winding,
+)
+from fleet.robot import JOINTS, Cooling
+from twin.logs.recording import READINGS, STEP_S, CurrentSource, HeatLog, Recording, heat_logs, source_of
 
 Array = np.ndarray
+
+LARGE = 4
+"""Joints 1..4 of a Gen3 have the large actuator, 5..7 the small one."""
+
+_FRICTION_SD = (0.25, 0.25)
+"""Engineering value: running friction within one joint class; breakaway (2.5 to 5.3 N·m in the logs) varies more."""
+
+PRIOR_SD: Mapping[str, tuple[float, float]] = {
+    "copper_w_per_a2": (0.24, 0.39),
+    "winding_j_per_k": (0.23, 0.23),
+    "winding_housing_k_per_w": (0.26, 0.30),
+    "housing_j_per_k": (0.15, 0.17),
+    "housing_ambient_k_per_w": (0.19, 0.22),
+    "idle_w": (0.20, 0.20),
+    "neighbour_w_per_k": (0.85, 0.85),
+    "coulomb_nm": _FRICTION_SD,
+    "viscous_nms_per_rad": _FRICTION_SD,
+}
+"""Relative standard deviations of large and small joints, read as those of a log-normal.
+
+Source: the fit of 65 public Gen3 logs behind `fleet/data/gen3_thermal.json`, spread of repeated fits with the prior on
+the absolute scale; the names are those of that file.
+"""
+
+THERMAL = tuple(name for name in PRIOR_SD if name not in ("coulomb_nm", "viscous_nms_per_rad"))
+"""Free parameters if an arm's friction is known. Fixed friction watts set the absolute scale of all heat, so an error
+in them, or in the speed between slow samples, enters every parameter and no interval shows it."""
+
+_CAPACITIES: Mapping[str, Callable[[int], str]] = {"winding_j_per_k": winding, "housing_j_per_k": housing}
+_RESISTANCES: Mapping[str, Callable[[int], tuple[str, str]]] = {
+    "winding_housing_k_per_w": lambda j: (winding(j), housing(j)),
+    "housing_ambient_k_per_w": lambda j: (housing(j), "ambient"),
+}
+_NEIGHBOURS = [(housing(j - 1), housing(j)) for j in range(1, JOINTS)]
+
+
+@dataclass(frozen=True, eq=False)
+class HeatModel:
+    """One arm's motors and thermal network."""
+
+    motors: Motors
+    network: nx.Graph
+
+    def value(self, name: str) -> Array:
+        """A parameter of `PRIOR_SD`, [joint]; [1] for the conductance between neighbours."""
+        if hasattr(self.motors, name):
+            return np.array(getattr(self.motors, name), dtype=float)
+        network, joints = self.network, range(JOINTS)
+        if name in _CAPACITIES:
+            return np.array([network.nodes[_CAPACITIES[name](j)]["capacity_j_per_k"] for j in joints])
+        if name in _RESISTANCES:
+            return np.array([1.0 / network.edges[_RESISTANCES[name](j)]["conductance_w_per_k"] for j in joints])
+        return np.array([np.mean([network.edges[edge]["conductance_w_per_k"] for edge in _NEIGHBOURS])])
+
+    def with_values(self, values: Mapping[str, Array]) -> "HeatModel":
+        """The same arm with some parameters of `PRIOR_SD` replaced, each [joint] or [1] as `value` gives them."""
+        graph = self.network.copy()
+        own = {}
+        for name, value in values.items():
+            if hasattr(self.motors, name):
+                own[name] = np.array(value)
+            elif name in _CAPACITIES:
+                for j in range(JOINTS):
+                    graph.nodes[_CAPACITIES[name](j)]["capacity_j_per_k"] = float(value[j])
+            elif name in _RESISTANCES:
+                for j in range(JOINTS):
+                    graph.edges[_RESISTANCES[name](j)]["conductance_w_per_k"] = 1.0 / float(value[j])
+            else:
+                for edge in _NEIGHBOURS:
+                    graph.edges[edge]["conductance_w_per_k"] = float(value[0])
+        return HeatModel(replace(self.motors, **own), graph)
+
+    def thermal(self) -> ThermalModel:
+        """The network as matrices."""
+        return thermal_model(self.network)
+
+
+class ParameterVector:
+    """Free parameters of one arm as a vector of logarithms, with their Gaussian prior around a nominal arm."""
+
+    def __init__(self, nominal: HeatModel, free: Sequence[str] = tuple(PRIOR_SD)) -> None:
+        """Raise ValueError for a name that is not in `PRIOR_SD` or given twice, and for a nominal value of zero."""
+        if not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
+            raise ValueError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {tuple(free)}).")
+        self.nominal = nominal
+        self.free = tuple(free)
+        self._held = {name: nominal.value(name) for name in PRIOR_SD}
+        centre = [nominal.value(name) for name in free]
+        if none := [name for name, values in zip(free, centre, strict=True) if not np.all(values > 0)]:
+            raise ValueError(f"Free parameters must have nominal values > 0 (got 0 for {', '.join(none)}).")
+        self.mean = np.log(np.concatenate(centre))
+        """Prior mean of the logarithms, [parameter]."""
+        self.sd = np.concatenate([_sd(name, len(values)) for name, values in zip(free, centre, strict=True)])
+        """Prior standard deviation of the logarithms, [parameter]."""
+        self.names = tuple(
+            (name, joint if len(values) > 1 else None)
+            for name, values in zip(free, centre, strict=True)
+            for joint in range(len(values))
+        )
+        """Name and joint (0..6, None for the one value of all neighbours) of each entry."""
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    def values(self, x: Array) -> dict[str, Array]:
+        """Values by name, [..., joint], also of those that are not free, for logarithms [..., parameter]."""
+        out = {name: np.broadcast_to(held, (*x.shape[:-1], len(held))) for name, held in self._held.items()}
+        first = 0
+        for name in self.free:
+            width = len(self._held[name])
+            out[name] = np.exp(x[..., first : first + width])
+            first += width
+        return out
+
+    def heat_model(self, x: Array) -> HeatModel:
+        """The arm with these logarithms, [parameter]."""
+        values = self.values(x)
+        return self.nominal.with_values({name: values[name] for name in self.free})
+
+    def models(self, x: Array) -> ThermalModel:
+        """Networks of several sets of logarithms [set, parameter] as one model, arrays [set, ...].
+
+        The same matrices as by `heat_model`, without a graph for each: the Laplacian is linear in the conductances.
+        """
+        values = self.values(x)
+        between = np.broadcast_to(values["neighbour_w_per_k"], (*x.shape[:-1], JOINTS - 1))
+        to_air = 1.0 / values["housing_ambient_k_per_w"]
+        conductance = np.concatenate([1.0 / values["winding_housing_k_per_w"], to_air, between], axis=-1)
+        laplacian = np.einsum("...e,en,em->...nm", conductance, _INCIDENCE, _INCIDENCE)
+        capacity = np.concatenate([values["winding_j_per_k"], values["housing_j_per_k"]], axis=-1)
+        direct = np.array([self._direct(j) for j in range(JOINTS)])
+        laplacian[..., range(JOINTS), range(JOINTS)] += direct
+        to_ambient = np.concatenate([np.broadcast_to(direct, to_air.shape), to_air], axis=-1)
+        return modal_model(capacity, laplacian, to_ambient)
+
+    def _direct(self, joint: int) -> float:
+        """Conductance from a winding to ambient, which no parameter changes; 0 unless the arm is immersed."""
+        edge = (winding(joint), "ambient")
+        network = self.nominal.network
+        return float(network.edges[edge]["conductance_w_per_k"]) if network.has_edge(*edge) else 0.0
+
+
+_ROWS = np.eye(NODES)
+_INCIDENCE = np.concatenate([_ROWS[WINDING] - _ROWS[HOUSING], _ROWS[HOUSING], np.diff(_ROWS[HOUSING], axis=0)])
+"""Ends of the edges winding–housing, housing–ambient and housing–housing, ±1, [edge, node]; ambient is no node."""
+
+
+def _sd(name: str, width: int) -> Array:
+    large, small = PRIOR_SD[name]
+    return np.array([large] * LARGE + [small] * (JOINTS - LARGE))[:width]
+
+
+HOUSING_SD_K = 10.0
+"""Prior standard deviation of a housing from its winding at the start of a log."""
+FITTED = 6
+"""Usual number of parameters per joint."""
+_NUDGE = 1e-4
+"""Change of a logarithm in central differences; their error is of order 1e-8."""
+
+
+def heat(log: HeatLog, values: Mapping[str, Array], motors: Motors, winding_c: Array, housing_c: Array) -> Array:
+    """Heat per node over each step, W, [set, step, node].
+
+    Args:
+        values: Parameters by name, [set, joint].
+        winding_c: For the resistance, [step, joint].
+        housing_c: For the magnets, where the current comes from torque, [step, joint].
+    """
+    coulomb, viscous = values["coulomb_nm"], values["viscous_nms_per_rad"]
+    current_sq = log.current_sq(coulomb, viscous)
+    if log.source == "torque":
+        current_sq = current_sq / magnet_factor(housing_c, motors) ** 2
+    per_ohm = copper_loss(current_sq, winding_c, motors) / motors.copper_w_per_a2
+    winding_w = values["copper_w_per_a2"][:, None] * per_ohm
+    return node_heat(winding_w, values["idle_w"][:, None] + log.friction_w(coulomb, viscous))
+
+
+def linear_temperatures(dt_s: Array, model: ThermalModel, heat_w: Array, ambient_c: float, start_c: Array) -> Array:
+    """Node temperatures at the edges of exact steps, °C, [set, step + 1, node], computed in modal coordinates.
+
+    Args:
+        dt_s: [step].
+        model: Arrays [set, ...].
+        heat_w: Constant over each step, [set, step, node].
+        start_c: [node] or [set, node].
+    """
+    left, right = _modal(model)
+    load = heat_w + model.to_ambient[:, None] * ambient_c
+    exponent = -dt_s[:, None, None] * model.rates
+    decay = np.exp(exponent)  # [step, set, mode]
+    gain = -np.expm1(exponent) / model.rates
+    driven = np.moveaxis(load @ (right / model.capacity[..., None]), 1, 0) * gain
+    z = np.empty((len(dt_s) + 1, *driven.shape[1:]))
+    z[0] = np.einsum("...n,...nm->...m", start_c, right)
+    for step in range(len(dt_s)):
+        z[step + 1] = decay[step] * z[step] + driven[step]
+    return np.moveaxis(z, 0, 1) @ np.swapaxes(left, -1, -2)
+
+
+def start_sensitivity(elapsed_s: Array, model: ThermalModel) -> Array:
+    """Derivative of each winding by each initial temperature of one network [1, ...], [time, joint, node]."""
+    left, right = (part[0] for part in _modal(model))
+    decay = np.exp(-np.outer(elapsed_s, model.rates[0]))
+    return (left[WINDING] * decay[:, None]) @ right.T
+
+
+def _modal(model: ThermalModel) -> tuple[Array, Array]:
+    """Temperatures = left · modes and modes = rightᵀ · temperatures, each [..., node, mode]."""
+    root = np.sqrt(model.capacity)[..., None]
+    return model.modes / root, model.modes * root
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Residuals of a fit: their size and autocorrelation."""
+
+    sd_k: Array
+    """[joint]."""
+    steps: Array
+    """Integrated autocorrelation time in steps, >= 1, [joint]: this many residuals count as one."""
+
+    @property
+    def weight(self) -> Array:
+        """Of one residual, 1/K, [joint]."""
+        return 1.0 / (self.sd_k * np.sqrt(self.steps))
+
+
+def noise_of(unexplained: Sequence[Array], floor_k: Array) -> Noise:
+    """Size and autocorrelation of residuals, K, [step, joint] per log; not below the sensors' own noise [joint].
+
+    The sum of autocorrelations ends where they first fall below 0.05 (Sokal 1997, a fixed cut instead of his window).
+    Corrected for the degrees of freedom of the fit: some parameters per joint, and per log the start of its two nodes.
+    """
+    sd_k = np.sqrt(np.mean(np.concatenate(unexplained) ** 2, axis=0))
+    square = np.maximum(sum((u**2).sum(axis=0) for u in unexplained), np.finfo(float).tiny)
+    steps, going = np.ones_like(sd_k), np.ones(len(sd_k), dtype=bool)
+    for lag in range(1, max(map(len, unexplained))):
+        pairs = [u[lag:] * u[:-lag] for u in unexplained if len(u) > lag]
+        share = sum(p.sum(axis=0) for p in pairs) / square
+        going &= share > 0.05
+        if not going.any():
+            break
+        steps += np.where(going, 2.0 * share, 0.0)
+    observations = sum(map(len, unexplained)) / steps
+    left = np.maximum(observations - FITTED - 2 * len(unexplained), observations / 4.0)
+    return Noise(np.maximum(sd_k * np.sqrt(observations / left), floor_k), steps)
+
+
+@dataclass(frozen=True, eq=False)
+class _Unknowns:
+    """Least squares for the unknowns of one log: matrix · solution ≈ wanted; the last rows are their priors."""
+
+    matrix: Array
+    wanted: Array
+    basis: Array
+    """Orthonormal basis of the matrix, [row, unknown]."""
+    solution: Array
+    """Node temperatures at the start, °C, and the ambient offset, K, [unknown]."""
+
+
+class Problem:
+    """Weighted residuals and their Jacobian for `scipy.optimize.least_squares`."""
+
+    def __init__(
+        self, logs: Sequence[HeatLog], ambient_c: float, ambient_sd_k: float, vector: ParameterVector, noise: Noise
+    ) -> None:
+        """
+        Args:
+            ambient_c: Ambient temperature, °C.
+            ambient_sd_k: Its standard deviation from log to log; 0 if it was measured.
+        """
+        self.logs, self.ambient_c, self.ambient_sd_k = tuple(logs), ambient_c, ambient_sd_k
+        self.vector, self.noise = vector, noise
+        self.winding_c = [log.middle_c for log in logs]
+        """For the resistance, [step, joint] per log."""
+        self.housing_c = self.winding_c
+        """For the magnets, [step, joint] per log; replaced by those of an earlier solution."""
+
+    def residual(self, x: Array) -> Array:
+        """Of every log, then of the prior, [row]; half its square is the negative log posterior."""
+        rows = [unknowns.wanted - unknowns.matrix @ unknowns.solution for unknowns in self._unknowns(x)]
+        return np.concatenate([*rows, (x - self.vector.mean) / self.vector.sd])
+
+    def jacobian(self, x: Array) -> Array:
+        """Derivative of `residual` by the logarithms, [row, parameter]."""
+        nudge = _NUDGE * np.eye(len(x))
+        near = np.concatenate([x + nudge, x - nudge])
+        model, values = self.vector.models(near), self.vector.values(near)
+        parts = []
+        for i, (log, unknowns) in enumerate(zip(self.logs, self._unknowns(x), strict=True)):
+            windings = self._temperatures(i, model, values, unknowns.solution)[..., WINDING]
+            slope = (windings[: len(x)] - windings[len(x) :]) / (2.0 * _NUDGE)
+            rows = np.zeros((len(unknowns.wanted), len(x)))
+            rows[: log.temp_c.size] = -(slope * self.noise.weight).reshape(len(x), -1).T
+            parts.append(rows - unknowns.basis @ (unknowns.basis.T @ rows))
+        return np.concatenate([*parts, np.diag(1.0 / self.vector.sd)])
+
+    def temperatures(self, x: Array) -> list[Array]:
+        """All node temperatures with the best unknowns of each log, °C, [step + 1, node] per log."""
+        model, values = self.vector.models(x[None]), self.vector.values(x[None])
+        return [self._temperatures(i, model, values, each.solution)[0] for i, each in enumerate(self._unknowns(x))]
+
+    def unexplained(self, x: Array) -> list[Array]:
+        """Simulated minus measured motor temperatures, K, [step + 1, joint] per log."""
+        temps = self.temperatures(x)
+        return [temp[:, WINDING] - log.temp_c for temp, log in zip(temps, self.logs, strict=True)]
+
+    def _temperatures(self, i: int, model: ThermalModel, values: Mapping[str, Array], start: Array) -> Array:
+        log = self.logs[i]
+        heat_w = heat(log, values, self.vector.nominal.motors, self.winding_c[i], self.housing_c[i])
+        ambient_c = self.ambient_c + start[NODES:].sum()
+        return linear_temperatures(log.dt_s, model, heat_w, ambient_c, start[:NODES])
+
+    def _unknowns(self, x: Array) -> list[_Unknowns]:
+        model, values = self.vector.models(x[None]), self.vector.values(x[None])
+        return [self._unknowns_in(i, model, values) for i in range(len(self.logs))]
+
+    def _unknowns_in(self, i: int, model: ThermalModel, values: Mapping[str, Array]) -> _Unknowns:
+        log = self.logs[i]
+        effect = start_sensitivity(log.time_s - log.time_s[0], model)
+        if self.ambient_sd_k > 0:
+            no_heat = np.zeros((1, len(log.dt_s), NODES))
+            warmer = linear_temperatures(log.dt_s, model, no_heat, 1.0, np.zeros(NODES))[0, :, WINDING]
+            effect = np.concatenate([effect, warmer[..., None]], axis=-1)
+        unknowns = effect.shape[-1]
+        prior_sd = np.append(np.full(JOINTS, HOUSING_SD_K), [self.ambient_sd_k] * (unknowns - NODES))
+        prior = np.eye(unknowns)[HOUSING.start :] / prior_sd[:, None]
+        forced_c = self._temperatures(i, model, values, np.zeros(NODES))[0, :, WINDING]
+        missing = (log.temp_c - forced_c) * self.noise.weight
+        likely = np.append(log.temp_c[0], np.zeros(unknowns - NODES)) / prior_sd
+        matrix = np.concatenate([(effect * self.noise.weight[:, None]).reshape(-1, unknowns), prior])
+        wanted = np.concatenate([missing.reshape(-1), likely])
+        basis, upper = np.linalg.qr(matrix)
+        return _Unknowns(matrix, wanted, basis, np.linalg.solve(upper, basis.T @ wanted))
+
+
+AMBIENT_C = 22.0
+"""Default ambient temperature; that of the public Gen3 logs."""
+INFORMED = 0.9
+"""A parameter is informed if its standard deviation is below this share of the prior's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """One identified number."""
+
+    name: str
+    """As in `fleet/data/gen3_thermal.json`."""
+    joint: int | None
+    """1..7; None for the one conductance between neighbours."""
+    value: float
+    low: float
+    """Lower end of the 95 % interval, given model, prior and logs."""
+    high: float
+    prior: float
+    prior_sd: float
+    """Of the logarithm, before the logs."""
+    sd: float
+    """Of the logarithm, after the logs."""
+
+    @property
+    def informed(self) -> bool:
+        """Whether the logs informed it; if not, it is the prior."""
+        return self.sd < INFORMED * self.prior_sd
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Identified:
+    """One arm's thermal network, identified from its logs."""
+
+    arm: str
+    heat_model: HeatModel
+    """Motors and network with the identified values."""
+    parameters: tuple[Parameter, ...]
+    ambient_c: float
+    """Assumed ambient temperature."""
+    ambient_sd_k: float
+    source: CurrentSource
+    """Source of the current."""
+    rms_k: dict[str, tuple[float, ...]]
+    """Root mean square residual of each recording, per joint."""
+    memory_s: tuple[float, ...]
+    """Correlation time of the residuals, per joint; intervals count this much of a log as one observation."""
+    seconds: float
+    """Length of the recordings used."""
+    data_hash: str
+
+    @cached_property
+    def version(self) -> str:
+        """Hash of every number that a prediction depends on, and of the data."""
+        sources = [self.arm, self.data_hash, self.ambient_c, self.source, self.parameters]
+        digest = hashlib.sha256(msgspec.json.encode(sources))
+        for value in vars(self.heat_model.motors).values():
+            digest.update(np.asarray(value, dtype=float).tobytes())
+        edges = self.heat_model.network.edges(data="conductance_w_per_k")
+        for part in sorted((*sorted(ends), value) for *ends, value in edges):
+            digest.update(msgspec.json.encode(part))
+        digest.update(msgspec.json.encode(sorted(self.heat_model.network.nodes(data="capacity_j_per_k"))))
+        return f"rc-{digest.hexdigest()[:13]}"
+
+    def parameter(self, name: str, joint: int | None = None) -> Parameter:
+        """One of the identified numbers, joint 1..7.
+
+        Raises:
+            KeyError: it was not free.
+        """
+        if named := [p for p in self.parameters if (p.name, p.joint) == (name, joint)]:
+            return named[0]
+        raise KeyError(f"{name} of joint {joint} was not free. Free: {sorted({p.name for p in self.parameters})}.")
+
+
+def nominal_heat_model(cooling: Cooling = "still_air") -> HeatModel:
+    """A Gen3 by the project's defaults."""
+    return HeatModel(gen3_motors(), gen3_network(cooling=cooling))
+
 
 LEAST_S = 300.0
 """Two time constants of a winding: shorter logs add nothing to the prior."""
@@ -53,7 +489,7 @@ def identify(
         ambient_c: Ambient temperature.
         ambient_sd_k: Its standard deviation from recording to recording, by default that of rooms; 0 if it was
             measured. Differences between recordings are attributed to it, not to the arm.
-        free: Names of `twin.thermal.parameters.PRIOR_SD`; the others keep their nominal values.
+        free: Names of `twin.thermal.identify.PRIOR_SD`; the others keep their nominal values.
 
     Raises:
         IdentificationError: the recordings are too little: none, other joints, no temperatures, too short, no motor

@@ -1,27 +1,185 @@
-"""The physical twin: an arm's thermal network, nominal or identified, which predicts motor temperatures of a plan.
+"""The predicted peak of a plan, and P(saturation) from it, by the thermal network of an arm.
+
+In each phase of a plan the drive is constant. Heat is linearised about a warm motor: copper loss is linear in the
+winding's temperature anyway, and that of the magnets changes it by a percent per five kelvin. So the temperature of
+each motor at each moment is affine in the temperatures known at the start, and the peak is a maximum of affine pieces.
+
+The physical twin: an arm's thermal network, nominal or identified, which predicts motor temperatures of a plan.
 
 It implements the same protocol as the learned twin, and also predicts temperatures.
+
+Peak motor temperatures in the next minutes, from every moment of a log.
+
+Housing temperatures, which have no sensor, from an arm's recent log: a Kalman filter on its thermal network.
+
+A learned twin with a predicted peak and P(saturation): what scores the plans of an arm.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import repeat
 
 import numpy as np
+from scipy.special import ndtr
 
-from fleet.difficulty import Difficulty, Forecast, difficulty_of_error
+from fleet.difficulty import KNOWN, SETTLING_S, Difficulty, Forecast, difficulty_of_error
+from fleet.heat.motor import Motors, copper_loss, magnet_factor
+from fleet.heat.thermal import NODES, STEP_S, WINDING, ThermalModel, drive_heat, node_heat, temperature_steps
 from fleet.motion import Drive, Plan, drives
-from fleet.motor import Motors
 from fleet.robot import JOINTS, Cooling, ThermalLimits
-from fleet.thermal import NODES, STEP_S, WINDING, ThermalModel, node_heat, temperature_steps
+from twin.logs.recording import HeatLog
+from twin.p_saturation import LEAST_JOBS, NotEnoughExperience, SaturationModel
 from twin.plan_cache import PlanCache
-from twin.thermal.parameters import HeatModel
-from twin.thermal.result import AMBIENT_C, Identified, nominal_heat_model
-from twin.thermal.risk import LinearHeat, PeakCurve, fit_curve, peak_forecast
+from twin.thermal.identify import AMBIENT_C, HeatModel, Identified, nominal_heat_model
+from twin.vae.twin import Twin
 from twin.vae.window import check_jobs
 
 Array = np.ndarray
+
+MOMENTS_S = (SETTLING_S, 480.0)
+"""Moments of a plan at which its motors are predicted, besides its end: they warm or cool steadily in between."""
+AROUND_C = 50.0, 42.0
+"""Temperatures of winding and housing about which heat is linearised: those of a motor that comes near its limit."""
+ROUNDING_K = 0.5
+"""Error of a peak that is accepted for fewer pieces."""
+_STARTS = 512
+"""Number of realistic starts by which pieces that never decide are found."""
+_LEVELS = np.array([0.003, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.997])
+"""Probabilities at the knots of a curve."""
+BAND_K = 12.0
+"""Past jobs whose predicted peak is this close to the limit show how far off a prediction is there."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearHeat:
+    """Temperatures under constant drives as T' = V diag(rates) V⁻¹ T + B [ambient, 1], arrays [phase, ...]."""
+
+    rates: Array
+    """1/s, [phase, mode]; positive beyond thermal runaway."""
+    modes: Array
+    """[phase, node, mode]."""
+    inverse: Array
+    """[phase, mode, node]."""
+    forcing: Array
+    """By 1 °C of ambient temperature, and by the heat at 0 °C, K/s, [phase, node, 2]."""
+
+    @classmethod
+    def of(cls, load: Drive, motors: Motors, thermal: ThermalModel) -> "LinearHeat":
+        """From drives [phase, joint]."""
+        winding_c, housing_c = AROUND_C
+        factor = magnet_factor(np.full(JOINTS, housing_c), motors)
+        warm_sq = load.current_sq / factor**2
+        loss_w = copper_loss(warm_sq, np.full(JOINTS, winding_c), motors)
+        by_winding = loss_w - copper_loss(warm_sq, np.full(JOINTS, winding_c - 1.0), motors)  # W/K
+        by_housing = -2.0 * motors.alpha_kt_per_k / factor * loss_w  # W/K
+        at_zero = loss_w - by_winding * winding_c - by_housing * housing_c
+        joints, slope = np.arange(JOINTS), np.zeros((len(loss_w), NODES, NODES))
+        slope[:, joints, joints], slope[:, joints, joints + JOINTS] = by_winding, by_housing
+        rates, modes = np.linalg.eig((slope - thermal.laplacian) / thermal.capacity[:, None])
+        heat = node_heat(at_zero, motors.idle_w + load.friction_w)
+        forcing = np.stack(np.broadcast_arrays(thermal.to_ambient, heat), axis=-1) / thermal.capacity[:, None]
+        # A tree of nodes: the matrix is similar to a symmetric one, so its modes are real.
+        rates, modes = np.real(rates), np.real(modes)
+        return cls(rates, modes, np.linalg.inv(modes), forcing)
+
+    def courses(self, elapsed_s: Array) -> Array:
+        """Temperatures as affine functions of the start: [moment, node, NODES + 2] for nodes, ambient and 1.
+
+        Args:
+            elapsed_s: Time spent in each phase until each moment, [moment, phase].
+        """
+        course = np.broadcast_to(np.eye(NODES, NODES + 2), (len(elapsed_s), NODES, NODES + 2))
+        for phase, rates in enumerate(self.rates):
+            exponent = np.multiply.outer(elapsed_s[:, phase], rates)  # [moment, mode]
+            safe = np.where(np.abs(rates) > 1e-12, rates, 1.0)
+            gain = np.where(np.abs(rates) > 1e-12, np.expm1(exponent) / safe, elapsed_s[:, phase, None])
+            inner = self.inverse[phase] @ course * np.exp(exponent)[..., None]
+            inner[..., NODES:] += gain[..., None] * (self.inverse[phase] @ self.forcing[phase])
+            course = self.modes[phase] @ inner
+        return course
+
+
+def peak_forecast(heat: LinearHeat, lasts_s: Array, curve: Array | None = None) -> Forecast:
+    """Hottest motor from `SETTLING_S` after the start of a plan, or its earlier end, until its end, °C.
+
+    Args:
+        lasts_s: Time of the phases, s, [phase].
+        curve: From the predicted peak to P(saturation), [knot, 2].
+    """
+    total_s = float(lasts_s.sum())
+    # The cycles end hotter than the retreat, which is short and without load.
+    working_s = max(float(lasts_s[:-1].sum()), min(SETTLING_S, total_s))
+    moments_s = np.array([*(t for t in MOMENTS_S if t < working_s), working_s])
+    until = np.cumsum(lasts_s)
+    elapsed_s = np.clip(moments_s[:, None] - (until - lasts_s), 0.0, lasts_s)
+    pieces = heat.courses(elapsed_s)[:, WINDING]  # [moment, joint, ...]
+    values = pieces @ _starts().T  # [moment, joint, start]
+    # A piece stays if it decides somewhere, by more than rounding against earlier moments: later ones may not come.
+    of_moment = values.max(axis=1)
+    before = np.maximum.accumulate(np.vstack([np.full_like(of_moment[:1], -np.inf), of_moment[:-1]]))
+    decides = (of_moment >= before + ROUNDING_K)[:, None]
+    stays = ((values == of_moment[:, None]) & decides).any(axis=-1)
+    time_s = np.broadcast_to(np.append(0.0, moments_s[1:])[:, None], stays.shape)
+    kept = pieces[stays]
+    return Forecast(kept[:, KNOWN].copy(), kept[:, :KNOWN].copy(), curve, time_s[stays])
+
+
+@cache
+def _starts() -> Array:
+    """Realistic temperatures at the start of a plan, with a 1, [start, KNOWN + 1].
+
+    From an arm at ambient temperature, over idle arms, to arms with some or all joints hot.
+    """
+    rng = np.random.default_rng(0)
+    ambient = rng.uniform(10.0, 42.0, (_STARTS, 1))
+    most_k = 30.0 * rng.uniform(0.0, 1.0, (2, _STARTS, 1)) ** 2
+    rise_k = most_k * rng.uniform(0.0, 1.0, (2, _STARTS, JOINTS))
+    housing = ambient + rise_k[0]
+    winding = np.minimum(housing - 1.0 + rise_k[1], 90.0)
+    return np.concatenate([winding, housing, ambient, np.ones((_STARTS, 1))], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeakCurve:
+    """From the predicted peak of a plan to the probability that its motors pass the warning limit."""
+
+    knots: tuple[tuple[float, float], ...]
+    """Predicted peak, °C, and probability."""
+    jobs: int
+    """Past jobs whose errors it is made of."""
+
+    @property
+    def name(self) -> str:
+        """Part of the twin's version: where the probability is a half, and how far it is from .1 to .9."""
+        at, p = np.array(self.knots).T
+        low, half, high = np.interp((0.1, 0.5, 0.9), p, at)
+        return f"{half:.2f}~{high - low:.2f}"
+
+
+def fit_curve(predicted_c: Array, peak_c: Array, limit_c: float) -> PeakCurve:
+    """The curve from past jobs: the chance that a prediction's error takes the true peak over the limit.
+
+    The errors are those of jobs that come near the limit, smoothed by a Gaussian kernel (Silverman's width).
+
+    Args:
+        predicted_c: Predicted peak of each job, [job].
+        peak_c: Its true peak, [job].
+
+    Raises:
+        NotEnoughExperience: too few jobs.
+    """
+    if len(peak_c) < LEAST_JOBS:
+        raise NotEnoughExperience(f"P(saturation) needs {LEAST_JOBS} past jobs, better 200 (got {len(peak_c)}).")
+    distance_k = np.abs(predicted_c - limit_c)
+    near = distance_k <= max(BAND_K, float(np.sort(distance_k)[LEAST_JOBS - 1]))
+    error_k = (peak_c - predicted_c)[near]
+    width = 1.06 * max(float(error_k.std()), 0.05) * len(error_k) ** -0.2
+    grid = np.linspace(error_k.min() - 4 * width, error_k.max() + 4 * width, 400)
+    below = ndtr((grid[:, None] - error_k) / width).mean(axis=1)  # P(error < grid)
+    at = limit_c - np.interp(1.0 - _LEVELS, below, grid)
+    knots = tuple((float(x), float(p)) for x, p in zip(at, _LEVELS, strict=True))
+    return PeakCurve(knots=knots, jobs=len(error_k))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,7 +236,7 @@ class RcTwin:
         """Node temperatures for measured motor temperatures, °C, [..., joint] to [..., node].
 
         Housings have no sensor and are taken as warm as their windings: true after some minutes of rest, cautious right
-        after work. `twin.thermal.kalman.filter_log` estimates them better from a log.
+        after work. `twin.thermal.thermal_twin.filter_log` estimates them better from a log.
         """
         return np.concatenate([temp_c, temp_c], axis=-1)
 
@@ -107,7 +265,7 @@ class RcTwin:
     def simulate(self, load: Drive, duration_s: Array, start_c: Array) -> Array:
         """Node temperatures under constant drives [job, joint], °C, [step + 1, job, node].
 
-        Every job has the same number of steps, equal within it, at most `fleet.thermal.STEP_S` long.
+        Every job has the same number of steps, equal within it, at most `fleet.heat.thermal.STEP_S` long.
         """
         steps = max(1, int(np.ceil(np.max(duration_s, initial=0.0) / STEP_S)))
         rows = temperature_steps(
@@ -188,3 +346,142 @@ class RcTwin:
         for plan in plans:
             if plan.cycle.profile.shape[-1] != JOINTS:
                 raise ValueError(f"The thermal network has {JOINTS} joints (got {plan.cycle.profile.shape[-1]}).")
+
+
+def planned_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float) -> Array:
+    """Peaks within `ahead_s` after each edge of the log's steps, with the load of the log's coming steps.
+
+    The load of a planned motion is known in advance.
+
+    Args:
+        states_c: Estimated temperatures at each edge, °C, [step + 1, node].
+
+    Returns:
+        °C, [step + 1, joint]; nan where the log ends before.
+    """
+    load = _drive(twin, log)
+    edges = np.arange(len(log.time_s))
+    until = np.searchsorted(log.time_s, log.time_s + ahead_s - 1e-9)  # first edge at or after the horizon
+    temp_c = states_c.astype(float)
+    peak_c = temp_c[:, WINDING]
+    for ahead in range(int(np.max(until - edges, initial=0))):
+        step = np.minimum(edges + ahead, len(log.dt_s) - 1)
+        heat_w = drive_heat(temp_c, load.current_sq[step], load.friction_w[step], twin.motors)
+        within = (edges + ahead < np.minimum(until, len(log.dt_s)))[:, None]
+        temp_c = np.where(within, twin.thermal.step(temp_c, heat_w, twin.ambient_c, log.dt_s[step]), temp_c)
+        peak_c = np.maximum(peak_c, temp_c[:, WINDING])
+    return np.where((until < len(edges))[:, None], peak_c, np.nan)
+
+
+def continued_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float, *, past_s: float) -> Array:
+    """The same if the mean load of the last `past_s` continues, without knowledge of the future.
+
+    Returns:
+        °C, [step + 1, joint]; nan at edges with less past than `past_s`.
+    """
+    load = _drive(twin, log)
+    step_s = float(np.median(log.dt_s))
+    past, count = max(1, round(past_s / step_s)), max(1, int(np.ceil(ahead_s / step_s)))
+    peak_c = np.full((len(log.time_s), load.current_sq.shape[1]), np.nan)
+    if len(load.current_sq) >= past:
+        mean = Drive(_trailing_mean(load.current_sq, past), _trailing_mean(load.friction_w, past))
+        rows = temperature_steps(
+            repeat(mean, count),
+            ahead_s / count,
+            motors=twin.motors,
+            thermal=twin.thermal,
+            start_c=states_c[past:],
+            ambient_c=twin.ambient_c,
+        )
+        peak_c[past:] = np.max([temp_c[:, WINDING] for temp_c in rows], axis=0)
+    return peak_c
+
+
+def _drive(twin: RcTwin, log: HeatLog) -> Drive:
+    """Mean drive of each step, [step, joint]."""
+    friction = (twin.motors.coulomb_nm, twin.motors.viscous_nms_per_rad)
+    return Drive(log.current_sq(*friction), log.friction_w(*friction))
+
+
+def _trailing_mean(values: Array, steps: int) -> Array:
+    """Mean over the `steps` steps before each edge after them, [edge, joint]."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    return (total[steps:] - total[:-steps]) / steps
+
+
+HOUSING_SD_K = 5.0
+"""Standard deviation of a housing from its winding at the start."""
+SENSOR_SD_K = 0.05
+"""Noise and slow drift of the motor temperature; larger than the noise at rest, which no model follows."""
+HEAT_NOISE_W2S = 10.0
+"""Intensity of unmodelled heat, W²·s, at every node: half a watt that lasts 20 s, three watts for one."""
+
+
+def filter_log(twin: RcTwin, log: HeatLog) -> Array:
+    """Temperatures of all nodes at the edges of a log's steps, each from the past alone, °C, [step + 1, node].
+
+    Housings start as warm as their windings.
+    """
+    temp = twin.likely_start(log.temp_c[0])
+    spread = np.diag(np.append(np.full(JOINTS, SENSOR_SD_K**2), np.full(JOINTS, HOUSING_SD_K**2)))
+    temps = [temp]
+    lengths, which = np.unique(np.round(log.dt_s, 2), return_inverse=True)
+    steps = [twin.thermal.step_matrices(dt) for dt in lengths]
+    # A recorded current does not depend on the magnets.
+    motors = twin.motors if log.source == "torque" else replace(twin.motors, alpha_kt_per_k=0.0)
+    square = log.current_sq(motors.coulomb_nm, motors.viscous_nms_per_rad)
+    friction = log.friction_w(motors.coulomb_nm, motors.viscous_nms_per_rad)
+    for k, length in enumerate(which):
+        phi, gamma = steps[length]
+        heat_w = drive_heat(temp, square[k], friction[k], motors)
+        temp = phi @ temp + gamma @ (heat_w + twin.thermal.to_ambient * twin.ambient_c)
+        # White heat noise over dt is like an independent constant heat of variance intensity/dt in each step.
+        spread = phi @ spread @ phi.T + gamma @ gamma.T * (HEAT_NOISE_W2S / log.dt_s[k])
+        temp, spread = _correct(temp, spread, log.temp_c[k + 1])
+        temps.append(temp)
+    return np.array(temps)
+
+
+def _correct(temp: Array, spread: Array, measured_c: Array) -> tuple[Array, Array]:
+    """State and covariance after a reading of all windings (Joseph's form keeps the covariance symmetric)."""
+    of_reading = spread[WINDING, WINDING] + np.eye(JOINTS) * SENSOR_SD_K**2
+    gain = np.linalg.solve(of_reading, spread[WINDING]).T  # [node, joint]
+    rest = np.eye(NODES)
+    rest[:, WINDING] -= gain
+    return temp + gain @ (measured_c - temp[WINDING]), rest @ spread @ rest.T + gain @ gain.T * SENSOR_SD_K**2
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedTwin:
+    """A twin with P(saturation); implements `fleet.difficulty.DifficultyModel`."""
+
+    twin: Twin
+    """Gives the difficulty d."""
+    heat: RcTwin
+    """Gives the predicted peak and, if it has a curve and there is no other model, P(saturation)."""
+    saturation: SaturationModel | None = None
+    """Gives P(saturation) from the features of the twin."""
+
+    def __post_init__(self) -> None:
+        if self.saturation is not None and self.saturation.twin != self.twin.version:
+            raise ValueError(
+                f"The saturation model was fitted on twin {self.saturation.twin}, this is {self.twin.version}; "
+                "fit it again on this twin's features."
+            )
+
+    @property
+    def version(self) -> str:
+        """Versions of the models that give difficulty, predicted peak, and P if it is another one."""
+        parts = {"d": self.twin.version, "peak": self.heat.version}
+        if self.saturation is not None:
+            parts["p"] = f"{self.saturation.evidence}-{self.saturation.version}"
+        return "+".join(f"{name}:{version}" for name, version in parts.items())
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        """Difficulty, predicted peak and risk of the repeated plan."""
+        features = self.twin.features([plan], [repetitions])
+        risk = None
+        if self.saturation is not None:
+            risk = self.saturation.risk(features, np.array([plan.duration_s(repetitions)]))[0]
+        peak = self.heat.peak(plan, repetitions)
+        return Difficulty(features.difficulty[0], risk=risk, peak=peak, weight=self.twin.joint_weight)

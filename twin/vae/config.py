@@ -1,7 +1,15 @@
-"""Input, size and training of a twin's networks."""
+"""Input, size and training of a twin's networks.
 
+Cache key of everything that determines the weights of a training.
+"""
+
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
+
+import msgspec
+import numpy as np
 
 from fleet.fields import check, option
 from fleet.motion import CHANNELS, RATE_HZ
@@ -110,3 +118,29 @@ class TwinConfig:
     def channels(self, joints: int) -> int:
         """Number of input channels of each network."""
         return len(CHANNELS) * joints // self.networks(joints)
+
+
+Array = np.ndarray
+
+RECIPE = 3
+"""Increase it when the same records, configuration and seed give other weights."""
+
+
+def hash_records(records: Sequence[Array]) -> str:
+    """Hash of the training data."""
+    digest = hashlib.sha256()
+    for record in records:
+        digest.update(f"{record.dtype}{record.shape}".encode())
+        digest.update(np.ascontiguousarray(record).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def training_key(records: Sequence[Array], config: TwinConfig, seed: np.random.SeedSequence) -> str:
+    """Cache key of a training: equal keys mean equal weights."""
+    parts = [str(RECIPE), hash_records(records), msgspec.json.encode(config).decode(), seed_text(seed)]
+    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:32]
+
+
+def seed_text(seed: np.random.SeedSequence) -> str:
+    """A seed as text, `entropy/spawn.key`."""
+    return f"{seed.entropy}/{'.'.join(map(str, seed.spawn_key))}"

@@ -15,13 +15,12 @@ from typing import Self
 import numpy as np
 import zenoh
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router, reachable
+from fleet.bus.client import BusClient
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.protocol import Broadcast, PeerView, checked_arms
+from fleet.bus.exchange.memory import Broadcast, MemoryExchange, PeerView, checked_arms
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
+from fleet.bus.router import Router, reachable
 from fleet.errors import BusError
 from fleet.telemetry import MODES
 

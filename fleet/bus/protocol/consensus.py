@@ -11,14 +11,16 @@ to commit is granted once and for good. The granter has all of it on disk before
 Why no two arms are away from home on plans that exclude each other: an arm grants the space of a plan to one peer at a
 time, and takes it for free only when a later claim of that peer says so, never because a lease has ended.
 (Leases: Gray & Cheriton 1989, SOSP. Majorities: Thomas 1979, ACM TODS 4.)
+
+Messages about what an arm has done: an auctioneer, or an arm, whose journal is lost learns it from them.
 """
 
 from typing import Annotated, Literal
 
 import msgspec
 
-from fleet.bus.protocol.auction import MOST_JOBS, Count, JobEstimate, JobSpec, LeaseTime
-from fleet.bus.protocol.messages import Name, Number, finite
+from fleet.bus.protocol.auction import MOST_JOBS, Award, JobEstimate, JobSpec, LeaseTime
+from fleet.bus.protocol.messages import Count, Name, Number, finite
 from fleet.bus.protocol.operator import Operation
 
 
@@ -140,3 +142,29 @@ class ClaimReply(msgspec.Struct, frozen=True):
     """Real seconds, counted by the claimer from the moment it sent the claim."""
     granted: tuple[GrantedEntry, ...] = ()
     denied: tuple[DeniedEntry, ...] = ()
+
+
+MOST_FINISHED = 256
+"""Jobs that an arm remembers to have finished, the last ones."""
+
+
+class HistoryRequest(msgspec.Struct, frozen=True):
+    """Request to `arm/*/history`: what the arm has done and has. An auctioneer asks before it awards the arm a job."""
+
+
+class History(msgspec.Struct, frozen=True):
+    """Reply to a `HistoryRequest`, from the disk of the arm."""
+
+    arm: Name
+    epoch: str = ""
+    """Of the last award that it accepted, or of its grants; "" for none."""
+    finished: Annotated[tuple[JobSpec, ...], msgspec.Meta(max_length=MOST_FINISHED)] = ()
+    """Jobs that it finished, in any epoch, oldest first; as many of the last ones as fit into one message."""
+    awards: Annotated[tuple[Award, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    """Awards that it has accepted and that have not ended, with the cycles that are done now."""
+    may_commit: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    """Awards among these with permission to commit."""
+    claims: Annotated[dict[Name, Count], msgspec.Meta(max_length=MOST_JOBS)] = {}
+    """Number of the last claim of each arm, where arms allocate jobs without an auctioneer."""
+    committed: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    """Likewise: jobs of arms with permission to commit, which are unfinished if their arms have lost their journals."""

@@ -1,4 +1,6 @@
-"""The contract of the bus as documents: JSON schemas of every message, and the bus as an AsyncAPI 3 document.
+"""One example of every message on the bus: a job `crate_1` from submission to receipt, and what is sent besides.
+
+The contract of the bus as documents: JSON schemas of every message, and the bus as an AsyncAPI 3 document.
 
 `docs/tables.py` writes them to docs/contract. The description of a field is the text under it in the source.
 AsyncAPI has no binding for Zenoh and refuses unknown ones; what is specific to Zenoh is under `x-zenoh`.
@@ -6,18 +8,29 @@ AsyncAPI has no binding for Zenoh and refuses unknown ones; what is specific to 
 
 import ast
 import inspect
+import json
 import sys
 from collections.abc import Mapping
 from functools import cache
+from importlib.resources import files
 from itertools import pairwise
 from typing import Any
 
 import msgspec
 
-from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator, policy
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol import auction, cell, consensus, keys, messages, operator, policy
 from fleet.bus.protocol.registry import CHANNELS, MESSAGES, PATTERNS, Channel, MessageType
 from fleet.job import Job, Work
+
+
+def _read() -> Mapping[type[msgspec.Struct], msgspec.Struct]:
+    kinds = {kind.__name__: kind for kind in MESSAGES}
+    examples = json.loads(files("fleet").joinpath("data", "bus_examples.json").read_bytes())
+    return {kinds[name]: msgspec.convert(example, kinds[name]) for name, example in examples.items()}
+
+
+EXAMPLES = _read()
+
 
 JSON_SCHEMA = "https://json-schema.org/draft/2020-12/schema"
 FIELD_SOURCES: Mapping[type, tuple[type, ...]] = {auction.JobSpec: (Work, Job)}
@@ -78,7 +91,7 @@ def _structs() -> Mapping[str, MessageType]:
     """Every struct that occurs in the schemas, by name."""
     return {
         name: value
-        for module in (messages, auction, cell, consensus, history, operator, policy)
+        for module in (messages, auction, cell, consensus, consensus, operator, policy)
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, msgspec.Struct)
     }

@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator, policy
+from fleet.bus.protocol import auction, cell, consensus, keys, messages, operator, policy
 from fleet.bus.protocol.keys import Role
 
 MessageType = type[msgspec.Struct]
@@ -43,7 +43,7 @@ class Channel:
     """Of a query; a `Refusal` may come instead."""
     receiver: str = "anybody"
     """Subscribes, or queries."""
-    history: int = 0
+    consensus: int = 0
     """Messages that the publisher caches; a subscriber that asks for history gets as many, and lost ones are resent."""
     heartbeat_s: float = 0.5
     """Of a publisher with history: within this its last sequence number is repeated, so that a loss is noticed."""
@@ -95,7 +95,7 @@ CHANNELS: tuple[Channel, ...] = (
         "arm", "quote", "query", auction.QuoteRequest, auction.Quote, receiver="auctioneer, or anybody for a dry run"
     ),
     Channel("arm", "award", "query", auction.Award, auction.Ack, receiver="auctioneer"),
-    Channel("arm", "history", "query", history.HistoryRequest, history.History, receiver="auctioneer, or arm"),
+    Channel("arm", "history", "query", consensus.HistoryRequest, consensus.History, receiver="auctioneer, or arm"),
     Channel("arm", "reset", "query", operator.ResetRequest, operator.ResetReply, receiver="operator"),
     Channel("arm", "bid", "publish", consensus.Bid, receiver="arm", history=1, rate_hz=1.0),
     Channel("arm", "claim", "query", consensus.Claim, consensus.ClaimReply, receiver="arm", lease_s=auction.LEASE_S),

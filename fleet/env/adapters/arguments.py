@@ -6,7 +6,7 @@ from typing import Any
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from fleet.engine.reward import TERMS
+from fleet.engine.batch import TERMS
 from fleet.env.vector import BatchEnv
 
 # Any: PettingZoo, Gymnasium and the trainers leave the types of observations, actions and infos open.

@@ -22,7 +22,7 @@ Traps:
 - With `decisions="events"` steps differ in length. Value estimators raise gamma to the power of the entry that
   `set_keys(steps_to_next_obs=("next", "arms", "elapsed_s"))` names: make gamma the discount of one second.
 - Use one thread (`OMP_NUM_THREADS=1`): the arrays are too small for more threads to help.
-- `rollout` stacks its frames into new tensors. `fleet.env.buffers.keep_pages()`, called once, keeps the system from
+- `rollout` stacks its frames into new tensors. `fleet.env.vector.keep_pages()`, called once, keeps the system from
   clearing their memory for every rollout, which gives half as many steps per second again.
 """
 

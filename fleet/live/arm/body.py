@@ -1,14 +1,36 @@
-"""Interface of the body of an arm: motion, heat and sensors, simulated or replayed."""
+"""Interface of the body of an arm: motion, heat and sensors, simulated or replayed.
 
-from dataclasses import dataclass
-from typing import Protocol
+Body that replays the log of a real arm: it moves and warms as recorded, and accepts no work.
+
+Simulated body of one live arm.
+
+It steps the engine of the simulator, `fleet.engine.step`, in a world of one arm and its current job. A job is done in
+stints: the arm leaves home, does the cycles that it is allowed, and returns home. The allowed cycles can grow during a
+stint, so a job that is allowed to its end is one stint, as in a simulated shift. After a fault the arm stands where it
+stopped. Once it has recovered it ends that cycle and goes home, if no person has moved it home before
+(`ThermalLimits.move_home_s`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import ceil, floor
+from typing import Literal, Protocol
 
 import numpy as np
 
+from fleet.difficulty import Blind
+from fleet.engine.profile_plant import ProfilePlant, telemetry_of
+from fleet.engine.shift import StepRecord, step
+from fleet.engine.state import DONE, State, World, initial
+from fleet.engine.step import ROUNDING_S
+from fleet.engine.world import Arm, build_world
 from fleet.events import Event
+from fleet.heat.motor import current
+from fleet.heat.thermal import HOUSING, WINDING, HousingObserver, housing_observer
 from fleet.job import Job
 from fleet.motion import Plan
-from fleet.telemetry import Mode
+from fleet.robot import ThermalLimits
+from fleet.telemetry import FAULTED, MODES, WORKING, Mode
 
 Array = np.ndarray
 
@@ -102,3 +124,416 @@ class Body(Protocol):
     def read_sensors(self) -> SensorReading:
         """Return the present sensor values."""
         ...
+
+
+MOVING_RAD_S = 0.01
+"""The arm is working when a joint is faster than this."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorLog:
+    """Sensor readings of one arm, each [time, joint], SI; None for what was not logged."""
+
+    time_s: Array
+    """Strictly increasing, [time]."""
+    temp_c: Array
+    q: Array
+    qd: Array
+    tau: Array
+    current_a: Array | None = None
+
+
+class ReplayBody:
+    """Body that replays a log once, in fleet time; then it keeps the last sample. See `fleet.live.arm.body.Body`.
+
+    Args:
+        time_s: Fleet time of the first sample.
+    """
+
+    def __init__(self, log: SensorLog, *, time_s: float = 0.0) -> None:
+        if not len(log.time_s):
+            raise ValueError("A log needs at least one sample.")
+        self._log = log
+        self._start_s = self._now_s = time_s
+
+    @property
+    def time_s(self) -> float:
+        return self._now_s
+
+    @property
+    def over(self) -> bool:
+        """Whether its last sample has passed."""
+        return self._row == len(self._log.time_s) - 1
+
+    @property
+    def housing_c(self) -> np.ndarray:
+        return self._log.temp_c[self._row]  # as warm as the motors: no job is quoted
+
+    # It takes no jobs.
+
+    job, is_free, cycles, away = "", False, 0, None
+
+    def last_cycle_in_s(self) -> float:
+        return np.inf
+
+    def free_in_s(self) -> float:
+        return np.inf
+
+    def start(self, job: Job, plan: Plan, cycles: int) -> None:
+        raise ValueError(f"A replayed log takes no jobs (got '{job.name}').")
+
+    def allow_cycles(self, cycles: int) -> None:
+        pass
+
+    def release(self) -> None:
+        pass
+
+    # Its log
+
+    def advance(self, until_s: float) -> list[Event]:
+        self._now_s = max(self._now_s, until_s)
+        return []
+
+    def set_time(self, time_s: float) -> None:
+        self._start_s += time_s - self._now_s
+        self._now_s = time_s
+
+    def clear_fault(self) -> str:
+        return "a recorded arm has no faults"
+
+    def set_step(self, dt_s: float) -> None:
+        pass  # samples are read at any time
+
+    def read_sensors(self) -> SensorReading:
+        log, row = self._log, self._row
+        qd = np.zeros_like(log.qd[row]) if self.over else log.qd[row]
+        current_a = () if log.current_a is None else tuple(log.current_a[row].tolist())
+        mode = "working" if np.abs(qd).max() > MOVING_RAD_S else "idle"
+        temp_c, q, tau = (tuple(values[row].tolist()) for values in (log.temp_c, log.q, log.tau))
+        return SensorReading(mode, temp_c, q, tuple(qd.tolist()), tau, current_a)
+
+    @property
+    def _row(self) -> int:
+        into_s = self._log.time_s[0] + self._now_s - self._start_s
+        after = np.searchsorted(self._log.time_s, into_s + 1e-9, side="right")  # pyright: ignore[reportUnknownVariableType]
+        return max(0, int(after) - 1)  # pyright: ignore[reportUnknownArgumentType]
+
+
+MAX_STEPS = 200
+"""Steps per call: a body that is far behind catches up gradually."""
+_REPORTED = ("torque_warning", "home", "warning", "fault", "recover", "moved")
+"""Events of the engine that a live arm reports unchanged."""
+_CARRIED = (
+    "tick",
+    "temp_c",
+    "housing_c",
+    "mode",
+    "clear_at_s",
+    "faults",
+    "peak_c",
+    "above_warning_s",
+    "busy_s",
+    "lost_s",
+    "energy_j",
+)
+"""Fields of the state that are kept when the job changes."""
+
+
+@dataclass(eq=False)
+class _Current:
+    """The current job."""
+
+    job: Job
+    plan: Plan
+    before: int
+    """Cycles done before this stint."""
+    allowed: int
+    """Cycles that may be begun, including those done."""
+    released: bool = False
+    """Finished or released: only the way home is left."""
+
+
+class SimulatedBody:
+    """One arm of the simulator in real time, as `fleet.live.arm.body.Body` describes.
+
+    Args:
+        arm: True parameters of the arm; its plans and its model are not used.
+        ambient_c: Ambient temperature at the arm, °C, by fleet time.
+        dt_s: Length of a step, fleet seconds.
+        max_dt_s: Upper limit of the length of a step.
+        time_s: Fleet time at the start.
+        warm: Whether it has been powered at home for hours; else all is at ambient temperature.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        limits: ThermalLimits,
+        ambient_c: Callable[[float], float],
+        *,
+        dt_s: float,
+        rng: np.random.Generator,
+        max_dt_s: float = np.inf,
+        time_s: float = 0.0,
+        warm: bool = True,
+    ) -> None:
+        if not (dt_s > 0 and max_dt_s > 0):
+            raise ValueError(f"SimulatedBody.dt_s and max_dt_s must be > 0 (got {dt_s}, {max_dt_s}).")
+        self._arm, self._limits, self._ambient_c, self._rng = arm, limits, ambient_c, rng
+        self._dt_s, self._max_dt_s = min(dt_s, max_dt_s), max_dt_s
+        self._start_s = time_s
+        self._task: _Current | None = None
+        self._plan: Plan | None = None
+        """Plan of the current or last job."""
+        self._world, self._plant = self._build_world(None, warm=warm)
+        self._state = initial(self._world)
+        self._last: tuple[World, StepRecord] | None = None
+
+    # Properties
+
+    @property
+    def time_s(self) -> float:
+        return self._start_s + float(self._state.tick[0]) * self._dt_s
+
+    @property
+    def job(self) -> str:
+        return "" if self._task is None or self._task.released else self._task.job.name
+
+    @property
+    def is_free(self) -> bool:
+        return self._task is None and self._state.mode[0, 0] not in (WORKING, FAULTED)
+
+    @property
+    def away(self) -> Plan | None:
+        return self._plan if self._state.plan[0, 0] >= 0 else None
+
+    @property
+    def housing_c(self) -> Array:
+        return self._state.housing_c[0, 0]  # the estimate of the arm's observer, not the true temperatures
+
+    @property
+    def cycles(self) -> int:
+        assert self._task is not None, "no current job"
+        return self._task.before + self._begun(done=True)
+
+    @property
+    def truth(self) -> State:
+        """State of the simulator, for tests only."""
+        return self._state
+
+    def last_cycle_in_s(self) -> float:
+        task = self._task
+        if task is None or task.released or self._faulted:
+            return np.inf
+        last = task.job.repetitions - 1
+        if self._in_stint:
+            approach_s, cycle_s, _ = self._times_s
+            return max(0.0, approach_s + (last - task.before) * cycle_s - self._progress_s)
+        return self._home_in_s + task.plan.approach.duration_s + (last - self.cycles) * task.plan.cycle.duration_s
+
+    def free_in_s(self) -> float:
+        if self._faulted:
+            return np.inf
+        task = self._task
+        if task is None or task.released:
+            return self._home_in_s
+        if self._in_stint:  # all of the job, not only the cycles that are allowed now
+            more = task.job.repetitions - task.before - int(self._state.todo[0, 0])
+            return self._home_in_s + more * task.plan.cycle.duration_s
+        return self.last_cycle_in_s() + task.plan.cycle.duration_s + task.plan.retreat.duration_s
+
+    def read_sensors(self) -> SensorReading:
+        if self._last is None:
+            still = np.zeros_like(self._arm.rest_tau)
+            temp_c, motors, tau = self._state.temp_c[0, 0], self._arm.motors, self._arm.rest_tau
+            noisy_c = temp_c[WINDING] + motors.sensor_noise_k * self._rng.standard_normal(still.shape)
+            values = (noisy_c, self._arm.robot.home_q(), still, tau, current(tau, still, temp_c[HOUSING], motors))
+            return SensorReading("idle", *(tuple(v.tolist()) for v in values))
+        world, record = self._last
+        end_s = np.array([world.dt_s])
+        motion = self._plant.motion(world, record, end_s)
+        sample = telemetry_of(world, record, end_s, motion, self._rng.standard_normal((1, 1, 1, motion.shape[-1])))
+        values = (sample.temp_c, sample.q, sample.qd, sample.tau, sample.current_a)
+        return SensorReading(
+            MODES[int(self._state.mode.item(0, 0))], *(tuple(value[0, 0].tolist()) for value in values)
+        )
+
+    # Commands
+
+    def start(self, job: Job, plan: Plan, cycles: int) -> None:
+        if not self.is_free:
+            raise ValueError(f"Arm '{self._arm.robot.name}' is not free and cannot start '{job.name}'.")
+        if not 0 <= cycles < job.repetitions:
+            raise ValueError(f"cycles must be 0 to {job.repetitions - 1} for '{job.name}' (got {cycles}).")
+        self._task, self._plan = _Current(job, plan, cycles, allowed=cycles), plan
+        self._world, self._plant = self._build_world(self._task)
+        self._state = self._carried(self._world)
+
+    def allow_cycles(self, cycles: int) -> None:
+        if self._task is not None and not self._task.released:
+            self._task.allowed = min(cycles, self._task.job.repetitions)
+
+    def release(self) -> None:
+        if self._task is not None:
+            self._task.allowed, self._task.released = 0, True
+            if not self._working:
+                self._task = None
+
+    def clear_fault(self) -> str:
+        hottest_c = float(self._state.temp_c[0, 0, WINDING].max())
+        if hottest_c >= self._limits.restart_c:
+            return f"a motor has {hottest_c:.1f} °C; a fault can be cleared below {self._limits.restart_c:g} °C"
+        self._state = self._state._replace(clear_at_s=np.full((1, 1), float(self._state.tick[0]) * self._dt_s))
+        return ""
+
+    def set_time(self, time_s: float) -> None:
+        self._start_s += time_s - self.time_s
+
+    def set_step(self, dt_s: float) -> None:
+        time_s, ticks, dt_s = self.time_s, float(self._state.tick[0]), min(dt_s, self._max_dt_s)
+        phi, gamma = self._world.thermal.step_matrices(dt_s)
+        # The engine counts its time in ticks of the new length.
+        later_s = ticks * (dt_s - self._dt_s)
+        clear_at_s, moved_at_s = self._state.clear_at_s + later_s, self._state.moved_at_s + later_s
+        observer = HousingObserver(*(part[None] for part in housing_observer(*self._arm.beliefs, dt_s)))
+        self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma, observer=observer)
+        self._state = self._state._replace(clear_at_s=clear_at_s, moved_at_s=moved_at_s)
+        self._dt_s = dt_s
+        self.set_time(time_s)
+
+    def advance(self, until_s: float) -> list[Event]:
+        """Simulate up to a fleet time, at most `MAX_STEPS` steps."""
+        events: list[Event] = []
+        steps = int((until_s - self.time_s) / self._dt_s + 1e-6)
+        for _ in range(min(max(steps, 0), MAX_STEPS)):
+            events += self._step()
+        return events
+
+    # One step
+
+    def _step(self) -> list[Event]:
+        task, log, shift_s = self._task, list[Event](), self._start_s
+        ambient_c = self._ambient_c(self.time_s + 0.5 * self._dt_s)
+        if ambient_c != self._world.ambient_c[0, 0]:
+            self._world = replace(self._world, ambient_c=np.array([[ambient_c]]))
+        leaves = task is not None and self._prepare_stint(task)
+        done = step(self._world, self._state, np.array([[int(leaves)]]), self._plant, log, compiled=False)
+        self._last, self._state = (self._world, done.record), done.state
+        events = [replace(e, time_s=e.time_s + shift_s) for e in log if e.kind in _REPORTED]
+        return events if task is None else events + self._job_events(task, int(done.record.todo[0, 0]), log, shift_s)
+
+    def _prepare_stint(self, task: _Current) -> bool:
+        """Apply the allowed cycles to the next step; return whether the arm leaves home in it."""
+        state = self._state
+        if self._faulted:
+            return False
+        if not self._working:
+            if task.allowed <= task.before:
+                return False
+            self._set_repetitions(task.allowed - task.before)
+            self._state = self._carried(self._world)
+            return True
+        if self._in_stint:
+            todo = max(task.allowed - task.before, self._begun())
+            if todo != state.todo[0, 0]:
+                self._set_repetitions(todo)  # otherwise the engine takes the job for given back
+                approach_s, cycle_s, _ = self._times_s
+                # A job that ends at this very moment has not ended for the engine yet.
+                progress_s = min(self._progress_s, approach_s + todo * cycle_s - 2 * ROUNDING_S)
+                self._state = state._replace(todo=np.array([[todo]]), progress_s=np.array([[progress_s]]))
+        return False
+
+    def _set_repetitions(self, count: int) -> None:
+        table = replace(self._world.jobs, repetitions=np.array([[count]]))
+        self._world = replace(self._world, jobs=table)
+
+    def _job_events(self, task: _Current, done: int, log: list[Event], shift_s: float) -> list[Event]:
+        """Return the events of the current job in a step; drop the job where it ended.
+
+        Args:
+            done: Cycles of the stint, if it ended.
+        """
+        events: list[Event] = []
+        total = task.job.repetitions
+
+        def report(kind: Literal["finish", "return"], at_s: float, value: float, reason: str) -> None:
+            arm, job = self._arm.robot.name, task.job.name
+            if not task.released:
+                events.append(Event(time_s=at_s, kind=kind, arm=arm, job=job, value=value, reason=reason))
+
+        for each in log:
+            at_s = each.time_s + shift_s
+            if each.kind == "finish":
+                task.before += done
+                if task.before == total:
+                    late_s = max(0.0, at_s - task.job.due_s)
+                    report("finish", at_s, late_s, f"late by {late_s:.0f} s" if late_s else "on time")
+                    task.released = True
+            elif each.kind == "home" and task.released:
+                self._task = None
+            elif each.kind == "fault":
+                kept = next((int(e.value) for e in log if e.kind == "return"), 0)
+                cycles = task.before + kept
+                report("return", at_s, float(cycles), f"{cycles} of {total} cycles kept")
+                self._task = None
+        return events
+
+    # Arrays of the engine
+
+    def _build_world(self, task: _Current | None, *, warm: bool = False) -> tuple[World, ProfilePlant]:
+        plans = {} if task is None else {task.job.work: (task.plan,)}
+        jobs = [] if task is None else [replace(task.job, release_s=0.0, due_s=np.inf, after=())]
+        world, rows = build_world(
+            [replace(self._arm, model=Blind(), plans=plans)],
+            [jobs],
+            limits=self._limits,
+            dt_s=self._dt_s,
+            ticks=1,
+            slots=1,
+            ambient_c=np.array([[self._ambient_c(self._start_s)]]),
+            start_warm=warm,
+        )
+        return world, ProfilePlant(rows, self._arm.robot.home_q()[None], self._arm.rest_tau[None])
+
+    def _carried(self, world: World) -> State:
+        """State at home before a stint, with temperatures and counters of the present state."""
+        return initial(world)._replace(**{name: getattr(self._state, name).copy() for name in _CARRIED})
+
+    @property
+    def _faulted(self) -> bool:
+        return bool(self._state.mode[0, 0] == FAULTED)
+
+    @property
+    def _working(self) -> bool:
+        return bool(self._state.mode[0, 0] == WORKING)
+
+    @property
+    def _in_stint(self) -> bool:
+        """Whether it is at work, and not yet on its way home."""
+        return self._working and bool(self._state.status[0, 0] != DONE)
+
+    @property
+    def _progress_s(self) -> float:
+        return float(self._state.progress_s[0, 0])
+
+    @property
+    def _times_s(self) -> tuple[float, float, float]:
+        """Durations of approach, cycle and retreat."""
+        return tuple(self._world.plans.times_s[0].tolist())
+
+    def _begun(self, *, done: bool = False) -> int:
+        """Cycles of this stint that were begun, or with `done` those that are complete."""
+        if not self._in_stint:
+            return 0
+        approach_s, cycle_s, _ = self._times_s
+        count = (self._progress_s - approach_s) / cycle_s
+        whole = floor(count + ROUNDING_S) if done else ceil(count - ROUNDING_S)
+        return min(max(whole, 0), int(self._state.todo[0, 0]))
+
+    @property
+    def _home_in_s(self) -> float:
+        """Seconds until it is home if this stint is not extended."""
+        if not self._working:
+            return 0.0
+        approach_s, cycle_s, retreat_s = self._times_s
+        return max(0.0, approach_s + float(self._state.todo[0, 0]) * cycle_s + retreat_s - self._progress_s)

@@ -12,17 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fleet.arm.space import plan_key, space_name
+from fleet.arm.trajectory import check_time, time_limit
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.errors import InfeasibleJob, printable
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import NODES, WINDING, gen3_network, temperature_steps, thermal_model
 from fleet.job import LONGEST_JOB_S, Job, Place, Work
 from fleet.motion import Drive, Plan, distinct
-from fleet.motor import gen3_motors
 from fleet.offered_plans import nominal_drive, offered_plans
-from fleet.planning.space import plan_key, space_name
-from fleet.planning.time_limit import check_time, time_limit
 from fleet.robot import JOINTS
-from fleet.thermal import NODES, WINDING, gen3_network, temperature_steps, thermal_model
 
 Array = np.ndarray
 _LOG = logging.getLogger(__name__)

@@ -1,36 +1,375 @@
-"""An arm on the bus: publishes its state, quotes jobs, accepts awards and executes them in fleet time.
+"""Configuration of an arm of a live fleet.
 
-One thread runs it, and another one plans (`fleet.live.arm.planning`), as a new motion takes 50 ms and more. A reply
+What an arm publishes about itself: constants, state, difficulty of jobs, events.
+
+Planning of quotes on a thread of its own, so that no job delays the arm's messages.
+
+Synchronisation of an arm's clock with fleet time.
+
+Source of an arm's work, by default auctioneers.
+
+An arm on the bus: publishes its state, quotes jobs, accepts awards and executes them in fleet time.
+
+One thread runs it, and another one plans (`fleet.live.arm.node`), as a new motion takes 50 ms and more. A reply
 waits for plans for at most `PLANNING_S`, publishes the state meanwhile, and calls the remaining jobs `NOT_PLANNED`; the
 next request finds them planned.
 """
 
+import logging
 import math
+import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
+import msgspec
 import numpy as np
 
-from fleet.bus.client.client import BusClient
+from fleet.arm.space import plan_key, space_name
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, Quote, QuoteRequest
-from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.auction import (
+    Ack,
+    ArmEvent,
+    Award,
+    Clock,
+    ClockRequest,
+    JobEstimate,
+    JobSpec,
+    Lease,
+    LeaseRequest,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+)
+from fleet.bus.protocol.consensus import HistoryRequest
+from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ResetReply, ResetRequest
+from fleet.bus.protocol.registry import STATE_HZ
 from fleet.difficulty import known_temperatures
-from fleet.errors import Refused, printable
-from fleet.events import Event
-from fleet.live.arm.auctioneer_client import AuctioneerClient, RateLimitedWarnings, WorkSource
-from fleet.live.arm.award_executor import AwardExecutor
+from fleet.errors import BusError, Refused, printable
+from fleet.events import EVENTS_PER_BOOT, Event
+from fleet.live.arm.awards import ActiveAward, ArmHistory, AwardExecutor, FaultCleared
 from fleet.live.arm.body import Body
-from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
-from fleet.live.arm.journal_records import ActiveAward, FaultCleared
-from fleet.live.arm.planning import PlanningThread
-from fleet.live.arm.publications import Publications
 from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.space import ANYWHERE
-from fleet.planning.space import plan_key, space_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmConfig:
+    """How an arm takes part in the fleet."""
+
+    warning_c: float
+    """Motor temperature above which it accepts no work."""
+    rate_hz: float = STATE_HZ
+    """State messages per real second."""
+    boot: int = 1
+    """Number of this start."""
+    ambient_c: Callable[[float], float] = lambda time_s: 25.0
+    """Measured ambient temperature of the cell by fleet time."""
+    takes_jobs: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate_hz <= 1000:
+            raise ValueError(f"ArmConfig.rate_hz must be > 0 and <= 1000 (got {self.rate_hz:g}).")
+
+
+class Publications:
+    """Publishers of one arm, which number its messages.
+
+    Attributes:
+        tick: Number of states so far.
+    """
+
+    def __init__(self, link: BusClient, arm: str, boot: int) -> None:
+        """Declare the publishers; `link` is open, and `boot` the number of this start of the arm."""
+        self._arm, self._boot = arm, boot
+        self.tick = self._events = 0
+        self._publish_state = link.publisher(keys.of_arm(link.fleet, arm, "state"), State)
+        self._publish_difficulty = link.publisher(keys.of_arm(link.fleet, arm, "difficulty"), DifficultyScores)
+        self._publish_event = link.publisher(keys.of_arm(link.fleet, arm, "event"), ArmEvent)
+        self._publish_info = link.publisher(keys.of_arm(link.fleet, arm, "info"), Info)  # holds the last one
+
+    def info(self, joints: int, twin: str) -> None:
+        """Publish the constants of the arm."""
+        self._publish_info(Info(self._arm, joints, twin))
+
+    def next_tick(self) -> int:
+        """Return the number of the next state."""
+        self.tick += 1
+        return self.tick
+
+    def state(self, state: State) -> None:
+        """Publish a state."""
+        self._publish_state(state)
+
+    def difficulty(self, estimates: tuple[JobEstimate, ...], twin: str, time_s: float) -> None:
+        """Publish how difficult jobs are for the arm, by the plan with the least difficulty."""
+        plans = [estimate.least for estimate in estimates]
+        self._publish_difficulty(
+            DifficultyScores(
+                arm=self._arm,
+                tick=self.tick,
+                time_s=time_s,
+                twin=twin,
+                jobs=tuple(estimate.job for estimate in estimates),
+                difficulty=tuple(plan.difficulty for plan in plans),
+                p_saturation=tuple(plan.p_saturation for plan in plans),
+                peak_c=tuple(plan.peak_c for plan in plans),
+            )
+        )
+
+    def event(self, event: Event, epoch: str) -> None:
+        """Publish an event of an epoch of the fleet."""
+        self._events += 1
+        self._publish_event(
+            ArmEvent(
+                arm=self._arm,
+                number=self._boot * EVENTS_PER_BOOT + self._events,
+                time_s=event.time_s,
+                kind=event.kind,
+                job=event.job,
+                joint=event.joint,
+                value=event.value if math.isfinite(event.value) else None,
+                reason=event.reason,
+                epoch=epoch,
+            )
+        )
+
+
+PLANNING_S, POLL_S = 0.3, 0.05
+"""Real seconds that one reply may wait for plans, as long as waiting takes less than half of all time; and between two
+looks at what else is due."""
+MAX_QUEUED = 256
+"""Jobs that wait to be planned; the oldest of a queue that is full is dropped, and has to be requested again."""
+IDLE_S = 5.0
+"""Real seconds without work after which the thread ends, until there is work again."""
+Key = tuple[JobSpec, int]
+
+
+class PlanningThread:
+    """Plans and scores jobs, those of an auction before those of dry runs.
+
+    A plan has bounded size and time: `fleet.job.BOUNDS` and `check_dwell` limit the samples, `Estimator` the time and
+    the memory of what it keeps. Only this thread calls `Estimator.prepare`.
+    """
+
+    def __init__(self, estimator: Estimator) -> None:
+        self._estimator = estimator
+        self._queues: tuple[OrderedDict[Key, None], OrderedDict[Key, None]] = (OrderedDict(), OrderedDict())
+        """Jobs and their cycles that are done, oldest first: of auctions, and of dry runs."""
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._waits_from_s = -math.inf
+        """Real second from which `plan` may wait again."""
+
+    def plan(self, jobs: Sequence[Key], step: Callable[[], None], *, dry_run: bool = False) -> None:
+        """Plan jobs, each with the number of its cycles that are done: now if it is quick, else after the return.
+
+        Args:
+            step: Called at least every `POLL_S` while this waits for the plans.
+        """
+        self._request(jobs, dry_run=dry_run)
+        start_s = time.monotonic()
+        until_s = start_s + PLANNING_S if start_s >= self._waits_from_s else start_s
+        self._waits_from_s = max(self._waits_from_s, until_s)  # also for what `step` plans
+        while (now_s := time.monotonic()) < until_s and not all(self._estimator.is_prepared(*job) for job in jobs):
+            with self._changed:
+                self._changed.wait(min(until_s - now_s, POLL_S))
+            step()
+        if until_s > start_s:
+            self._waits_from_s = 2.0 * time.monotonic() - start_s
+
+    def _request(self, jobs: Iterable[Key], *, dry_run: bool) -> None:
+        with self._changed:
+            queue = self._queues[dry_run]
+            for key in jobs:
+                queue[key] = None
+                if len(queue) > MAX_QUEUED:
+                    queue.popitem(last=False)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="planning", daemon=True)
+                self._thread.start()
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                queue = next(filter(None, self._queues), None)
+                if queue is None:
+                    if self._changed.wait(IDLE_S) or any(self._queues):
+                        continue
+                    self._thread = None
+                    return
+                job, done = next(iter(queue))
+            self._estimator.prepare(job, done)
+            with self._changed:
+                queue.pop((job, done), None)
+                self._changed.notify_all()
+
+
+REPLY_S = 1.0
+"""Real seconds that an auctioneer has to reply."""
+CLOCK_S = (1.0, 30.0)
+"""Real seconds between two clock requests: until the first reply, and after it."""
+
+
+class ClockSync:
+    """Requests fleet time, and sets a clock to it: at once by the first reply, gradually by later ones.
+
+    Args:
+        clock: Returns the clock.
+        set_clock: Replaces it; the second argument is whether it reads another time now.
+        warn: Logs a warning of a kind.
+    """
+
+    def __init__(
+        self,
+        link: BusClient,
+        clock: Callable[[], FleetClock],
+        set_clock: Callable[[FleetClock, bool], None],
+        warn: Callable[[str, str], None],
+    ) -> None:
+        self._link, self._clock, self._set_clock, self._warn = link, clock, set_clock, warn
+        self._asked_s, self._is_set = -math.inf, False
+
+    def step(self, real_s: float) -> None:
+        """Request the fleet time, when that is due."""
+        if real_s < self._asked_s + CLOCK_S[self._is_set]:
+            return
+        self._asked_s = real_s
+
+        def done(answers: Replies[Clock]) -> None:
+            for reply in answers.messages.values():
+                self._apply(reply, real_s, time.monotonic())
+                return
+
+        try:
+            self._link.query(keys.of_clock(self._link.fleet), ClockRequest(), Clock, done, timeout_s=REPLY_S)
+        except BusError as error:
+            self._warn("bus", str(error))
+
+    def _apply(self, reply: Clock, asked_s: float, answered_s: float) -> None:
+        clock = self._clock()
+        if reply.speed != clock.speed:
+            clock = FleetClock(reply.speed, answered_s, clock.now_s(answered_s))
+        clock = replace(clock, epoch=reply.epoch)
+        set_to, jump = (clock.slewed_to, False) if self._is_set else (clock.set_to, True)
+        self._is_set = True
+        self._set_clock(set_to(asked_s, answered_s, reply.time_s), jump)
+
+
+_LOG = logging.getLogger(__name__)
+
+Message = TypeVar("Message", bound=msgspec.Struct)
+WARNING_S = 10.0
+"""Real seconds between two warnings about the same thing."""
+
+
+class WorkSource(Protocol):
+    """Gives an arm its work, and takes its reports."""
+
+    objection: str
+    """Why nobody else may award the arm jobs; "" if everybody may."""
+    wake_s: float
+    """Real second at which `step` is due even if no message arrives."""
+
+    def request_leases(self, auctioneer: str, request: LeaseRequest, asked_s: float) -> None:
+        """Request renewal of leases, and permission to commit."""
+        ...
+
+    def send_report(self, auctioneer: str, report: Report) -> None:
+        """Report the end of an award."""
+        ...
+
+    def step(self, real_s: float) -> None:
+        """Do what is due."""
+        ...
+
+
+class RateLimitedWarnings:
+    """Logs warnings of an arm, each kind at most once in `WARNING_S`."""
+
+    def __init__(self, arm: str) -> None:
+        self._arm = arm
+        self._logged_s: dict[str, float] = {}
+
+    def __call__(self, kind: str, sentence: str) -> None:
+        """Log a warning; `sentence` continues after the name of the arm."""
+        if (now_s := time.monotonic()) >= self._logged_s.get(kind, -math.inf) + WARNING_S:
+            self._logged_s[kind] = now_s
+            _LOG.warning("Arm '%s' %s", self._arm, sentence)
+
+
+class WorkingArm(Protocol):
+    """What a work source needs of its arm."""
+
+    link: BusClient
+    executor: AwardExecutor
+    clock: FleetClock
+
+    def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
+        """Use another clock; with `jump` it reads another time now."""
+        ...
+
+
+class AuctioneerClient:
+    """Work source: any auctioneer that awards a job. Fleet time is that of the auctioneer."""
+
+    objection = ""
+    wake_s = math.inf
+
+    def __init__(self, arm: WorkingArm, history: ArmHistory | None = None) -> None:
+        """Start.
+
+        Args:
+            history: The awards of the arm on its disk, now and later: auctioneers ask for it.
+        """
+        self._link, self._executor = arm.link, arm.executor
+        if history is not None:
+            link, fleet, name = arm.link, arm.link.fleet, arm.executor.arm
+            link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, lambda _: history.message(name))
+        self._warn = RateLimitedWarnings(arm.executor.arm)
+        self._clock = ClockSync(
+            arm.link, lambda: arm.clock, lambda clock, jump: arm.set_clock(clock, jump=jump), self._warn
+        )
+
+    def request_leases(self, auctioneer: str, request: LeaseRequest, asked_s: float) -> None:
+        """Send a lease request to its auctioneer."""
+        self._send(auctioneer, "lease", request, Lease, lambda lease: self._executor.apply_lease(lease, asked_s))
+
+    def send_report(self, auctioneer: str, report: Report) -> None:
+        """Send a report to its auctioneer."""
+        self._send(auctioneer, "report", report, Receipt, self._executor.apply_receipt)
+
+    def step(self, real_s: float) -> None:
+        """Request the fleet time, when that is due."""
+        self._clock.step(real_s)
+
+    def _send(
+        self,
+        auctioneer: str,
+        topic: keys.AskedTopic,
+        request: LeaseRequest | Report,
+        kind: type[Message],
+        apply: Callable[[Message], None],
+    ) -> None:
+        """Send a request, and apply its replies; if it cannot be sent now, the next one is due later anyway."""
+
+        def done(answers: Replies[Message]) -> None:
+            for reply in answers.messages.values():
+                apply(reply)
+
+        key = keys.asked_by(self._link.fleet, auctioneer, topic, self._executor.arm)
+        try:
+            self._link.query(key, request, kind, done, timeout_s=REPLY_S)
+        except BusError as error:
+            self._warn("bus", str(error))
+
 
 Array = np.ndarray
 

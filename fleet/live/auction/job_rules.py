@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
 from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Change as ChangeJob
-from fleet.live.auction.past_jobs import PastJobs
+from fleet.live.auction.records import PastJobs
 
 MAX_OPEN_JOBS = 10_000
 """Jobs of one auctioneer that are neither finished nor given up; more are refused."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet.bus.protocol.auction import JobEstimate, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
-from fleet.live.auction.round import Bidding, Choice
+from fleet.live.auction.rounds import Bidding, Choice
 from fleet.observation import LONG_S, Layout, Observation, all_peers
 from fleet.offered_plans import PLANS
 from fleet.robot import JOINTS, ThermalLimits

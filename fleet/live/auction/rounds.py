@@ -1,29 +1,513 @@
-"""Rounds of an auction: which jobs are offered when, to whom, and what is awarded."""
+"""One round of an auction: its time limits, the bids of the arms, and which arm gets which job.
+
+New and adopted awards, and leases of open ones as the auctioneer counts them.
+
+Ledger of an auctioneer with the leases of its open awards: a record is on disk before it changes anything.
+
+Space in an auction: what quotes say about it, which estimates it closes, and whose space a person may free.
+
+Rounds of an auction: which jobs are offered when, to whom, and what is awarded.
+"""
 
 import logging
 import math
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
-from fleet.bus.protocol.auction import Announcement, Award, QuoteRequest
-from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import ALL_ARMS
-from fleet.errors import JournalFull
-from fleet.live.auction.leases import CountedLease, SendAward, new_awards, unanswered
-from fleet.live.auction.round import (
-    Allocate,
-    Assignment,
-    Bidding,
-    Round,
-    Timing,
-    drop_invalid,
-    infeasible_jobs,
-    planned_jobs,
+from msgspec.structs import asdict, replace
+
+from fleet.bus.protocol.auction import (
+    LEASE_S,
+    MOST_OFFERS,
+    NOT_PLANNED,
+    Announcement,
+    ArmOffer,
+    Award,
+    JobSpec,
+    PlanQuote,
+    Quote,
+    QuoteRequest,
+    Result,
 )
-from fleet.live.auction.space_rules import stated_spaces, waits_for_space
-from fleet.live.auction.writer import LedgerWriter
-from fleet.live.space import Excludes
+from fleet.bus.protocol.consensus import History
+from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import ALL_ARMS, ClearRequest, Operation
+from fleet.errors import JournalFull, Refused
+from fleet.live.auction.job_rules import is_same_work
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted, Operated
+from fleet.live.auction.records import Change as RecordChange
+from fleet.live.clock import CLOCK_DRIFT
+from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, SpaceCleared, SpaceTaken
+from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
 
 _LOG = logging.getLogger(__name__)
+
+MAX_REASON = 500
+"""Characters of a reason, so that a message does not grow with the number of arms."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Auction timeouts, in real seconds."""
+
+    lease_s: float = LEASE_S
+    """Length of a lease: an arm may work this long without renewing it."""
+    margin_s: float = 0.25
+    """Between the end of a lease and the next offer of its job."""
+    window_s: float = 0.5
+    """A round closes after this, if not every arm has answered before."""
+    ack_s: float = 1.0
+    """To wait for the answer to an award."""
+    attempts: int = 3
+    """Maximum number of times that an award is sent."""
+    pause_s: tuple[float, float] = (0.25, 2.0)
+    """Between rounds in which nothing was awarded: the first pause and the longest."""
+    max_jobs: int = 64
+    """Jobs in one round; a quote for more would be a large message."""
+
+    def __post_init__(self) -> None:
+        for name in ("lease_s", "margin_s", "window_s", "ack_s", "attempts", "max_jobs"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"Timing.{name} must be > 0 (got {getattr(self, name)}).")
+        if not 0 < self.pause_s[0] <= self.pause_s[1]:
+            raise ValueError(f"Timing.pause_s must be 0 < first <= longest (got {self.pause_s}).")
+
+    @property
+    def counted_lease_s(self) -> float:
+        """Length of a lease as the granting side counts it: longer than the arm does, as clocks differ in rate."""
+        return self.lease_s * (1.0 + CLOCK_DRIFT) + self.margin_s
+
+
+@dataclass(frozen=True, eq=False)
+class Bidding:
+    """Input of an allocation rule."""
+
+    auction: str
+    time_s: float
+    """Fleet time."""
+    jobs: tuple[JobSpec, ...]
+    quotes: Mapping[str, Quote]
+    """Quotes of the arms with capacity for a job."""
+    full: Mapping[str, Quote] = field(default_factory=dict[str, Quote])
+    """Quotes of the arms without."""
+    states: Mapping[str, State] = field(default_factory=dict[str, State])
+    """Latest published state of each arm."""
+    returned: Mapping[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
+    """Number of faults in a job, and fleet time at which it last returned; only of jobs that were ever returned."""
+    busy: frozenset[str] = frozenset()
+    """Stations at which an arm may be at work."""
+    taken: Mapping[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
+    """Names of the spaces that each arm may take."""
+    excludes: Excludes = no_conflicts
+
+    def offer(self, arm: str, job: str, plan: int = 0) -> PlanQuote | None:
+        """Return what an arm quotes for a plan of a job of the round; None if it is not open."""
+        return self.plans(arm, job).get(plan)
+
+    def plans(self, arm: str, job: str) -> Mapping[int, PlanQuote]:
+        """Return an arm's open plans for a job of the round, by number.
+
+        A plan is open if the arm has capacity and quotes the plan, and its stations and its space are free.
+        """
+        return self._plans.get((arm, job), {})
+
+    @cached_property
+    def _plans(self) -> dict[tuple[str, str], dict[int, PlanQuote]]:
+        names = {job.name for job in self.jobs if self.has_free_stations(job)}
+        pairs = ((arm, offer) for arm, quote in self.quotes.items() for offer in quote.estimates)
+        return {
+            (arm, offer.job): {plan.plan: plan for plan in offer.plans if not self.in_the_way(arm, plan.space)}
+            for arm, offer in pairs
+            if offer.job in names
+        }
+
+    def has_free_stations(self, job: JobSpec) -> bool:
+        """Return whether no arm is at work at the stations of a job."""
+        return self.busy.isdisjoint(job.places)
+
+    def in_the_way(self, arm: str, space: str | None) -> tuple[str, ...]:
+        """Return the arms that take a space which excludes this one of an arm."""
+        key = arm, space
+        if key not in self._in_the_way:
+            self._in_the_way[key] = arms_in_the_way(arm, space, self.taken, self.excludes)
+        return self._in_the_way[key]
+
+    @cached_property
+    def _in_the_way(self) -> dict[tuple[str, str | None], tuple[str, ...]]:
+        return {}
+
+
+class Choice(NamedTuple):
+    """What an arm claims."""
+
+    job: str
+    plan: int = 0
+    """Number of the plan that it quotes."""
+
+
+class Assignment(NamedTuple):
+    """Who does a job."""
+
+    arm: str
+    plan: int = 0
+    """Number of the plan that it quotes."""
+
+
+Allocate = Callable[[Bidding], Mapping[str, Assignment]]
+"""Arm and plan of each assigned job. An arm gets one job a round, since its other bids no longer hold after that."""
+
+
+def resolve_claims(bidding: Bidding, claims: Mapping[str, Choice], order: Sequence[str]) -> dict[str, Assignment]:
+    """Return the arm and plan of each job: the lower quoted difficulty wins, then the arm that comes first in `order`.
+
+    As in simulation, a job goes to one arm, a station serves one job, plans that exclude each other are not done at a
+    time, and an unknown difficulty loses.
+
+    Args:
+        claims: What each arm claims; a claim without such an offer is ignored.
+    """
+    ranked: list[tuple[float, int, str, Assignment]] = []
+    for arm, (job, plan) in claims.items():
+        if (offer := bidding.offer(arm, job, plan)) is not None:
+            difficulty = math.inf if offer.difficulty is None else offer.difficulty
+            ranked.append((difficulty, order.index(arm), job, Assignment(arm, plan)))
+    return _without_conflicts(bidding, [(job, assignment) for _, _, job, assignment in sorted(ranked)])
+
+
+def offers_of(bidding: Bidding, job: str, awarded: Assignment) -> tuple[ArmOffer, ...]:
+    """Return what the arms offered for an awarded job: first the arm that gets it, then the others, best first."""
+    offers: list[ArmOffer] = []
+    for quote in (*bidding.quotes.values(), *bidding.full.values()):
+        estimate = next((each for each in quote.estimates if each.job == job), None)
+        plan = None if estimate is None or not estimate.feasible else estimate.least
+        if quote.arm == awarded.arm:
+            plan = bidding.offer(awarded.arm, job, awarded.plan)
+        shown = None if plan is None else replace(plan, joint_difficulty=None, space=None)
+        offers.append(ArmOffer(quote.arm, quote.mode, bool(bidding.plans(quote.arm, job)), shown))
+
+    def rank(offer: ArmOffer) -> tuple[bool, bool, float, float]:
+        cost = offer.plan or PlanQuote()
+        p, d = (math.inf if value is None else value for value in (cost.p_saturation, cost.difficulty))
+        return offer.arm != awarded.arm, not offer.free, p, d
+
+    return tuple(sorted(offers, key=rank)[:MOST_OFFERS])
+
+
+def drop_invalid(bidding: Bidding, allocation: Mapping[str, Assignment]) -> dict[str, Assignment]:
+    """Return the valid part of an allocation: jobs with a bid, one job per arm, station and space. Log the rest."""
+    pairs = sorted(allocation.items())
+    valid = _without_conflicts(bidding, pairs)
+    for job, (arm, plan) in pairs:
+        if bidding.offer(arm, job, plan) is None:
+            _LOG.error("The policy gives '%s' to '%s', which did not bid for it: not awarded.", job, arm)
+        elif job not in valid:
+            _LOG.error(
+                "The policy gives '%s' to '%s', which conflicts with another job of that arm, station or space.",
+                job,
+                arm,
+            )
+    return valid
+
+
+def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, Assignment]]) -> dict[str, Assignment]:
+    """Return the assignment of each job with an offer; of two with one job, arm, station or space the first is kept."""
+    places = {job.name: frozenset(job.places) for job in bidding.jobs}
+    kept: dict[str, Assignment] = {}
+    busy: set[str] = set()
+    taken: dict[str, list[str]] = {}
+    for job, assignment in pairs:
+        arm, plan = assignment
+        offer = bidding.offer(arm, job, plan)
+        if offer is None or job in kept or arm in taken or busy & places[job]:
+            continue
+        if not arms_in_the_way(arm, offer.space, taken, bidding.excludes):
+            kept[job] = assignment
+            busy |= places[job]
+            taken[arm] = [offer.space or ANYWHERE]
+    return kept
+
+
+def no_arm_can(reasons: Mapping[str, str]) -> str:
+    """Return the reason of a job that no arm can do, from the reasons of the arms."""
+    return f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in sorted(reasons.items()))}."[:MAX_REASON]
+
+
+def infeasible_jobs(quotes: Mapping[str, Quote]) -> dict[str, str]:
+    """Return the jobs that every arm with a quote calls infeasible, with the reasons of the arms."""
+    reasons: dict[str, dict[str, str]] = {}
+    for arm, quote in sorted(quotes.items()):
+        for offer in quote.estimates:
+            if not offer.feasible:
+                reasons.setdefault(offer.job, {})[arm] = offer.reason or "infeasible"
+    return {
+        job: no_arm_can(by_arm)
+        for job, by_arm in reasons.items()
+        if len(by_arm) == len(quotes) and NOT_PLANNED not in by_arm.values()
+    }
+
+
+def planned_jobs(quotes: Mapping[str, Quote]) -> set[str]:
+    """Return the jobs for which an arm quotes a plan, and those for which every arm says that it has none."""
+    offers = [offer for quote in quotes.values() for offer in quote.estimates]
+    open_jobs = {offer.job for offer in offers if offer.reason == NOT_PLANNED}
+    return {offer.job for offer in offers if offer.feasible or offer.job not in open_jobs}
+
+
+@dataclass(eq=False)
+class Round:
+    """A round that is open for bids."""
+
+    auction: str
+    jobs: tuple[JobSpec, ...]
+    asked: frozenset[str]
+    """Arms whose quotes it waits for."""
+    until_s: float
+    """Real second at which it closes in any case."""
+    space: Mapping[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
+    """Space that each arm might still take for closed awards alone when the round was opened: its quote says if it
+    does."""
+    quotes: dict[str, Quote] = field(default_factory=dict[str, Quote])
+
+    def complete(self, present: frozenset[str]) -> bool:
+        """Return whether every arm that was asked and is still present has answered."""
+        return (self.asked & present) <= self.quotes.keys()
+
+
+@dataclass(frozen=True)
+class SendAward:
+    """Send this award to its arm."""
+
+    arm: str
+    award: Award
+
+
+@dataclass(eq=False)
+class CountedLease:
+    """Lease of an open award, as the auctioneer counts it."""
+
+    until_s: float
+    """Real second at which it ends."""
+    cycles: int = 0
+    """Last reported progress."""
+    unanswered: SendAward | None = None
+    """The award, until its arm answers."""
+    sent_s: float = -math.inf
+    attempts: int = 1
+
+
+def unanswered(leases: Mapping[str, CountedLease]) -> list[tuple[CountedLease, SendAward]]:
+    """Return the leases of awards that their arms have not answered, and these awards."""
+    return [(lease, lease.unanswered) for lease in leases.values() if lease.unanswered is not None]
+
+
+def send_again(leases: Mapping[str, CountedLease], real_s: float, timing: Timing) -> list[SendAward]:
+    """Return the unanswered awards that are due to be sent again; they count as sent."""
+    due: list[SendAward] = []
+    for lease, message in unanswered(leases):
+        if real_s >= lease.sent_s + timing.ack_s and lease.attempts < timing.attempts:
+            lease.sent_s, lease.attempts = real_s, lease.attempts + 1
+            due.append(message)
+    return due
+
+
+def new_awards(ledger: Ledger, bidding: Bidding, allocation: Mapping[str, Assignment], time_s: float) -> list[Awarded]:
+    """Return the records of the awards of a round."""
+    records: list[Awarded] = []
+    for job, (arm, plan) in allocation.items():
+        offer = bidding.offer(arm, job, plan)
+        assert offer is not None, "drop_invalid keeps jobs with a bid"
+        names = (f"{bidding.auction}:{job}", bidding.auction, job, arm, bidding.quotes[arm].quote)
+        heat = (offer.difficulty, offer.p_saturation, offer.peak_c)
+        terms = (ledger.jobs[job].cycles, time_s, *heat, offer.space or ANYWHERE, plan)
+        records.append(Awarded(*names, *terms, offers_of(bidding, job, Assignment(arm, plan))))
+    return records
+
+
+def adopted(ledger: Ledger, history: History, name: str, time_s: float) -> list[AuctionRecord]:
+    """Return what an auctioneer takes over from an arm: jobs that it finished, and awards that it has.
+
+    Args:
+        name: Name of the auctioneer; an arm leases the awards of another one there.
+    """
+    records: list[AuctionRecord] = []
+    waiting = {job: entry.spec for job, entry in ledger.waiting.items()}
+
+    def is_waiting(job: JobSpec) -> bool:
+        return job.name in waiting and is_same_work(waiting[job.name], job)
+
+    unknown = tuple(
+        job
+        for job in history.finished
+        if is_waiting(job) or (job.name not in ledger.jobs and job.name not in ledger.past)
+    )
+    if unknown:
+        records.append(HistoryAdopted(history.arm, unknown, time_s))
+    done = {job.name for job in unknown}
+    for award in history.awards:
+        job = award.job
+        fresh = job.name not in ledger.jobs and job.name not in ledger.past and job.name not in done
+        if award.auctioneer != name or award.award in ledger.awards or not (fresh or is_waiting(job)):
+            continue
+        if fresh:
+            records.append(JobsAccepted((job,), f"adopted from {history.arm}", time_s))
+        records.append(_awarded(award, history.arm, time_s))
+        if award.award in history.may_commit:
+            records.append(CommitPermitted(award.award, time_s))
+    return records
+
+
+def _awarded(award: Award, arm: str, time_s: float) -> Awarded:
+    terms = (award.award, award.auction, award.job.name, arm, award.quote, award.cycles, time_s)
+    return Awarded(*terms, plan=award.plan)
+
+
+Out = QuoteRequest | SendAward | Announcement | Result | Operation
+
+
+class LedgerWriter:
+    """Writes records, applies them, and announces the changes.
+
+    Attributes:
+        ledger: Jobs and awards.
+        leases: Leases of the open awards.
+        out: Messages to send, oldest first.
+    """
+
+    def __init__(self, name: str, ledger: Ledger, keep: Callable[..., None], counted_until_s: float) -> None:
+        """Start with a ledger.
+
+        Args:
+            name: Of the auctioneer.
+            keep: Writes records; returns when they are on disk, or raises `JournalError` and has written none.
+            counted_until_s: Real second until which its open awards count as leased.
+        """
+        self.ledger = ledger
+        self.leases = {award: CountedLease(counted_until_s) for award in ledger.open}
+        self._name, self._keep = name, keep
+        self.out: deque[Out] = deque(self._result(change) for change in ledger.recent)
+        first = ledger.operated - len(ledger.operations)
+        self.out.extend(self._operation(record, first + place) for place, record in enumerate(ledger.operations))
+
+    def record(self, *records: AuctionRecord) -> None:
+        """Write records, then apply them.
+
+        Raises:
+            JournalError: nothing was written, and nothing has changed.
+        """
+        if not records:
+            return
+        records = (*self.ledger.checks_due(), *records)
+        self._keep(*records)
+        for record in records:
+            self.out.extend(map(self._result, self.ledger.apply(record)))
+            if isinstance(record, Operated):
+                self.out.append(self._operation(record, self.ledger.operated - 1))
+        for award in self.leases.keys() - self.ledger.open.keys():
+            del self.leases[award]
+
+    def try_to_record(self, failure: str, *records: AuctionRecord) -> bool:
+        """Record; return whether that is on disk, and log the failure if not."""
+        try:
+            self.record(*records)
+        except JournalFull as error:
+            _LOG.error("%s: %s", failure, error)
+            return False
+        return True
+
+    def _result(self, change: RecordChange) -> Result:
+        return Result(self._name, epoch=self.ledger.epoch, **asdict(change))
+
+    def _operation(self, record: Operated, number: int) -> Operation:
+        return Operation(self._name, record.time_s, record.request, number, self.ledger.epoch)
+
+
+def _stated_space(quote: Quote) -> frozenset[str]:
+    """Return the names of the spaces that an arm takes, and of those of its jobs, by its quote."""
+    if quote.space is None:
+        return frozenset() if quote.mode == "idle" else frozenset([ANYWHERE])
+    return frozenset(quote.space)
+
+
+def waits_for_space(bidding: Bidding) -> dict[str, str]:
+    """Return why no plan for a job has free space, by job."""
+    waits: dict[str, set[str]] = {}
+    open_jobs: set[str] = set()
+    for arm, quote in {**bidding.quotes, **bidding.full}.items():
+        for offer in quote.estimates:
+            for plan in offer.plans:
+                in_way = bidding.in_the_way(arm, plan.space)
+                waits.setdefault(offer.job, set()).update(in_way)
+                if not in_way:
+                    open_jobs.add(offer.job)
+    return {
+        job: f"It waits until {', '.join(sorted(arms))} is out of the way."[:MAX_REASON]
+        for job, arms in waits.items()
+        if arms and job not in open_jobs
+    }
+
+
+def stated_spaces(ledger: Ledger, closing: Round, time_s: float) -> list[SpaceTaken]:
+    """Return what the quotes of a round change in the space that arms take.
+
+    A quote says nothing about awards that were closed after the round was opened: these keep their space.
+    """
+    records: list[SpaceTaken] = []
+    for arm, quote in sorted(closing.quotes.items()):
+        before = ledger.space.get(arm, frozenset())
+        open_space = {award.record.space for award in ledger.open.values() if award.record.arm == arm}
+        after = (before - closing.space.get(arm, frozenset())) | (_stated_space(quote) - open_space)
+        if after != before:
+            records.append(SpaceTaken(arm, tuple(sorted(after)), time_s))
+    return records
+
+
+def retaken_space(ledger: Ledger, arm: str, space: Set[str]) -> list[SpaceTaken]:
+    """Return what changes when an arm takes this space; it counts as free after a person has freed it.
+
+    Args:
+        space: Names of spaces that the arm takes, or for which it has an award.
+    """
+    taken = ledger.taken_space().get(arm, frozenset())
+    if ANYWHERE in taken or space <= taken:
+        return []
+    return [SpaceTaken(arm, tuple(sorted(ledger.space.get(arm, frozenset()) | space)), ledger.time_s)]
+
+
+def cleared_space(
+    ledger: Ledger,
+    request: ClearRequest,
+    present: frozenset[str],
+    cycles: Mapping[str, int],
+    lease_s: float,
+    time_s: float,
+) -> list[Closed | SpaceCleared]:
+    """Return what changes when a person frees the space of an arm: its awards end, each may be done or not.
+
+    Args:
+        cycles: Reported progress, by award.
+
+    Raises:
+        Refused: the arm is unknown, or present, or may have a lease.
+    """
+    arm, taken = request.arm, ledger.taken_space()
+    awards = {name: award for name, award in ledger.open.items() if award.record.arm == arm}
+    if arm in present:
+        raise Refused(f"'{arm}' is present and says itself which space it takes. Stop it first, or move it home.")
+    if arm not in ledger.space and not awards:
+        arms = ", ".join(sorted(name for name, spaces in taken.items() if spaces))
+        raise Refused(f"'{arm}' takes no space. Arms that do: {arms or 'none'}.")
+    if not all(award.silent for award in awards.values()):
+        raise Refused(f"The lease of '{arm}' has not ended; try again in {lease_s:g} s.")
+    if not taken.get(arm):
+        return []
+    reason = f"The space of '{arm}' was cleared; it was about to finish it."[:MAX_REASON]
+    ends = [Closed(name, "dropped", cycles.get(name, 0), time_s, reason, unsure=True) for name in awards]
+    return [*ends, SpaceCleared(arm, request.by, time_s)]
+
 
 SCAN_S = 0.05
 """Real seconds between two checks for jobs that have become ready."""

@@ -1,4 +1,8 @@
-"""An arm's part in allocation by consensus: it bids, chooses a job by its policy, and claims it.
+"""What an arm without an auctioneer knows of jobs and arms that people steer, for `fleet.live.auction.auctioneer`.
+
+Jobs that an arm without an auctioneer knows, and where they stand.
+
+An arm's part in allocation by consensus: it bids, chooses a job by its policy, and claims it.
 
 A state machine without a clock and without I/O. Real seconds (`real_s`, monotonic) and fleet time (`time_s`) are
 arguments; messages to send are in `out`. The steps of an arm with capacity for a job:
@@ -7,37 +11,244 @@ arguments; messages to send are in `out`. The steps of an arm with capacity for 
    peers know by it how well a job suits them.
 2. When the bids of its peers have arrived, its policy chooses a job, and the next bid names it.
 3. When the choices of its peers have arrived, of two that exclude each other the one with the lower difficulty remains.
-4. It claims the job that remains (`fleet.live.consensus.claimant`); a majority has to grant it.
+4. It claims the job that remains (`fleet.live.consensus.grants`); a majority has to grant it.
 
-Safety rests on step 4 alone (`fleet.live.consensus.granter`). Steps 1 to 3 only keep the arms from claiming the same
+Safety rests on step 4 alone (`fleet.live.consensus.grants`). Steps 1 to 3 only keep the arms from claiming the same
 job: where messages are lost two arms may claim one, and the one without a majority waits and tries again.
 """
 
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from random import Random
 
-from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
+from msgspec.structs import replace
+
+from fleet.bus.protocol.auction import NOT_PLANNED, JobSpec, JobState, JobStatus, Quote
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Controlled, ControlRequest, Operation, Settle
+from fleet.bus.protocol.operator import ALL_ARMS, Controlled, ControlRequest, Operation, Settle
 from fleet.errors import JournalFull
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection, was_carried_out
-from fleet.live.auction.job_rules import job_order
+from fleet.live.auction.auctioneer import ALREADY_DONE, job_of, next_step, objection, was_carried_out
+from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs, with_terms
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
-from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
-from fleet.live.consensus.control import KnownFleet
-from fleet.live.consensus.granter import Granter
-from fleet.live.consensus.known_jobs import KnownJobs
+from fleet.live.auction.ledger import MAX_SETTLED
+from fleet.live.auction.rounds import Bidding, Choice, Timing, no_arm_can, resolve_claims
+from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
+from fleet.live.consensus.jobs import MAX_AWARDS, MAX_NOTES, Register
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.space import Excludes, no_conflicts
 from fleet.observation import Observation
+
+
+@dataclass(frozen=True)
+class KnownJob:
+    """A job, as `SteeredJob`."""
+
+    spec: JobSpec
+    status: JobStatus
+    cancelled: bool
+    award: str
+    """Of the arm that has it, or had it last."""
+
+    @property
+    def state(self) -> JobState:
+        """Its state."""
+        return self.status.state
+
+
+@dataclass(frozen=True)
+class KnownFleet:
+    """The fleet, as `SteeredFleet`."""
+
+    register: Register
+    jobs: Mapping[str, KnownJob]
+    past: Container[str]
+    ended: bool
+
+    @property
+    def paused(self) -> Mapping[str, str]:
+        """Who paused an arm, by arm."""
+        return self.register.operations.paused
+
+    @property
+    def space(self) -> Mapping[str, frozenset[str]]:
+        """Names of the spaces that an arm may take, by arm."""
+        return self.register.space
+
+    @property
+    def aside(self) -> Container[str]:
+        """Jobs whose record cannot be read: none."""
+        return ()
+
+    @property
+    def requests(self) -> Mapping[str, int]:
+        """Names of the last requests; their content is not kept."""
+        return dict.fromkeys(self.register.operations.names, 0)
+
+    def at_work(self) -> Mapping[str, tuple[str, bool]]:
+        """Return the arm that has a job, and whether it has permission to commit, by job."""
+        grants = self.register.grants.items()
+        settled = self.register.settled
+        return {
+            job: (grant.arm, grant.may_commit)
+            for job, grant in grants
+            if not grant.revoked and (job not in settled or settled[job].outcome != "unfinished")
+        }
+
+    def operation(self, arm: str, request: ControlRequest, time_s: float) -> Operation:
+        """Return a request as the arm `arm` carries it out."""
+        awards: tuple[str, ...] = ()
+        match request.action:
+            case Settle(job, "redo") if (known := self.jobs.get(job)) is not None:
+                before = self.register.operations.latest.get(("redo", job))
+                earlier = () if before is None else before.awards
+                awards = (*earlier, known.award)[-MAX_AWARDS:] if known.award else earlier
+            case _:
+                pass
+        return Operation(arm, time_s, request, awards=awards)
+
+
+class KnownJobs:
+    """All jobs that an arm knows.
+
+    Attributes:
+        submitted: Jobs as they were submitted, by release and name.
+        current: The same jobs with the changes that people have requested.
+        ended: The shift is over.
+    """
+
+    def __init__(self, granter: Granter) -> None:
+        """Start without jobs; `granter` knows the grants and outcomes."""
+        self.submitted: dict[str, JobSpec] = {}
+        self.current: dict[str, JobSpec] = {}
+        self.ended = False
+        self._granter, self._register = granter, granter.register
+        self._refusals: dict[str, dict[str, str]] = {}
+        """Why arms cannot do a job, by arm, by job."""
+
+    def add(self, jobs: Iterable[JobSpec]) -> None:
+        """Add jobs that are not known yet."""
+        new = {job.name: job for job in jobs if job.name not in self.submitted and job.name not in self._register.past}
+        if new:
+            self.submitted = {job.name: job for job in sorted((self.submitted | new).values(), key=job_order)}
+            self.apply_changes()
+
+    def forget(self, real_s: float, time_s: float) -> None:
+        """Drop the jobs that have left, and have those leave that are given up without a fault, if there are many.
+
+        Raises:
+            JournalError: they are not on disk, and stay.
+        """
+        if len(self.current) > 2 * MAX_SETTLED:
+            waiting = {name: job for name, job in self.current.items() if name not in self._register.settled}
+            lost = self._lost(waiting, real_s, time_s)
+            if len(lost) > MAX_SETTLED:
+                self._granter.give_up(dict(list(lost.items())[: len(lost) - MAX_SETTLED]), time_s)
+        for name in self._register.take_gone():
+            self.submitted.pop(name, None)
+            self.current.pop(name, None)
+
+    def note_offers(self, bid: Bid) -> None:
+        """Note which jobs the arm of a bid cannot do."""
+        for offer in bid.estimates:
+            by_arm = self._refusals.setdefault(offer.job, {})
+            by_arm[bid.arm] = "" if offer.feasible else offer.reason or "infeasible"
+        while len(self._refusals) > MAX_NOTES:
+            del self._refusals[next(iter(self._refusals))]
+
+    def _refusal(self, job: str, present: Set[str]) -> str:
+        """Return why no present arm can do a job, or none works; "" if one can, or it is unknown."""
+        if (pauser := self._register.operations.paused.get(ALL_ARMS)) is not None:
+            return f"All arms are paused by '{pauser}'."
+        reasons = self._refusals.get(job, {})
+        if not reasons or present - reasons.keys() or not all(reasons.values()) or NOT_PLANNED in reasons.values():
+            return ""
+        return no_arm_can(reasons)
+
+    def apply_changes(self) -> None:
+        """Have the jobs follow what people have requested."""
+        self.current = {name: self._register.operations.changed(job) for name, job in self.submitted.items()}
+
+    def open(self, present: Set[str], real_s: float, time_s: float) -> list[str]:
+        """Return the jobs that can still be done, without those of absent arms that had permission to commit."""
+        register = self._register
+        gone = {job for job in self._granter.out_of_contact(real_s) if register.grants[job].arm not in present}
+        gone.update(register.settled, register.operations.all_cancelled, self._lost(self.current, real_s, time_s))
+        return [job for job in self.current if job not in gone]
+
+    def ready(self, real_s: float, time_s: float, limit: int, paused_until_s: Mapping[str, float]) -> list[JobSpec]:
+        """Return the jobs that wait for an arm, as `ready_jobs` does.
+
+        Args:
+            paused_until_s: Real second from which on a job counts again, by job.
+        """
+        settled, cancelled = self._register.settled, self._register.operations.all_cancelled
+        free = (
+            job
+            for name, job in self.current.items()
+            if name not in settled
+            and name not in cancelled
+            and not self._granter.is_granted(name, real_s)
+            and not is_late(job, time_s)
+            and paused_until_s.get(name, real_s) <= real_s
+        )
+        finished, busy = self._register.is_finished, self._granter.busy_stations(real_s)
+        return ready_jobs(free, time_s, limit, busy, finished, self._register.returned_s)
+
+    def status(
+        self,
+        later: Iterable[JobSpec],
+        states: Mapping[str, State],
+        real_s: float,
+        time_s: float,
+        present: Set[str] = frozenset(),
+    ) -> list[JobStatus]:
+        """Return the status of all known jobs, and of `later` ones that are not offered yet."""
+        jobs = self.current | {job.name: job for job in later}
+        lost = self._lost(jobs, real_s, time_s)
+        names = dict.fromkeys([*jobs, *self._register.settled])
+        found = [self._status(name, jobs.get(name), lost, states, real_s) for name in names]
+        return [
+            replace(each, reason=each.reason or self._refusal(each.job, present)) if each.state == "waiting" else each
+            for each in found
+        ]
+
+    def steered(self, name: str, states: Mapping[str, State], real_s: float, time_s: float) -> dict[str, KnownJob]:
+        """Return what is known of one job, by its name; nothing of an unknown one."""
+        spec, register = self.current.get(name), self._register
+        if spec is None:
+            return {}
+        status = self._status(name, spec, self._lost(self.current, real_s, time_s), states, real_s)
+        grant, cancelled = register.grants.get(name), register.operations.cancelled(name) is not None
+        return {name: KnownJob(spec, status, cancelled, status.award or ("" if grant is None else grant.award))}
+
+    def _status(
+        self, name: str, job: JobSpec | None, lost: Mapping[str, str], states: Mapping[str, State], real_s: float
+    ) -> JobStatus:
+        status = self._granter.status(name, real_s)
+        if status.state == "waiting" and name in lost:
+            status = replace(status, state="given_up", reason=lost[name])
+        elif status.state == "waiting" and self.ended:
+            status = replace(status, state="unfinished", reason=SHIFT_ENDED)
+        state = states.get(status.arm) if status.state in ("awarded", "finishing") else None
+        finish_s = state.time_s + state.busy_s if state is not None and state.job == name else None
+        return replace(with_terms(status, job), finish_s=finish_s)
+
+    def _lost(self, jobs: Mapping[str, JobSpec], real_s: float, time_s: float) -> dict[str, str]:
+        """Return why jobs are given up in which no arm has faulted too often: they expired, or wait for one that is."""
+        late = (job.name for job in jobs.values() if is_late(job, time_s))
+        settled = self._register.settled
+        expired = {name for name in late if name not in settled and not self._granter.is_granted(name, real_s)}
+        before = {name for job in jobs.values() for name in job.after if name not in jobs}
+        past = {name for name in before if self._register.past.is_given_up(name)}
+        causes = self._register.given_up | expired | past
+        return dict.fromkeys(expired, EXPIRED) | (lost_jobs(jobs.values(), causes) if causes else {})
+
 
 _LOG = logging.getLogger(__name__)
 

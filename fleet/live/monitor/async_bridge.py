@@ -16,8 +16,7 @@ from typing import Self, TypeVar
 
 import msgspec
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.replies import Replies, replier
+from fleet.bus.client import BusClient, Replies, replier
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Quote, QuoteRequest
 from fleet.bus.protocol.messages import encode

@@ -17,8 +17,7 @@ from typing import Literal, TypeVar
 
 import msgspec
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.replies import Replies
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import auction, keys
 from fleet.bus.protocol.auction import (
     Announcement,

@@ -6,8 +6,7 @@ from itertools import count
 
 import pytest
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -23,13 +22,13 @@ from fleet.bus.protocol.auction import (
     Receipt,
     Report,
 )
-from fleet.bus.protocol.history import History, HistoryRequest
+from fleet.bus.protocol.consensus import History, HistoryRequest
 from fleet.bus.protocol.messages import State
+from fleet.bus.router import Router
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, salvage
-from fleet.live.auction.round import Assignment
-from fleet.live.journal import Journal
-from fleet.live.journal_upkeep import put_aside
+from fleet.live.auction.rounds import Assignment
+from fleet.live.journal import Journal, put_aside
 from tests.waiting import PATIENCE_S
 
 

@@ -5,8 +5,6 @@ import os
 
 import pytest
 
-from fleet.bus.client.discover import other_versions
-from fleet.bus.client.router import open_client
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Announcement,
@@ -20,8 +18,9 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State, encode
+from fleet.bus.router import open_client, other_versions
 from fleet.errors import JournalFull
-from fleet.live import journal, journal_upkeep
+from fleet.live import journal
 from fleet.live.auction.job_rules import status_reply
 from fleet.live.journal import Journal
 from tests.waiting import PATIENCE_S
@@ -123,7 +122,7 @@ def test_the_journal_is_compacted_at_the_start_and_when_it_has_grown(bus, monkey
     again = bus.auctioneer()
     assert [type(record).__name__ for record in again.journal.records()] == ["LedgerSnapshot", *TWICE]
     assert bus.states(again) == ["finished"]
-    monkeypatch.setattr(journal_upkeep, "TICK_S", 0.01)
+    monkeypatch.setattr(journal, "TICK_S", 0.01)
     monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
     before = again.journal.path.stat().st_size
     bus.kill(again)

@@ -2,11 +2,11 @@
 
 from contextlib import ExitStack
 
-from fleet.bus.client.router import open_client
 from fleet.bus.protocol.auction import Submission
+from fleet.bus.router import open_client
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.policy_client import PolicyClient
-from scenarios.live.allocation import ON_BUS_S, CentralAllocation
+from scenarios.live.auctioneer import ON_BUS_S, CentralAllocation
 from tests.bus.test_policy_client import Server
 from tests.waiting import PATIENCE_S
 

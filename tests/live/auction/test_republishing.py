@@ -5,8 +5,8 @@ from fleet.bus.protocol.operator import ControlRequest, Operation, Pause
 from fleet.bus.protocol.registry import HISTORY
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import Operated
-from fleet.live.auction.writer import LedgerWriter
-from fleet.live.journal_records import EpochBegun, JobsAccepted
+from fleet.live.auction.rounds import LedgerWriter
+from fleet.live.journal import EpochBegun, JobsAccepted
 
 
 def writer(ledger: Ledger) -> LedgerWriter:

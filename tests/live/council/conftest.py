@@ -11,18 +11,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from agents.consensus import Consensus
+from agents.auction import Consensus
 from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
 from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import JournalFull, Refused
-from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.journal_records import ArmHistory
+from fleet.live.arm.awards import ArmHistory, AwardExecutor, ExecutorConfig
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.round import Timing
-from fleet.live.consensus.granter import Granter
+from fleet.live.auction.rounds import Timing
+from fleet.live.consensus.grants import Granter
+from fleet.live.consensus.jobs import RANKS, Register
 from fleet.live.consensus.participant import Membership, Participant
-from fleet.live.consensus.register import Register
-from fleet.live.consensus.settled_jobs import RANKS
 from fleet.live.space import no_conflicts
 from tests.live.disk import Crash, Disk
 

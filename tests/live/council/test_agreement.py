@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from agents.registry import RULES
 from fleet.bus.protocol.auction import JobSpec
-from fleet.bus.protocol.history import History
+from fleet.bus.protocol.consensus import History
 from fleet.errors import BusError
-from fleet.live.consensus.claimant import NUMBERS_PER_BOOT
-from fleet.live.consensus.epochs import check_journals
+from fleet.live.consensus.grants import NUMBERS_PER_BOOT
+from fleet.live.consensus.node import check_journals
 
 ARM_POLICIES = [name for name, rule in RULES.items() if rule.scope == "arm"]
 

@@ -10,27 +10,25 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from agents.consensus import Consensus
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from agents.auction import Consensus
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobSpec, Status, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.operator import Cancel, Controlled, ControlRequest, Operation, Pause
+from fleet.bus.router import Router
 from fleet.errors import BusError
 from fleet.job import Place
-from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.config import ArmConfig
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor, Closed, ExecutorConfig
+from fleet.live.arm.body import SimulatedBody
 from fleet.live.arm.estimator import Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, Closed
-from fleet.live.arm.node import ArmNode
-from fleet.live.arm.simulated_body import SimulatedBody
+from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.round import Timing
+from fleet.live.auction.rounds import Timing
 from fleet.live.clock import FleetClock
+from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode, Membership
-from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from fleet.robot import ThermalLimits
 from scenarios.live.arm import refuse_auctioneer

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agents.consensus import Consensus
+from agents.auction import Consensus
 from fleet.bus.protocol.auction import (
     ClockRequest,
     JobEstimate,
@@ -19,18 +19,26 @@ from fleet.bus.protocol.auction import (
     Submission,
 )
 from fleet.bus.protocol.cell import CellRequest
-from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
-from fleet.bus.protocol.examples import EXAMPLES
-from fleet.bus.protocol.history import History, HistoryRequest
+from fleet.bus.protocol.consensus import (
+    Bid,
+    Claim,
+    ClaimEntry,
+    ClaimReply,
+    DeniedEntry,
+    GrantedEntry,
+    History,
+    HistoryRequest,
+    JobOutcome,
+)
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import State, encode
 from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, ControlRequest, Operation, Pause, Resume, Settle
-from fleet.live.arm.award_executor import AwardExecutor
-from fleet.live.arm.journal_records import ArmHistory
+from fleet.live.arm.awards import ArmHistory, AwardExecutor
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.clock import FleetClock
+from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
-from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from tests.live.test_poison import GROWN_BYTES, SILENT_S, Wire, odd, resident
 from tests.profiles import examples

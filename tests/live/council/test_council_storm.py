@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.operator import Cancel, Change, Pause, Resume, Settle
 from fleet.errors import JournalFull, Refused
-from fleet.live.consensus import settled_jobs
+from fleet.live.consensus import jobs
 from tests.live.conflicts import random_conflicts
 
 START_S = 100.0
@@ -241,7 +241,7 @@ rates = st.lists(st.floats(1 - 1e-3, 1 + 1e-3), min_size=1, max_size=5)
 def storm(council, rates, seed: int, actions) -> None:
     rng = random.Random(seed)
     limit = rng.choice([2, 2, 2000])
-    with patch.object(settled_jobs, "MAX_SETTLED", limit):
+    with patch.object(jobs, "MAX_SETTLED", limit):
         storm_with(council, rates, seed, actions, rng, limit)
 
 

@@ -5,9 +5,9 @@ import pytest
 from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, JobOutcome
 from fleet.errors import Refused
-from fleet.live.auction.round import Timing
-from fleet.live.consensus.granter import Granter
-from fleet.live.consensus.register import Register
+from fleet.live.auction.rounds import Timing
+from fleet.live.consensus.grants import Granter
+from fleet.live.consensus.jobs import Register
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05)
 ROSTER = ("a", "b", "c")

@@ -5,12 +5,10 @@ import pytest
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.errors import Refused
-from fleet.live.arm.award_executor import AwardExecutor
-from fleet.live.arm.journal_records import ArmHistory
-from fleet.live.auction.round import Timing
-from fleet.live.consensus.claimant import Claimant
-from fleet.live.consensus.granter import Granter
-from fleet.live.consensus.register import Register
+from fleet.live.arm.awards import ArmHistory, AwardExecutor
+from fleet.live.auction.rounds import Timing
+from fleet.live.consensus.grants import Claimant, Granter
+from fleet.live.consensus.jobs import Register
 from tests.live.disk import Disk
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05)

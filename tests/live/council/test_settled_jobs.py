@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, JobOutcome
 from fleet.bus.protocol.messages import encode
-from fleet.live.consensus import settled_jobs
-from fleet.live.consensus.granter import Granter
-from fleet.live.consensus.records import JobSettled
-from fleet.live.consensus.register import Register
-from fleet.live.journal_records import JobsAccepted
+from fleet.live.consensus import jobs
+from fleet.live.consensus.grants import Granter
+from fleet.live.consensus.jobs import JobSettled, Register
+from fleet.live.journal import JobsAccepted
 from tests.live.disk import Disk
 
 
@@ -35,7 +34,7 @@ kinds = st.sampled_from(["finished", "given_up", "cancelled"])
 @given(st.lists(st.tuples(st.integers(0, 9), kinds)), st.randoms())
 def test_arms_with_the_same_outcomes_keep_the_same_ones_in_any_order(several, rng):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(settled_jobs, "MAX_SETTLED", 3)
+        patch.setattr(jobs, "MAX_SETTLED", 3)
         digests, kept = set(), set()
         for _ in range(3):
             register = Register().replay([JobsAccepted(tuple(map(job, range(10))))])
@@ -68,7 +67,7 @@ def test_a_long_run_takes_bounded_memory_and_disk_and_no_job_is_granted_again():
             sizes.append(sum(len(encode(record)) for record in records) - len(register.past.packed()) * 4 / 3)
     assert sizes[1] < 1.1 * sizes[0]
     for content in (register.settled, register.jobs, register.cycles, register.faults, register.returned_s):
-        assert len(content) <= settled_jobs.MAX_SETTLED
+        assert len(content) <= jobs.MAX_SETTLED
     assert (len(register.past), register.settled.left) == (4000, {"finished": 4000})
     again = Register().replay(register.compact())
     for number in random.Random(0).sample(range(6000), 50):
@@ -82,7 +81,7 @@ def test_a_long_run_takes_bounded_memory_and_disk_and_no_job_is_granted_again():
 
 
 def test_an_arm_that_was_away_learns_that_a_job_has_left(council, monkeypatch):
-    monkeypatch.setattr(settled_jobs, "MAX_SETTLED", 2)
+    monkeypatch.setattr(jobs, "MAX_SETTLED", 2)
     fleet = council.Fleet([1.0] * 3, [JobSpec(f"job {n}", "hold", (f"p{n}",), 2) for n in range(8)])
     fleet.cut = {"arm_2"}
     for _ in range(100):

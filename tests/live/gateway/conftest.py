@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.bus.client.router import Router
+from fleet.bus.router import Router
 from tests.live.gateway.served import Served, StandIn
 
 

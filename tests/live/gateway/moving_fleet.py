@@ -4,7 +4,7 @@ import math
 import threading
 import time
 
-from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.client import BusClient, Refused
 from fleet.bus.protocol import auction as bus
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, CellRequest, Limit, PlannedWork

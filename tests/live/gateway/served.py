@@ -8,16 +8,15 @@ import threading
 import time
 from contextlib import contextmanager
 
-from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.client import BusClient, Refused
 from fleet.bus.protocol import auction as bus
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.bus.protocol.operator import Controlled, ControlRequest
 from fleet.live.monitor.async_bridge import AsyncBridge
-from scenarios.live.http_app import Readers, application
-from scenarios.live.http_server import Server, listen
+from scenarios.live.gateway import Readers, Server, application, listen
 from tests.waiting import PATIENCE_S
 
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.bus.client.router import Router
+from fleet.bus.router import Router
 from tests import commands
 from tests.waiting import PATIENCE_S, wait_until
 

@@ -8,14 +8,13 @@ import re
 
 import pytest
 
-from fleet.bus.client.router import Router
 from fleet.bus.protocol.auction import Status
 from fleet.bus.protocol.operator import ControlRequest, Operation, Pause, ResetRequest, Resume
+from fleet.bus.router import Router
 from fleet.live.monitor.snapshot import FleetView
 from scenarios.live.fleet_processes import page_of
-from scenarios.live.http_page import FILES, PAGE, LivePage
-from scenarios.live.http_server import scene_of
-from scenarios.load import load
+from scenarios.live.gateway import FILES, PAGE, LivePage, scene_of
+from scenarios.spec.load import load
 from tests.live.gateway.moving_fleet import MovingFleet, until
 from tests.live.gateway.served import PATIENCE_S, Served
 

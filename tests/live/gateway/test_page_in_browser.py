@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 from playwright.sync_api import expect, sync_playwright
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, Pause, ResetRequest, Settle
-from scenarios.live.http_page import LivePage
+from fleet.bus.router import Router
+from scenarios.live.gateway import LivePage
 from tests.live.gateway.moving_fleet import MovingFleet, until
 from tests.live.gateway.served import Served
 

@@ -5,9 +5,9 @@ import socket
 
 import pytest
 
-from fleet.bus.client.router import Router
 from fleet.bus.protocol.operator import Cancel, ControlRequest
-from scenarios.live.http_app import MAX_BYTES
+from fleet.bus.router import Router
+from scenarios.live.gateway import MAX_BYTES
 from tests.live.gateway.served import CRATE_JSON, Served
 from tests.waiting import PATIENCE_S, wait_until
 

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus.client.router import Router
+from fleet.bus.router import Router
 from tests.live.gateway.served import CRATE_JSON, Served, events, numbers_of, of
 from tests.waiting import PATIENCE_S, wait_until
 

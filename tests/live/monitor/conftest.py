@@ -4,11 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent
 from fleet.bus.protocol.messages import DifficultyScores
+from fleet.bus.router import Router
 from tests.live.monitor.messages import state
 
 

@@ -2,10 +2,10 @@
 
 import time
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, StatusRequest
+from fleet.bus.router import Router
 from fleet.live.monitor import snapshot as listener_module
 from fleet.live.monitor.snapshot import FleetListener
 from tests.live.monitor.messages import stands

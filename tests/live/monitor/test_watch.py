@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from rich.console import Console
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent
+from fleet.bus.router import Router
 from fleet.events import EVENT_KINDS
 from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
 from scenarios.live.fleet_processes import free_port

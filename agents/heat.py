@@ -1,0 +1,363 @@
+"""Reactive thermal control as a wrapper of any policy: a torque limiter, a thermal switch and a fuzzy speed control.
+
+Both react to measured temperatures, and need neither a twin nor a thermal model. On a real arm they act on torque and
+speed within a motion. An allocation policy has no such command, so they act by what the environment allows: they close
+claims, leave only the cooler of the two plans of a job, and give the current job back after its cycle. The wrapped
+policy chooses among the claims that are left.
+
+Rules that consider heat and value: one by measured temperatures, the others by predicted peak temperatures.
+
+All take the jobs with the most value per time. Warning and error limit follow from the observed headrooms.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from agents.policy import WAIT, ArmPolicy, Local, Lookahead, Planner, Policy, per_option, plans_of
+from agents.rules import Ahead, Matching
+from fleet.observation import Observation
+from fleet.robot import RATING
+
+Array = np.ndarray
+
+
+class Guard(Protocol):
+    """Claims and returns that the temperatures of an arm allow."""
+
+    def claims(self, seen: Observation) -> Array:
+        """Claims that it allows, of those that are legal, bool [option]."""
+        ...
+
+    def gives_back(self, seen: Observation, payload_kg: float) -> bool:
+        """Whether the arm must return the job with this payload."""
+        ...
+
+
+class TorqueLimiter:
+    """Torque limit that falls with the temperature: 1 up to `full_k` below the warning limit, 0 at the error limit.
+
+    The torque of a job is that of joint 2 of a stretched arm with its payload, relative to that with the rated payload.
+    An arm claims a job only below the limit, and gives its job back above.
+
+    Source: thermal derating of the joint torque limit, as in the motor protection of Singh et al. (2021).
+    """
+
+    full_k: ClassVar = 10.0
+    arm_kg: ClassVar = 2.65
+    """Payload whose torque at joint 2 of the stretched Gen3 equals that of the arm itself: 23.5 N·m of 8.85 N·m/kg."""
+
+    def limit(self, seen: Observation) -> float:
+        """Torque limit as a share of the rated torque."""
+        error_k, apart_k = float(seen.error_headroom_k), float(seen.error_headroom_k - seen.headroom_k)
+        return float(np.clip(error_k / (self.full_k + apart_k), 0.0, 1.0))
+
+    def torque(self, payload_kg: Array | float) -> Array:
+        """Torque with a payload, as a share of the rated torque."""
+        rated_kg = self.arm_kg + RATING.mid_range_kg
+        return np.minimum((self.arm_kg + np.asarray(payload_kg)) / rated_kg, 1.0)
+
+    def claims(self, seen: Observation) -> Array:
+        """Claims of jobs whose torque is below the limit, bool [option]."""
+        return per_option(seen, self.torque(seen.payload_kg)) <= self.limit(seen)
+
+    def gives_back(self, seen: Observation, payload_kg: float) -> bool:
+        """Whether the torque of the job is above the limit."""
+        return bool(self.torque(payload_kg) > self.limit(seen))
+
+
+class FuzzySpeed:
+    """Speed from fuzzy rules about the temperature and its tendency.
+
+    Inputs: headroom to the warning limit (cool, warm, hot), and the excess of a winding over its housing (steady,
+    rising), which is proportional to the heat that flows into the housing. The speed is the mean of the rules' values,
+    weighted by their truth (Takagi & Sugeno, IEEE Trans. SMC 15, 1985). At less than `fast` an arm takes the cooler of
+    two plans, at less than `slow` it claims nothing, at less than `stop` it gives its job back.
+
+    Source: fuzzy control of the speed by the motor temperature, as in Afaq et al.
+    """
+
+    warm_k, cool_k = 10.0, 20.0
+    """Headroom at which an arm is just warm, and just cool; it is hot at 0."""
+    steady_k, rising_k = 2.0, 10.0
+    rules: ClassVar = {"cool": (1.0, 1.0), "warm": (0.8, 0.5), "hot": (0.3, 0.0)}
+    """Speeds of a steady and of a rising temperature."""
+    fast, slow, stop = 0.75, 0.4, 0.15
+
+    def speed(self, headroom_k: float, excess_k: float) -> float:
+        """Speed as a share of the full speed."""
+        warm = np.interp(headroom_k, (0.0, self.warm_k, self.cool_k), (0.0, 1.0, 0.0))
+        truth = {
+            "cool": np.interp(headroom_k, (self.warm_k, self.cool_k), (0.0, 1.0)),
+            "warm": warm,
+            "hot": np.interp(headroom_k, (0.0, self.warm_k), (1.0, 0.0)),
+        }
+        rising = np.interp(excess_k, (self.steady_k, self.rising_k), (0.0, 1.0))
+        return float(sum(t * np.dot((1.0 - rising, rising), self.rules[name]) for name, t in truth.items()))
+
+    def _speed_of(self, seen: Observation) -> float:
+        return self.speed(float(seen.headroom_k), float((seen.temp_c - seen.housing_c).max()))
+
+    def claims(self, seen: Observation) -> Array:
+        """All claims of a fast arm, the cooler plans of a slower one, none of a slow one, bool [option]."""
+        speed, plans = self._speed_of(seen), plans_of(seen)
+        allowed = seen.action_mask[1:-1].astype(bool).reshape(-1, plans)
+        if speed < self.slow:
+            allowed[:] = False
+        elif speed < self.fast:
+            allowed[:, :-1] &= ~allowed[:, -1:]
+        return allowed.ravel()
+
+    def gives_back(self, seen: Observation, payload_kg: float) -> bool:
+        """Whether the speed is less than `stop`."""
+        return self._speed_of(seen) < self.stop
+
+
+class Shutdown:
+    """Thermal switch: an arm above a temperature claims nothing until it has cooled by the hysteresis.
+
+    It finishes its present job. The switch opens at the warning limit.
+
+    Source: thermal protection of motors by a switch that resets at a lower temperature (IEC 60034-11).
+    """
+
+    hysteresis_k: ClassVar = 10.0
+
+    def __init__(self) -> None:
+        self._open = False
+
+    def claims(self, seen: Observation) -> Array:
+        """All claims of an arm whose switch is closed, else none, bool [option]; to be called at every step."""
+        headroom_k = float(seen.headroom_k)
+        self._open = headroom_k < (self.hysteresis_k if self._open else 0.0)
+        return np.full(len(seen.action_mask) - 2, not self._open)
+
+    def gives_back(self, seen: Observation, payload_kg: float) -> bool:
+        """Never: the arm finishes its job."""
+        return False
+
+
+class _GuardOfArm:
+    """A guard of one arm, with the payload of its present job."""
+
+    def __init__(self, guard: Guard) -> None:
+        self._guard, self._claimed_kg = guard, 0.0
+
+    def narrow(self, seen: Observation) -> Observation:
+        """The observation with the claims that the guard allows."""
+        allowed = self._guard.claims(seen)  # also without a legal claim: a guard may remember temperatures
+        if not seen.action_mask[1:-1].any():
+            return seen
+        narrower = seen.action_mask.copy()
+        narrower[1:-1] &= allowed
+        return replace(seen, action_mask=narrower)
+
+    def decide(self, seen: Observation, action: int) -> int:
+        """The action of the wrapped policy, or that which gives the job back."""
+        last = len(seen.action_mask) - 1
+        if 0 < action < last:
+            self._claimed_kg = float(seen.payload_kg[(action - 1) // plans_of(seen)])
+        elif seen.action_mask[last] and self._guard.gives_back(seen, self._claimed_kg):
+            return last
+        return action
+
+
+class GuardedArm:
+    """An arm policy whose claims pass a guard."""
+
+    def __init__(self, guard: Callable[[], Guard], policy: ArmPolicy) -> None:
+        self.scope = policy.scope
+        self._make_guard, self._policy = guard, policy
+        self._guard = _GuardOfArm(guard())
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+        self._guard = _GuardOfArm(self._make_guard())
+        self._policy.reset(rng)
+
+    def choose(self, observation: Observation, place: int) -> int:
+        """The choice of the policy among the claims that the guard allows."""
+        narrowed = self._guard.narrow(observation)
+        return self._guard.decide(observation, self._policy.choose(narrowed, place))
+
+
+class GuardedFleet:
+    """A policy for all arms, with a guard for each of them."""
+
+    def __init__(self, guard: Callable[[], Guard], policy: Policy) -> None:
+        self.scope = policy.scope
+        self._make_guard, self._policy = guard, policy
+        self._guards: dict[str, _GuardOfArm] = {}
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+        self._guards = {}
+        self._policy.reset(rng)
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The actions of the policy among the claims that the guards allow."""
+        for arm in observations:
+            self._guards.setdefault(arm, _GuardOfArm(self._make_guard()))
+        actions = self._policy.act({arm: self._guards[arm].narrow(seen) for arm, seen in observations.items()})
+        return {arm: self._guards[arm].decide(seen, actions.get(arm, WAIT)) for arm, seen in observations.items()}
+
+    def choose(self, observation: Observation, place: int) -> int:
+        """The choice of one arm, of a policy of scope arm."""
+        return self.act({"": observation})[""]
+
+
+class GuardedPlanner(GuardedFleet):
+    """A policy that plans in a simulator, which knows of no guards, with a guard for each arm."""
+
+    def plan_in(self, cell: Lookahead) -> None:
+        """Let the policy plan in the simulator of a shift."""
+        if isinstance(self._policy, Planner):
+            self._policy.plan_in(cell)
+
+
+def guarded(guard: Callable[[], Guard], policy: Policy | ArmPolicy) -> Policy | ArmPolicy:
+    """A policy, for one arm or for all, whose claims pass a guard."""
+    if hasattr(policy, "act"):
+        kind = GuardedPlanner if isinstance(policy, Planner) else GuardedFleet
+        return kind(guard, policy)  # pyright: ignore  # hasattr does not narrow the type
+    return GuardedArm(guard, policy)  # pyright: ignore
+
+
+Floats = Array | float
+
+
+class Thermometer(Matching):
+    """Matching by value per time, among claims for which the arm is cool enough. It needs no twin.
+
+    An arm may claim a job if the headroom of joints 1 to 4, in K, is at least the payload in kg times
+    min(duration / 15 min, 1). Scope central: it compares the arms' times.
+    """
+
+    scope: ClassVar = "central"
+    only_choices = True
+
+    def cost(self, observations: Sequence[Observation]) -> Array:
+        """Minus value per second, [arm, option]; inf for claims that are not allowed."""
+        return np.stack([-self._rate(seen) for seen in observations])
+
+    def _rate(self, seen: Observation) -> Array:
+        """Value per second of every option, [option]; −inf for those that must not be claimed."""
+        needed_k = per_option(seen, seen.payload_kg) * np.minimum(seen.duration_s, QUARTER_S) / QUARTER_S
+        cool = warning_of(seen) - seen.temp_c[:LARGE].max() >= needed_k
+        return _per_second(seen, per_option(seen, seen.value), cool)
+
+
+QUARTER_S = 900.0
+LARGE = 4
+"""Joints 1 to 4 have the large motors, which carry payloads."""
+
+
+class Wsept(Thermometer):
+    """Matching by expected worth per time: weighted shortest expected processing time, with the cost of heat.
+
+    The worth of a claim is the expected value of the job, less the expected cost of heat. The true peak is assumed to
+    be normally distributed around the predicted one. The probability of a fault is that of a true peak above the error
+    limit. A fault costs the value of the job and `fault_price`, each minute above the warning limit `minute_price`. An
+    arm takes the plan of a job with the most worth per time, and makes no claim without a positive worth.
+
+    Without a predicted peak, P(saturation) gives one; with neither, heat costs almost nothing. Scope central: it
+    compares the arms' worths.
+
+    Source: Rothkopf, Management Science 12, 1966 (weighted expected processing times).
+    """
+
+    only_choices = True
+    fault_price: ClassVar = 20.0
+    """In units of value; `thermofleet show` prints 14 to 27 for the scenarios of the library."""
+    peak_sd_k: ClassVar = 2.5
+    """Standard deviation of true peaks around predicted ones near the error limit: chosen on the validation split of
+    the suite among 1, 1.5, 2.5 and 5."""
+    minute_price: ClassVar = 0.05
+    """Price of a minute above the warning limit, as in the default reward."""
+    tardiness_price: ClassVar = 0.01
+    """Price of a minute of tardiness for each unit of a job's value, as in the default reward: for others, as the worth
+    of `wsept` has no tardiness."""
+
+    def _rate(self, seen: Observation) -> Array:
+        """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
+        value, hottest_c = per_option(seen, seen.value), float(seen.temp_c.max())
+        warning_c, error_c = warning_of(seen), error_of(seen)
+        peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
+        worth = self.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c)
+        return _per_second(seen, worth, worth > 0)
+
+    @classmethod
+    def predicted_peak_c(cls, peak_c: Array, p_saturation: Array, warning_c: Floats) -> Array:
+        """Predicted peaks, or those that P(saturation) gives where they are unknown (0), °C, [n]."""
+        if (peak_c > 0).all():
+            return peak_c
+        from scipy.special import logit  # slow import that few processes need
+
+        # An unknown peak is placed so far from the limit that its error gives P(saturation).
+        margin_k = cls.peak_sd_k * logit(np.clip(p_saturation, LEAST_P, 1.0 - LEAST_P))
+        return np.where(peak_c > 0, peak_c, warning_c + margin_k)
+
+    @classmethod
+    def worth_of(
+        cls,
+        value: Array,
+        duration_s: Array,
+        peak_c: Array,
+        hottest_c: Floats,
+        warning_c: Floats,
+        error_c: Floats,
+        factors: Sequence[Floats] = (1.0, 1.0, 1.0),
+    ) -> Array:
+        """Expected value of jobs less the expected cost of heat, [n].
+
+        Args:
+            value, duration_s, peak_c: Of each job, [n], with the predicted peak.
+            hottest_c: Hottest motor at the beginning, [n] or one for all.
+            warning_c, error_c: The limits.
+            factors: On `peak_sd_k`, `fault_price` and `minute_price`.
+        """
+        from scipy.special import ndtr  # slow import that few processes need
+
+        spread, fault, minute = factors
+        p_fault = ndtr((peak_c - error_c) / (cls.peak_sd_k * spread))
+        # Approximation: the temperature rises linearly to its peak.
+        above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
+        heat = p_fault * cls.fault_price * fault + cls.minute_price * minute * above_share * duration_s / 60.0
+        return (1.0 - p_fault) * value - heat
+
+
+class WseptAhead(Ahead, Wsept):
+    """As `wsept`, with arms that are home soon as well: a job waits for such an arm if that is worth more per time.
+
+    Scope central, as `wsept`.
+    """
+
+    only_choices = True
+
+
+class WseptLocal(Local):
+    """As `wsept` for a fleet of one: every arm claims the job that is worth most per time to it. Scope arm."""
+
+    central = Wsept
+    only_choices = True
+
+
+LEAST_P = 1e-3
+
+
+def warning_of(seen: Observation) -> float:
+    """The warning limit, °C."""
+    return float(seen.headroom_k) + float(seen.temp_c.max())
+
+
+def error_of(seen: Observation) -> float:
+    """The error limit, °C."""
+    return float(seen.error_headroom_k) + float(seen.temp_c.max())
+
+
+def _per_second(seen: Observation, worth: Array, allowed: Array) -> Array:
+    """Worth over duration, [option]; −inf where it is not allowed or not legal."""
+    rate = worth / np.maximum(seen.duration_s, 1.0)
+    return np.where(seen.action_mask[1:-1].astype(bool) & allowed, rate, -np.inf).astype(float)

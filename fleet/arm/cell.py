@@ -1,0 +1,380 @@
+"""The cell in three dimensions, as plain values that every way to show it shares.
+
+Shows recorded postures of a cell in MuJoCo: as pictures without a display, or in its viewer.
+
+Contacts between arms, floor, fixtures and payloads, found in recorded postures with MuJoCo.
+"""
+
+import base64
+import threading
+from collections.abc import Callable, Sequence
+from copy import copy
+from types import TracebackType
+from typing import Any  # plain values of JSON
+
+import mujoco
+import numpy as np
+
+from fleet.arm.model import build_cell, payload_bodies, quaternion, set_payload_balls
+from fleet.errors import FleetError
+from fleet.events import Event
+from fleet.job import MOST_PAYLOAD_M, PAYLOAD_KG_PER_M3, Fixture, Place
+from fleet.robot import JOINTS, Mount, Robot, rotation
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+SHAPES = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+}
+"""Shapes of links; sizes are MuJoCo's: radius, half length along z, or half lengths along x, y and z."""
+HIDDEN = 3
+"""MuJoCo's geom group of the primitives that meshes replace."""
+DIGITS = 5
+
+
+def cell_model(
+    robots: Sequence[Robot],
+    places: Sequence[Place] = (),
+    fixtures: Sequence[Fixture] = (),
+    *,
+    meshes: bool = False,
+) -> dict[str, Any]:
+    """Arms, places and fixtures, with the movement of the links.
+
+    Args:
+        meshes: Kinova's shells instead of primitives.
+
+    Returns:
+        `links`: the bodies of one arm in the order of the chain, each with the index of its parent (-1 for the
+        mount), its pose in the parent's frame, whether it turns about its z axis (joints in the order of the links),
+        and its shapes. `hand`: pose of the flange in the last link's frame. `arms`, `places`, `fixtures`: names and
+        poses in the world. `meshes`: the surfaces that shapes of the kind "mesh" name. Positions and sizes are in m,
+        quaternions w, x, y, z.
+
+    Raises:
+        FleetError: the meshes are not available.
+    """
+    model = build_cell([Robot(name="arm", mount=Mount())], meshes=meshes)
+    first, payload = model.body("arm/base").id, model.body("arm/payload").id
+    links: list[dict[str, Any]] = []
+    for body in range(first, model.nbody):
+        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] != HIDDEN]
+        shapes = [_shape(model, g) for g in geoms]
+        if body == payload or (not shapes and not model.body_jntnum[body]):
+            continue
+        links.append(
+            {
+                "parent": int(model.body_parentid[body]) - first if body > first else -1,
+                "position": _rounded(model.body_pos[body]),
+                "quaternion": _rounded(model.body_quat[body]),
+                "turns": bool(model.body_jntnum[body]),
+                "shapes": shapes,
+            }
+        )
+    hand = {"position": _rounded(model.body_pos[payload]), "quaternion": _rounded(model.body_quat[payload])}
+    return {
+        "links": links,
+        "hand": hand,
+        "arms": [{"name": robot.name, **_pose(robot.mount.position_m, robot.mount.rotation())} for robot in robots],
+        "places": [{"name": place.name, **_pose(place.position_m, rotation(place.tool_deg))} for place in places],
+        "fixtures": [
+            {"name": box.name, "size": list(box.size_m), **_pose(box.position_m, rotation(box.tilt_deg))}
+            for box in fixtures
+        ],
+        "meshes": [_mesh(model, mesh) for mesh in range(model.nmesh)],
+        "load": {"most_m": MOST_PAYLOAD_M, "kg_per_m3": PAYLOAD_KG_PER_M3},
+    }
+
+
+def _shape(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
+    kind = SHAPES[mujoco.mjtGeom(model.geom_type[geom])]
+    return {
+        "kind": kind,
+        **({"mesh": int(model.geom_dataid[geom])} if kind == "mesh" else {"size": _rounded(model.geom_size[geom])}),
+        "position": _rounded(model.geom_pos[geom]),
+        "quaternion": _rounded(model.geom_quat[geom]),
+        "colour": _rounded(model.geom_rgba[geom][:3]),
+    }
+
+
+def _mesh(model: mujoco.MjModel, mesh: int) -> dict[str, Any]:
+    """A surface: coordinates of its points as int16 in `unit_m`, points of its triangles as uint32; base64."""
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    points = model.mesh_vert[first : first + count]
+    unit_m = float(np.abs(points).max()) / np.iinfo(np.int16).max
+    first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    triangles = model.mesh_face[first : first + count].astype("<u4")
+    encoded = (np.rint(points / unit_m).astype("<i2"), triangles)
+    coordinates, corners = (base64.b64encode(values.tobytes()).decode("ascii") for values in encoded)
+    return {"unit_m": unit_m, "points": coordinates, "triangles": corners}
+
+
+def _pose(position_m: Sequence[float], matrix: np.ndarray) -> dict[str, Any]:
+    return {"position": _rounded(position_m), "quaternion": _rounded(quaternion(matrix))}
+
+
+def _rounded(values: Sequence[float] | np.ndarray) -> list[float]:
+    return [round(float(value), DIGITS) for value in values]
+
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+Array = np.ndarray
+
+NO_OPENGL = (
+    "No OpenGL without a display could be had ({error}). Install EGL or OSMesa (on Debian: libegl1 and "
+    "libgl1-mesa-dri, or libosmesa6), or choose one with MUJOCO_GL=egl or MUJOCO_GL=osmesa."
+)
+FRAME_S = 1 / 30
+AZIMUTH_DEG, ELEVATION_DEG = 128.0, -36.0
+"""Direction of the camera."""
+ROOM_M = 0.12
+"""From the middle of a link to what must be seen round it."""
+LABEL_M = 0.08
+"""From the foot of an arm to its name, away from the arm."""
+PLACE_RGB = (0.48, 0.36, 0.65)
+"""A place must not look like a warm motor."""
+
+
+class CellPlayer:
+    """A model of a cell that takes any posture.
+
+    Args:
+        meshes: Kinova's shells instead of primitives, see `fleet.arm.model.build_cell`.
+
+    Raises:
+        FleetError: the meshes are not available.
+    """
+
+    def __init__(
+        self,
+        robots: Sequence[Robot],
+        places: Sequence[Place] = (),
+        fixtures: Sequence[Fixture] = (),
+        *,
+        meshes: bool = False,
+    ) -> None:
+        self.model = build_cell(robots, places, fixtures, meshes=meshes)
+        self.data = mujoco.MjData(self.model)
+        self._payloads = payload_bodies(self.model, robots)
+        self._mounts_m = np.array([robot.mount.position_m for robot in robots])
+        self.labels_m = self._mounts_m - LABEL_M * np.array([robot.mount.rotation()[:, 2] for robot in robots])
+        """Places for the names of the arms, m, [arm, 3]."""
+        self._fixed_m = np.array([thing.position_m for thing in (*places, *fixtures)]).reshape(-1, 3)
+        self.model.geom("floor").size[:2] = 0.0  # drawn without an edge
+        for place in places:
+            self.model.site(f"station/{place.name}").rgba[:3] = PLACE_RGB
+        sites = [f"{robot.name}/motor_{joint + 1}" for robot in robots for joint in range(JOINTS)]
+        self._motors = np.array([self.model.site(name).id for name in sites])
+        self.model.site_group[self._motors] = 0
+
+    def show(self, q: Array, motor_rgb: Array, motor_m: Array, payload_kg: Array) -> None:
+        """Take postures [arm, joint] in rad and payloads [arm] in kg, with a sphere at each motor.
+
+        Args:
+            motor_rgb: Colours of the spheres, 0 to 1, [arm, joint, 3].
+            motor_m: Their radius, m, [arm, joint].
+        """
+        self.data.qpos[:] = q.ravel()
+        self.model.site_rgba[self._motors, :3] = motor_rgb.reshape(-1, 3)
+        self.model.site_size[self._motors, 0] = motor_m.ravel()
+        set_payload_balls(self.model, self._payloads, payload_kg)
+        mujoco.mj_forward(self.model, self.data)
+
+    def extent(self, q: Array) -> Array:
+        """Points to see, m, [point, 3]: links in postures [sample, arm, joint] in rad, mounts, places and fixtures."""
+        points = [self._mounts_m, self._fixed_m]
+        for posture in q:
+            self.data.qpos[:] = posture.ravel()
+            mujoco.mj_kinematics(self.model, self.data)
+            points.append(self.data.xpos[1:].copy())
+        return np.concatenate(points)
+
+    def open_viewer(self, update: Callable[[], object]) -> None:
+        """Show the cell in MuJoCo's viewer until its window is closed; `update` runs before every frame."""
+        import mujoco.viewer
+
+        pause = threading.Event()
+        with mujoco.viewer.launch_passive(self.model, self.data, show_left_ui=False, show_right_ui=False) as viewer:
+            low, high = self._mounts_m.min(axis=0), self._mounts_m.max(axis=0)
+            viewer.cam.azimuth, viewer.cam.elevation = AZIMUTH_DEG, ELEVATION_DEG
+            viewer.cam.lookat[:] = (low + high) / 2 + (0.0, 0.0, ROOM_M)
+            viewer.cam.distance = 2.0 + float(np.ptp(self._mounts_m, axis=0).max())
+            while viewer.is_running():
+                with viewer.lock():
+                    update()
+                viewer.sync()
+                pause.wait(FRAME_S)
+
+
+class CellCamera:
+    """Takes pictures of a cell without a display; a context manager.
+
+    Args:
+        points_m: What must be seen, [point, 3], as `CellPlayer.extent` gives it.
+        top, bottom: Shares of the picture's height that are kept free at its edges.
+
+    Raises:
+        FleetError: OpenGL is not available.
+    """
+
+    def __init__(
+        self, player: CellPlayer, width: int, height: int, points_m: Array, *, top: float = 0.0, bottom: float = 0.0
+    ) -> None:
+        model = player.model
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        model.vis.quality.offsamples = 0
+        try:
+            self._renderer = mujoco.Renderer(model, height, width)
+        except Exception as error:  # each OpenGL backend has errors of its own
+            raise FleetError(NO_OPENGL.format(error=error or type(error).__name__)) from error
+        self._player, self._size = player, np.array((width, height))
+        self._tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
+        azimuth, elevation = np.radians((AZIMUTH_DEG, ELEVATION_DEG))
+        ahead = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
+        right = np.array((np.sin(azimuth), -np.cos(azimuth), 0.0))
+        self._axes = np.stack((right, np.cross(right, ahead), ahead))
+        x, y, depth = self._axes @ points_m.T
+        across = self._tangent * width / height
+        sides, heights = _slopes(across, 0.0, 0.0), _slopes(self._tangent, bottom, top)
+        # The nearest camera whose picture holds every point: each edge of the picture is a plane through the camera.
+        distance = max(_least(x, depth, *sides), _least(y, depth, *heights))
+        at = [_middle(v, depth + distance, *slopes) for v, slopes in ((x, sides), (y, heights))]
+        self._eye = np.array((*at, -distance))
+        self._camera = mujoco.MjvCamera()
+        self._camera.azimuth, self._camera.elevation, self._camera.distance = AZIMUTH_DEG, ELEVATION_DEG, 1.0
+        self._camera.lookat[:] = self._eye @ self._axes + ahead
+
+    def pixels(self, points_m: Array) -> Array:
+        """Where points [point, 3] in m are in the picture: px from its left and its upper edge, [point, 2]."""
+        x, y, depth = self._axes @ points_m.T - self._eye[:, None]
+        return (np.stack((x, -y)) / (depth * self._tangent) * self._size[1] / 2 + self._size[:, None] / 2).T
+
+    def __enter__(self) -> "CellCamera":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._renderer.close()
+
+    def picture(self) -> Array:
+        """The cell as it stands, uint8 [height, width, 3]."""
+        self._renderer.update_scene(self._player.data, self._camera)
+        for slow in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._renderer.scene.flags[slow] = 0
+        return self._renderer.render()
+
+
+def _slopes(tangent: float, low: float, high: float) -> tuple[float, float]:
+    """Slopes of the lower and the upper edge of a view, whose parts `low` and `high` of the picture stay free."""
+    return tangent * (2.0 * low - 1.0), tangent * (1.0 - 2.0 * high)
+
+
+def _least(across: Array, depth: Array, low: float, high: float) -> float:
+    """Least distance at which all points are between two slopes, wherever the camera is across."""
+    room = max(0.0, float((across + ROOM_M - depth * high).max() - (across - ROOM_M - depth * low).min()))
+    return max(0.3, room / (high - low), ROOM_M * 2 - float(depth.min()))
+
+
+def _middle(across: Array, ahead: Array, low: float, high: float) -> float:
+    """The camera's place across, so that as much room is left on both sides."""
+    return float((across + ROOM_M - ahead * high).max() + (across - ROOM_M - ahead * low).min()) / 2
+
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+Pair = tuple[int, int]
+"""Ids of two geoms, the lower first."""
+
+APART_S = 1.0
+"""A contact of two links that were apart for longer than this is a new event."""
+
+
+class ContactFinder:
+    """Finds the contacts of a shift, from one stretch of recorded postures to the next.
+
+    Args:
+        model: Of the cell; see `fleet.arm.model.build_cell`. It stays as it is.
+        robots: The arms in the order of the model.
+    """
+
+    def __init__(self, model: mujoco.MjModel, robots: Sequence[Robot]) -> None:
+        self._model = copy(model)
+        self._data = mujoco.MjData(self._model)
+        self._payloads = payload_bodies(model, robots)
+        self._names = [_described(model.geom(g).name) for g in range(model.ngeom)]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all contacts: a new shift begins."""
+        self._latest_s: dict[Pair, float] = {}
+        """When two geoms were last in contact."""
+
+    def events(self, time_s: Array, q: Array, payload_kg: Array) -> list[Event]:
+        """Contacts that begin in a stretch of a shift, each with its greatest depth in this stretch.
+
+        Args:
+            time_s: Rising, from the end of the stretch before, [sample].
+            q: rad, [sample, arm, joint].
+            payload_kg: Payload in the hand of each arm, [sample, arm].
+
+        Returns:
+            One event for each pair of links or obstacles and each episode of contact, in order of time. Its arm is the
+            first of the two; its value is the depth in mm.
+        """
+        depth_m: dict[tuple[Pair, float], float] = {}
+        """By pair and beginning."""
+        began_s: dict[Pair, float] = {}
+        regrasped = np.append(True, (np.diff(payload_kg, axis=0) != 0).any(axis=1))
+        for i, now_s in enumerate(time_s.tolist()):
+            if regrasped[i]:
+                set_payload_balls(self._model, self._payloads, payload_kg[i])
+            for pair, deep_m in self._in_contact(q[i]).items():
+                if now_s - self._latest_s.get(pair, -np.inf) > APART_S:
+                    began_s[pair] = now_s
+                self._latest_s[pair] = now_s
+                if pair in began_s:  # not one that began in an earlier stretch
+                    episode = (pair, began_s[pair])
+                    depth_m[episode] = max(depth_m.get(episode, 0.0), deep_m)
+        return [self._event(pair, at_s, deep_m) for (pair, at_s), deep_m in depth_m.items()]
+
+    def _in_contact(self, q: Array) -> dict[Pair, float]:
+        """Depth of the geoms that are inside each other, m, in one posture."""
+        model, data = self._model, self._data
+        data.qpos[:] = q.ravel()
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        depth_m: dict[Pair, float] = {}
+        if not data.ncon:
+            return depth_m
+        for (a, b), distance_m in zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True):
+            pair = (min(a, b), max(a, b))
+            if distance_m < 0:
+                depth_m[pair] = max(depth_m.get(pair, 0.0), -distance_m)
+        return depth_m
+
+    def _event(self, pair: Pair, time_s: float, depth_m: float) -> Event:
+        (one, arm), (other, other_arm) = (self._names[g] for g in pair)
+        if not arm:  # an obstacle; world bodies come first in the model
+            one, other, arm = other, one, other_arm
+        reason = f"{one} and {other}, {depth_m * 1e3:.1f} mm deep"
+        return Event(time_s=time_s, kind="contact", arm=arm, value=depth_m * 1e3, reason=reason)
+
+
+def _described(geom: str) -> tuple[str, str]:
+    """What a geom is in the words of an event, and its arm, if any."""
+    owner, _, name = geom.partition("/")
+    if not name:
+        return f"the {geom}", ""
+    return (f"the fixture '{name}'", "") if owner == "fixture" else (f"{name} of {owner}", owner)

@@ -1,0 +1,574 @@
+"""Replies to one query: messages, refusals and timeouts, by the key of the replier.
+
+The client of the bus: publishes, subscribes, queries and replies, and calls all handlers on one thread.
+
+What each key carries, and with which history, priority and congestion control, is in `fleet.bus.protocol.registry`.
+Zenoh's threads only queue what arrives; `serve` calls the handlers. So a participant needs no locks, and a handler may
+publish and query. `query` does not wait: its replies go to a handler, too; outside handlers, `ask` waits for a reply. A
+malformed message is counted and logged, and never raises; a malformed request is refused with the reason.
+"""
+
+import logging
+import math
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from queue import Empty
+from threading import Lock
+from typing import Any, Generic, Self, TypeVar, TypeVarTuple
+
+import msgspec
+import zenoh
+from zenoh import ext as advanced
+
+from fleet.bus.mailbox import Mailbox
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode_as, encode, encoding
+from fleet.bus.protocol.registry import Channel, channel_for, channel_of
+from fleet.bus.router import connect, plain_reason
+from fleet.bus.security.access_control import Participant, rights_by_role
+from fleet.bus.security.tls import participant_at
+from fleet.errors import BusError, Refused
+
+Message = TypeVar("Message", bound=msgspec.Struct)
+Entry = TypeVar("Entry")
+
+_SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer"}
+"""The field of a message that names the sender, by the role in its key."""
+
+
+class AnotherReplies(Exception):
+    """Raised by a handler of requests: another participant will reply."""
+
+
+@dataclass(eq=False)
+class NoReply(BusError):
+    """Nobody replied to a query, and nobody refused it."""
+
+    key: str
+    late: bool
+    """Whether a participant received the query and did not reply in time."""
+
+    def __str__(self) -> str:
+        if self.late:
+            return f"The {replier(self.key)} did not reply in time."
+        return f"There is no {replier(self.key)} in this fleet."
+
+
+@dataclass(eq=False)
+class Replies(Generic[Message]):
+    """Replies so far; complete when the handler gets them."""
+
+    messages: dict[str, Message] = field(default_factory=dict)
+    """By the key of the replier; a second reply under the same key gets a number, as `KEY (2)`."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Reasons by the key of the replier; "" for one that did not reply in time, whose key is not known."""
+    took_s: float = math.nan
+    """Real seconds until they were complete."""
+
+    @property
+    def refusals(self) -> list[str]:
+        """Reasons of the participants that refused, without those that did not reply in time."""
+        return [reason for reason in self.refused.values() if reason]
+
+    def first(self, key: str) -> Message:
+        """The first reply to a query of `key`.
+
+        Raises:
+            Refused: there is none, and a participant refuses, with its reason.
+            NoReply: there is neither.
+        """
+        for message in self.messages.values():
+            return message
+        for reason in self.refusals:
+            raise Refused(reason)
+        raise NoReply(key, late=bool(self.refused))
+
+    def take(self, key: str, sent_encoding: str, payload: bytes, kind: type[Message]) -> Message | None:
+        """Add a reply of this kind, or a refusal; return the reply.
+
+        Raises:
+            MalformedMessage: it is neither, or names another sender than its key; added to `refused`.
+        """
+        try:
+            if sent_encoding == encoding(Refusal):
+                _add(self.refused, key, read_message(Refusal, key, sent_encoding, payload)[1].reason)
+                return None
+            message = read_message(kind, key, sent_encoding, payload)[1]
+        except ValueError as error:
+            _add(self.refused, key, str(error))
+            raise MalformedMessage(str(error)) from error
+        _add(self.messages, key, message)
+        return message
+
+    def miss(self, reason: str) -> None:
+        """Add an error of Zenoh's own, which does not say whose it is."""
+        _add(self.refused, "?", "" if reason == "Timeout" else reason)
+
+
+def replier(key: str) -> str:
+    """Who replies to the queries of a key, for example `auctioneer` or `arm 'arm_0'`."""
+    sender = channel_of(key).sender
+    return f"{sender} '{keys.parse(key).name}'" if sender == "arm" and "*" not in key else sender
+
+
+def read_message(kind: type[Message], key: str, sent_encoding: str, payload: bytes) -> tuple[str, Message]:
+    """The name in the key and the message of this type in the payload.
+
+    Raises:
+        ValueError: not a key of this bus.
+        MalformedMessage: another encoding, not of this type, or the message names another sender than its key.
+    """
+    sender = keys.parse(key)
+    message = decode_as(kind, sent_encoding, payload)
+    name = _SENDER.get(sender.role, "")
+    return sender.name, check_name(message, sender.name, name) if hasattr(message, name) else message
+
+
+def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:
+    """Add without replacing another entry: several may reply under one key, as two auctioneers do."""
+    name, number = key, 1
+    while name in table:
+        number += 1
+        name = f"{key} ({number})"
+    table[name] = entry
+
+
+_LOG = logging.getLogger(__name__)
+
+Request = TypeVar("Request", bound=msgspec.Struct)
+Reply = TypeVar("Reply", bound=msgspec.Struct)
+Arguments = TypeVarTuple("Arguments")
+
+BACKLOG = 4096
+MOST_REPLIES = 1024
+"""Replies to one query that are read: one of each arm of the largest fleet."""
+
+
+class BusClient:
+    """A participant's connection to the router, for one thread: `with BusClient(endpoint, fleet) as client:`.
+
+    Attributes:
+        fleet: Name of the fleet, part of every key.
+        malformed: Number of messages that violate the contract.
+        rejections: The reasons, for the last of them.
+        overrun: Messages dropped because `serve` was not called for too long.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        fleet: str,
+        *,
+        timeout_s: float = 5.0,
+        backlog: int = BACKLOG,
+        stopped: Callable[[], bool] | None = None,
+    ) -> None:
+        """Prepare a client of the router at `endpoint`.
+
+        Args:
+            timeout_s: How long the router may take to accept the connection.
+            backlog: Most messages in the queue; when it is full, the oldest is dropped.
+            stopped: Wait for a router until this is true, instead of `timeout_s`.
+        """
+        self.fleet = fleet
+        self.malformed = 0
+        self.rejections: deque[str] = deque(maxlen=8)
+        self.overrun = 0
+        self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
+        self._waiting: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox()
+        self._backlog = backlog
+        self._overrunning = Lock()
+        self._session: zenoh.Session | None = None
+        self._participant: Participant | None = None
+        self._resources = ExitStack()
+        # A process that exits without closing its session would hang.
+        self._at_exit = weakref.finalize(self, self._resources.close)
+
+    def open(self) -> Self:
+        """Connect; raises a BusError if no router accepts the connection."""
+        if self._session is None:
+            self._session = connect(self._endpoint, self._timeout_s, self._stopped)
+            self._resources.callback(self._session.close)
+            self._participant = participant_at(self._endpoint)
+        return self
+
+    def close(self) -> None:
+        """Disconnect; messages that were not handled are dropped. May be called twice."""
+        self._session = None
+        try:
+            self._resources.close()
+        except zenoh.ZError as error:
+            raise BusError(f"The session at {self._endpoint} did not close cleanly: {plain_reason(error)}.") from error
+        finally:
+            self._waiting = Mailbox()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    # Handling what arrives
+
+    def serve(self, until_s: float = -math.inf, *, at_least: int = 1) -> int:
+        """Wait until `time.monotonic()` is `until_s` or `at_least` messages are queued, and handle all that are.
+
+        Returns how many it handled. Waking once for many messages costs much less than once for each.
+        """
+        self._waiting.wait(at_least, until_s)
+        handled = 0
+        for handle, arguments in self._waiting.drain():
+            handle(*arguments)
+            handled += 1
+        return handled
+
+    def post(self, handle: Callable[[*Arguments], None], *arguments: *Arguments, urgent: bool = False) -> None:
+        """Queue a call of `handle` for `serve`, which an urgent one wakes at once; any thread may post."""
+        if len(self._waiting) >= self._backlog:
+            with self._overrunning, suppress(Empty):
+                self._waiting.get()
+                self.overrun += 1
+                if self.overrun == 1 or self.overrun % 1000 == 0:
+                    _LOG.warning("Dropped %d message(s): they arrive faster than they are handled.", self.overrun)
+        self._waiting.put((handle, arguments), urgent=urgent)
+
+    # Publishing
+
+    def publisher(self, key: str, kind: type[Message]) -> Callable[[Message], None]:
+        """A function that publishes messages under one key; late subscribers get the history that the registry sets."""
+        channel = channel_for(key, "publish", kind)
+        publisher = advanced.declare_advanced_publisher(
+            self._open(),
+            key,
+            **_settings(channel, kind),
+            cache=advanced.CacheConfig(channel.history),
+            publisher_detection=True,
+            # Sporadic: the sequence number is repeated only after a publication, so silence costs nothing.
+            sample_miss_detection=advanced.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=channel.heartbeat_s),
+        )
+        return lambda message: publisher.put(encode(message))
+
+    def publish(self, key: str, message: msgspec.Struct) -> None:
+        """Publish one message to the present subscribers, without history."""
+        channel = channel_for(key, "publish", type(message))
+        self._open().put(key, encode(message), **_settings(channel, type(message)))
+
+    def declare_token(self, key: str) -> None:
+        """Show a liveliness token until this client is closed or loses its connection."""
+        channel_for(key, "token")
+        self._keep(self._open().liveliness().declare_token(key))
+
+    # Querying
+
+    def query(
+        self,
+        key: str,
+        request: msgspec.Struct,
+        kind: type[Reply],
+        done: Callable[[Replies[Reply]], None],
+        *,
+        timeout_s: float,
+        each: Callable[[Reply], None] = lambda reply: None,
+        most: int = MOST_REPLIES,
+    ) -> None:
+        """Query all that reply under a key or key expression; `done` gets the replies, complete or after the timeout.
+
+        Args:
+            kind: Message type of the replies; one that names another sender than its key is malformed.
+            timeout_s: Real seconds. A stopped process costs this long, unless `each` has enough replies before.
+            each: Called with every reply as it arrives.
+            most: Replies that are read; the next one ends the query, with a reason in `refused`.
+
+        Raises:
+            BusError: the client is not open, or its certificate does not allow the query: a router would drop it.
+        """
+        channel = channel_for(key, "query", type(request))
+        if channel.reply is not kind:
+            raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
+        self._check_may_query(key)
+        pending = _PendingQuery(kind, most=most, post=self.post, each=each, reject=self.reject, done=done)
+        try:
+            self._open().get(
+                key,
+                _direct(pending.receive, pending.finish),
+                payload=encode(request),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+                cancellation_token=pending.token,
+                **_settings(channel, type(request)),
+            )
+        except zenoh.ZError as error:
+            raise BusError(f"The query of '{key}' failed: {error}") from error
+
+    def query_and_wait(
+        self, key: str, request: msgspec.Struct, kind: type[Reply], *, timeout_s: float, most: int = MOST_REPLIES
+    ) -> Replies[Reply]:
+        """As `query`, and serve until the replies are complete."""
+        complete: list[Replies[Reply]] = []
+        self.query(key, request, kind, complete.append, timeout_s=timeout_s, most=most)
+        deadline_s = time.monotonic() + timeout_s + 1.0
+        while not complete and time.monotonic() < deadline_s:
+            self.serve(deadline_s)
+        return complete[0] if complete else Replies(took_s=timeout_s)
+
+    def ask(
+        self, key: str, request: msgspec.Struct, kind: type[Reply], *, timeout_s: float, attempts: int = 1
+    ) -> Reply:
+        """Query a participant, and return its reply; of several, the first.
+
+        Args:
+            timeout_s: Real seconds of one attempt.
+            attempts: The request is sent again, at most this often in all, while nobody replies.
+
+        Raises:
+            Refused: the participant refuses, with its reason.
+            NoReply: nobody replied.
+            BusError: as `query`.
+        """
+        replies: Replies[Reply] = Replies()
+        for _ in range(attempts):
+            replies = self.query_and_wait(key, request, kind, timeout_s=timeout_s)
+            if replies.messages or replies.refusals:
+                break
+        return replies.first(key)
+
+    # Replying and subscribing
+
+    def reply_to(self, key: str, kind: type[Request], handle: Callable[[Request], msgspec.Struct]) -> None:
+        """Reply to queries of a concrete key; `handle` may raise `Refused` or `AnotherReplies`.
+
+        A key may end in `*` for the querier (`keys.asked_by_every_arm`); replies then go under the key of the query. A
+        request that names another arm than that key is malformed.
+        """
+        channel_for(key, "query", kind)
+        receive = _direct(partial(self._receive, key, kind, handle))
+        self._keep(self._open().declare_queryable(key, receive, complete=True))
+
+    def subscribe(
+        self,
+        expression: str,
+        kind: type[Message],
+        handle: Callable[[str, Message], None],
+        *,
+        history: bool = False,
+    ) -> None:
+        """Receive all messages of one key expression; `handle` gets the name in the key and the message.
+
+        Args:
+            history: Also receive what publishers have cached, now and after a break, and messages lost in transit.
+        """
+        channel = channel_for(expression, "publish", kind)
+
+        def take(sample: zenoh.Sample) -> None:
+            if sample.kind != zenoh.SampleKind.PUT:
+                return
+            try:
+                payload = sample.payload.to_bytes()
+                name, message = read_message(kind, str(sample.key_expr), str(sample.encoding), payload)
+            except ValueError as error:
+                self.reject(f"under '{sample.key_expr}': {error}")
+            else:
+                handle(name, message)
+
+        receive = _direct(partial(self.post, take))
+        if not history:
+            self._keep(self._open().declare_subscriber(expression, receive))
+            return
+        self._keep(
+            advanced.declare_advanced_subscriber(
+                self._open(),
+                expression,
+                receive,
+                history=advanced.HistoryConfig(detect_late_publishers=True, max_samples=channel.history),
+                recovery=advanced.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            )
+        )
+
+    def watch_tokens(self, expression: str, handle: Callable[[str, bool], None]) -> None:
+        """Follow liveliness tokens: `handle` gets the name in the key, and whether the token is present.
+
+        The same change may be reported twice.
+        """
+        channel_for(expression, "token")
+
+        def receive(sample: zenoh.Sample) -> None:
+            self.post(self._token, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT, handle, urgent=True)
+
+        self._keep(self._open().liveliness().declare_subscriber(expression, _direct(receive), history=True))
+
+    def tokens(self, expression: str, *, timeout_s: float) -> frozenset[str]:
+        """Names in the keys of the present liveliness tokens; waits for the router's reply."""
+        names: set[str] = set()
+        for reply in self._open().liveliness().get(expression, timeout=timeout_s):
+            if reply.ok is not None:
+                self._token(str(reply.ok.key_expr), True, lambda name, _: names.add(name))
+        return frozenset(names)
+
+    def reject(self, reason: str) -> None:
+        """Count and log a malformed message."""
+        self.malformed += 1
+        self.rejections.append(reason)
+        if self.malformed & (self.malformed - 1) == 0:  # 1, 2, 4, 8, …: a flood of messages must not flood the log
+            _LOG.warning("Dropped invalid message (%d so far): %s", self.malformed, reason)
+
+    # Inside
+
+    def _check_may_query(self, key: str) -> None:
+        if self._participant is None:
+            return
+        queried = zenoh.KeyExpr(key)
+        allowed = [
+            role
+            for role, rights in rights_by_role(self.fleet, self._participant.name).items()
+            if any(zenoh.KeyExpr(expression).includes(queried) for expression in rights.queries)
+        ]
+        if self._participant.role not in allowed:
+            needed = f"; that takes a certificate of the role {' or '.join(allowed)}" if allowed else ""
+            raise BusError(f"'{self._participant.common_name}' may not query '{key}'{needed}.")
+
+    def _open(self) -> zenoh.Session:
+        if self._session is None:
+            raise BusError("The BusClient is not open. Use it as a context manager.")
+        return self._session
+
+    def _keep(self, entity: object) -> None:
+        """Keep a declared entity until the client is closed: Zenoh undeclares what is garbage-collected."""
+        self._resources.callback(lambda: entity)
+
+    def _token(self, key: str, present: bool, handle: Callable[[str, bool], None]) -> None:
+        try:
+            name = keys.parse(key).name
+        except ValueError as error:
+            self.reject(str(error))
+        else:
+            handle(name, present)
+
+    def _receive(
+        self, key: str, kind: type[Request], handle: Callable[[Request], msgspec.Struct], query: zenoh.Query
+    ) -> None:
+        """Queue a request; on Zenoh's thread. A large one is refused at once, because queued ones fill the memory."""
+        parts = (query.payload, query.attachment, str(query.parameters))
+        if (size := sum(len(part) for part in parts if part is not None)) <= MOST_BYTES:
+            self.post(self._reply, key, query, kind, handle)
+            return
+        refusal = Refusal(f"The request has {size:,} bytes, and at most {MOST_BYTES:,} are allowed.")
+        self.post(self.reject, f"query of '{key}': {refusal.reason}")
+        with query, suppress(ValueError):  # if there is no key to reply under
+            query.reply(keys.answered(key, str(query.key_expr)), encode(refusal), encoding=encoding(Refusal))
+
+    def _reply(
+        self, key: str, query: zenoh.Query, kind: type[Request], handle: Callable[[Request], msgspec.Struct]
+    ) -> None:
+        with query:
+            try:
+                own_key = keys.answered(key, str(query.key_expr))
+            except ValueError as error:  # there is no key to reply under
+                self.reject(f"query of '{query.key_expr}': {error}")
+                return
+            try:
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                request = decode_as(kind, "" if query.encoding is None else str(query.encoding), payload)
+                if querier := keys.parse(own_key).asker:
+                    request = check_name(request, querier, "arm")
+                reply = handle(request)
+            except MalformedMessage as error:
+                self.reject(f"query of '{own_key}': {error}")
+                reply = Refusal(str(error))
+            except Refused as refused:
+                reply = Refusal(str(refused))
+            except AnotherReplies:
+                return
+            query.reply(own_key, encode(reply), encoding=encoding(type(reply)))
+
+
+class _PendingQuery(Generic[Reply]):
+    """A query that is not complete. Zenoh's thread calls `receive` and `finish`, which only queue calls.
+
+    Attributes:
+        token: Cancels the query when more replies arrive than are read.
+    """
+
+    def __init__(
+        self,
+        kind: type[Reply],
+        *,
+        most: int,
+        post: Callable[..., None],
+        each: Callable[[Reply], None],
+        reject: Callable[[str], None],
+        done: Callable[[Replies[Reply]], None],
+    ) -> None:
+        """Start the clock; arguments as of `BusClient.query`.
+
+        Args:
+            post: Queues a call for the thread of the client.
+            reject: Gets the reason why a reply is malformed.
+        """
+        self.token = zenoh.CancellationToken()
+        self._kind, self._most, self._post, self._each, self._reject, self._done = kind, most, post, each, reject, done
+        self._replies: Replies[Reply] = Replies()
+        self._start_s = time.monotonic()
+        self._arrived = 0
+
+    def receive(self, reply: zenoh.Reply) -> None:
+        """Queue a reply."""
+        self._arrived += 1
+        if self._arrived <= self._most:
+            self._post(self._take, reply)
+        elif self._arrived == self._most + 1:
+            self._post(self._stop)
+
+    def finish(self) -> None:
+        """Queue the end: no reply follows."""
+        self._post(self._complete)
+
+    def _take(self, reply: zenoh.Reply) -> None:
+        if reply.ok is None:
+            self._replies.miss(_error_in(reply))
+            return
+        replier = str(reply.ok.key_expr)
+        try:
+            payload = reply.ok.payload.to_bytes()
+            message = self._replies.take(replier, str(reply.ok.encoding), payload, self._kind)
+        except MalformedMessage as error:
+            self._reject(f"reply under '{replier}': {error}")
+        else:
+            if message is not None:
+                self._each(message)
+
+    def _stop(self) -> None:
+        self._replies.miss(f"More than {self._most} replies to one query; no more are read.")
+        self.token.cancel()  # and so calls `finish`
+
+    def _complete(self) -> None:
+        self._replies.took_s = time.monotonic() - self._start_s
+        self._done(self._replies)
+
+
+def _error_in(reply: zenoh.Reply) -> str:
+    # Any: Zenoh's stubs do not state that a reply has either `ok` or `err`.
+    error: Any = reply.err
+    return "" if error is None else error.payload.to_bytes().decode(errors="replace")
+
+
+# Any in both: Zenoh's stubs have no types for settings, and type handlers by their internals.
+
+
+def _settings(channel: Channel, kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """How Zenoh transports a message of this type."""
+    return {
+        "encoding": encoding(kind),
+        "congestion_control": getattr(zenoh.CongestionControl, channel.congestion),
+        "priority": getattr(zenoh.Priority, channel.priority),
+    }
+
+
+def _direct(handle: Callable[[Any], None], drop: Callable[[], None] | None = None) -> Any:
+    """A handler on Zenoh's receiving thread: it only queues, so a Python thread in between would only cost time."""
+    return zenoh.handlers.Callback(handle, drop, indirect=False)

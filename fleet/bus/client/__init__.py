@@ -1,1 +1,0 @@
-"""The Zenoh client, its router, and what both need."""

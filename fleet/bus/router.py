@@ -1,0 +1,441 @@
+"""Limits of what a router forwards from each session, so that one faulty session does not disturb the rest.
+
+The router of a fleet, and the transport settings of all sessions.
+
+Plain TCP does not authenticate, so it is limited to loopback. With TLS both ends of every connection are authenticated,
+and the router enforces the access control of its roster.
+
+Fleets at a router, found by the tokens of their arms and auctioneers.
+"""
+
+import ipaddress
+import json
+import logging
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import zenoh
+
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import MOST_BYTES
+from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
+from fleet.bus.protocol.registry import SESSION_LEASE_S
+from fleet.bus.security.access_control import ROSTER, Roster, access_control, read_roster
+from fleet.bus.security.tls import Tls, identified, why_not
+from fleet.errors import BusError, NoRouter
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a router forwards from each session; the rest is dropped silently."""
+
+    message_bytes: int = MOST_BYTES
+    """Largest payload with its attachment, of a publication, a request or a reply. A request to a policy, or with a
+    wildcard or an unknown role in its key, may have `MOST_REQUEST_BYTES` with plain TCP or a policy in the roster."""
+    state_hz: float | None = None
+    """Telemetry messages a second, real time, of each session, or with TLS of each arm; None for any number. A steady
+    stream needs a limit of twice its rate, as Zenoh limits the gap between two messages, which varies."""
+
+    def __post_init__(self) -> None:
+        if self.message_bytes < 1:
+            raise ValueError(f"Limits.message_bytes must be >= 1 (got {self.message_bytes}).")
+        if self.state_hz is not None and not 0 < self.state_hz < 1e6:
+            raise ValueError(f"Limits.state_hz must be > 0, or None (got {self.state_hz}).")
+
+    def settings(self, roster: Roster | None = None) -> dict[str, Any]:
+        """Settings for Zenoh's configuration.
+
+        Args:
+            roster: Participants, if each is held to its own keys. The rate is then limited by key: one session, that of
+                a linked router, may carry the telemetry of many arms.
+        """
+        all_keys = ["**", keys.caches_of("**")]
+        # Of two filters that apply, the smaller one counts; only requests to policies may be larger.
+        others = [f"{keys.PREFIX}/*/{role}/**" for role in keys.TOPICS if role != "policy"]
+        # Of two limits of one key expression the last one counts, so each has one.
+        sizes = [
+            _size(["put", "delete", "reply"], all_keys, self.message_bytes),
+            _size(["query"], [*others, keys.caches_of("**")], self.message_bytes),
+            _size(["query"], ["**"], self._request_bytes(roster)),
+        ]
+        if self.state_hz is None:
+            return {"low_pass_filter": sizes}
+        limited = (
+            [keys.STATES]
+            if roster is None
+            else [keys.of_arm(roster.fleet, arm, "state") for arm in roster.of_role("arm")]
+        )
+        rate = {
+            "flows": ["ingress"],
+            "messages": ["put", "delete"],
+            "rules": [{"key_expr": key, "freq": self.state_hz} for key in limited],
+        }
+        return {"low_pass_filter": sizes, "downsampling": [rate]}
+
+    def assembled_bytes(self, roster: Roster | None = None) -> int:
+        """Largest fragmented message that the router assembles in memory before it checks its size."""
+        return max(2 * self.message_bytes, self._request_bytes(roster)) + MOST_BYTES
+
+    def _request_bytes(self, roster: Roster | None) -> int:
+        """Largest request to a policy, if there may be one."""
+        without = roster is not None and not roster.of_role("policy")
+        return self.message_bytes if without else max(self.message_bytes, MOST_REQUEST_BYTES)
+
+
+def _size(messages: list[str], expressions: list[str], most_bytes: int) -> dict[str, Any]:
+    return {"flows": ["ingress"], "messages": messages, "key_exprs": expressions, "size_limit": most_bytes}
+
+
+_LOG = logging.getLogger(__name__)
+
+_ATTEMPTS = 3
+_TURN_S = 1.0
+"""Real seconds of one attempt while waiting for a router."""
+_ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
+_ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
+"""Wildcard addresses of a listener, and the address at which this machine reaches it."""
+
+_SCOUTING: Mapping[str, Any] = {
+    # Otherwise a router waits half a second to discover others.
+    "delay": 0,
+    "multicast": {"enabled": False},
+    "gossip": {"enabled": False},
+}
+_ACCEPTING: Mapping[str, Any] = {
+    # Too many half-open connections keep new ones out (by default 100, 10 s).
+    "accept_pending": 1000,
+    "accept_timeout": 3000,
+    # A closing session waits this long for a connection to a stopped router.
+    "open_timeout": 3000,
+}
+_RETRY: Mapping[str, Any] = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
+_SENDING: Mapping[str, Any] = {
+    "lease": round(1000 * SESSION_LEASE_S),
+    "queue": {
+        "size": {"data": 16},
+        # Microseconds: enough for a burst of a whole fleet on a busy machine; a stuck peer is not waited for.
+        "congestion_control": {"drop": {"wait_before_drop": 20_000}, "block": {"wait_before_close": 1_000_000}},
+    },
+}
+
+
+def loopback(endpoint: str) -> str:
+    """The endpoint, if it is `tcp/<address>:<port>` on loopback.
+
+    Raises:
+        BusError: it is not, with the reason.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or match["protocol"] != "tcp" or not 0 <= int(match["port"]) <= 65535:
+        raise BusError(
+            f"'{endpoint}' is no endpoint of this bus. Expected tcp/<address>:<port>, as tcp/127.0.0.1:7447."
+        )
+    host = match["v6"] or match["host"]
+    if host == "localhost":
+        return endpoint
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError as error:
+        raise BusError(
+            f"Endpoint '{endpoint}': '{host}' may resolve to another machine. "
+            "Without TLS, allowed: 127.0.0.1, [::1], localhost."
+        ) from error
+    if not address.is_loopback:
+        raise BusError(
+            f"Endpoint '{endpoint}' is not on loopback. Plain TCP does not authenticate, so any process that reaches "
+            "it could act as any arm. Allowed: 127.0.0.1, [::1], localhost; other hosts need tls/ and certificates "
+            "of thermofleet bus keys."
+        )
+    return endpoint
+
+
+def reachable(endpoint: str, tls: Tls | None = None) -> str:
+    """The endpoint, if a session may connect to it: on loopback without TLS, on any host with it.
+
+    Raises:
+        BusError: it may not, with the reason.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if tls is None and match is not None and match["protocol"] == "tls":
+        raise BusError(f"Endpoint '{endpoint}' needs a certificate; name it, as {endpoint}#FOLDER/NAME.")
+    if tls is None:
+        return loopback(endpoint)
+    if match is None or match["protocol"] != "tls" or not 0 < int(match["port"]) <= 65535:
+        raise BusError(
+            f"'{endpoint}' is no endpoint for the certificate of '{tls.name}'. Expected tls/<address>:<port>, as "
+            "tls/127.0.0.1:7447."
+        )
+    return endpoint
+
+
+def reached_at(host: str) -> str:
+    """Address, as in an endpoint, at which this machine reaches a router that listens on `host`."""
+    bare = host.strip("[]")
+    return _ANY_ADDRESS.get(bare, f"[{bare}]" if ":" in bare else bare)
+
+
+def connect(endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None) -> zenoh.Session:
+    """A client session on the router at `endpoint`: once there is one, if `stopped` is given, instead of `timeout_s`.
+
+    Raises:
+        BusError: as `open_client`, if waiting does not help, or stopped meanwhile.
+    """
+    if stopped is None:
+        return open_client(endpoint, timeout_s=timeout_s)
+    waits = False
+    while not stopped():
+        try:
+            return open_client(endpoint, timeout_s=_TURN_S)
+        except NoRouter as error:
+            if not waits:
+                _LOG.warning("Waiting for a router. %s", error)
+            waits = True
+    raise NoRouter(f"Stopped while waiting for a router at {endpoint}.")
+
+
+def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:
+    """A client session on the router at `endpoint`.
+
+    Args:
+        endpoint: As `tcp/127.0.0.1:7447`, or with the participant as `tls/127.0.0.1:7447#FOLDER/NAME`.
+        tls: The participant, for an endpoint that begins with `tls/` and does not name one.
+
+    Raises:
+        BusError: the endpoint is not on loopback and has no TLS, or the certificate is not valid.
+        NoRouter: no router answered within `timeout_s`.
+    """
+    if tls is None:
+        endpoint, tls = identified(endpoint)
+    connect = {
+        "endpoints": [reachable(endpoint, tls)],
+        "timeout_ms": max(1, round(1000 * timeout_s)),
+        "retry": _RETRY,
+    }
+    link = {"tx": _SENDING}
+    if tls is not None:
+        tls.check(serves=False)
+        link["tls"] = tls.link(serves=False)
+    try:
+        return zenoh.open(_config({"mode": "client", "connect": connect}, link))
+    except zenoh.ZError as error:
+        reason, stays = why_not(*_address(endpoint), tls)
+        sentence = f"No router answered at {endpoint} within {timeout_s} s ({reason or plain_reason(error)})."
+        raise (BusError if stays else NoRouter)(sentence) from error
+
+
+class Router:
+    """A router in this process, for the sessions of one fleet.
+
+    `with Router() as router:` listens on a free port of 127.0.0.1 until the end of the block. Linked routers (Zenoh's
+    router mode) forward messages between their sessions; each enforces the access control for its own ones.
+    """
+
+    def __init__(
+        self,
+        port: int = 0,
+        *,
+        host: str = "127.0.0.1",
+        tls: Tls | None = None,
+        limits: Limits | None = None,
+        connect: Sequence[str] = (),
+    ) -> None:
+        """Prepare a router.
+
+        Args:
+            port: TCP port; 0 lets the system choose a free one.
+            host: Address to listen on; without TLS one of loopback.
+            tls: The router's certificate; the roster of its folder sets the access control. None for plain TCP.
+            connect: Endpoints of other routers of the fleet, `tls/HOST:PORT`. A link that is not there, or is lost, is
+                tried again every second at most.
+
+        Raises:
+            BusError: plain TCP beyond loopback, a link without TLS, or no endpoint of TLS.
+        """
+        if not 0 <= port <= 65535:
+            raise ValueError(f"A port is 0..65535 (got {port}).")
+        self._host = f"[{host.strip('[]')}]" if ":" in host else host
+        self._port = port
+        self._tls = tls
+        self._limits = limits or Limits()
+        self._listen = f"{'tcp' if tls is None else 'tls'}/{self._host}:{port}"
+        if tls is None:
+            loopback(self._listen)
+        elif _ENDPOINT.fullmatch(self._listen) is None:
+            raise BusError(f"'{host}' is no address to listen on, as 127.0.0.1 or 0.0.0.0.")
+        if connect and tls is None:
+            raise BusError(
+                f"A link to another router ({connect[0]}) needs TLS: routers recognise each other by certificates. "
+                "Start both with --tls."
+            )
+        self._connect = [reachable(endpoint, tls) for endpoint in connect]
+        self._session: zenoh.Session | None = None
+        self._endpoint: str | None = None
+
+    @property
+    def endpoint(self) -> str:
+        """Where sessions connect, as `tcp/127.0.0.1:7447`.
+
+        Raises:
+            BusError: the router is not open.
+        """
+        if self._endpoint is None:
+            raise BusError("The router is not open.")
+        return self._endpoint
+
+    def open(self) -> Self:
+        """Listen.
+
+        Raises:
+            BusError: the port is in use, none is free, or the router's certificate is not valid.
+        """
+        if self._session is not None:
+            return self
+        config = self._settings()
+        problem = BusError("The router did not open.")
+        # A second attempt only helps if the system chooses the port.
+        for attempt in range(1, 1 + (1 if self._port else _ATTEMPTS)):
+            try:
+                session = zenoh.open(config)
+            except zenoh.ZError as error:
+                where = (
+                    f"port {self._port} of {self._host}; is it in use?"
+                    if self._port
+                    else f"a free port of {self._host}."
+                )
+                problem = BusError(f"The router could not listen on {where} ({plain_reason(error)})")
+                problem.__cause__ = error
+                continue
+            try:
+                self._endpoint = self._where(session)
+            except BusError as error:
+                problem = error
+                session.close()
+                continue
+            self._session = session
+            _LOG.debug("Router at %s (attempt %d).", self._endpoint, attempt)
+            return self
+        raise problem
+
+    def linked(self) -> int:
+        """Number of other routers that it has a link to now."""
+        return 0 if self._session is None else len(self._session.info.routers_zid())
+
+    def close(self) -> None:
+        """Stop listening and close all connections; may be called twice.
+
+        Raises:
+            BusError: the router did not close cleanly.
+        """
+        session, self._session, self._endpoint = self._session, None, None
+        if session is None:
+            return
+        try:
+            session.close()
+        except zenoh.ZError as error:
+            raise BusError(f"The router did not close cleanly ({plain_reason(error)}).") from error
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _settings(self) -> zenoh.Config:
+        roster = None
+        if self._tls is not None:
+            self._tls.check(serves=True, links=bool(self._connect))
+            roster = read_roster(self._tls.folder)
+        own = {
+            "mode": "router",
+            "listen": {"endpoints": [self._listen]},
+            # Without end and without failure: the other router may start later.
+            "connect": {"endpoints": self._connect, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
+            # The admin space holds the port that the system chose.
+            "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
+            **self._limits.settings(roster),
+        }
+        link = {"tx": _SENDING, "rx": {"max_message_size": self._limits.assembled_bytes(roster)}}
+        if self._tls is not None and roster is not None:
+            link["tls"] = self._tls.link(serves=True)
+            if self._connect:
+                link["tls"] |= self._tls.link(serves=False)
+            own["access_control"] = access_control(roster, self._tls.name)
+        return _config(own, link)
+
+    def _where(self, session: zenoh.Session) -> str:
+        """The endpoint that a router session listens on, from its admin space."""
+        for reply in session.get(f"@/{session.zid()}/router", timeout=5.0):
+            if reply.ok is None:
+                continue
+            locators = json.loads(reply.ok.payload.to_bytes())["locators"]
+            ports = {locator.rsplit(":", 1)[1] for locator in locators}
+            if len(ports) == 1:
+                return f"{self._listen[:3]}/{reached_at(self._host)}:{ports.pop()}"
+        raise BusError("The router opened, but its port is unknown.")
+
+
+def _config(own: Mapping[str, Any], link: Mapping[str, Any]) -> zenoh.Config:
+    transport = {"shared_memory": {"enabled": False}, "unicast": _ACCEPTING, "link": link}
+    return zenoh.Config.from_json5(json.dumps({"scouting": _SCOUTING, "transport": transport, **own}))
+
+
+def _address(endpoint: str) -> tuple[str, int]:
+    """Host and port of a valid endpoint."""
+    host, port = endpoint[len("tcp/") :].rsplit(":", 1)
+    return host.strip("[]"), int(port)
+
+
+def plain_reason(error: zenoh.ZError) -> str:
+    """Zenoh's error text without locations in its source."""
+    return re.split(r" at /|\.? \[", str(error))[0]
+
+
+OURS = keys.PREFIX.rpartition("/")[2]
+"""Version of the bus that this program uses."""
+EVERYBODY = f"{keys.PREFIX}/*/*/*/alive"
+
+
+def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
+    """Names of the fleets with a present participant, sorted.
+
+    With TLS no participant may look beyond its own fleet, which the roster in its folder names, if there is one.
+
+    Raises:
+        BusError: no router accepted the connection.
+    """
+    _, tls = identified(endpoint)
+    if tls is not None:
+        return (read_roster(tls.folder).fleet,) if (tls.folder / ROSTER).exists() else ()
+    found: set[str] = set()
+    with open_client(endpoint, timeout_s=timeout_s) as session:
+        for reply in session.liveliness().get(EVERYBODY, timeout=timeout_s):
+            if reply.ok is None:
+                continue
+            try:
+                found.add(keys.parse(str(reply.ok.key_expr)).fleet)
+            except ValueError:
+                continue  # a token of somebody else
+    return tuple(sorted(found))
+
+
+def other_versions(endpoint: str, fleet: str, *, timeout_s: float = 2.0) -> tuple[str, ...]:
+    """Return a sentence on each participant of a fleet that uses another version of the bus, by name.
+
+    With TLS there is none: the router lets nobody see them.
+
+    Raises:
+        BusError: no router accepted the connection.
+    """
+    if identified(endpoint)[1] is not None:
+        return ()
+    found: set[tuple[str, str]] = set()
+    with open_client(endpoint, timeout_s=timeout_s) as session:
+        for reply in session.liveliness().get(keys.tokens_of_all_versions(fleet), timeout=timeout_s):
+            peer = None if reply.ok is None else keys.other_version(str(reply.ok.key_expr))
+            found |= {peer} if peer else set()
+    return tuple(
+        f"'{name}' uses version {version} of the bus, and this program {OURS}: it takes no part. Use one version."
+        for name, version in sorted(found)
+    )

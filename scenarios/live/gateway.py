@@ -1,0 +1,718 @@
+"""The live page: its files, as browsers load them, and the cell in three dimensions as it draws it.
+
+Nobody needs a token for the files, which say nothing about a fleet; the page asks for one and sends it with each
+request.
+
+The bus over HTTP: the fleet as JSON, messages as server-sent events, job submissions and quotes; who may do what.
+
+The bus is served on a thread of its own (`fleet.live.monitor.async_bridge`); feed and reader buffers are used on the
+event loop only. Errors are problem details (RFC 9457).
+
+The bus over HTTP and server-sent events, and a page for browsers, as a process.
+"""
+
+import asyncio
+import gzip
+import hmac
+import ipaddress
+import logging
+import math
+import os
+import secrets
+import signal
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from http import HTTPStatus
+from pathlib import Path
+from typing import (
+    Any,  # values of JSON
+    Literal,
+    TypeVar,
+    get_args,
+)
+
+import msgspec
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import JobSpec, QuoteRequest, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.messages import MalformedMessage, decode, encode
+from fleet.bus.protocol.operator import (
+    Cleared,
+    ClearRequest,
+    Controlled,
+    ControlRequest,
+    Person,
+    ResetReply,
+    ResetRequest,
+)
+from fleet.env.render.picture import heat_scale
+from fleet.errors import NAME_RULE, BusError, FleetError, Refused, is_name, nearest
+from fleet.live.monitor.async_bridge import AsyncBridge, Entry, EventFeed, ReaderBuffer
+from fleet.live.monitor.snapshot import MAX_JOBS
+from scenarios.cli.options import the_fleet
+from scenarios.cli.signals import until_stopped
+from scenarios.cli.terminal import Interrupted, echo
+from scenarios.spec.schema import Scenario
+
+PAGE = "dashboard.html"
+FILES = ("page.css", "dashboard.css", "cell.js", "stream.js", "tables.js", "actions.js", "dashboard.js")
+TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' data: blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'none'",
+    "Content-Encoding": "gzip",
+    "Cache-Control": "no-cache",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "Vary": "Accept",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class LivePage:
+    """The page of a gateway."""
+
+    def __init__(self, model: Mapping[str, Any] | None = None) -> None:
+        """Prepare; without a model the cell is drawn as the auctioneer describes it."""
+        self._given, self._model = model is not None, model
+        self._cell: Cell | None = None
+
+    async def scene(self, ask_cell: Callable[[], Awaitable[Cell]]) -> Mapping[str, Any]:
+        """The cell in three dimensions; raises BusError if nobody describes it, or with wrong numbers."""
+        if self._given and self._model is not None:
+            return self._model
+        cell = await ask_cell()
+        if self._model is None or cell != self._cell:
+            try:
+                self._model = await asyncio.to_thread(_model_of, cell)
+            except ValueError as error:
+                raise BusError(f"The auctioneer describes a cell that cannot be: {error}") from error
+            self._cell = cell
+        return self._model
+
+    async def file(self, request: Request) -> Response:
+        """A file of the page."""
+        return self.response(str(request.url.path).removeprefix("/page/"))
+
+    def response(self, name: str = PAGE) -> Response:
+        """The page, or one of its files."""
+        kind = f"{TYPES[name.rpartition('.')[2]]}; charset=utf-8"
+        return Response(self.contents[name], media_type=kind, headers=HEADERS)
+
+    @cached_property
+    def contents(self) -> Mapping[str, bytes]:
+        """The page and its files by name, compressed."""
+        from scenarios.show.replay import three_js
+        from scenarios.show.table import static
+
+        texts = {name: static(name) for name in (PAGE, *FILES)}
+        texts["three.js"] = three_js()
+        return {name: gzip.compress(text.encode(), mtime=0) for name, text in texts.items()}
+
+
+def wants_page(scope: Scope) -> bool:
+    """Whether a browser asks for the page: at `/`, and it accepts HTML."""
+    return scope["path"] == "/" and b"text/html" in dict(scope["headers"]).get(b"accept", b"")
+
+
+def is_public(scope: Scope) -> bool:
+    """Whether a request is for the page or one of its files."""
+    return scope["method"] in ("GET", "HEAD") and (wants_page(scope) or scope["path"].startswith("/page/"))
+
+
+def _model_of(cell: Cell) -> Mapping[str, Any]:
+    from scenarios.live.cell import described_model  # loads MuJoCo
+
+    return {**described_model(cell, [arm.name for arm in cell.arms]), "heat": heat_scale(cell.warning_c, cell.error_c)}
+
+
+Role = Literal["monitor", "submitter", "operator"]
+ROLES: tuple[Role, ...] = get_args(Role)
+"""Each role may do what the ones before it may."""
+MIN_TOKEN = 16
+MAX_BODIES = 32
+"""Unfinished bodies at a time; one more ends the oldest."""
+RATE_HZ, BURST = 50.0, 100.0
+"""Requests per real second of one token, or without tokens of one address; and how many at once after a pause."""
+MAX_SENDERS = 4096
+"""Tokens and addresses whose rate is kept."""
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+MAX_BYTES = 60_000
+"""Of a body: what the router passes, less the overhead of a message."""
+MAX_READERS, MAX_REQUESTS = 64, 16
+BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
+"""Real seconds: for a body to arrive; for a reader to take what was sent; between two heartbeats."""
+Body = TypeVar("Body", bound=msgspec.Struct)
+Asked = TypeVar("Asked", bound=msgspec.Struct)
+Reply = TypeVar("Reply")
+Endpoint = Callable[[Request], Awaitable[Response]]
+NO_TOKENS: Mapping[str, Role] = {}
+
+
+class Problem(Exception):
+    """An HTTP error with a sentence that says what is wrong."""
+
+    def __init__(self, status: HTTPStatus, detail: str) -> None:
+        super().__init__(detail)
+        self.status, self.detail = status, detail
+
+
+def check_token(token: str) -> str:
+    """Return the token.
+
+    Raises:
+        FleetError: it is too short, or has other characters than printable ASCII.
+    """
+    if len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable():
+        raise FleetError(f"A token needs {MIN_TOKEN} or more printable ASCII characters (got {len(token)}).")
+    return token
+
+
+def read_tokens(path: Path) -> dict[str, Role]:
+    """Roles by token, of a file with `ROLE TOKEN` in each line.
+
+    Raises:
+        FleetError: it cannot be read, others may read it, or a line is wrong.
+    """
+    try:
+        if path.stat().st_mode & 0o077:
+            raise FleetError(f"Other users can read the tokens in '{path}'. Run: chmod 600 {path}")
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FleetError(f"Cannot read the tokens in '{path}': {error}.") from error
+    tokens: dict[str, Role] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        name, _, token = line.strip().partition(" ")
+        role: Role | None = next((role for role in ROLES if role == name), None)
+        if role is None:
+            raise FleetError(f"{path}, line {number}: no role '{name}'{nearest(name, ROLES)}")
+        tokens[check_token(token.strip())] = role
+    if not tokens:
+        raise FleetError(f"'{path}' holds no tokens; a line is ROLE TOKEN. Roles: {', '.join(ROLES)}.")
+    return tokens
+
+
+class AccessCheck:
+    """Passes requests that show a token, at a limited rate; without tokens, requests to this machine's local names.
+
+    The name is checked since a page of another site must not reach the gateway under a name of its own. A request that
+    is `public` needs no token.
+    """
+
+    def __init__(
+        self, app: ASGIApp, tokens: Mapping[str, Role], public: Callable[[Scope], bool] = lambda scope: False
+    ) -> None:
+        self.app, self.tokens, self.public = app, {token.encode(): role for token, role in tokens.items()}, public
+        self._senders: dict[bytes, tuple[float, float]] = {}
+        """Requests that each may still send, and the loop's time at which that was counted."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse the request or pass it on, with its role."""
+        refusal = None
+        if scope["type"] == "http":
+            headers = dict(scope["headers"])
+            refusal = None if self.tokens and self.public(scope) else self.refusal(headers)
+            if refusal is None:
+                shown = headers.get(b"authorization", b"")[7:]
+                scope["role"] = self.tokens.get(shown, "monitor" if self.tokens else "operator")
+                sender = shown if shown in self.tokens else str((scope.get("client") or ("",))[0]).encode()
+                refusal = self._too_fast(sender)
+        await (refusal or self.app)(scope, receive, send)
+
+    def refusal(self, headers: dict[bytes, bytes]) -> Response | None:
+        """Error response, None if the request may pass."""
+        if not self.tokens:
+            host = headers.get(b"host", b"").decode("latin-1")
+            name = host if host.endswith("]") else host.rpartition(":")[0] or host
+            if name in LOCAL:
+                return None
+            return problem_response(HTTPStatus.MISDIRECTED_REQUEST, f"This gateway is {LOCAL[0]}, not '{name}'.")
+        shown = headers.get(b"authorization", b"")
+        if shown[:7].lower() == b"bearer " and any([hmac.compare_digest(shown[7:], token) for token in self.tokens]):
+            return None
+        detail = "This gateway needs a token: Authorization: Bearer …."
+        return problem_response(HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
+
+    def _too_fast(self, sender: bytes) -> Response | None:
+        now_s = asyncio.get_running_loop().time()
+        left, counted_s = self._senders.pop(sender, (BURST, now_s))
+        left = min(BURST, left + RATE_HZ * (now_s - counted_s))
+        self._senders[sender] = max(0.0, left - 1.0), now_s
+        if len(self._senders) > MAX_SENDERS:
+            del self._senders[next(iter(self._senders))]
+        if left >= 1.0:
+            return None
+        detail = f"More than {RATE_HZ:g} requests a second."
+        return problem_response(HTTPStatus.TOO_MANY_REQUESTS, detail, {"Retry-After": str(math.ceil(1 / RATE_HZ))})
+
+
+def check_role(request: Request, needed: Role) -> None:
+    """Check the role of a request's token.
+
+    Raises:
+        Problem: it may not do this.
+    """
+    role: Role = request.scope["role"]
+    if ROLES.index(role) < ROLES.index(needed):
+        raise Problem(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")
+
+
+class Bodies:
+    """Limits the time and the number of unfinished bodies: who sends quickly is not held up by those who do not."""
+
+    def __init__(self, body_s: float) -> None:
+        self.body_s = body_s
+        self._unfinished: dict[asyncio.Timeout, None] = {}
+
+    @asynccontextmanager
+    async def reading(self) -> AsyncIterator[None]:
+        """Within it one body is read.
+
+        Raises:
+            TimeoutError: it took too long, or too many newer ones arrived meanwhile.
+        """
+        async with asyncio.timeout(self.body_s) as limit:
+            self._unfinished[limit] = None
+            if len(self._unfinished) > MAX_BODIES:
+                oldest = next(iter(self._unfinished))
+                del self._unfinished[oldest]
+                oldest.reschedule(asyncio.get_running_loop().time())
+            try:
+                yield
+            finally:
+                self._unfinished.pop(limit, None)
+
+
+def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
+    """Problem details, RFC 9457."""
+    fields = {"type": "about:blank", "title": status.phrase, "status": status.value, "detail": detail}
+    return Response(msgspec.json.encode(fields), status.value, headers, media_type="application/problem+json")
+
+
+class AskBody(msgspec.Struct, frozen=True):
+    """Body of /v4/ask: jobs to be quoted, not done."""
+
+    jobs: tuple[JobSpec, ...]
+
+
+class ResetBody(msgspec.Struct, frozen=True):
+    """Body of /v4/reset: clear the fault of an arm."""
+
+    arm: str
+    by: Person = ""
+    """Who requests it."""
+
+
+@dataclass(eq=False)
+class Reader(ReaderBuffer):
+    """One reader of the event stream."""
+
+    wake: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+@dataclass(eq=False)
+class Readers:
+    """All readers of the event stream; used on the event loop only."""
+
+    connected: set[Reader] = field(default_factory=set[Reader])
+    closed: bool = False
+
+    def put(self, entry: Entry) -> None:
+        """Pass an entry to every reader."""
+        for reader in self.connected:
+            reader.put(entry)
+            reader.wake.set()
+
+    def close(self) -> None:
+        """End every stream."""
+        self.closed = True
+        for reader in self.connected:
+            reader.wake.set()
+
+
+def application(
+    bridge: AsyncBridge,
+    readers: Readers,
+    *,
+    tokens: Mapping[str, Role] = NO_TOKENS,
+    heartbeat_s: float = HEARTBEAT_S,
+    stuck_s: float = STUCK_S,
+    body_s: float = BODY_S,
+    page: LivePage | None = None,
+) -> Starlette:
+    """Make the application; with tokens every request must show one, without any only local requests are served.
+
+    Args:
+        page: Shown to browsers at `/`; None for none.
+    """
+    boot = secrets.token_hex(4)  # event numbers are valid for one start of the gateway
+    slots, bodies, shown = asyncio.Semaphore(MAX_REQUESTS), Bodies(body_s), page or LivePage()
+
+    async def limited(request: Callable[[], Awaitable[Reply]]) -> Reply:
+        if slots.locked():
+            raise Problem(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_REQUESTS} requests are waiting; try again.")
+        async with slots:
+            return await request()
+
+    async def fleet(request: Request) -> Response:
+        text = request.query_params.get("jobs", "")
+        jobs = int(text) if text.isdecimal() and len(text) < 5 else MAX_JOBS
+        return json_response(await bridge.snapshot(jobs))
+
+    async def ask(key: str, message: msgspec.Struct, kind: type[Asked]) -> Asked:
+        return await limited(lambda: bridge.ask(key, message, kind))
+
+    def of_jobs(topic: keys.JobsTopic, kind: type[Body], reply: type[msgspec.Struct]) -> Endpoint:
+        """Passes the body of a request on to the auctioneer."""
+
+        async def post(request: Request) -> Response:
+            message = await read_body(request, kind, bodies)
+            return json_response(await ask(keys.of_jobs(bridge.fleet, topic), message, reply))
+
+        return post
+
+    submit = of_jobs("submit", Submission, SubmissionReply)
+    control = of_jobs("control", ControlRequest, Controlled)
+    clear = of_jobs("clear", ClearRequest, Cleared)
+
+    async def get_jobs(request: Request) -> Response:
+        names = tuple(request.query_params.getlist("job"))
+        return json_response(await ask(keys.of_jobs(bridge.fleet, "status"), StatusRequest(names), Status))
+
+    async def post_reset(request: Request) -> Response:
+        body = await read_body(request, ResetBody, bodies)
+        if not is_name(body.arm):
+            raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
+        key = keys.of_arm(bridge.fleet, body.arm, "reset")
+        return json_response(await ask(key, ResetRequest(body.by), ResetReply))
+
+    async def ask_cell() -> Cell:
+        return await ask(keys.of_jobs(bridge.fleet, "cell"), CellRequest(), Cell)
+
+    async def get_cell(request: Request) -> Response:
+        return json_response(await ask_cell())
+
+    async def get_scene(request: Request) -> Response:
+        return json_response(await shown.scene(ask_cell))
+
+    async def post_ask(request: Request) -> Response:
+        body = await read_body(request, AskBody, bodies)
+        try:
+            quote_request = decode(QuoteRequest, encode(QuoteRequest("http", body.jobs, dry_run=True)))
+        except MalformedMessage as error:
+            raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+        return json_response(await limited(lambda: bridge.quotes(quote_request)))
+
+    async def events(request: Request) -> Response:
+        if readers.closed or len(readers.connected) >= MAX_READERS:
+            detail = f"{len(readers.connected)} readers are connected; try again later."
+            raise Problem(HTTPStatus.SERVICE_UNAVAILABLE, detail)
+        last_event = request.headers.get("last-event-id", "")
+        return EventStream(bridge.feed, readers, boot, last_event, heartbeat_s, stuck_s)
+
+    async def contents(request: Request) -> Response:
+        if page is not None and wants_page(request.scope):
+            return page.response()
+        entries = [{"method": m, "path": p, "role": role, "what": what} for m, p, role, _, what in table]
+        return json_response({"gateway": "thermofleet", "role": request.scope["role"], "requests": entries})
+
+    table: list[tuple[str, str, Role, Endpoint, str]] = [
+        ("GET", "/", "monitor", contents, "This list."),
+        (
+            "GET",
+            "/v4/fleet",
+            "monitor",
+            fleet,
+            "State of every arm, jobs and messages, as `thermofleet bus watch --json`.",
+        ),
+        ("GET", "/v4/events", "monitor", events, "Every message as server-sent events."),
+        ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
+        ("POST", "/v4/jobs", "submitter", submit, "Submit jobs: a Submission."),
+        ("GET", "/v4/cell", "monitor", get_cell, "Places, arms, kinds of jobs and limits: all that a job may name."),
+        ("GET", "/v4/scene", "monitor", get_scene, "Arms, places and colours in three dimensions, as the page draws."),
+        ("POST", "/v4/control", "operator", control, "Cancel, settle, change, pause, resume: a ControlRequest."),
+        ("POST", "/v4/clear", "operator", clear, "Free the space of an absent arm: a ClearRequest."),
+        ("POST", "/v4/reset", "operator", post_reset, 'Clear the fault of an arm: {"arm": …, "by": …}.'),
+        ("POST", "/v4/ask", "submitter", post_ask, 'Quotes without submitting: {"jobs": […]}.'),
+    ]
+    routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
+    if page is not None:
+        routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
+    handlers = dict.fromkeys((Problem, BusError, Refused, HTTPException, Exception), error_response)
+    access = Middleware(AccessCheck, tokens=tokens, **({"public": is_public} if page is not None else {}))
+    return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
+
+
+class EventStream(StreamingResponse):
+    """Server-sent events until the reader disconnects or falls behind, or the gateway stops."""
+
+    def __init__(
+        self, feed: EventFeed, readers: Readers, boot: str, last_event: str, heartbeat_s: float, stuck_s: float
+    ) -> None:
+        super().__init__(self._text(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+        self._feed, self._readers, self._boot, self._last_event = feed, readers, boot, last_event
+        self._heartbeat_s, self._stuck_s, self._reader = heartbeat_s, stuck_s, Reader()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Write the stream."""
+
+        async def send_in_time(message: Message) -> None:
+            await asyncio.wait_for(send(message), self._stuck_s)
+
+        self._readers.connected.add(self._reader)
+        try:
+            await super().__call__(scope, receive, send_in_time)
+        except TimeoutError:
+            pass  # the reader is stuck: the server closes the connection of an unfinished stream
+        finally:
+            self._readers.connected.discard(self._reader)
+
+    async def _text(self) -> AsyncIterator[str]:
+        reader = self._reader
+        last_boot, _, number = self._last_event.partition("-")
+        seen = int(number) if last_boot == self._boot and number.isdecimal() and len(number) < 20 else 0
+        missed, gap = self._feed.since(seen)
+        gap_text = "event: gap\ndata: {}\n\n" if gap and self._last_event else ""
+        yield "retry: 1000\n\n" + gap_text + "".join(map(self._event, missed))
+        seen = missed[-1].number if missed else 0
+        while not (self._readers.closed or reader.full):
+            try:
+                await asyncio.wait_for(reader.wake.wait(), self._heartbeat_s)
+            except TimeoutError:
+                yield ": heartbeat\n\n"
+                continue
+            reader.wake.clear()
+            entries = [entry for entry in reader.take() if entry.number > seen]
+            if entries and not reader.full:
+                yield "".join(map(self._event, entries))
+
+    def _event(self, entry: Entry) -> str:
+        name = msgspec.json.encode(entry.name).decode()
+        data = f'{{"name":{name},"message":{entry.data}}}'
+        return f"id: {self._boot}-{entry.number}\nevent: {entry.topic}\ndata: {data}\n\n"
+
+
+def _checked(role: Role, handle: Endpoint) -> Endpoint:
+    """The handler of a request that needs a role."""
+
+    async def check(request: Request) -> Response:
+        check_role(request, role)
+        return await handle(request)
+
+    return check
+
+
+async def read_body(request: Request, kind: type[Body], bodies: Bodies) -> Body:
+    """Read the message that is the body of a request.
+
+    Raises:
+        Problem: too large, too slow, not JSON, or not a message of this kind.
+    """
+    content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if content_type != "application/json":
+        detail = f"The body must be application/json (got '{content_type}')."
+        raise Problem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
+    parts: list[bytes] = []
+    try:
+        async with bodies.reading():
+            async for part in request.stream():
+                parts.append(part)
+                if sum(map(len, parts)) > MAX_BYTES:
+                    detail = f"A body has at most {MAX_BYTES} bytes; send several requests."
+                    raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
+        return decode(kind, b"".join(parts))
+    except TimeoutError as error:
+        raise Problem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {bodies.body_s:g} s.") from error
+    except ClientDisconnect as error:
+        raise Problem(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
+    except MalformedMessage as error:
+        raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+
+
+def json_response(value: object) -> Response:
+    """Response with a value as JSON."""
+    return Response(msgspec.json.encode(value), media_type="application/json", headers={"Cache-Control": "no-store"})
+
+
+def error_response(_: Request, error: Exception) -> Response:
+    """Problem details of an error."""
+    match error:
+        case Problem():
+            return problem_response(error.status, error.detail)
+        case BusError() | Refused():
+            return problem_response(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+        case HTTPException():
+            return problem_response(HTTPStatus(error.status_code), str(error.detail), error.headers)
+        case _:
+            return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The gateway failed; the reason is in its log.")
+
+
+TOKEN = "THERMOFLEET_TOKEN"
+MAX_CONNECTIONS, MAX_WAITING, HEADER_S = 1000, 128, 5.0
+"""Connections at a time; those that have sent no complete request yet, of which one more ends the oldest; and real
+seconds after which such a connection ends."""
+_LOG = logging.getLogger(__name__)
+
+
+def scene_of(scenario: Scenario) -> dict[str, Any]:  # values of JSON
+    """The cell of a scenario as the page draws it."""
+    from fleet.arm.cell import cell_model
+
+    limits, robots = scenario.limits, [arm.robot() for arm in scenario.arms]
+    heat = heat_scale(limits.warning_c, limits.error_c)
+    return {**cell_model(robots, scenario.places, scenario.fixtures), "heat": heat}
+
+
+def run_gateway(
+    endpoint: str, fleet: str, port: int, host: str, token: str, tokens: Path | None, page: LivePage | None = None
+) -> None:
+    """Serve until a signal arrives; the arguments are the options of `thermofleet bus gateway`."""
+    roles = read_tokens(tokens) if tokens else {}
+    if token:
+        roles[check_token(token)] = "operator"
+    check(host, endpoint, bool(roles))
+    name = the_fleet(fleet, endpoint)
+    with listen(host, port, STUCK_S) as bound:
+        with until_stopped() as stop:
+            link = BusClient(endpoint, name, stopped=stop.is_set).open()
+        with link:
+            number = asyncio.run(serve(link, bound, roles, page))
+    if number == signal.SIGINT:
+        raise Interrupted("The gateway was interrupted.")
+
+
+def check(host: str, endpoint: str, has_tokens: bool) -> None:
+    """Refuse to pass on requests without a token of those that could not send them to the router themselves.
+
+    Raises:
+        FleetError: an option is wrong or missing.
+    """
+    try:
+        local = ipaddress.ip_address(host).is_loopback
+    except ValueError as error:
+        raise FleetError(f"--host must be an IP address, as 127.0.0.1 or ::1 (got '{host}').") from error
+    if not has_tokens and endpoint.startswith("tls/"):
+        raise FleetError(
+            f"The router needs certificates, and without a token every user of this machine could use yours. Set "
+            f"{TOKEN} (or --token) to {MIN_TOKEN} or more random characters, or give --tokens."
+        )
+    if local:
+        return
+    if not has_tokens:
+        raise FleetError(
+            f"--host {host} is reachable from other machines, which could submit jobs. Set {TOKEN} (or --token) to "
+            f"{MIN_TOKEN} or more random characters, or use 127.0.0.1."
+        )
+    _LOG.warning("Listening on %s: HTTP is not encrypted and shows the token; put TLS in front.", host)
+
+
+def listen(host: str, port: int, stuck_s: float) -> socket.socket:
+    """Socket on which the system drops connections whose reader takes nothing for `stuck_s`.
+
+    Raises:
+        FleetError: the address is not of this machine, or the port is in use.
+    """
+    bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):
+        bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * stuck_s))
+    try:
+        bound.bind((host, port))
+        bound.listen()
+    except OSError as error:
+        bound.close()
+        raise FleetError(f"The gateway cannot listen on {host}:{port}: {os.strerror(error.errno or 0)}.") from error
+    return bound
+
+
+class Server(uvicorn.Server):
+    """Server that leaves signals to its caller, and ends the event streams when it stops."""
+
+    def __init__(self, app: Starlette, readers: Readers) -> None:
+        config = uvicorn.Config(
+            app,
+            http=_protocol(),
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            lifespan="off",
+            limit_concurrency=MAX_CONNECTIONS,
+            timeout_keep_alive=5,
+            timeout_graceful_shutdown=2,
+        )
+        super().__init__(config)
+        self._readers = readers
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Do nothing: uvicorn would raise SIGTERM again when it stops."""
+        yield
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the event streams, which have no end of their own, and shut down."""
+        self._readers.close()
+        await super().shutdown(sockets)
+
+
+def _protocol() -> type[H11Protocol]:
+    """HTTP of one server, which does not let connections wait without a complete request."""
+    waiting: dict[H11Protocol, Callable[[], None]] = {}
+
+    class Protocol(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:
+            super().connection_made(transport)
+            waiting[self] = self._end_waiting
+            if len(waiting) > MAX_WAITING:
+                next(iter(waiting.values()))()
+            self.loop.call_later(HEADER_S, self._end_waiting)
+
+        def handle_events(self) -> None:
+            super().handle_events()
+            if self.cycle is not None:
+                waiting.pop(self, None)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            waiting.pop(self, None)
+            super().connection_lost(exc)
+
+        def _end_waiting(self) -> None:
+            if self in waiting:
+                del waiting[self]
+                self.transport.close()
+
+    return Protocol
+
+
+async def serve(link: BusClient, bound: socket.socket, tokens: Mapping[str, Role], page: LivePage | None = None) -> int:
+    """Serve until a signal arrives; return its number."""
+    readers, received = Readers(), [0]
+    async with AsyncBridge(link, readers.put) as bridge:
+        server = Server(application(bridge, readers, tokens=tokens, page=page), readers)
+
+        def stop(number: int) -> None:
+            received[0], server.should_exit = number, True
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, stop, number)
+        address, bound_port, *_ = bound.getsockname()
+        shown = f"[{address}]" if ":" in address else address
+        kind, path = ("gateway", "/v4") if page is None else ("page", "/")
+        echo(f"ready {kind} http://{shown}:{bound_port}{path} {os.getpid()}")
+        await server.serve(sockets=[bound])
+    return received[0]

@@ -1,0 +1,295 @@
+"""One arm of a scenario: its hardware, and its plans for the scenario's work.
+
+Everything in a scenario that cannot work.
+
+True motor temperatures under a plan: for simulated past jobs, and for the model `oracle`, which measures regret.
+
+They follow from the parameters of the simulator, which arms and policies must not use.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.arm.plan_cache import CachedPlanner, LoadedPlans, rest_torque
+from fleet.arm.space import FARTHEST_M, collisions_of_homes, conflicts_with_homes
+from fleet.difficulty import Blind, Difficulty, difficulty_of_error
+from fleet.engine.world import Arm, warm_start
+from fleet.errors import InfeasibleJob
+from fleet.heat.motor import Motors, gen3_motors, thermal_data
+from fleet.heat.thermal import (
+    WINDING,
+    ThermalModel,
+    ThermalSpread,
+    gen3_network,
+    simulate_temperatures,
+    spread_motors,
+    thermal_model,
+)
+from fleet.job import Work
+from fleet.motion import Plan, drives
+from fleet.robot import JOINTS, Robot
+from scenarios.progress import Count, Progress
+from scenarios.spec.jobs import works_of
+from scenarios.spec.schema import Scenario
+from twin.thermal.thermal_twin import LinearHeat, peak_forecast
+
+log = logging.getLogger(__name__)
+
+
+class ArmHardware(NamedTuple):
+    """An arm's robot, its motors and its thermal model."""
+
+    robot: Robot
+    motors: Motors
+    thermal: ThermalModel
+
+    def content(self) -> bytes:
+        """Every parameter of motors and thermal model, for cache keys."""
+        values = (*vars(self.motors).values(), *vars(self.thermal).values())
+        return b"".join(np.asarray(value, dtype=float).tobytes() for value in values)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedArm:
+    """An arm of a scenario with its plans."""
+
+    index: int
+    """Place in the scenario's list of arms; random draws for the arm depend on it."""
+    hardware: ArmHardware
+    plans: Mapping[Work, tuple[Plan, ...]]
+    infeasible: tuple[InfeasibleJob, ...] = ()
+    """Work that the arm cannot do, with reasons."""
+    too_heavy: frozenset[Work] = frozenset()
+    """Work whose load exceeds the arm's rating."""
+
+    @property
+    def all_plans(self) -> list[Plan]:
+        """The plans of all works."""
+        return [plan for variants in self.plans.values() for plan in variants]
+
+
+def hardware_of(scenario: Scenario, index: int) -> ArmHardware:
+    """The hardware of one arm, with its random deviation from the nominal Gen3; the same for every seed of a run."""
+    spec = scenario.arms[index]
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index]))
+    spread = ThermalSpread.gen3(scenario.spread.scale)
+    motors = spread_motors(gen3_motors(wear=spec.wear), spread, rng)
+    if spec.sensor_noise_k is not None:
+        motors = replace(motors, sensor_noise_k=np.full(JOINTS, spec.sensor_noise_k))
+    network = gen3_network(cooling=spec.cooling, cooling_factor=spec.cooling_factor, spread=spread, rng=rng)
+    return ArmHardware(spec.robot(), motors, thermal_model(network))
+
+
+def air_offsets(scenario: Scenario) -> np.ndarray:
+    """Ambient temperature at each arm minus that of the cell, K, [arm]: given by the scenario, plus a random part."""
+    sd = scenario.spread.scale * thermal_data()["spread"]["ambient_k"]
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, len(scenario.arms), 1]))
+    drawn = sd * rng.standard_normal(len(scenario.arms))
+    return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
+
+
+class CellPlanner:
+    """Plans of one arm of a scenario that keep clear of the other arms at home; cached in a folder."""
+
+    def __init__(self, robot: Robot, scenario: Scenario, folder: Path, loaded: LoadedPlans | None = None) -> None:
+        spec = scenario.planning
+        self._robot, self._folder, self._clearance_m = robot, folder / "plans", scenario.clearance_m
+        self._others = [arm.robot() for arm in scenario.arms if arm.name != robot.name]
+        self._planner = CachedPlanner(
+            robot, scenario.fixtures, elbows=spec.elbows, speeds=spec.speeds, cache_dir=self._folder, loaded=loaded
+        )
+
+    def plan(self, work: Work) -> tuple[Plan, ...]:
+        """All variants, as `fleet.arm.planner.Planner.plan`, that come too close to no other arm at home.
+
+        Raises:
+            InfeasibleJob: there is none.
+        """
+        for place in work.places:
+            far_m = float(np.linalg.norm(np.subtract(place.position_m, self._robot.mount.position_m)))
+            if far_m > FARTHEST_M:  # not worth a search, nor a file in the cache
+                raise InfeasibleJob(self._robot.name, place.name, f"reach: {far_m:.2f} m from the base of the arm")
+        plans = self._planner.plan(work)
+        reasons = conflicts_with_homes(self._robot, self._others, plans, self._clearance_m, self._folder)
+        clear = tuple(plan for plan, reason in zip(plans, reasons, strict=True) if reason is None)
+        if not clear:
+            raise InfeasibleJob(self._robot.name, work.places[0].name, str(reasons[0]))
+        return clear
+
+
+def homes_in_fixtures(scenario: Scenario) -> list[str]:
+    """A sentence for each arm that stands or waits inside a fixture, with depth."""
+    if not scenario.fixtures:
+        return []
+    from fleet.arm.model import ArmModel
+    from fleet.arm.trajectory import CollisionChecker
+
+    inside = []
+    for i, spec in enumerate(scenario.arms):
+        robot = spec.robot()
+        collision = CollisionChecker(ArmModel(robot, scenario.fixtures)).deepest_collision(robot.home_q()[None])
+        if collision:
+            inside.append(f"arms[{i}] '{robot.name}' at home: {collision}")
+    return inside
+
+
+def plan_arms(
+    scenario: Scenario, indices: Sequence[int], works: Sequence[Work], folder: Path, progress: Progress
+) -> list[PlannedArm]:
+    """The arms at these places of the scenario, each with its plans for the works (cached in `folder`)."""
+    planned, loaded = [], LoadedPlans()
+    for done, index in enumerate(indices):
+        hardware = hardware_of(scenario, index)
+        planner = CellPlanner(hardware.robot, scenario, folder, loaded)
+        plans: dict[Work, tuple[Plan, ...]] = {}
+        infeasible: list[InfeasibleJob] = []
+        too_heavy: set[Work] = set()
+        for i, work in enumerate(works):
+            progress("planning", Count(done + i / len(works), len(indices)))
+            try:
+                plans[work] = planner.plan(work)
+            except InfeasibleJob as error:
+                infeasible.append(error)
+                if error.too_heavy:
+                    too_heavy.add(work)
+                log.info("%s", error)
+        planned.append(PlannedArm(index, hardware, plans, tuple(infeasible), frozenset(too_heavy)))
+    return planned
+
+
+REASONS = 4
+"""Maximum number of reasons in one error message."""
+
+
+def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
+    """Everything in a scenario that cannot work, one sentence each.
+
+    Args:
+        arms: With plans for all works; the work of a stream that none can do is a problem. If there are none, only
+            the arms at home are compared.
+        folder: Of the cache.
+    """
+    file = f"{scenario.name}.toml"
+    robots = [spec.robot() for spec in scenario.arms]
+    near = collisions_of_homes(robots, scenario.clearance_m, folder / "plans")
+    advice = "move or turn an arm, or give it another `home`"
+    if scenario.clearance_m:
+        advice = "move or turn an arm, give it another `home`, or lower clearance_m"
+    problems = [f"{file}: arms: {sentence}; {advice}." for sentence in near]
+    problems += [
+        f"{file}: {sentence}; move the arm or the fixture, or give the arm another `home`."
+        for sentence in homes_in_fixtures(scenario)
+    ]
+    problems += [f"{file}: {sentence}." for sentence in _outside_limits_at_home(scenario, arms, folder)]
+    infeasible = [error for arm in arms for error in arm.infeasible]
+    possible = {work for arm in arms for work in arm.plans}
+    for i, stream in enumerate(scenario.jobs if arms else ()):
+        loads = [f"{work.payload_kg:g}" for work in works_of(scenario, stream) if work not in possible]
+        if not loads:
+            continue
+        here = [error for error in infeasible if error.place in stream.places]
+        reasons = list(dict.fromkeys(f"{error.arm} at '{error.place}': {error.reason}" for error in here))
+        if near and any(reason.endswith("at home") for reason in reasons):
+            continue  # it may be possible once the homes are apart
+        more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
+        problems.append(
+            f"{file}: jobs[{i}].places: no arm can do '{stream.name}' with {' or '.join(loads)} kg "
+            f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
+        )
+    return problems
+
+
+def _outside_limits_at_home(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
+    """A sentence for each arm that begins too cold, or that never settles at home though the shift begins settled."""
+    cell_c, offsets_k = float(scenario.ambient.at(np.zeros(1))[0]), air_offsets(scenario)
+    lower_c, found = scenario.limits.lower_c, []
+    for arm in arms:
+        ambient_c = coldest_c = cell_c + float(offsets_k[arm.index])
+        if scenario.start == "idle_warm":
+            robot, motors, thermal = arm.hardware
+            rest_tau = rest_torque(robot, folder / "plans")
+            still = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=Blind(), plans={})
+            try:
+                coldest_c = float(warm_start(still, ambient_c)[WINDING].min())
+            except ValueError as error:
+                reason = str(error).rstrip(".")
+                advice = 'give it more cooling or cooler air, or begin with start = "cold"'
+                found.append(f"arms[{arm.index}]: {reason}; {advice}")
+        if coldest_c < lower_c:
+            advice = "give it warmer air" + (', or begin with start = "idle_warm"' if scenario.start == "cold" else "")
+            name = scenario.arms[arm.index].name
+            found.append(
+                f"arms[{arm.index}]: a motor of '{name}' begins at {coldest_c:.1f} °C, below limits.lower_c "
+                f"({lower_c:g} °C); {advice}"
+            )
+    return found
+
+
+Array = np.ndarray
+
+
+def peaks(
+    plans: Sequence[Plan],
+    duration_s: Sequence[float],
+    *,
+    motors: Motors,
+    thermal: ThermalModel,
+    start_c: Array,
+    ambient_c: float,
+) -> Array:
+    """Hottest winding temperature of each joint while one arm repeats the cycle of each plan, °C, [plan, joint].
+
+    Args:
+        duration_s: Time during which the cycle repeats, [plan].
+        start_c: Initial temperatures, [node].
+    """
+    load = drives([plan.cycle.profile for plan in plans], motors)
+    return simulate_temperatures(
+        load, duration_s, motors=motors, thermal=thermal, start_c=start_c, ambient_c=ambient_c
+    ).highest_c
+
+
+SURE_K = 0.15
+"""P rises from 0 to 1 between the warning limit minus and plus this: twice the RMS error of the linearised heat."""
+
+
+@dataclass(frozen=True, eq=False)
+class Oracle:
+    """Scores a plan with the true motor parameters: the peak that follows from the present temperatures.
+
+    The arm's housing observer then has the true parameters too (`fleet.engine.world.Arm.known`). P(saturation) is 0 or
+    1, except within `SURE_K` of the warning limit. d_k = 1 − exp(−rise_k / (warning − start_k)), from idle equilibrium.
+    """
+
+    motors: Motors
+    thermal: ThermalModel
+    start_c: Array
+    """Idle equilibrium, [node]."""
+    ambient_c: float
+    """Ambient temperature of the idle equilibrium; the peak uses the present one."""
+    warning_c: float
+    version: str = "oracle"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        """Difficulty of the repeated plan from idle equilibrium, and its peak as a function of known temperatures."""
+        peak = peaks(
+            [plan],
+            [plan.duration_s(repetitions)],
+            motors=self.motors,
+            thermal=self.thermal,
+            start_c=self.start_c,
+            ambient_c=self.ambient_c,
+        )[0]
+        start = self.start_c[WINDING]
+        room = np.maximum(self.warning_c - start, 1.0)
+        heat = LinearHeat.of(drives([phase.profile for phase in plan.phases], self.motors), self.motors, self.thermal)
+        step = np.array([[self.warning_c - SURE_K, 0.0], [self.warning_c + SURE_K, 1.0]])
+        return Difficulty(
+            per_joint=difficulty_of_error(np.maximum(peak - start, 0.0) / room),
+            peak=peak_forecast(heat, plan.duration_s(repetitions) * plan.weights(repetitions), step),
+        )

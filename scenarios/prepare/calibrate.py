@@ -1,0 +1,415 @@
+"""Simulated past jobs of an arm, with the records that a real arm would have of them.
+
+Each job begins as warm as earlier work left the arm, in any of the ambient temperatures of its hall. The records hold
+what is known before the job (measured motors, estimated housings, ambient temperature), and the hottest temperatures
+during it.
+
+Give a scenario's twins a predicted peak and a probability of saturation, from simulated past jobs of their arms.
+
+An arm that has worked for weeks has such jobs in its records. Here they are simulated: the arm's own work and random
+work with heavy payloads, in every ambient temperature of its hall, from cold, idle and hot starts.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from fleet.arm.model import ArmModel
+from fleet.arm.random_motions import RANDOM_MOTIONS_VERSION, random_jobs
+from fleet.difficulty import SETTLING_S, known_temperatures
+from fleet.heat.motor import Motors
+from fleet.heat.thermal import NODES, STEP_S, WINDING, ThermalModel, drive_heat, housing_observer, temperature_steps
+from fleet.job import Work
+from fleet.motion import Drive, Plan, drives, static_drive
+from fleet.offered_plans import offered_plans
+from fleet.robot import JOINTS, ThermalLimits
+from scenarios.prepare.arms import ArmHardware, PlannedArm, air_offsets
+from scenarios.prepare.identify import identify_arms
+from scenarios.prepare.twins import CachedModel, load_or_make
+from scenarios.progress import Progress
+from scenarios.spec.jobs import works_of
+from scenarios.spec.options import RiskName
+from scenarios.spec.schema import Scenario
+from twin.p_saturation import (
+    Evidence,
+    Experience,
+    NotEnoughExperience,
+    SaturationModel,
+    fit_saturation,
+    load_saturation,
+    save_saturation,
+)
+from twin.thermal.checkpoint import load_curve, save_curve
+from twin.thermal.identify import HeatModel, nominal_heat_model
+from twin.thermal.thermal_twin import CalibratedTwin, PeakCurve, RcTwin
+from twin.vae.twin import Twin
+
+Array = np.ndarray
+
+AMBIENT_C = (19.0, 27.0)
+"""Default range of the ambient temperature."""
+DURATION_S = (180.0, 2700.0)
+EARLIER_S = (300.0, 3600.0)
+"""Range of the duration of the work before."""
+REST_S = (120.0, 1800.0)
+"""Largest powered rest between the work before and this job, for one half of the jobs and for the other."""
+BEFORE = {"cold": 0.1, "idle": 0.2, "work": 0.7}
+"""Shares of the jobs that begin just after power-on, after a long idle time, and after work and a rest."""
+LONG_S = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class PastJobs:
+    """Jobs that one arm has done, with what was known before and the outcome."""
+
+    plans: tuple[Plan, ...]
+    repetitions: Array
+    """int [job]."""
+    duration_s: Array
+    """From leaving home to being home again, [job]."""
+    start_c: Array
+    """True temperatures at the start, [job, node]; hidden from the arm."""
+    known_c: Array
+    """Measured motors, estimated housings and ambient temperature at the start, [job, KNOWN]."""
+    peak_c: Array
+    """Hottest winding temperature during the job, counted as in `fleet.difficulty.SETTLING_S`, [job, joint]."""
+    warning_c: float
+
+    def __len__(self) -> int:
+        return len(self.plans)
+
+    @property
+    def hottest_c(self) -> Array:
+        """Temperature of the hottest winding, [job]."""
+        return self.peak_c.max(axis=1, initial=-np.inf)
+
+    @property
+    def passed(self) -> Array:
+        """Whether any motor reached the warning limit, bool [job]."""
+        return self.hottest_c >= self.warning_c
+
+
+def past_jobs(
+    hardware: ArmHardware,
+    plans: Sequence[Plan],
+    rng: np.random.Generator,
+    *,
+    limits: ThermalLimits,
+    ambient_c: tuple[float, float] = AMBIENT_C,
+    repetitions: Array | None = None,
+    known: HeatModel | None = None,
+) -> PastJobs:
+    """One past job of an arm for each plan. The earlier jobs are drawn from the same plans.
+
+    Args:
+        ambient_c: Range of the ambient temperature.
+        repetitions: int [plan]; by default such that the jobs last from 3 to 45 minutes.
+        known: The heat model by which the arm estimates its housings; default: nominal in the arm's cooling.
+    """
+    known = known or nominal_heat_model(hardware.robot.cooling)
+    history = _Simulator(hardware, known.motors, known.thermal(), limits.error_c)
+    count, noise_k = len(plans), hardware.motors.sensor_noise_k
+    if repetitions is None:
+        repetitions = repetitions_for(plans, rng)
+    ambient = rng.uniform(*ambient_c, count)
+    start = history.start(plans, ambient, rng)
+    measured_c = start.temp_c[:, WINDING] + noise_k * rng.standard_normal((count, noise_k.size))
+    return PastJobs(
+        plans=tuple(plans),
+        repetitions=repetitions,
+        duration_s=np.array([p.duration_s(int(n)) for p, n in zip(plans, repetitions, strict=True)]),
+        start_c=start.temp_c,
+        known_c=known_temperatures(measured_c, start.housing_c, ambient),
+        peak_c=history.peaks(plans, repetitions, start, ambient),
+        warning_c=limits.warning_c,
+    )
+
+
+def experience(twin: Twin, jobs: PastJobs) -> Experience:
+    """The past jobs with the features that the arm's twin computes for them."""
+    repetitions = jobs.repetitions.tolist()
+    return Experience.of_jobs(twin, jobs.plans, repetitions, known_c=jobs.known_c, passed=jobs.passed)
+
+
+def repetitions_for(
+    plans: Sequence[Plan], rng: np.random.Generator, lasts_s: tuple[float, float] = DURATION_S
+) -> Array:
+    """Repetitions such that the jobs last from 3 to 45 minutes, or in another range, int [job]."""
+    return _repetitions(plans, rng.uniform(*lasts_s, len(plans)))
+
+
+def _repetitions(plans: Sequence[Plan], duration_s: Array) -> Array:
+    """Repetitions that come closest to the durations, at least one, int [job]."""
+    around_s = [plan.approach.duration_s + plan.retreat.duration_s for plan in plans]
+    cycle_s = [plan.cycle.duration_s for plan in plans]
+    return np.array(
+        [max(1, round((d - a) / c)) for d, a, c in zip(duration_s, around_s, cycle_s, strict=True)], dtype=int
+    )
+
+
+class _Arms(NamedTuple):
+    """Temperatures of one arm in each job."""
+
+    temp_c: Array
+    """True, [job, node]."""
+    housing_c: Array
+    """The arm's estimate of its housings, [job, joint]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Simulator:
+    """True temperatures of one arm through work and rest, and what it believes of its housings."""
+
+    hardware: ArmHardware
+    known_motors: Motors
+    known_thermal: ThermalModel
+    error_c: float
+
+    def start(self, plans: Sequence[Plan], ambient: Array, rng: np.random.Generator) -> _Arms:
+        """Temperatures at which the jobs begin."""
+        count = len(plans)
+        before = rng.choice(list(BEFORE), size=count, p=list(BEFORE.values()))
+        cold = _Arms(np.repeat(ambient[:, None], NODES, axis=1), np.repeat(ambient[:, None], JOINTS, axis=1))
+        idle = self.idle(ambient)
+        # Somewhere between power-on and a long idle time: shifts begin at any time.
+        share = rng.uniform(0.0, 1.0, (count, 1))
+        arms = _Arms(*(one + share * (other - one) for one, other in zip(cold, idle, strict=True)))
+        earlier = [plans[i] for i in rng.integers(count, size=count)] if count else []
+        repetitions = repetitions_for(earlier, rng, EARLIER_S)
+        faulted = np.zeros((count, 1), bool)
+        for _, warmer in self._work(earlier, repetitions, arms, ambient):
+            arms = _choose(faulted, arms, warmer)  # a fault ends the work
+            faulted |= arms.temp_c[:, WINDING].max(axis=1, keepdims=True, initial=-np.inf) >= self.error_c
+        rest_s = rng.uniform(0.0, np.where(rng.random(count) < 0.5, *REST_S))
+        for _, cooler in self._course(self._at_home(), np.zeros(JOINTS), rest_s, arms, ambient):
+            arms = cooler
+        worked = _choose(before[:, None] == "idle", idle, arms)
+        return _choose(before[:, None] == "cold", cold, worked)
+
+    def peaks(self, plans: Sequence[Plan], repetitions: Array, start: _Arms, ambient: Array) -> Array:
+        """Hottest windings during jobs, counted as in `SETTLING_S`, [job, joint]."""
+        duration_s = np.array([plan.duration_s(int(n)) for plan, n in zip(plans, repetitions, strict=True)])
+        from_s = np.minimum(SETTLING_S, duration_s) - 1e-6
+        highest = np.full((len(plans), JOINTS), -np.inf)
+        for time_s, arms in self._work(plans, repetitions, start, ambient):
+            counts = (time_s >= from_s)[:, None]
+            highest = np.where(counts, np.maximum(highest, arms.temp_c[:, WINDING]), highest)
+        return highest
+
+    def idle(self, ambient: Array) -> _Arms:
+        """Temperatures after hours at home."""
+        _, motors, thermal = self.hardware
+        load, temp = self._at_home(), np.repeat(ambient[:, None], NODES, axis=1)
+        for _ in range(6):  # heat changes by a few percent with temperature
+            temp = thermal.steady(drive_heat(temp, load.current_sq, load.friction_w, motors), ambient)
+        observer = housing_observer(self.known_thermal, self.known_motors, LONG_S)
+        estimate = np.zeros((len(ambient), JOINTS))
+        return _Arms(temp, observer.step(estimate, temp[:, WINDING], ambient, 0.0))
+
+    def _at_home(self) -> Drive:
+        robot, motors, _ = self.hardware
+        return static_drive(ArmModel(robot).gravity_torque(robot.home_q()), motors)
+
+    def _work(
+        self, plans: Sequence[Plan], repetitions: Array, start: _Arms, ambient: Array
+    ) -> Iterator[tuple[Array, _Arms]]:
+        """Time since the start, s, [job], and temperatures after each step of approach, repeated cycle and retreat."""
+        arms, begun_s = start, np.zeros(len(plans))
+        for name in ("approach", "cycle", "retreat"):
+            profiles = [getattr(plan, name).profile for plan in plans]
+            duration_s = np.array([getattr(plan, name).duration_s for plan in plans])
+            if name == "cycle":
+                duration_s = duration_s * repetitions
+            load, friction_w = drives(profiles, self.hardware.motors), drives(profiles, self.known_motors).friction_w
+            for time_s, warmer in self._course(load, friction_w, duration_s, arms, ambient):
+                arms = warmer
+                yield begun_s + time_s, arms
+            begun_s = begun_s + duration_s
+
+    def _course(
+        self, load: Drive, friction_w: Array, duration_s: Array, start: _Arms, ambient: Array
+    ) -> Iterator[tuple[Array, _Arms]]:
+        """Time since the start, s, [job], and temperatures after each step under constant drives.
+
+        Args:
+            friction_w: As the arm believes, [job, joint].
+        """
+        _, motors, thermal = self.hardware
+        steps = np.ceil(duration_s / STEP_S)
+        dt_s = duration_s / np.maximum(steps, 1)
+        observer = housing_observer(self.known_thermal, self.known_motors, dt_s)
+        most = int(steps.max(initial=0.0))
+        course = temperature_steps(
+            [load] * most, dt_s, motors=motors, thermal=thermal, start_c=start.temp_c, ambient_c=ambient, steps=steps
+        )
+        temp_c, housing_c = next(course), start.housing_c
+        for step, next_c in enumerate(course, start=1):
+            mean_c = (temp_c + next_c)[:, WINDING] / 2.0
+            estimate = observer.step(housing_c, mean_c, ambient, friction_w)
+            housing_c = np.where((step <= steps)[:, None], estimate, housing_c)
+            temp_c = next_c
+            yield np.minimum(step, steps) * dt_s, _Arms(temp_c, housing_c)
+
+
+def _choose(first: Array, one: _Arms, other: _Arms) -> _Arms:
+    """The first where so, else the other; bool [job, 1]."""
+    return _Arms(*(np.where(first, a, b) for a, b in zip(one, other, strict=True)))
+
+
+RECIPE = 3
+"""Raise it whenever the same twin and scenario would give other past jobs or another fit."""
+PAST = 4
+"""Spawn key, different from those of `scenarios.prepare.twins` for the same arm."""
+PAST_JOBS = 400
+"""Past jobs of each arm: enough that even a well-cooled arm has some in which a motor passed the limit."""
+OWN = 0.6
+"""Share of the past jobs that are the scenario's own work."""
+HEAVY_KG = (2.0, 4.0)
+"""Payloads of the other jobs: lighter ones say little about saturation."""
+AIR_MARGIN_K = 3.0
+"""By how much the ambient temperature of past jobs exceeds the scenario's range at either end."""
+
+
+def calibrate_twins(
+    scenario: Scenario,
+    arms: Sequence[PlannedArm],
+    twins: Sequence[Twin],
+    folder: Path,
+    progress: Progress,
+    *,
+    risk: RiskName = "rc",
+    jobs: int = PAST_JOBS,
+) -> list[CalibratedTwin]:
+    """Every arm's twin with its predicted peak and probability of saturation, from the folder where possible.
+
+    A twin whose past jobs say too little about saturation gets no probability; a warning says why.
+
+    Args:
+        arms: With their plans for all motion of the scenario, light loads included.
+    """
+    heats = calibrate_networks(scenario, arms, folder, progress, risk=risk, jobs=jobs)
+    inputs = list(zip(arms, twins, heats, strict=True))
+    if risk in ("rc", "rc-nominal"):
+        return [CalibratedTwin(twin, heat) for _, twin, heat in inputs]
+    models = [_saturation(scenario, a, t, heat, risk, folder, jobs) for a, t, heat in inputs]
+    fitted = load_or_make(models, "calibrating", progress)
+    return [CalibratedTwin(t, heat, model) for (_, t, heat), model in zip(inputs, fitted, strict=True)]
+
+
+def calibrate_networks(
+    scenario: Scenario,
+    arms: Sequence[PlannedArm],
+    folder: Path,
+    progress: Progress,
+    *,
+    risk: RiskName = "rc",
+    jobs: int = PAST_JOBS,
+) -> list[RcTwin]:
+    """Every arm's thermal network, identified for `rc`, else nominal; for `rc` and `rc-nominal` with its P(saturation).
+
+    Arguments as in `calibrate_twins`.
+    """
+    robots, ambient_c = [arm.hardware.robot for arm in arms], scenario.twin.ambient_c
+    if risk == "rc":
+        heats = [RcTwin.of(found) for found in identify_arms(scenario, arms, folder, progress)]
+    else:
+        heats = [RcTwin.nominal(robot.name, ambient_c=ambient_c, cooling=robot.cooling) for robot in robots]
+    heats = [replace(heat, warning_c=scenario.limits.warning_c) for heat in heats]
+    if risk not in ("rc", "rc-nominal"):
+        return heats
+    makers = [_curve(scenario, arm, heat, folder, jobs) for arm, heat in zip(arms, heats, strict=True)]
+    curves = load_or_make(makers, "calibrating", progress)
+    return [replace(heat, curve=curve) for heat, curve in zip(heats, curves, strict=True)]
+
+
+def _curve(scenario: Scenario, arm: PlannedArm, heat: RcTwin, folder: Path, jobs: int) -> CachedModel[PeakCurve]:
+    def make(home: Path, _report: Callable[[float], None]) -> None:
+        past = simulate_past(scenario, arm, heat.heat_model, jobs=jobs)
+        fitted = heat.with_past_jobs(past.plans, past.repetitions, known_c=past.known_c, peak_c=past.hottest_c)
+        assert fitted.curve is not None
+        save_curve(fitted.curve, home)
+
+    return CachedModel(folder / "saturation" / _key(scenario, arm, heat.version, jobs), load_curve, make)
+
+
+def _saturation(
+    scenario: Scenario, arm: PlannedArm, twin: Twin, heat: RcTwin, evidence: Evidence, folder: Path, jobs: int
+) -> CachedModel[SaturationModel | None]:
+    def load(home: Path) -> SaturationModel | None:
+        return load_saturation(home) if home.is_dir() else None
+
+    def make(home: Path, _report: Callable[[float], None]) -> str | None:
+        past = simulate_past(scenario, arm, heat.heat_model, jobs=jobs)
+        try:
+            save_saturation(fit_saturation(experience(twin, past), evidence=evidence), home)
+        except NotEnoughExperience as error:
+            return f"{scenario.name}: arm '{arm.hardware.robot.name}' gets no probability of saturation. {error}"
+        return None
+
+    version = f"{evidence}-{twin.version}-{heat.version}"
+    return CachedModel(folder / "saturation" / _key(scenario, arm, version, jobs), load, make)
+
+
+def simulate_past(scenario: Scenario, arm: PlannedArm, known: HeatModel, *, jobs: int = PAST_JOBS) -> PastJobs:
+    """Simulated past jobs of an arm that knows this of its heat; the same for every seed of a run.
+
+    A share `OWN` of the jobs is drawn from the scenario's streams.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, arm.index], spawn_key=(PAST,)))
+    own = _own_jobs(scenario, arm, round(OWN * jobs), rng)
+    other = random_jobs(arm.hardware.robot, jobs - len(own), rng, payload_kg=HEAVY_KG)
+    repetitions = [times for _, times in own] + repetitions_for(other, rng).tolist()
+    return past_jobs(
+        arm.hardware,
+        [*(plan for plan, _ in own), *other],
+        rng,
+        limits=scenario.limits,
+        ambient_c=_ambient_range(scenario, arm.index),
+        repetitions=np.array(repetitions, dtype=int),
+        known=known,
+    )
+
+
+def _own_jobs(scenario: Scenario, arm: PlannedArm, count: int, rng: np.random.Generator) -> list[tuple[Plan, int]]:
+    """Plans that the arm offers for jobs of the scenario, with repetitions; none if it can do no work."""
+    possible = [
+        (repetitions, works)
+        for repetitions, all_of_them in _kinds_of_jobs(scenario)
+        if (works := [work for work in all_of_them if arm.plans.get(work)])
+    ]
+    jobs = []
+    for _ in range(count if possible else 0):
+        (fewest, most), works = possible[rng.integers(len(possible))]
+        repetitions = int(rng.integers(fewest, most + 1))
+        offered = offered_plans(arm.plans[works[rng.integers(len(works))]], repetitions)
+        jobs.append((offered[rng.integers(len(offered))], repetitions))
+    return jobs
+
+
+def _kinds_of_jobs(scenario: Scenario) -> list[tuple[tuple[int, int], tuple[Work, ...]]]:
+    """Repetitions and works of the streams, each once: arrivals, values and due dates do not matter to past jobs."""
+    return list(dict.fromkeys((stream.repetitions, works_of(scenario, stream)) for stream in scenario.jobs))
+
+
+def _ambient_range(scenario: Scenario, index: int) -> tuple[float, float]:
+    """Ambient temperatures of past jobs at one arm: those of the scenario and a margin."""
+    offset_k = float(air_offsets(scenario)[index])
+    temps = [temp_c + offset_k for temp_c in scenario.twin.air_c or [temp_c for _, temp_c in scenario.ambient.points]]
+    return min(temps) - AIR_MARGIN_K, max(temps) + AIR_MARGIN_K
+
+
+def _key(scenario: Scenario, arm: PlannedArm, version: str, jobs: int) -> str:
+    """Cache key of a model: the version of what it calibrates, the arm's hardware and plans, and the past jobs."""
+    robot, air_c = arm.hardware.robot, _ambient_range(scenario, arm.index)
+    parts = [RECIPE, RANDOM_MOTIONS_VERSION, jobs, version, scenario.spread.seed, scenario.limits, robot, air_c]
+    digest = hashlib.sha256(msgspec.json.encode([*parts, _kinds_of_jobs(scenario)]))
+    digest.update(arm.hardware.content())
+    for phase in (phase for plan in arm.all_plans for phase in plan.phases):
+        digest.update(f"{phase.profile.shape}".encode())
+        digest.update(np.ascontiguousarray(phase.profile).tobytes())
+    return digest.hexdigest()[:32]

@@ -1,0 +1,105 @@
+"""What commands and calls are asked to do, as plain values whose fields are options.
+
+Nothing here is slow to import, so that the help of a command is fast.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from agents.registry import NAMES_HELP, WRAPPERS_HELP, names_of
+from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.fields import MAX_SEED, MAX_SPEED, MIN_SPEED, check, option
+
+DifficultyName = Literal["twin", "blind", "oracle"]
+RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
+"""Model of P(saturation): from the peak predicted by the identified or by the nominal thermal network of the arm, or
+a regression on features of the learned twin (`twin.p_saturation.evidence_of`)."""
+RISK: RiskName = "rc"
+PlantName = Literal["profile", "mujoco"]
+BusName = Literal["zenoh", "memory"]
+DIFFICULTY_HELP = "Source of the difficulty scores: twin, oracle (simulator) or blind (none)."
+RISK_HELP = (
+    "With --difficulty twin, model of P(saturation): rc (peak predicted by the arm's own thermal network), rc-nominal "
+    "(peak predicted by that of a nominal arm), excess, load, errors (regression on errors of the learned twin), or "
+    "torque (regression on mean squared torque)."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSpec:
+    """What to run, without the fleet."""
+
+    policy: str = option(NAMES_HELP, "least_difficulty")
+    seed: int = option(
+        "Random seed of jobs, sensor noise and policy.",
+        0,
+        low=0,
+        high=MAX_SEED,
+        shown="0, or of an instance of the suite its own",
+    )
+    plant: PlantName = option(
+        "profile (arms follow their plans exactly) or mujoco (all arms in closed loop in MuJoCo).",
+        "profile",
+        choices=get_args(PlantName),
+    )
+    bus: BusName = option(
+        "Transport between the arms: zenoh (in-process router) or memory.", "zenoh", choices=get_args(BusName)
+    )
+    difficulty: DifficultyName = option(DIFFICULTY_HELP, "twin", choices=get_args(DifficultyName))
+    risk: RiskName = option(RISK_HELP, RISK, choices=get_args(RiskName))
+    channel: Channel = PERFECT
+    """Topology, delay and loss of the arms' messages."""
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+PORT, PAGE_PORT = 7447, 8080
+"""TCP ports of the router and of the gateway, unless they are taken."""
+LiveModel = Literal["twin", "blind"]
+JobSource = Literal["scenario", "none"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveSpec:
+    """How a live fleet works; each of its processes gets what concerns it."""
+
+    policy: str = option(
+        f"Allocation policy. Run by the auctioneer: {names_of('central')}. Run by each arm, without an auctioneer: "
+        f"{names_of('arm')}, or a folder of `thermofleet train`. Your own as FILE.py:CLASS, run according to its "
+        f"scope, or bus:NAME in another process. {WRAPPERS_HELP}.",
+        "matching",
+    )
+    speed: float = option("Fleet seconds per real second.", 1.0, low=MIN_SPEED, high=MAX_SPEED)
+    difficulty: LiveModel = option("Difficulty model.", "twin", choices=get_args(LiveModel))
+    risk: RiskName = option(RISK_HELP, RISK, choices=get_args(RiskName))
+    jobs: JobSource = option(
+        "scenario: the scenario's job stream; none: submitted jobs only.",
+        "scenario",
+        choices=get_args(JobSource),
+        noun="source of jobs",
+    )
+    seed: int = option("Random seed of the scenario's jobs, the sensor noise and the policy.", 0, low=0, high=MAX_SEED)
+    fleet: str = option("Name of the fleet. Default: the scenario's name.", "", is_name=True)
+    journal: Path | None = option("Folder of the journals; an existing journal is continued.", None)
+    new_epoch: bool = option("Begin with empty journals although other participants know older ones.", False)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """What to film and how."""
+
+    speed: float = option("Shift seconds per second of the film.", 120.0, low=0.1, high=3600)
+    fps: int = option("Pictures per second.", 30, low=1, high=60)
+    width: int = 1280
+    height: int = 720
+    begin_s: float = option("First second of the shift.", 0.0, low=0, high=1e9, flag="--begin")
+    end_s: float = option("Last second of the shift; by default its end.", 1e9, low=0, high=1e9, flag="--end", shown="")
+    meshes: bool = option("Kinova's shells; needs the extra `meshes`.", False)
+
+    def __post_init__(self) -> None:
+        check(self)

@@ -1,0 +1,328 @@
+"""Readable errors for scenario files and for names among several.
+
+`kind` is a type annotation such as `float | None`, for which Python has no type (hence Any).
+
+Parse the content of scenario files: a `Scenario`, or an error of one sentence.
+
+Hash of a scenario.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from itertools import combinations, pairwise
+from math import dist, isfinite
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+
+from fleet.errors import ScenarioError, nearest, printable
+from scenarios.spec.schema import Scenario
+
+_WORDS = {
+    "float": "a number",
+    "int": "a whole number",
+    "str": "a text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "a table",
+    "datetime": "a date with a time",
+    "date": "a date",
+    "time": "a time of day",
+    "null": "nothing",
+}
+"""Plain words for msgspec's type names."""
+_LENGTH = re.compile(r"Expected `array` of length (\d+), got (\d+)")
+_TYPE = re.compile(r"Expected `([^`]+)`, got `([^`]+)`")
+_MISSING = re.compile(r"Object missing required field `([^`]+)`")
+_OWN_FIELD = re.compile(r"[A-Z]\w*\.(\w.*)", re.DOTALL)
+"""`Robot.tool_kg must be >= 0 (got -1.0).`"""
+_OWN = re.compile(r"[A-Z]\w* (needs? .*)", re.DOTALL)
+"""`Poisson needs 0 <= start_s <= stop_s (got 5.0, 1.0).`"""
+_STEP = re.compile(r"\[(\d+)\]|\.?(\w+)")
+
+
+def readable_error(error: msgspec.ValidationError, raw: object, schema: Any) -> str:
+    """One sentence that begins with the place: `arms[0].tool_kg: expected a number, got a text ('heavy').`
+
+    Args:
+        error: Raised by `msgspec.convert(raw, schema)`.
+        raw: Parsed TOML.
+        schema: Annotation of the type to convert to.
+    """
+    text, _, place = str(error).partition(" - at `$")
+    place = place.strip("`").lstrip(".")
+    text = text.rstrip(".")
+    if match := _OWN_FIELD.fullmatch(text):
+        return f"{place}.{match[1]}{'' if match[1].endswith('?') else '.'}".lstrip(".")
+    if match := _OWN.fullmatch(text):
+        return f"{place} {match[1]}.".lstrip()
+    lead = f"{place}: " if place else ""
+    value, kind = _follow(raw, schema, place)
+    if match := _MISSING.fullmatch(text):
+        return f"{lead}'{match[1]}' is missing."
+    if match := _LENGTH.fullmatch(text):
+        return f"{lead}expected {match[1]} values, got {match[2]}."
+    if match := _TYPE.fullmatch(text):
+        wanted = [_WORDS.get(name, name) for name in match[1].split(" | ") if name != "null"]
+        return f"{lead}expected {' or '.join(wanted)}, got {_WORDS.get(match[2], match[2])}{_shown(value)}."
+    if text.startswith("Invalid enum value"):
+        return f"{lead}'{value}' is not allowed{nearest(str(value), get_args(kind))}"
+    return f"{lead}{text[:1].lower()}{text[1:]}."
+
+
+def check_finite(raw: object, file: str, place: str = "") -> None:
+    """Check that no number, at any depth, is `nan` or `inf`, which TOML allows.
+
+    Raises:
+        ScenarioError: names the place.
+    """
+    if isinstance(raw, Mapping):
+        for key, value in raw.items():
+            check_finite(value, file, f"{place}.{key}" if place else key)
+    elif isinstance(raw, list | tuple):
+        for i, value in enumerate(raw):
+            check_finite(value, file, f"{place}[{i}]")
+    elif isinstance(raw, float) and not math.isfinite(raw):
+        raise ScenarioError(f"{file}: {place}: expected a finite number, got {raw}.")
+
+
+def choose(what: str, name: str, kind: Any) -> Any:
+    """Return the name if it is one of a Literal type.
+
+    Raises:
+        ScenarioError: names the nearest allowed one.
+    """
+    if name not in get_args(kind):
+        raise ScenarioError(f"No {what} '{name}'{nearest(str(name), get_args(kind))}")
+    return name
+
+
+def plain_kind(kind: Any) -> Any:
+    """A type without its `| None`."""
+    if get_origin(kind) in (Union, UnionType):
+        rest = [arg for arg in get_args(kind) if arg is not type(None)]
+        return rest[0] if len(rest) == 1 else kind
+    return kind
+
+
+def _follow(raw: object, kind: Any, place: str) -> tuple[object, Any]:
+    """Value and type at a place such as `arms[0].tool_kg`; None if there is no such place."""
+    for index, name in _STEP.findall(place):
+        kind = plain_kind(kind)
+        if name:
+            raw = raw.get(name) if isinstance(raw, Mapping) else None
+            kind = get_type_hints(kind).get(name) if is_dataclass(kind) else None
+        else:
+            inside = get_args(kind)
+            raw = raw[int(index)] if isinstance(raw, list | tuple) and int(index) < len(raw) else None
+            each = inside[:1] if inside[-1:] == (Ellipsis,) else inside[int(index) :]
+            kind = each[0] if each else None
+    kind = plain_kind(kind)
+    return raw, kind if get_origin(kind) is Literal else None
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, bool):
+        return f" ({str(value).lower()})"
+    if isinstance(value, str | int | float):
+        return f" ({value!r})"
+    return ""
+
+
+MOST_JOBS = 100_000
+"""Largest number of expected jobs in a shift: a mistyped gap would give billions."""
+APART_M = 0.2
+"""Smallest distance of two bases: a Gen3 base is 0.09 m wide, and its first joint must turn freely."""
+
+
+def parse_toml(content: bytes, path: Path) -> Scenario:
+    """The scenario in the content of a file; `path` names it in errors and locates the files it refers to.
+
+    Raises:
+        ScenarioError: place, what was given and what is allowed.
+    """
+    try:
+        try:
+            raw = tomllib.loads(content.decode("utf-8-sig"))
+        except UnicodeDecodeError as error:
+            raise ScenarioError(f"{path.name}: not a UTF-8 text file.") from error
+        except ValueError as error:  # also an integer with too many digits
+            reason = str(error).partition(";")[0]
+            raise ScenarioError(f"{path.name}: not valid TOML: {printable(reason)}.") from error
+        return parse_scenario({"name": path.stem, **raw}, path)
+    except RecursionError as error:
+        raise ScenarioError(f"{path.name}: its tables are nested too deeply; a scenario needs 4 levels.") from error
+
+
+def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
+    """The scenario of a parsed TOML file; `path` names the file in errors and locates the files it refers to."""
+    _known_keys(raw, Scenario, path.name, "")
+    check_finite(raw, path.name)
+    raw = {"arms": (), "places": (), "jobs": (), **raw}  # an absent list and an empty one give the same error
+    try:
+        scenario = msgspec.convert(raw, Scenario, strict=True)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(f"{path.name}: {readable_error(error, raw, Scenario)}") from error
+    _check(scenario, path)
+    return _with_traces(scenario, path)
+
+
+def override(scenario: Scenario, **changes: object) -> Scenario:
+    """A copy of the scenario with some top-level fields changed.
+
+    Raises:
+        ScenarioError: there is no such field, or its value is not allowed.
+    """
+    where = f"{scenario.name} with overrides"
+    try:
+        plain = plain_values(changes)
+    except TypeError as error:
+        raise ScenarioError(f"{where}: {error}.") from error
+    return parse_scenario({**msgspec.to_builtins(scenario), **plain}, Path(where))
+
+
+def plain_values(fields: Mapping[str, object]) -> dict[str, Any]:
+    """The values of a mapping as those of a TOML or JSON file.
+
+    Raises:
+        TypeError: a value is neither a number, a text, a list nor a table.
+    """
+    return msgspec.to_builtins(dict(fields), enc_hook=_plain)
+
+
+def _plain(value: object) -> object:
+    """A NumPy scalar or array as Python's own."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"expected numbers, texts, lists and tables, got {value!r}")
+
+
+def _known_keys(raw: object, kind: Any, file: str, place: str) -> None:
+    """Check that the dataclass `kind` (an annotation, hence Any) has all the keys, at every depth."""
+    kind = plain_kind(kind)
+    if get_origin(kind) is tuple and isinstance(raw, list):
+        for i, item in enumerate(raw):
+            _known_keys(item, get_args(kind)[0], file, f"{place}[{i}]")
+    if not dataclasses.is_dataclass(kind) or not isinstance(raw, Mapping):
+        return
+    hints = get_type_hints(kind)
+    allowed = [f.name for f in dataclasses.fields(kind)]
+    for key, value in raw.items():
+        if key not in allowed:
+            where = f"{file}: {place}" if place else file
+            raise ScenarioError(f"{where}: unknown key '{key}'{nearest(key, allowed)}")
+        _known_keys(value, hints[key], file, f"{place}.{key}" if place else key)
+
+
+def _check(scenario: Scenario, path: Path) -> None:
+    """Check rules across fields: unique names, references, distances."""
+    file = path.name
+    if not scenario.arms:
+        raise ScenarioError(f"{file}: arms: there are no arms; give at least one [[arms]].")
+    if not scenario.jobs:
+        raise ScenarioError(f"{file}: jobs: there are no jobs; give at least one [[jobs]].")
+    for kind in ("arms", "places", "jobs", "fixtures"):
+        names = [item.name for item in getattr(scenario, kind)]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise ScenarioError(f"{file}: {kind}[{i}].name: '{name}' is given twice; names must be unique.")
+    for (i, one), (j, other) in combinations(enumerate(scenario.arms), 2):
+        apart = dist(one.position_m, other.position_m)
+        if apart < APART_M:
+            raise ScenarioError(
+                f"{file}: arms[{j}].position_m: '{other.name}' is {apart:.2f} m from '{one.name}' (arms[{i}]); "
+                f"bases must be at least {APART_M} m apart."
+            )
+    places = [place.name for place in scenario.places]
+    streams = [stream.name for stream in scenario.jobs]
+    for i, stream in enumerate(scenario.jobs):
+        for name in stream.places:
+            if name not in places:
+                raise ScenarioError(f"{file}: jobs[{i}].places: no place '{name}'{nearest(name, places)}")
+        for name in stream.after:
+            if name not in streams[:i]:
+                known = nearest(name, streams[:i]) if i else "."
+                raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
+    try:
+        scenario.bus.channel().check([arm.name for arm in scenario.arms])
+    except ValueError as error:
+        raise ScenarioError(f"{file}: bus.partitions: {error}") from error
+    total = sum(stream.arrivals.expected(scenario.horizon_s) for stream in scenario.jobs)
+    if total > MOST_JOBS:
+        raise ScenarioError(
+            f"{file}: jobs: about {total:.3g} jobs would arrive in a shift; at most {MOST_JOBS} are allowed."
+        )
+
+
+def _with_traces(scenario: Scenario, path: Path) -> Scenario:
+    """The scenario with the arrival times of its trace files."""
+    streams = []
+    for i, stream in enumerate(scenario.jobs):
+        spec = stream.arrivals
+        if spec.file is not None:
+            where = path.parent / spec.file
+            times = _trace(where, f"{path.name}: jobs[{i}].arrivals.file")
+            stream = dataclasses.replace(stream, arrivals=dataclasses.replace(spec, file=None, times_s=times))
+        streams.append(stream)
+    return dataclasses.replace(scenario, jobs=tuple(streams))
+
+
+def _trace(where: Path, place: str) -> tuple[float, ...]:
+    try:
+        lines = where.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise ScenarioError(f"{place}: there is no file '{where}'.") from error
+    except OSError as error:
+        raise ScenarioError(f"{place}: cannot read '{where}': {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{place}: '{where.name}' is not a UTF-8 text file.") from error
+    times: list[float] = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            times.append(float(line))
+        except ValueError as error:
+            raise ScenarioError(
+                f"{place}: line {number} of '{where.name}' is not a number of seconds: {line!r}."
+            ) from error
+    if not times:
+        raise ScenarioError(f"{place}: '{where.name}' holds no times; give one arrival time in seconds per line.")
+    for before, time in pairwise([0.0, *times]):
+        if not (isfinite(time) and before <= time):
+            raise ScenarioError(f"{place}: the times in '{where.name}' must be >= 0 and in order ({time} s is not).")
+    return tuple(times)
+
+
+def scenario_hash(scenario: Scenario) -> str:
+    """Hash of what is no default in a scenario, so that a new field with a default does not change it."""
+    return hash_of(scenario_content(scenario))
+
+
+def scenario_content(value: Any) -> Any:
+    """What is no default in a dataclass, at every depth (hence Any): a new field with a default changes no hash."""
+    if isinstance(value, tuple):
+        return [scenario_content(item) for item in value]
+    if not is_dataclass(value):
+        return value
+    content: dict[str, Any] = {}
+    for field in fields(value):
+        given = getattr(value, field.name)
+        default = field.default_factory() if field.default_factory is not MISSING else field.default
+        if given != default:
+            content[field.name] = scenario_content(given)
+    return content
+
+
+def hash_of(content: Any) -> str:
+    """Hash of JSON values (hence Any)."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,378 @@
+"""The schema of scenario files, with the defaults that `fleet` does not define."""
+
+from dataclasses import dataclass, field
+from math import ceil
+from typing import Literal, get_args
+
+import numpy as np
+
+from fleet.arrivals import Arrivals, Batch, Poisson, Trace
+from fleet.bus.exchange.channel import Channel, Partition, TopologyName
+from fleet.engine.batch import RewardWeights
+from fleet.env.allocation_v1 import Decisions
+from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
+from fleet.heat.effects import LONGEST_CONTACT_S, SHORTEST_CONTACT_S, burn_threshold_c
+from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_dwell, check_places
+from fleet.observation import MOST_SLOTS
+from fleet.robot import Cooling, Mount, Robot, ThermalLimits
+
+SplitName = Literal["train", "validation", "test", "sizes"]
+SPLITS: tuple[SplitName, ...] = get_args(SplitName)
+"""Of the suite."""
+MOST_SAMPLES = 1_000_000
+"""Telemetry samples of an arm in a shift: eleven days at one per second."""
+MOST_CLEARANCE_M = 0.2
+MOST_FIXTURES = 64
+MOST_EXPLORATION = 10_000
+MOST_SPREAD = 10.0
+MOST_WEIGHT = 1e9
+MOST_NOISE_K = 50.0
+_NOT_OF_ROBOT = ("position_m", "tilt_deg", "sensor_noise_k")
+_NUMBER = 8
+"""Characters that the name of a job may have after that of its stream."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmSpec:
+    """One arm of a scenario; `fleet.robot.Robot` and `Mount` define the fields."""
+
+    name: str
+    position_m: tuple[float, float, float] = Mount.position_m
+    tilt_deg: tuple[float, float, float] = Mount.tilt_deg
+    home: str = Robot.home
+    tool_kg: float = Robot.tool_kg
+    payload_limit_kg: float | None = Robot.payload_limit_kg
+    cooling: Cooling = Robot.cooling
+    cooling_factor: float = Robot.cooling_factor
+    ambient_offset_k: float = Robot.ambient_offset_k
+    wear: float = Robot.wear
+    sensor_noise_k: float | None = None
+    """Standard deviation of a reading of a motor temperature; None: that of the Gen3, at most 0.014 K."""
+
+    def __post_init__(self) -> None:
+        self.robot()
+        if self.sensor_noise_k is not None:
+            check_between(self, 0.0, MOST_NOISE_K, "sensor_noise_k")
+
+    def robot(self) -> Robot:
+        """The arm with its mount."""
+        own = {name: value for name, value in vars(self).items() if name not in _NOT_OF_ROBOT}
+        return Robot(mount=Mount(position_m=self.position_m, tilt_deg=self.tilt_deg), **own)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrivalSpec:
+    """When jobs of a stream arrive."""
+
+    kind: Literal["poisson", "batch", "trace"]
+    every_s: float | None = None
+    """poisson: mean gap. batch: gap between batches; None for a single batch."""
+    count: int | None = None
+    """batch: jobs per batch."""
+    start_s: float = 0.0
+    stop_s: float | None = None
+    """poisson: no arrivals after this."""
+    times_s: tuple[float, ...] | None = None
+    """trace: the arrival times."""
+    file: str | None = None
+    """trace: a text file beside the scenario, one arrival time in seconds per line."""
+
+    def __post_init__(self) -> None:
+        kinds = {"poisson": ("every_s", "stop_s"), "batch": ("count", "every_s"), "trace": ("file", "times_s")}
+        for name in sorted({name for names in kinds.values() for name in names} - {*kinds[self.kind]}):
+            if getattr(self, name) is not None:
+                allowed = ", ".join(sorted((*kinds[self.kind], "start_s")))
+                raise ValueError(f"arrivals of kind '{self.kind}' take no '{name}'; they take {allowed}")
+        needed = kinds[self.kind][0]
+        if self.kind != "trace" and getattr(self, needed) is None:
+            raise ValueError(f"arrivals of kind '{self.kind}' need '{needed}'")
+        if self.kind == "trace" and (self.times_s is None) == (self.file is None):
+            raise ValueError("arrivals of kind 'trace' need either 'times_s' or 'file'")
+        if self.file is None:
+            self.arrivals()
+
+    def arrivals(self, from_file: tuple[float, ...] = ()) -> Arrivals:
+        """The arrival process; `from_file` are the times from the file of a trace."""
+        if self.kind == "poisson":
+            assert self.every_s is not None
+            stop_s = np.inf if self.stop_s is None else self.stop_s
+            return Poisson(every_s=self.every_s, start_s=self.start_s, stop_s=stop_s)
+        if self.kind == "batch":
+            assert self.count is not None
+            return Batch(count=self.count, start_s=self.start_s, every_s=self.every_s)
+        return Trace(times_s=tuple(t + self.start_s for t in (self.times_s or from_file)))
+
+    def expected(self, horizon_s: float) -> float:
+        """Expected number of arrivals before the horizon; 0 for a trace whose file is not read yet."""
+        if self.kind == "trace":
+            return float(sum(t + self.start_s < horizon_s for t in self.times_s or ()))
+        left_s = max(0.0, min(self.stop_s or horizon_s, horizon_s) - self.start_s)
+        if self.kind == "poisson":
+            assert self.every_s is not None
+            return left_s / self.every_s
+        assert self.count is not None
+        batches = ceil(left_s / self.every_s) if self.every_s else float(left_s > 0)
+        return self.count * batches
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobStream:
+    """A kind of job that arrives repeatedly; payload and repetitions are drawn for each job."""
+
+    name: str
+    kind: Kind
+    places: tuple[str, ...]
+    """Names of places: [from, to] for pick_place and sort, one for hold and press."""
+    arrivals: ArrivalSpec
+    payload_kg: tuple[float, ...] = (0.0,)
+    repetitions: tuple[int, int] = (1, 1)
+    """Fewest and most."""
+    dwell_s: float = DWELL_S
+    """See `fleet.job.Work`: duration of one repetition of a hold or press."""
+    force_n: float = 0.0
+    value: float = 1.0
+    due_s: float = 1800.0
+    """Time from release to due date."""
+    due: Literal["soft", "hard"] = "soft"
+    """soft: a later finish is tardy. hard: a job that waits then expires, begun before or not."""
+    after: tuple[str, ...] = ()
+    """Streams whose job of the same number must finish first."""
+
+    def __post_init__(self) -> None:
+        if not self.payload_kg:
+            raise ValueError("JobStream.payload_kg must not be an empty list")
+        check_places(self, self.kind, self.places)
+        check_bounds(self, "payload_kg", "repetitions", "dwell_s", "force_n", "value", "due_s")
+        low, high = self.repetitions
+        if low > high:
+            raise ValueError(f"JobStream.repetitions must be [fewest, most] (got {low}, {high})")
+        check_dwell(self, self.kind, self.dwell_s)
+        check_duration(self, self.dwell_s, high)
+        if self.force_n and self.kind != "press":
+            raise ValueError(f"JobStream.force_n: only a press has a contact force (got {self.force_n} N)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ambient:
+    """Ambient temperature of the cell over the shift."""
+
+    points: tuple[tuple[float, float], ...] = ((0.0, 25.0),)
+    """(time s, °C), linear in between, constant outside."""
+
+    def __post_init__(self) -> None:
+        times = [t for t, _ in self.points]
+        if not times or times != sorted(times):
+            raise ValueError("Ambient.points must be a non-empty list of [time_s, temperature_c] in order of time")
+        if not all(-40 <= c <= 60 for _, c in self.points):
+            raise ValueError(f"Ambient.points must be between -40 and 60 °C (got {[c for _, c in self.points]})")
+
+    def at(self, time_s: np.ndarray) -> np.ndarray:
+        """Ambient temperatures at the times, °C, of the same shape."""
+        times, temps = zip(*self.points, strict=True)
+        return np.interp(time_s, times, temps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class People:
+    """People who may touch the arms during the shift."""
+
+    contact_s: float = 1.0
+    """Longest time for which they do: 1 s by mistake, minutes where they guide an arm or lean on it."""
+
+    def __post_init__(self) -> None:
+        check_between(self, SHORTEST_CONTACT_S, LONGEST_CONTACT_S, "contact_s")
+
+    @property
+    def burn_c(self) -> float:
+        """Temperature of uncoated metal from which such a contact may burn."""
+        return burn_threshold_c(self.contact_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BusSpec:
+    """How the arms' messages reach their peers in a simulated shift; fields as in `fleet.bus.exchange.channel.Channel`.
+
+    A channel that a command or a call is given, other than a perfect one, takes its place.
+    """
+
+    topology: TopologyName = "complete"
+    radius: float = Channel.radius
+    topology_seed: int = Channel.topology_seed
+    delay_s: float = Channel.delay_s
+    jitter_s: float = Channel.jitter_s
+    loss: float = Channel.loss
+    partitions: tuple[Partition, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.channel()
+
+    def channel(self) -> Channel:
+        """The channel between the arms."""
+        return Channel(**vars(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planning:
+    """Which plans each arm makes for a work."""
+
+    elbows: int = 3
+    speeds: tuple[float, ...] = (1.0, 0.6)
+    """Shares of the arm's speed limits."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.elbows <= 12:
+            raise ValueError(f"Planning.elbows must be between 1 and 12 (got {self.elbows})")
+        if not self.speeds or not all(0.05 <= speed <= 1 for speed in self.speeds):
+            raise ValueError(
+                f"Planning.speeds must be a non-empty list of shares between 0.05 and 1 (got {list(self.speeds)})"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinSpec:
+    """How the twins of the arms are trained."""
+
+    size: Literal["quick", "full"] = "full"
+    """quick: fewer windows and fewer epochs."""
+    cool_c: float = 40.0
+    """A motion is cool if no motor passes this temperature within the horizon."""
+    horizon_s: float = 1800.0
+    ambient_c: float = 22.0
+    """Ambient temperature while the motion repeats from a cold start."""
+    payload_kg: tuple[float, ...] = (0.0, 0.5, 1.0)
+    """Light payloads with which every motion of the scenario is also simulated for training."""
+    exploration: int = 64
+    """Number of further light motions for training: folded, elbow out, fast wrist, turned base; 0: none."""
+    air_c: tuple[float, float] | None = None
+    """Lowest and highest ambient temperature of the cell in the arms' past jobs; None: those of the shift."""
+
+    def __post_init__(self) -> None:
+        check_positive(self, "horizon_s")
+        if self.cool_c <= self.ambient_c:
+            raise ValueError(f"TwinSpec.cool_c must be above ambient_c (got {self.cool_c}, {self.ambient_c})")
+        if min(self.payload_kg, default=0.0) < 0:
+            raise ValueError(f"TwinSpec.payload_kg must be masses >= 0 (got {list(self.payload_kg)})")
+        if self.air_c is not None and not -40 <= self.air_c[0] <= self.air_c[1] <= 60:
+            raise ValueError(f"TwinSpec.air_c must be [lowest, highest] between -40 and 60 °C (got {list(self.air_c)})")
+        if not 0 <= self.exploration <= MOST_EXPLORATION:
+            raise ValueError(f"TwinSpec.exploration must be between 0 and {MOST_EXPLORATION} (got {self.exploration})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Random deviation of the arms from the nominal Gen3; the same for every seed of a run."""
+
+    scale: float = 1.0
+    """Factor on the log-normal standard deviations of `fleet.heat.thermal.ThermalSpread.gen3`; 0: all arms are equal."""
+    seed: int = 0
+    """Seed of the deviations."""
+
+    def __post_init__(self) -> None:
+        check_between(self, 0.0, MOST_SPREAD, "scale")
+        check_nonnegative(self, "seed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardSpec:
+    """Weights of the reward terms; `fleet.engine.batch.RewardWeights` defines the fields."""
+
+    finished_value: float = RewardWeights.finished_value
+    tardiness: float = RewardWeights.tardiness
+    above_warning: float = RewardWeights.above_warning
+    faults: float | None = None
+    """None: minus the price of a fault, see `scenarios.spec.jobs`."""
+    energy: float = RewardWeights.energy
+
+    def __post_init__(self) -> None:
+        given = (name for name in vars(RewardWeights()) if getattr(self, name) is not None)
+        check_between(self, -MOST_WEIGHT, MOST_WEIGHT, *given)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """One shift of one fleet in one cell."""
+
+    name: str
+    description: str
+    horizon_s: float
+    arms: tuple[ArmSpec, ...]
+    places: tuple[Place, ...]
+    jobs: tuple[JobStream, ...]
+    fixtures: tuple[Fixture, ...] = ()
+    decision_interval_s: float = 10.0
+    decisions: Decisions = "interval"
+    """Length of a step of the environment: one decision interval, or until an arm has a choice."""
+    clearance_m: float = 0.02
+    """Smallest distance that two arms keep from each other."""
+    slots: int = 16
+    start: Literal["idle_warm", "cold"] = "idle_warm"
+    telemetry_interval_s: float = 1.0
+    ambient: Ambient = field(default_factory=Ambient)
+    limits: ThermalLimits = field(default_factory=ThermalLimits)
+    people: People = field(default_factory=People)
+    reward: RewardSpec = field(default_factory=RewardSpec)
+    planning: Planning = field(default_factory=Planning)
+    twin: TwinSpec = field(default_factory=TwinSpec)
+    spread: Spread = field(default_factory=Spread)
+    bus: BusSpec = field(default_factory=BusSpec)
+
+    def __post_init__(self) -> None:
+        check_positive(self, "horizon_s", "decision_interval_s", "telemetry_interval_s")
+        if self.decision_interval_s > self.horizon_s:
+            raise ValueError(
+                "Scenario.decision_interval_s must not exceed horizon_s "
+                f"(got {self.decision_interval_s}, {self.horizon_s})"
+            )
+        if self.telemetry_interval_s > self.decision_interval_s:
+            raise ValueError(
+                "Scenario.telemetry_interval_s must not exceed decision_interval_s "
+                f"(got {self.telemetry_interval_s}, {self.decision_interval_s})"
+            )
+        if not 0 <= self.clearance_m <= MOST_CLEARANCE_M:
+            raise ValueError(
+                f"Scenario.clearance_m must be between 0 and {MOST_CLEARANCE_M} m (got {self.clearance_m})"
+            )
+        if not 1 <= self.slots <= MOST_SLOTS:
+            raise ValueError(f"Scenario.slots must be between 1 and {MOST_SLOTS} (got {self.slots})")
+        if len(self.fixtures) > MOST_FIXTURES:
+            raise ValueError(f"Scenario.fixtures must be at most {MOST_FIXTURES} (got {len(self.fixtures)})")
+        if self.horizon_s / self.telemetry_interval_s > MOST_SAMPLES:
+            raise ValueError(
+                f"Scenario.horizon_s must be at most {MOST_SAMPLES} times telemetry_interval_s "
+                f"(got {self.horizon_s}, {self.telemetry_interval_s})"
+            )
+        latest_s = self.horizon_s + max((stream.due_s for stream in self.jobs), default=0.0)
+        if latest_s > BOUNDS["due_s"].high:
+            raise ValueError(
+                f"Scenario.jobs: horizon_s plus the longest due_s must be at most {BOUNDS['due_s'].high:.15g} s "
+                f"(got {latest_s:.15g})"
+            )
+        check_names(self, "name")
+        for each in (*self.arms, *self.places, *self.fixtures, *self.jobs):
+            check_names(each, "name")
+        for stream in self.jobs:
+            if len(stream.name) > MAX_NAME - _NUMBER:
+                raise ValueError(
+                    f"JobStream.name must have at most {MAX_NAME - _NUMBER} characters, as its jobs have a number "
+                    f"after it (got {len(stream.name)})"
+                )
+
+    def channel(self, given: Channel) -> Channel:
+        """The given channel between the arms; that of the scenario if the given one is perfect."""
+        return self.bus.channel() if given.perfect else given
+
+    @property
+    def ticks(self) -> int:
+        """Decision intervals in the shift."""
+        return max(1, round(self.horizon_s / self.decision_interval_s))
+
+    def index_of(self, arm: str) -> int:
+        """Index of an arm in `arms`.
+
+        Raises:
+            FleetError: there is no such arm; names the known ones.
+        """
+        names = [spec.name for spec in self.arms]
+        if arm not in names:
+            raise FleetError(f"No arm '{arm}' in {self.name}{nearest(arm, names)}")
+        return names.index(arm)

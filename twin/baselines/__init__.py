@@ -1,1 +1,0 @@
-"""Rival detectors and nominal loads that the twin is compared with."""

@@ -1,1 +1,0 @@
-"""Calibrated probability that a motor passes its warning limit."""

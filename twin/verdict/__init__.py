@@ -1,1 +1,0 @@
-"""Uncritical or anomalous: verdicts on jobs and recordings."""
