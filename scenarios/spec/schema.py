@@ -263,7 +263,7 @@ class Spread:
     """Random deviation of the arms from the nominal Gen3; the same for every seed of a run."""
 
     scale: float = 1.0
-    """Factor on the log-normal standard deviations of `fleet.heat.thermal.ThermalSpread.gen3`; 0: all arms are equal."""
+    """Factor on the log-normal standard deviations of `fleet.heat.thermal.ThermalSpread.gen3`; 0: equal arms."""
     seed: int = 0
     """Seed of the deviations."""
 

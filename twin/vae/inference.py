@@ -1,14 +1,9 @@
-"""The gates of LSTM cells side by side, compiled: one step forward, and its gradient.
+"""Scoring with the trained networks of one arm, in NumPy, and the compiled LSTM cells that training shares with it.
 
-All arrays are float32 and contiguous, [net, ...]. Networks lie side by side; within one, hidden units and batch are one
-axis of size m, batch last, so that every gate is one block. Gates are in the order of torch.nn.LSTM: input, forget,
-cell, output. The matrix products are the caller's: `twin.vae.train` trains, `twin.vae.inference` scores.
-
-The trained networks of one arm on windows of all joints, in NumPy: scoring needs no torch.
-
-All networks run together: a matrix product and `twin.vae.inference.forward` per layer and time step, with the batch last as
-there. Weights have the names and the order of gates
-(input, forget, cell, output) of torch.nn.LSTM and torch.nn.Linear in `twin.vae.model.LstmVae`.
+All networks run together: a matrix product and `forward` for each layer and time step. Arrays are float32 and
+contiguous, [net, ...]; within a network, hidden units and batch are one axis of size m, batch last, so that every gate
+is one block of memory. Weights have the names and the order of gates (input, forget, cell, output) of torch.nn.LSTM and
+torch.nn.Linear in `twin.vae.model.LstmVae`. Scoring needs no torch.
 """
 
 from collections.abc import Callable, Mapping, Sequence

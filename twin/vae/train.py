@@ -1,19 +1,10 @@
-"""Networks of one shape trained side by side, with a network axis in front: `twin.vae.model.LstmVae`, many at once.
+"""Train the twins of arms on motion that stayed cool.
 
-Windows are [time, net, channel, batch]: with the batch last, each gate of a cell is one block of memory. Between the
-matrix products, `twin.vae.inference` computes a whole time step at once. torch.nn.LSTM takes three times as long for windows
-this small (`benchmarks/bench_twin.py`), and `torch.vmap` does not run it.
-
-One training of several networks side by side, which can stop and continue.
-
-Train the twins of arms on motion that stayed cool.
-
-The networks of all joints and restarts, and of several arms, are trained side by side (`twin.vae.train`).
-
-All restarts run the same schedule for a trial; only the one with the best ELBO on the training windows continues, so
-two cost 1.6 trainings. A shorter trial ranks them worse: of four pairs of trainings on the quickstart's cool motion
-(joints 2 and 4) the later winner led in 4 at epoch 36 of 60, in 2 at epoch 30. Held-out windows would cost data and
-gave the same winner over five trainings of joint 2.
+The networks of all joints and restarts, and of several arms, are trained side by side, with a network axis in front;
+a training can stop and continue. Windows are [time, net, channel, batch]: with the batch last, each gate of a cell is
+one block of memory. Between the matrix products, `twin.vae.inference.forward` computes a whole time step at once.
+torch.nn.LSTM takes three times as long for windows this small (`benchmarks/bench_twin.py`), and `torch.vmap` does not
+run it.
 """
 
 import math

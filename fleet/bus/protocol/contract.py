@@ -1,6 +1,4 @@
-"""One example of every message on the bus: a job `crate_1` from submission to receipt, and what is sent besides.
-
-The contract of the bus as documents: JSON schemas of every message, and the bus as an AsyncAPI 3 document.
+"""The contract of the bus as documents: JSON schemas and an example of every message, and an AsyncAPI 3 document.
 
 `docs/tables.py` writes them to docs/contract. The description of a field is the text under it in the source.
 AsyncAPI has no binding for Zenoh and refuses unknown ones; what is specific to Zenoh is under `x-zenoh`.
@@ -91,7 +89,7 @@ def _structs() -> Mapping[str, MessageType]:
     """Every struct that occurs in the schemas, by name."""
     return {
         name: value
-        for module in (messages, auction, cell, consensus, consensus, operator, policy)
+        for module in (messages, auction, cell, consensus, operator, policy)
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, msgspec.Struct)
     }

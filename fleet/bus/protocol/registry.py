@@ -43,7 +43,7 @@ class Channel:
     """Of a query; a `Refusal` may come instead."""
     receiver: str = "anybody"
     """Subscribes, or queries."""
-    consensus: int = 0
+    history: int = 0
     """Messages that the publisher caches; a subscriber that asks for history gets as many, and lost ones are resent."""
     heartbeat_s: float = 0.5
     """Of a publisher with history: within this its last sequence number is repeated, so that a loss is noticed."""

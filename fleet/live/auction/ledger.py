@@ -727,7 +727,7 @@ class Ledger(LedgerState):
         return None if award.may_commit or record.outcome == "refused" else self.pauser_of(award.record.arm)
 
     def _operate(self, record: Operated) -> list[JobEntry]:
-        """Carry out a request of a person, which `fleet.live.auction.auctioneer` has checked; return what has changed."""
+        """Carry out a checked request of a person; return what has changed."""
         request, time_s = record.request, record.time_s
         self.requests[request.request] = content_hash(request)
         while len(self.requests) > MAX_REQUESTS:

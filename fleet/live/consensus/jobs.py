@@ -335,11 +335,11 @@ class Operations:
 
     def changed(self, job: JobSpec) -> JobSpec:
         """Return a job with the due date and value that people have requested."""
-        for field in ("due_s", "value"):
-            operation = self.latest.get((field, job.name))
+        for name in ("due_s", "value"):
+            operation = self.latest.get((name, job.name))
             if operation is not None and isinstance(change := operation.request.action, Change):
                 try:
-                    job = changed_spec(job, Change(job.name, **{field: getattr(change, field)}))
+                    job = changed_spec(job, Change(job.name, **{name: getattr(change, name)}))
                 except ValueError:
                     continue  # two changes that are possible one by one only
         return job
