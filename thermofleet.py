@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from agents.policy import Policy as Policy
     from fleet.bus.client import BusClient as BusClient
-    from scenarios.spec.load import load as load
+    from scenarios.evaluate.comparison import compare as compare
+    from scenarios.prepare.fleet import make_batch as make_batch
     from scenarios.prepare.fleet import make_env as make_env
     from scenarios.prepare.fleet import prepare as prepare
     from scenarios.prepare.twins import train_twin as train_twin
-    from scenarios.prepare.fleet import make_batch as make_batch
-    from scenarios.evaluate.comparison import compare as compare
+    from scenarios.run.log import open_run as open_run
     from scenarios.run.shift import run as run
-    from scenarios.run.stored_run import read_run as open_run
+    from scenarios.spec.load import load as load
     from scenarios.spec.schema import Scenario as Scenario
     from twin.thermal.identify import identify as identify
 
@@ -37,12 +37,12 @@ _HOMES = {
     "load": "scenarios.spec.load",
     "make_batch": "scenarios.prepare.fleet",
     "make_env": "scenarios.prepare.fleet",
-    "open_run": "scenarios.run.stored_run",
+    "open_run": "scenarios.run.log",
     "prepare": "scenarios.prepare.fleet",
     "run": "scenarios.run.shift",
     "train_twin": "scenarios.prepare.twins",
 }
-__all__ = [*_HOMES, "__version__"]  # noqa: PLE0604
+__all__ = [*_HOMES]
 _PACKAGES = ("fleet", "agents", "twin", "scenarios")
 
 
@@ -59,7 +59,7 @@ def __getattr__(name: str) -> Any:  # functions and classes
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})
 
 
 def _check_packages() -> None:
