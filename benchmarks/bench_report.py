@@ -24,8 +24,7 @@ from playwright.sync_api import Browser, sync_playwright
 from fleet.arm.cell import cell_model
 from fleet.robot import Mount, Robot
 from fleet.telemetry import Telemetry
-from scenarios.run.run_folder import run_html
-from scenarios.run.stored_run import StoredRun, read_run
+from scenarios.run.log import RunLog, open_run, run_html
 from scenarios.show.run_page import report_html
 
 CHROMIUM = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -58,14 +57,14 @@ PICTURES = """(scrub) => new Promise((done) => {
 })"""
 
 
-def page_of(run: StoredRun) -> str:
+def page_of(run: RunLog) -> str:
     """The report of a run."""
-    return run_html(run.card, run.scenario, run.telemetry, run.events, run.jobs, run.offers)
+    return run_html(run.card, run.scenario, run.readings, run.events, run.jobs, run.offers)
 
 
-def enlarged(run: StoredRun, arms: int) -> str:
+def enlarged(run: RunLog, arms: int) -> str:
     """The report of a fleet whose arms repeat those of a run."""
-    telemetry, count = run.telemetry, len(run.arms)
+    telemetry, count = run.readings, len(run.arms)
     names = tuple(f"arm_{i:03d}" for i in range(arms))
     moments = np.arange(len(telemetry.time_s))
 
@@ -130,9 +129,9 @@ def main() -> None:
     parser.add_argument("--loads", type=int, default=5)
     parser.add_argument("--chromium", default="/usr/bin/chromium")
     options = parser.parse_args()
-    run = read_run(options.run)
+    run = open_run(options.run)
     pages = {len(run.arms): page_of(run)} | ({options.arms: enlarged(run, options.arms)} if options.arms else {})
-    print(f"{run.telemetry.time_s[-1] / 3600:.1f} h; median of {options.loads} loads")
+    print(f"{run.readings.time_s[-1] / 3600:.1f} h; median of {options.loads} loads")
     print(f"{'arms':>5}{'MB':>7}" + "".join(f"{title:>18}" for title in COLUMNS))
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=options.chromium, args=[*CHROMIUM, "--ignore-gpu-blocklist"])

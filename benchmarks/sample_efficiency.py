@@ -39,7 +39,7 @@ from fleet.env.vector import BatchEnv, Library, Obs, random_legal
 from scenarios.evaluate.rollout import Act, rollout
 from scenarios.json_rows import Rows
 from scenarios.prepare.fleet import Fleet, env_of, library_of, prepare
-from scenarios.run.provenance import code_hash
+from scenarios.run.log import code_hash
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.load import load
 from scenarios.train.networks import rule_actions

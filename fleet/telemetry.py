@@ -5,6 +5,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from fleet.robot import JOINTS
+
 Array = np.ndarray
 
 Mode = Literal["idle", "working", "faulted"]
@@ -31,6 +33,12 @@ class Telemetry:
     """[sample, arm, joint]."""
     temp_c: Array
     """Motor (winding) temperature with sensor noise, [sample, arm, joint]."""
+
+    @classmethod
+    def empty(cls, arms: int) -> "Telemetry":
+        """Telemetry without samples."""
+        sensors = [np.empty((0, arms, JOINTS), np.float32) for _ in range(5)]
+        return cls(np.empty(0), np.empty((0, arms), np.int8), *sensors)
 
 
 class Readings:

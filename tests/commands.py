@@ -25,7 +25,7 @@ ADDRESS = "THERMOFLEET_TEST_SERVER"
 """Variable with the address of the server, without its first zero byte; all workers of a run share one."""
 IMPORTED = (
     *("scenarios.cli.main", "scenarios.cli.look", "scenarios.cli.run", "scenarios.cli.live", "scenarios.cli.jobs"),
-    *("scenarios.run.shift", "scenarios.run.run_folder", "scenarios.prepare.fleet"),
+    *("scenarios.run.shift", "scenarios.run.log", "scenarios.prepare.fleet"),
     *("scenarios.live.arm", "scenarios.live.auctioneer", "scenarios.live.requests", "scenarios.show.watch"),
     *("fleet.live.arm.node", "fleet.live.auction.node", "fleet.env.allocation_v1", "fleet.arm.planner"),
     *("fleet.bus.router", "pyarrow.parquet", "numba", "scipy.optimize"),

@@ -9,7 +9,7 @@ import pytest
 from agents.registry import RULES
 from fleet.robot import JOINTS
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.run_folder import telemetry_table
+from scenarios.run.log import telemetry_table
 from scenarios.run.shift import run
 from scenarios.spec.jobs import all_works
 from scenarios.spec.load import library, load
@@ -67,9 +67,8 @@ def test_every_rule_works_its_first_minutes(fleet_of, name, policy):
     result = run(fleet, spec, stopped=lambda: next(asked) >= TICKS)
     assert result.time_s == TICKS * fleet.scenario.decision_interval_s
     assert result.metrics.illegal_actions == 0
-    assert result.telemetry is not None
     arms = [arm.name for arm in fleet.scenario.arms]
-    table = telemetry_table(result.telemetry, arms)
+    table = telemetry_table(result.readings, arms)
     joints = [f"{name}_{j + 1}" for name in ("q", "qd", "tau", "current_a", "temp_c") for j in range(JOINTS)]
     assert table.column_names == ["time_s", "arm", "mode", *joints]
     assert table.num_rows == len(arms) * round(result.time_s / fleet.scenario.telemetry_interval_s)

@@ -206,13 +206,13 @@ def view_command(
     import numpy as np
 
     from fleet.arm.cell import CellPlayer
-    from scenarios.run.stored_run import read_run
+    from scenarios.run.log import open_run
     from scenarios.show.film import Film, show_heat
     from scenarios.spec.load import load
 
     if (Path(what) / "run.json").exists():
-        run = read_run(Path(what))
-        film, last_s, began_s = Film(run, meshes=shot.meshes), float(run.telemetry.time_s[-1]), time.monotonic()
+        run = open_run(Path(what))
+        film, last_s, began_s = Film(run, meshes=shot.meshes), float(run.readings.time_s[-1]), time.monotonic()
         player = film.player
 
         def update() -> object:
@@ -253,10 +253,10 @@ def _write_files(
             require_extra(extra)
     if not (Path(what) / "run.json").exists():
         raise FleetError(f"--mcap and --gltf need the folder of a `thermofleet run` (got '{what}').")
-    from scenarios.run.stored_run import read_run
+    from scenarios.run.log import open_run
     from scenarios.show.moments import Moments
 
-    moments = Moments(read_run(Path(what)), every_s)
+    moments = Moments(open_run(Path(what)), every_s)
     for name, (path, _) in files.items():
         with progress_bar(kept="") as progress, disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -294,11 +294,11 @@ def film_command(
     width, height = _size(size)
     if sys.platform.startswith("linux"):  # MuJoCo chooses its OpenGL when it is loaded, and the default needs a display
         os.environ.setdefault("MUJOCO_GL", "egl")
-    from scenarios.run.stored_run import read_run
+    from scenarios.run.log import open_run
     from scenarios.show.film import frames, times, write_film
 
     shot = Shot(**given, width=width, height=height)
-    stored = read_run(run)
+    stored = open_run(run)
     at_s = times(stored, shot)
     most = min(MOST_FRAMES, MOST_GIF_PIXELS // (width * height)) if suffix == ".gif" else MOST_FRAMES
     if len(at_s) > most:
@@ -346,13 +346,12 @@ def report_command(
     from fleet.files import atomic_path
     from scenarios.live.recording_report import recording_html
     from scenarios.result_folder import disk_errors
-    from scenarios.run.run_folder import run_html
-    from scenarios.run.stored_run import read_run
+    from scenarios.run.log import open_run
     from scenarios.spec.load import load
 
     if (folder / "run.json").exists():
-        path, run = out or folder / "report.html", read_run(folder)
-        html = run_html(run.card, run.scenario, run.telemetry, run.events, run.jobs, run.offers, meshes=meshes)
+        path, run = out or folder / "report.html", open_run(folder)
+        html = run.page(meshes=meshes)
     else:
         path = out or folder.parent / "report.html"
         html = recording_html(folder, None if scenario is None else load(scenario))

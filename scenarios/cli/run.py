@@ -22,8 +22,8 @@ if TYPE_CHECKING:  # slow to import
     from fleet.events import Event
     from scenarios.prepare.fleet import Fleet
     from scenarios.progress import Progress
+    from scenarios.run.log import RunLog
     from scenarios.run.metrics import Metrics
-    from scenarios.run.shift import RunResult
     from scenarios.spec.schema import Scenario
 
 DEMO_POLICY = "wsept"
@@ -53,8 +53,7 @@ def run_command(
     """Run one shift of a scenario and record it."""
     from scenarios.policy_loader import label, policy_of
     from scenarios.result_folder import check_free
-    from scenarios.run.run_folder import RUN
-    from scenarios.run.shift import summary
+    from scenarios.run.log import RUN
     from scenarios.spec.load import load, own_seed
 
     chosen = load(scenario)
@@ -74,8 +73,8 @@ def run_command(
         progress = open_until_end.enter_context(progress_bar())
         _, result = _run_into(chosen, spec, where, overwrite, progress, endpoint=endpoint)
     if as_json:
-        run, keys = summary(result), ("status", "policy", "seed", "plant", "bus", "difficulty", "metrics")
-        print_json({"out": str(where), **{key: run[key] for key in keys}})
+        keys = ("status", "policy", "seed", "plant", "bus", "difficulty", "metrics")
+        print_json({"out": str(where), **{key: result.card[key] for key in keys}})
     else:
         say(f"{chosen.name}, seed {spec.seed}", out_console)
         out_console.print(metrics_table({label(spec.policy): result.metrics}))
@@ -99,12 +98,11 @@ def demo_command(
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
     from scenarios.result_folder import disk_errors
-    from scenarios.run.shift import summary
     from scenarios.show.run_page import Side, pair_page
     from scenarios.spec.load import load
 
     chosen = load("quickstart")
-    results: dict[str, RunResult] = {}
+    results: dict[str, RunLog] = {}
     fleet = None
     with progress_bar() as progress:
         for policy in ("round_robin", DEMO_POLICY):
@@ -116,7 +114,7 @@ def demo_command(
             results[policy] = result
     first, second = (
         Side(
-            run=summary(result),
+            run=result.card,
             events=result.events,
             arms=[arm.name for arm in chosen.arms],
             time_s=result.time_s,
@@ -150,11 +148,11 @@ def _run_into(
     *,
     endpoint: str | None = None,
     fleet: "Fleet | None" = None,
-) -> tuple["Fleet", "RunResult"]:
+) -> tuple["Fleet", "RunLog"]:
     """Run a shift and write it to `out`; the fleet is prepared unless it is given."""
     from scenarios.prepare.fleet import prepare
     from scenarios.result_folder import new_folder
-    from scenarios.run.run_folder import RUN, write
+    from scenarios.run.log import RUN
     from scenarios.run.shift import run
 
     with new_folder(out, RUN, overwrite=overwrite) as folder:
@@ -163,7 +161,7 @@ def _run_into(
             result = run(fleet, spec, progress=progress, stopped=stopped, endpoint=endpoint)
             progress("writing", 0.0)
             gc.collect()  # the environment of a large fleet, which the page needs no more
-            write(result, folder)
+            result.write(folder)
     return fleet, result
 
 

@@ -35,7 +35,7 @@ from scenarios.policy_loader import blaming, policy_at, policy_of
 from scenarios.prepare.fleet import Fleet, ShiftFactory, simulator_of_shift
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
-from scenarios.run.provenance import code_hash
+from scenarios.run.log import code_hash
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import RISK, DifficultyName
 from scenarios.spec.parse import scenario_hash

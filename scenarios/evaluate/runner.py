@@ -27,7 +27,7 @@ from scenarios.prepare.fleet import Fleet
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.processes import MOST_DEATHS, LocalWorker, Queue, Worker, run_all
 from scenarios.progress import Count, Progress, quiet
-from scenarios.run.provenance import code_hash
+from scenarios.run.log import code_hash
 from scenarios.spec.options import RiskName
 
 HERE_S = 5.0

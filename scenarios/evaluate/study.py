@@ -18,7 +18,7 @@ from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trai
 from scenarios.evaluate.store import RowKind
 from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
-from scenarios.run.provenance import code_hash
+from scenarios.run.log import code_hash
 from scenarios.spec.load import INSTANCE, SPLITS, library, load
 from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.parse import scenario_hash

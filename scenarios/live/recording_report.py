@@ -29,8 +29,8 @@ from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
 from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
+from scenarios.run.log import Offer
 from scenarios.run.schedule import SAME_MOMENT_DIGITS
-from scenarios.shift_records import Offer
 from scenarios.spec.schema import Scenario
 
 Array = np.ndarray

@@ -17,7 +17,7 @@ from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import FleetError
 from scenarios.live.recording import CARD, MESSAGES, SOURCES, Message, read_card, read_parts, states
-from scenarios.run.run_folder import check_format
+from scenarios.run.log import check_format
 
 TURN_S, TOKENS_S = 0.2, 2.0
 """Real seconds between two checks whether to stop; for the router to name the arms that are present."""

@@ -1,83 +1,75 @@
 """One shift from beginning to end, recorded."""
 
-import platform
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents.policy import only_choices
-from fleet.bus.exchange.channel import PERFECT
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
-from fleet.env.allocation_v1 import VERSION, AllocationEnv, actions_of
+from fleet.env.allocation_v1 import AllocationEnv, actions_of
+from fleet.errors import FleetError, nearest
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
 from scenarios.policy_loader import OnBus, blaming, policy_at
-from scenarios.prepare.fleet import Fleet, env_of, let_plan
+from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.progress import Progress, quiet
-from scenarios.run.metrics import HeatUse, Metrics, metrics_of
-from scenarios.run.provenance import code_hash, provenance
-from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
+from scenarios.result_folder import new_folder
+from scenarios.run.log import RUN, Offer, RunLog, card_of, job_records, offers_of, provenance
+from scenarios.run.metrics import HeatUse, metrics_of
+from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RunSpec
-from scenarios.spec.parse import scenario_hash
 from scenarios.spec.schema import Scenario
 
-RUN_FORMAT = 6
-"""Raised when run.json or the columns of the recordings change so that an earlier version cannot be read."""
 AT_ONCE = 20_000
 """Readings of an arm that are computed at a time."""
-_LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
-
-
-@dataclass(frozen=True, eq=False)
-class RunResult:
-    """Result of a shift."""
-
-    spec: RunSpec
-    scenario: Scenario
-    metrics: Metrics
-    telemetry: Telemetry | None
-    """None if the shift was interrupted before its first step."""
-    events: tuple[Event, ...]
-    jobs: tuple[JobRecord, ...]
-    offers: tuple[Offer, ...]
-    """Of all arms, at every award."""
-    twins: dict[str, dict[str, Any]]
-    """`provenance` of each arm's difficulty model."""
-    finished: bool
-    """False if interrupted."""
-    time_s: float
-    """Simulated time at the end."""
-    total_reward: float
-
-    def _repr_html_(self) -> str:
-        from scenarios.show.run_page import run_html
-
-        return run_html(summary(self), self.events, self.offers)
 
 
 def run(
-    fleet: Fleet,
-    spec: RunSpec,
+    fleet: Fleet | Scenario | str | Path,
+    spec: RunSpec | None = None,
     *,
     progress: Progress = quiet,
     stopped: Callable[[], bool] = lambda: False,
     record: bool = True,
     endpoint: str | None = None,
-) -> RunResult:
+    out: str | Path | None = None,
+    **options: Any,  # one type per field
+) -> RunLog:
     """Run one shift; once `stopped` returns True it ends early, between two steps.
 
     Args:
+        fleet: A prepared fleet, or a scenario (a library name, a .toml file, a `Scenario`), which is prepared first.
+        spec: What to run; without it, `options` are its fields, and messages stay in memory (`bus="memory"`).
         record: Keep telemetry.
         endpoint: Zenoh router on loopback, for other listeners; by default the fleet has its own.
+        out: Folder for the files of the run; it must not exist yet.
 
     Raises:
-        PolicyFailed: the policy is one of one's own, and raised something or returned no action.
+        FleetError: an option is not allowed, the fleet cannot be prepared, or the folder cannot be written.
+        PolicyFailed: a user-defined policy raised an exception or returned no action.
     """
+    if spec is None:
+        try:
+            spec = RunSpec(**{"bus": "memory", **options})
+        except TypeError as error:
+            unknown = next((name for name in options if name not in RunSpec.__dataclass_fields__), "")
+            raise FleetError(
+                f"run() has no option '{unknown}'{nearest(unknown, RunSpec.__dataclass_fields__)}"
+            ) from error
+    elif options:
+        raise FleetError(f"Give either a RunSpec or single options, not both (got {', '.join(options)}).")
+    if not isinstance(fleet, Fleet):
+        fleet = prepare(scenario_with(fleet, {}, run), difficulty=spec.difficulty, risk=spec.risk, progress=progress)
+    if out is not None:
+        with new_folder(Path(out), RUN) as folder:
+            log = run(fleet, spec, progress=progress, stopped=stopped, record=record, endpoint=endpoint)
+            log.write(folder)
+        return log
     shift = f"{fleet.scenario.name}/{spec.seed}"
     with blaming(spec.policy, shift):
         policy = policy_at(spec.policy, spec.seed, OnBus(fleet=fleet.scenario.name))
@@ -117,26 +109,18 @@ def run(
         env.close()
     state, world = env.truth, env.world
     events = tuple(sorted(env.events, key=lambda event: event.time_s))
-    return RunResult(
-        spec=spec,
-        scenario=fleet.scenario,
-        metrics=metrics_of(
-            world,
-            state,
-            recorder.heat or HeatUse(world.start_c, fleet.scenario.people.burn_c),
-            events,
-            env.messages,
-            finds_contacts=not env.episode.plant.follows_plans,
-        ),
-        telemetry=recorder.telemetry(),
-        events=events,
-        jobs=job_records(world, state),
-        offers=tuple(offers),
-        twins={arm.robot.name: provenance(arm.model) for arm in fleet.arms},
+    heat = recorder.heat or HeatUse(world.start_c, fleet.scenario.people.burn_c)
+    finds_contacts = not env.episode.plant.follows_plans
+    card = card_of(
+        spec,
+        fleet.scenario,
+        metrics_of(world, state, heat, events, env.messages, finds_contacts=finds_contacts),
+        {arm.robot.name: provenance(arm.model) for arm in fleet.arms},
         finished=finished,
         time_s=float(state.tick[0] * world.dt_s),
-        total_reward=reward,
+        reward=reward,
     )
+    return RunLog(card, fleet.scenario, recorder.readings(), events, job_records(world, state), tuple(offers))
 
 
 def _with_prediction(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int]) -> Event:
@@ -166,6 +150,7 @@ class _Recorder:
         self._offsets_s = np.arange(1, int(np.floor(dt_s / every_s + 1e-9)) + 1) * every_s
         self._most_steps = max(1, AT_ONCE // (len(scenario.arms) * len(self._offsets_s)))
         self._records: list[StepRecord] = []
+        self._arms = len(scenario.arms)
         self._kept = Readings(scenario.ticks * len(self._offsets_s))
 
     def __call__(self, record: StepRecord) -> None:
@@ -177,11 +162,11 @@ class _Recorder:
         if len(self._records) >= min(self._most_steps, self.env.episode.plant.most_steps):
             self._read()
 
-    def telemetry(self) -> Telemetry | None:
-        """All readings; None before the first step, or without reading."""
+    def readings(self) -> Telemetry:
+        """All readings; no samples before the first step, or without reading."""
         if self._records:
             self._read()
-        return self._kept.telemetry()
+        return self._kept.telemetry() or Telemetry.empty(self._arms)
 
     def _read(self) -> None:
         episode, record = self.env.episode, stack_records(self._records)
@@ -190,22 +175,3 @@ class _Recorder:
         noise = recorded_noise(episode.noise_key, record, offsets_s, world.dt_s, len(world.arms))
         self._kept.add(telemetry_of(world, record, offsets_s, motion, noise))
         self._records.clear()
-
-
-def summary(result: RunResult) -> dict[str, Any]:
-    """The content of run.json. It holds no clock time, so the same seed gives the same file."""
-    return {
-        "format": RUN_FORMAT,
-        "environment": VERSION,
-        "status": "finished" if result.finished else "interrupted",
-        "time_s": result.time_s,
-        "scenario": asdict(result.scenario),
-        "scenario_hash": scenario_hash(result.scenario),
-        **asdict(replace(result.spec, channel=PERFECT)),
-        "channel": result.scenario.channel(result.spec.channel).described(),
-        "twins": result.twins,
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
-        "code_hash": code_hash(),
-        "reward": result.total_reward,
-        "metrics": asdict(result.metrics),
-    }

@@ -12,7 +12,7 @@ from fleet.env.render.picture import heat_colour, heat_marks
 from fleet.errors import FleetError, install, visible
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES
-from scenarios.run.stored_run import StoredRun
+from scenarios.run.log import RunLog
 from scenarios.show.moments import motor_spheres
 from scenarios.show.words import clock
 from scenarios.spec.options import Shot
@@ -32,13 +32,13 @@ POSTURES = 64
 """Postures of the film that the camera must hold."""
 
 
-def times(run: StoredRun, shot: Shot) -> Array:
+def times(run: RunLog, shot: Shot) -> Array:
     """Times of the frames, s.
 
     Raises:
         FleetError: the run has no readings between `begin_s` and `end_s`.
     """
-    time_s = run.telemetry.time_s
+    time_s = run.readings.time_s
     begin_s, end_s = max(shot.begin_s, float(time_s[0])), min(shot.end_s, float(time_s[-1]))
     if not begin_s <= end_s:
         raise FleetError(
@@ -59,12 +59,12 @@ class Film:
         FleetError: the meshes are not available.
     """
 
-    def __init__(self, run: StoredRun, *, meshes: bool = False) -> None:
+    def __init__(self, run: RunLog, *, meshes: bool = False) -> None:
         scenario = run.scenario
         robots = [arm.robot() for arm in scenario.arms]
         self.player = CellPlayer(robots, scenario.places, scenario.fixtures, meshes=meshes)
         self._limits = scenario.limits
-        self._load_kg, self._readings = run.load_kg, run.telemetry
+        self._load_kg, self._readings = run.load_kg, run.readings
 
     def show(self, time_s: float) -> tuple[Array, Array]:
         """Put the cell into its state at a time; returns the temperatures [arm, joint] and the modes [arm]."""
@@ -87,7 +87,7 @@ class Film:
         return self._readings.q[np.unique(np.linspace(first, last, POSTURES).astype(int))]
 
 
-def frames(run: StoredRun, shot: Shot, at_s: Array) -> Iterator[Array]:
+def frames(run: RunLog, shot: Shot, at_s: Array) -> Iterator[Array]:
     """Pictures of a shift, uint8 [height, width, 3].
 
     Raises:
@@ -106,7 +106,7 @@ def frames(run: StoredRun, shot: Shot, at_s: Array) -> Iterator[Array]:
 class Overlay:
     """Clock, hottest motors, names of the arms and colour scale, written into a picture."""
 
-    def __init__(self, run: StoredRun, shot: Shot) -> None:
+    def __init__(self, run: RunLog, shot: Shot) -> None:
         self._arms, self._limits = [visible(arm) for arm in run.arms], run.scenario.limits
         text_px = max(SMALLEST_PX, round(TEXT_PX * min(shot.width / 1280, shot.height / 720)))
         self._font, self._small = _font(text_px), _font(max(SMALLEST_PX, round(0.75 * text_px)))

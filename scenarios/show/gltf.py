@@ -69,7 +69,7 @@ class _File:
         self.materials: list[Json] = []
         self.channels: list[Json] = []
         self.samplers: list[Json] = []
-        time_s = moments.run.telemetry.time_s
+        time_s = moments.run.readings.time_s
         self._begin_s = float(time_s[0])
         self.pose_s, self.heat_s = self._played(time_s[moments.poses]), self._played(time_s[moments.heats])
         self._shapes = [
@@ -130,7 +130,7 @@ class _File:
 
     def add_arm(self, index: int, arm: Mapping[str, Any]) -> None:
         """Nodes and animations of an arm."""
-        moments, readings = self.moments, self.moments.run.telemetry
+        moments, readings = self.moments, self.moments.run.readings
         links, name = moments.model["links"], arm["name"]
         root = self._node(0, name, arm)
         q = readings.q[moments.poses, index].astype(float)

@@ -99,7 +99,7 @@ class _File:
     def write_once(self) -> None:
         """Mounts, shapes and limits."""
         moments, model = self.moments, self.moments.model
-        begin_s = float(moments.run.telemetry.time_s[0])
+        begin_s = float(moments.run.readings.time_s[0])
         mounts = [
             transform(WORLD, frames[0], arm["position"], arm["quaternion"])
             for arm, frames in zip(model["arms"], self.frames, strict=True)
@@ -120,13 +120,13 @@ class _File:
         self.put("/cell", MARKERS, begin_s, write(message(MARKERS, markers=markers), MARKERS), LATCHED)
         for name in ("warning", "error"):
             limit_c = getattr(moments.limits, f"{name}_c")
-            for time_s in (begin_s, float(moments.run.telemetry.time_s[-1])):
+            for time_s in (begin_s, float(moments.run.readings.time_s[-1])):
                 content = message(TEMPERATURE, header=header(time_s), temperature=float(limit_c))
                 self.put(f"/limits/{name}", TEMPERATURE, time_s, write(content, TEMPERATURE))
 
     def link_transforms(self, arm: int, sample: int) -> list[Any]:
         """Transforms of the links above the first."""
-        turned = self.moments.link_quaternions(self.moments.run.telemetry.q[sample, arm])
+        turned = self.moments.link_quaternions(self.moments.run.readings.q[sample, arm])
         frames, links = self.frames[arm], self.moments.model["links"]
         return [
             transform(frames[link["parent"]], frames[i], link["position"], turned[i])
@@ -136,7 +136,7 @@ class _File:
 
     def write_poses(self, report: Report) -> None:
         """Joint states, and the transforms of all links of all arms."""
-        moments, readings = self.moments, self.moments.run.telemetry
+        moments, readings = self.moments, self.moments.run.readings
         names = joint_names(readings.q.shape[2])
         moving = [i for i, link in enumerate(moments.model["links"]) if link["parent"] >= 0]
         stamped = [each for arm in range(len(self.arms)) for each in self.link_transforms(arm, 0)]
@@ -158,7 +158,7 @@ class _File:
 
     def write_heat(self, report: Report) -> None:
         """Temperatures, the spheres of the motors, and diagnostics."""
-        moments, readings = self.moments, self.moments.run.telemetry
+        moments, readings = self.moments, self.moments.run.readings
         turned = moments.joint_links
         spheres = [
             [
@@ -203,7 +203,7 @@ class _File:
 
     def write_loads(self, _report: Report) -> None:
         """The balls in the hands, whenever one changes."""
-        moments, time_s = self.moments, self.moments.run.telemetry.time_s
+        moments, time_s = self.moments, self.moments.run.readings.time_s
         radii, hand = moments.payload_m, moments.model["hand"]
         changed = np.flatnonzero(np.any(np.diff(radii, axis=0, prepend=-1.0) != 0.0, axis=1))
         for sample in changed.tolist():

@@ -12,7 +12,7 @@ from fleet.arm.cell import cell_model
 from fleet.env.render.picture import heat_colour, heat_marks
 from fleet.job import payload_radius_m
 from fleet.robot import ThermalLimits
-from scenarios.run.stored_run import StoredRun
+from scenarios.run.log import RunLog
 from scenarios.show.replay import HEAT_STEP_S
 from scenarios.show.words import SEVERITY, event_text, offers_text
 
@@ -54,8 +54,8 @@ class Moments:
         every_s: Time between two poses; by default the samples of the run, or as few as keep the file small.
     """
 
-    def __init__(self, run: StoredRun, every_s: float | None = None) -> None:
-        scenario, readings = run.scenario, run.telemetry
+    def __init__(self, run: RunLog, every_s: float | None = None) -> None:
+        scenario, readings = run.scenario, run.readings
         self.run, self.limits = run, scenario.limits
         robots = [arm.robot() for arm in scenario.arms]
         self.model: Mapping[str, Any] = cell_model(robots, scenario.places, scenario.fixtures)

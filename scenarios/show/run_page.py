@@ -17,8 +17,8 @@ from urllib.parse import quote
 from fleet.env.render.picture import heat_scale
 from fleet.events import Event
 from fleet.telemetry import Telemetry
+from scenarios.run.log import Offer
 from scenarios.run.schedule import Assignment, Outage, Schedule, payloads, schedule
-from scenarios.shift_records import Offer
 from scenarios.show.page import Chart, Page, Replay
 from scenarios.show.replay import packed
 from scenarios.show.table import Moment, Table, render

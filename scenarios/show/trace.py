@@ -12,8 +12,7 @@ from fleet.errors import FleetError, nearest
 from fleet.events import EVENT_KINDS, MEANINGS, Event
 from scenarios.live.recording import CARD, read_card, read_parts
 from scenarios.live.recording_report import offers_of
-from scenarios.run.stored_run import StoredRun, read_run
-from scenarios.shift_records import JobRecord, Offer
+from scenarios.run.log import JobRecord, Offer, RunLog, open_run
 from scenarios.show.table import Table
 from scenarios.show.words import CANNOT, by_joint, clock
 
@@ -87,7 +86,7 @@ def thread_of(folder: Path, asked: str) -> Thread:
         FleetError: no run or recording, or no such event.
     """
     if (folder / "run.json").exists():
-        log = _of_run(read_run(folder))
+        log = _of_run(open_run(folder))
     elif (folder / CARD).exists():
         log = _of_recording(folder)
     else:
@@ -161,7 +160,7 @@ def _live_twin(award: Event | None) -> str:
     return version if stated else NOT_RECORDED
 
 
-def _of_run(run: StoredRun) -> _Log:
+def _of_run(run: RunLog) -> _Log:
     card = run.card
     records: dict[str, JobRecord] = {record.job: record for record in run.jobs}
 

@@ -13,7 +13,7 @@ from fleet.offered_plans import PLANS
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import Fleet, env_of, library_of, prepare
-from scenarios.run.shift import RunResult, run
+from scenarios.run.shift import RunLog, run
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import RunSpec
 
@@ -27,12 +27,12 @@ def fleet(request, cell, plans) -> Fleet:
 
 
 @pytest.fixture(scope="module", params=["random", "round_robin"])
-def recorded(request, fleet) -> RunResult:
+def recorded(request, fleet) -> RunLog:
     """Return a run as recorded by `thermofleet run`."""
     return run(fleet, RunSpec(policy=request.param, seed=SEED, bus="memory"))
 
 
-def actions_of(result: RunResult, offered: list[str], arms: list[str], now_s: float) -> dict[str, int]:
+def actions_of(result: RunLog, offered: list[str], arms: list[str], now_s: float) -> dict[str, int]:
     """Return the claims of the arms at a step, won and lost ones, from the record; each arm has one plan a job."""
     claims = [e for e in result.events if e.time_s == now_s and e.kind in ("award", "lost")]
     return {arm: next((1 + PLANS * offered.index(e.job) for e in claims if e.arm == arm), 0) for arm in arms}
@@ -89,22 +89,22 @@ def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None
     # All of them equal the record.
     happened = [(e.time_s, e.kind, e.arm, e.job) for e in sorted(logged.events, key=lambda e: e.time_s)]
     assert happened == [(e.time_s, e.kind, e.arm, e.job) for e in recorded.events]
-    np.testing.assert_allclose(rewards, recorded.total_reward, rtol=1e-9)
+    np.testing.assert_allclose(rewards, recorded.reward, rtol=1e-9)
     finished = {e.job: e.time_s for e in recorded.events if e.kind == "finish"}
     truth, world = single.truth, single.world
     actual = {n: truth.finished_s[0, j] for j, n in enumerate(world.jobs.names[0]) if truth.status[0, j] == DONE}
     assert actual == pytest.approx(finished, rel=1e-9)
     assert truth.faults.sum() == sum(e.kind == "fault" for e in recorded.events) == recorded.metrics.faults > 0
     assert dict(zip(arms, truth.peak_c[0].tolist(), strict=True)) == pytest.approx(recorded.metrics.peak_c, rel=1e-9)
-    measured = recorded.telemetry.temp_c[-1]
+    measured = recorded.readings.temp_c[-1]
     np.testing.assert_allclose(measured, truth.temp_c[0, :, WINDING], atol=6 * logged.world.motors.sensor_noise_k.max())
     assert terms["reward_finished_value"] == pytest.approx(recorded.metrics.value, rel=1e-9)
 
 
 def test_bus_and_watcher_do_not_change_a_run(fleet, recorded) -> None:
-    over_zenoh = run(fleet, RunSpec(policy=recorded.spec.policy, seed=SEED, bus="zenoh"), record=False)
+    over_zenoh = run(fleet, RunSpec(policy=recorded.card["policy"], seed=SEED, bus="zenoh"), record=False)
     assert list(map(repr, over_zenoh.events)) == list(map(repr, recorded.events))  # as text, because NaN != NaN
-    assert over_zenoh.total_reward == recorded.total_reward
+    assert over_zenoh.reward == recorded.reward
 
 
 @pytest.mark.ci_slow

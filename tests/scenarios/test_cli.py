@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.run.run_folder import FILES
+from scenarios.run.log import FILES
 from scenarios.spec.load import library
 from tests.commands import REAL
 

@@ -88,7 +88,7 @@ def one_by_one(fleet: Fleet, policy: str, seeds, channel: Channel = PERFECT) -> 
         m = result.metrics
         found.append(
             Outcome(
-                reward=result.total_reward, value=m.value, finished=m.finished, on_time=m.on_time, faults=m.faults,
+                reward=result.reward, value=m.value, finished=m.finished, on_time=m.on_time, faults=m.faults,
                 above_warning_min=m.above_warning_min, peak_c=max(m.peak_c.values()), availability=m.availability,
                 insulation_ppb=max(m.insulation_ppb.values()), tool_drift_mm=max(m.tool_drift_mm.values()),
                 hot_surface_min=m.hot_surface_min,

@@ -9,14 +9,14 @@ import pytest
 
 from fleet.errors import FleetError
 from scenarios.prepare.fleet import prepare
-from scenarios.run.run_folder import FILES, event_table, telemetry_table, write
-from scenarios.run.shift import RunResult, run
+from scenarios.run.log import FILES, event_table, telemetry_table
+from scenarios.run.shift import RunLog, run
 from scenarios.spec.load import load
 from scenarios.spec.options import RunSpec
 
 
 @pytest.fixture
-def result(small_toml: Path, plans: Path) -> RunResult:
+def result(small_toml: Path, plans: Path) -> RunLog:
     fleet = prepare(load(small_toml), difficulty="blind", cache=plans)
     return run(fleet, RunSpec(policy="round_robin", bus="memory", difficulty="blind"))
 
@@ -26,13 +26,13 @@ def test_a_disk_that_refuses_at_the_end_is_told(result, tmp_path):
     gone.mkdir()
     shutil.rmtree(gone)
     with pytest.raises(FleetError, match=r"Cannot write to '.*gone': No such file or directory"):
-        write(result, gone)
+        result.write(gone)
 
 
 def test_the_files_of_a_run_read_back_as_documented(result, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
-    write(result, folder)
+    result.write(folder)
     assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
     told = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     assert told["status"] == "finished"
@@ -49,12 +49,12 @@ def test_the_files_of_a_run_read_back_as_documented(result, tmp_path):
 
 
 def test_telemetry_rows_go_arm_by_arm_within_a_moment(result):
-    table = telemetry_table(result.telemetry, ["left", "right"])
+    table = telemetry_table(result.readings, ["left", "right"])
     rows = table.slice(6, 2).to_pylist()
     assert [(row["time_s"], row["arm"]) for row in rows] == [(4.0, "left"), (4.0, "right")]
     for a, row in enumerate(rows):
-        assert row["temp_c_2"] == pytest.approx(float(result.telemetry.temp_c[3, a, 1]), rel=1e-6)
-        assert row["qd_7"] == pytest.approx(float(result.telemetry.qd[3, a, 6]), rel=1e-6)
+        assert row["temp_c_2"] == pytest.approx(float(result.readings.temp_c[3, a, 1]), rel=1e-6)
+        assert row["qd_7"] == pytest.approx(float(result.readings.qd[3, a, 6]), rel=1e-6)
 
 
 def test_events_keep_their_order_and_their_values(result):

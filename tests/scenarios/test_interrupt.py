@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scenarios.run.run_folder import FILES
+from scenarios.run.log import FILES
 
 QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
 

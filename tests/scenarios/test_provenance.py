@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from fleet.difficulty import Blind
-from scenarios.run.provenance import provenance
+from scenarios.run.log import provenance
 
 TWIN = SimpleNamespace(version="ab12", data_hash="cd34", seed="[0, 1]/")
 

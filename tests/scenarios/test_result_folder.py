@@ -7,7 +7,7 @@ import pytest
 
 from fleet.errors import FleetError
 from scenarios.result_folder import check_free, new_folder
-from scenarios.run.run_folder import RUN
+from scenarios.run.log import RUN
 
 
 def an_earlier_run(folder: Path, status: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from agents.registry import RULES
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.shift import RunResult, run, summary
+from scenarios.run.shift import RunLog, run
 from scenarios.spec.load import load
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import scenario_hash
@@ -35,10 +35,8 @@ def spec(policy: str = "round_robin", seed: int = 0, **changes) -> RunSpec:
     return replace(RunSpec(policy=policy, seed=seed, bus="memory", difficulty="blind"), **changes)
 
 
-def same(one: RunResult, two: RunResult) -> bool:
-    assert one.telemetry is not None
-    assert two.telemetry is not None
-    pairs = zip(vars(one.telemetry).values(), vars(two.telemetry).values(), strict=True)
+def same(one: RunLog, two: RunLog) -> bool:
+    pairs = zip(vars(one.readings).values(), vars(two.readings).values(), strict=True)
     alike = all(np.array_equal(a, b) for a, b in pairs)
     return alike and repr(one.events) == repr(two.events) and one.metrics == two.metrics
 
@@ -75,20 +73,18 @@ def test_a_stopped_shift_is_the_beginning_of_the_whole_one(fleet):
     assert not part.finished
     assert part.time_s == 50.0
     assert whole.finished
-    assert part.telemetry is not None
-    assert whole.telemetry is not None
-    n = len(part.telemetry.time_s)
-    assert part.telemetry.time_s[-1] == 50.0
-    assert np.array_equal(part.telemetry.temp_c, whole.telemetry.temp_c[:n])
+    n = len(part.readings.time_s)
+    assert part.readings.time_s[-1] == 50.0
+    assert np.array_equal(part.readings.temp_c, whole.readings.temp_c[:n])
     assert repr(part.events) == repr(whole.events[: len(part.events)])
 
 
 def test_a_shift_stopped_before_it_begins_has_no_telemetry(fleet):
     nothing = run(fleet, spec(), stopped=lambda: True)
-    assert nothing.telemetry is None
+    assert len(nothing.readings.time_s) == 0
     assert nothing.time_s == 0.0
     assert nothing.metrics.finished == 0
-    json.dumps(summary(nothing), allow_nan=False)
+    json.dumps(nothing.card, allow_nan=False)
 
 
 def test_ctrl_c_outside_the_steps_is_not_taken_for_a_result(fleet, monkeypatch):
@@ -106,10 +102,9 @@ def test_ctrl_c_outside_the_steps_is_not_taken_for_a_result(fleet, monkeypatch):
 
 def test_telemetry_is_read_once_a_second_from_every_arm(fleet):
     result = run(fleet, spec())
-    assert result.telemetry is not None
-    assert np.array_equal(result.telemetry.time_s, np.arange(1, len(result.telemetry.time_s) + 1))
-    assert result.telemetry.temp_c.shape == (len(result.telemetry.time_s), 2, 7)
-    assert run(fleet, spec(), record=False).telemetry is None
+    assert np.array_equal(result.readings.time_s, np.arange(1, len(result.readings.time_s) + 1))
+    assert result.readings.temp_c.shape == (len(result.readings.time_s), 2, 7)
+    assert run(fleet, spec(), record=False).telemetry.num_rows == 0
 
 
 def test_telemetry_at_the_end_of_a_step_is_what_the_policy_observes_next(fleet, monkeypatch):
@@ -125,7 +120,7 @@ def test_telemetry_at_the_end_of_a_step_is_what_the_policy_observes_next(fleet, 
             return {arm: int(each.action_mask[1]) for arm, each in observations.items()}
 
     monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda *name: Watching())
-    telemetry = run(fleet, spec()).telemetry
+    telemetry = run(fleet, spec()).readings
     assert telemetry is not None
     ends = telemetry.time_s % fleet.scenario.decision_interval_s == 0
     assert len(seen) > 5
@@ -160,7 +155,7 @@ def test_the_metrics_agree_with_the_event_log(fleet):
 
 
 def test_the_summary_says_how_the_run_was_made_and_holds_no_clock_time(fleet):
-    page = summary(run(fleet, spec(seed=4)))
+    page = run(fleet, spec(seed=4)).card
     assert page["status"] == "finished"
     assert page["seed"] == 4
     assert page["policy"] == "round_robin"

@@ -15,8 +15,7 @@ from scenarios.cli.main import main
 from scenarios.cli.terminal import out_console
 from scenarios.live.recorder import Recorder
 from scenarios.prepare.fleet import prepare
-from scenarios.run.provenance import code_hash
-from scenarios.run.run_folder import write
+from scenarios.run.log import code_hash
 from scenarios.run.shift import run
 from scenarios.show.trace import NOT_RECORDED, rows_of, thread_of, thread_table
 from scenarios.spec.load import load
@@ -37,7 +36,7 @@ def folder(small_toml: Path, plans: Path, tmp_path: Path) -> Path:
     out = tmp_path / "runs" / "one"
     out.mkdir(parents=True)
     fleet = prepare(load(small_toml), difficulty="oracle", cache=plans)
-    write(run(fleet, RunSpec(policy="least_difficulty", bus="memory", difficulty="oracle")), out)
+    run(fleet, RunSpec(policy="least_difficulty", bus="memory", difficulty="oracle")).write(out)
     return out
 
 

@@ -3,8 +3,8 @@
 import pytest
 
 from fleet.events import Event
+from scenarios.run.log import Offer
 from scenarios.run.schedule import schedule
-from scenarios.shift_records import Offer
 from scenarios.show.run_page import verdict
 
 ARMS = ("hot", "cool")

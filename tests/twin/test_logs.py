@@ -20,7 +20,7 @@ from fleet.arm.model import ArmModel
 from fleet.errors import LogError
 from fleet.robot import Robot
 from fleet.telemetry import Telemetry
-from scenarios.run.run_folder import telemetry_table
+from scenarios.run.log import telemetry_table
 from twin.logs.reader import read, read_folder, time_damage
 from twin.logs.recording import READINGS
 

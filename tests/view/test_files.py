@@ -10,7 +10,7 @@ import pytest
 from fleet.ros2.cdr import read, read_diagnostics, read_joints
 from fleet.telemetry import MODES
 from scenarios.cli.main import main
-from scenarios.run.stored_run import StoredRun, read_run
+from scenarios.run.log import RunLog, open_run
 from scenarios.show.film import Film
 from scenarios.show.moments import Moments
 
@@ -25,18 +25,18 @@ def written(run_folder: Path, path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(run_folder: Path) -> StoredRun:
-    return read_run(run_folder)
+def run(run_folder: Path) -> RunLog:
+    return open_run(run_folder)
 
 
-def hottest_moment(run: StoredRun) -> tuple[int, float]:
+def hottest_moment(run: RunLog) -> tuple[int, float]:
     """A kept sample at which an arm works and is hot, and its time."""
     kept = Moments(run, EVERY_S).heats
-    sample = int(kept[run.telemetry.temp_c[kept].max(axis=(1, 2)).argmax()])
-    return sample, float(run.telemetry.time_s[sample])
+    sample = int(kept[run.readings.temp_c[kept].max(axis=(1, 2)).argmax()])
+    return sample, float(run.readings.time_s[sample])
 
 
-def positions_in_mujoco(run: StoredRun, time_s: float) -> np.ndarray:
+def positions_in_mujoco(run: RunLog, time_s: float) -> np.ndarray:
     """Motors in the world as MuJoCo has them, [arm, joint, 3]."""
     film = Film(run)
     film.show(time_s)
@@ -55,7 +55,7 @@ def along(parents: dict[str, str], poses: dict[str, tuple[list[float], list[floa
     return point
 
 
-def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, run: StoredRun, tmp_path: Path) -> None:
+def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, run: RunLog, tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
     path = written(run_folder, tmp_path / "shift.mcap")
@@ -67,7 +67,7 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, run: 
             if channel.topic == "/diagnostics":
                 content = read_diagnostics(message.data)
             messages[channel.topic].append((message.log_time / 1e9, content))
-    readings, moments = run.telemetry, Moments(run, EVERY_S)
+    readings, moments = run.readings, Moments(run, EVERY_S)
     for index, arm in enumerate(run.arms):
         joints = [read_joints(payload) for _, payload in messages[f"/quickstart/{arm}/joint_states"]]
         assert np.array([each.q for each in joints]) == pytest.approx(readings.q[moments.poses, index])

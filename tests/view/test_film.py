@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.run.stored_run import read_run
+from scenarios.run.log import open_run
 from scenarios.show.film import Film, Shot, times
 
 FILM = "from scenarios.cli.main import main; main()"
@@ -27,8 +27,8 @@ def has_egl() -> bool:
 
 
 def test_the_cell_takes_the_recorded_postures_and_heat(run_folder: Path) -> None:
-    run = read_run(run_folder)
-    shown, readings = Film(run), run.telemetry
+    run = open_run(run_folder)
+    shown, readings = Film(run), run.readings
     model, data = shown.player.model, shown.player.data
     hottest = int(readings.temp_c.max(axis=(1, 2)).argmax())
     temp_c, mode = shown.show(float(readings.time_s[hottest]))
@@ -47,10 +47,10 @@ SEEN = """
 import sys, numpy as np
 from pathlib import Path
 from fleet.arm.cell import CellCamera
-from scenarios.run.stored_run import read_run
+from scenarios.run.log import open_run
 from scenarios.show.film import Film
-run = read_run(Path(sys.argv[1]))
-film, t = Film(run), run.telemetry
+run = open_run(Path(sys.argv[1]))
+film, t = Film(run), run.readings
 row, arm, joint = np.unravel_index(t.temp_c.argmax(), t.temp_c.shape)
 points = film.player.extent(film.postures(t.time_s))
 film.show(float(t.time_s[row]))
@@ -79,7 +79,7 @@ def test_the_camera_holds_every_posture_and_sees_no_edge_of_the_floor(run_folder
 
 @pytest.mark.parametrize(("begin_s", "end_s"), [(0.0, 1e9), (600.0, 700.0)])
 def test_the_pictures_follow_the_clock(run_folder: Path, begin_s: float, end_s: float) -> None:
-    run = read_run(run_folder)
+    run = open_run(run_folder)
     at_s = times(run, Shot(begin_s=begin_s, end_s=end_s, speed=60, fps=30))
     assert np.diff(at_s) == pytest.approx(2.0)
     assert at_s[0] >= begin_s
@@ -111,8 +111,8 @@ def test_a_film_can_be_read_by_ffmpeg_and_shows_the_heat(run_folder: Path, tmp_p
         pytest.skip("this machine has no EGL")
     import av
 
-    run = read_run(run_folder)
-    hottest_s = float(run.telemetry.time_s[run.telemetry.temp_c.max(axis=(1, 2)).argmax()])
+    run = open_run(run_folder)
+    hottest_s = float(run.readings.time_s[run.readings.temp_c.max(axis=(1, 2)).argmax()])
     options = ["--size", "480x270", "--speed", "60", "--fps", "10"]
     span = ["--begin", f"{hottest_s - 60}", "--end", f"{hottest_s}"]
     done = film(run_folder, tmp_path / f"shift.{kind}", *options, *span)

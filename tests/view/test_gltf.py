@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from scenarios.cli.main import main
-from scenarios.run.stored_run import StoredRun, read_run
+from scenarios.run.log import RunLog, open_run
 from scenarios.show.film import Film
 from scenarios.show.gltf import LONGEST_TURN_RAD, SAME_RAD, Z_UP, divided, keys_of
 from scenarios.show.moments import motor_spheres
@@ -29,8 +29,8 @@ NEAR_M = 1e-4
 
 
 @pytest.fixture(scope="module")
-def run(run_folder: Path) -> StoredRun:
-    return read_run(run_folder)
+def run(run_folder: Path) -> RunLog:
+    return open_run(run_folder)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
     return (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
 
 
-def motors_in_mujoco(run: StoredRun, time_s: float) -> np.ndarray:
+def motors_in_mujoco(run: RunLog, time_s: float) -> np.ndarray:
     """Motors in the world, [arm, joint, 3]."""
     film = Film(run)
     film.show(time_s)
@@ -112,22 +112,22 @@ def motors_in_mujoco(run: StoredRun, time_s: float) -> np.ndarray:
     return np.array([[data.site_xpos[model.site(f"{arm}/motor_{j + 1}").id] for j in range(7)] for arm in run.arms])
 
 
-def moments_of(run: StoredRun, count: int) -> np.ndarray:
+def moments_of(run: RunLog, count: int) -> np.ndarray:
     """Times at which some arm moves, s."""
-    moving = np.abs(run.telemetry.qd).max(axis=(1, 2)) > 0.2
-    return np.random.default_rng(5).choice(run.telemetry.time_s[moving], count, replace=False)
+    moving = np.abs(run.readings.qd).max(axis=(1, 2)) > 0.2
+    return np.random.default_rng(5).choice(run.readings.time_s[moving], count, replace=False)
 
 
-def test_the_motors_are_where_mujoco_has_them(file: Path, run: StoredRun) -> None:
-    reader, begin_s = Reader(file), float(run.telemetry.time_s[0])
+def test_the_motors_are_where_mujoco_has_them(file: Path, run: RunLog) -> None:
+    reader, begin_s = Reader(file), float(run.readings.time_s[0])
     for time_s in moments_of(run, 12):
         nodes = reader.at((time_s - begin_s) / SPEED)
         found = np.array([[reader.place(nodes, f"{arm}/link_{j + 1}") for j in range(7)] for arm in run.arms])
         assert np.abs(found - motors_in_mujoco(run, float(time_s))).max() < NEAR_M
 
 
-def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path, run: StoredRun) -> None:
-    reader, readings = Reader(file), run.telemetry
+def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path, run: RunLog) -> None:
+    reader, readings = Reader(file), run.readings
     hottest = readings.temp_c.max(axis=(1, 2)).argmax()
     for sample in (0, hottest // 10 * 10, len(readings.time_s) // 20 * 10):
         nodes = reader.at((readings.time_s[sample] - readings.time_s[0]) / SPEED + 1e-9)
@@ -147,7 +147,7 @@ def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path
                 assert nodes[reader.index[shown[0]]]["scale"] == pytest.approx([float(radius_m)] * 3)
 
 
-def test_trimesh_reads_the_shapes(file: Path, run: StoredRun) -> None:
+def test_trimesh_reads_the_shapes(file: Path, run: RunLog) -> None:
     import trimesh
 
     scene = trimesh.load_scene(file)
@@ -178,7 +178,7 @@ def test_a_resting_joint_has_two_keys_and_a_long_turn_goes_the_right_way() -> No
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
-def test_three_js_plays_it_as_mujoco_has_it(browser, file: Path, run: StoredRun, tmp_path: Path) -> None:  # noqa: F811
+def test_three_js_plays_it_as_mujoco_has_it(browser, file: Path, run: RunLog, tmp_path: Path) -> None:  # noqa: F811
     """The loader and the mixer of three.js, which trimesh carries for its own viewer."""
     package = find_spec("trimesh")
     assert package is not None
@@ -194,7 +194,7 @@ def test_three_js_plays_it_as_mujoco_has_it(browser, file: Path, run: StoredRun,
     times_s = moments_of(run, 4)
     names = [f"{arm}/link_{j + 1}" for arm in run.arms for j in range(7)]
     for time_s in times_s.tolist():
-        played_s = (time_s - float(run.telemetry.time_s[0])) / SPEED
+        played_s = (time_s - float(run.readings.time_s[0])) / SPEED
         shown = page.evaluate("([time_s, names]) => show(time_s, names)", [played_s, names])
         x, y, z = np.array(shown).reshape(len(run.arms), 7, 3).transpose(2, 0, 1)
         found = np.stack([x, -z, y], axis=-1)  # back to z up

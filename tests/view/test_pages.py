@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from scenarios.run.stored_run import read_run
+from scenarios.run.log import open_run
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
@@ -56,7 +56,7 @@ def canvas(page: Page) -> np.ndarray:
 
 
 def test_the_cell_is_drawn_and_moves_with_the_clock(page: Page, run_folder: Path) -> None:
-    run = read_run(run_folder)
+    run = open_run(run_folder)
     before = canvas(page)
     assert len(np.unique(before.reshape(-1, 3), axis=0)) > 50
     work = next(event.time_s for event in run.events if event.kind == "finish")
@@ -84,7 +84,7 @@ def test_the_cursor_of_the_figure_and_the_clock_are_one(page: Page) -> None:
 def test_a_click_on_an_event_goes_there(page: Page, run_folder: Path) -> None:
     row = page.locator("#events tbody tr:not(.lost)").first
     at_s, arm = float(row.get_attribute("data-time") or "nan"), row.get_attribute("data-arm")
-    assert (at_s + 5, arm) in [(pytest.approx(event.time_s), event.arm) for event in read_run(run_folder).events]
+    assert (at_s + 5, arm) in [(pytest.approx(event.time_s), event.arm) for event in open_run(run_folder).events]
     row.click()
     assert float(page.locator("#time").input_value()) == pytest.approx(at_s, abs=0.5)
     assert page.locator("#arm option:checked").inner_text() == arm

@@ -14,8 +14,7 @@ import pytest
 from fleet.errors import FleetError
 from fleet.telemetry import Telemetry
 from scenarios.cli.main import main
-from scenarios.run.run_folder import telemetry_table
-from scenarios.run.stored_run import read_run
+from scenarios.run.log import open_run, telemetry_table
 from scenarios.show.replay import packed
 
 
@@ -34,8 +33,8 @@ def unpacked(text: str) -> dict[str, tuple[dict, np.ndarray]]:
 
 
 def test_the_readings_are_those_of_the_file(run_folder: Path) -> None:
-    run = read_run(run_folder)
-    again = telemetry_table(run.telemetry, list(run.arms))
+    run = open_run(run_folder)
+    again = telemetry_table(run.readings, list(run.arms))
     assert again.drop_columns(["arm", "mode"]).equals(
         pq.read_table(run_folder / "telemetry.parquet").drop_columns(["arm", "mode"])
     )
@@ -46,7 +45,7 @@ def test_the_readings_are_those_of_the_file(run_folder: Path) -> None:
 
 
 def test_a_page_gets_the_shift_within_its_resolution(run_folder: Path) -> None:
-    readings = read_run(run_folder).telemetry
+    readings = open_run(run_folder).readings
     arrays = unpacked(packed(readings))
     entry, q = arrays["q"]
     stride = round(entry["step_s"] / float(readings.time_s[1] - readings.time_s[0]))
@@ -72,7 +71,7 @@ def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, dam
     copied = shutil.copytree(run_folder, tmp_path / "run")
     (copied / damage).write_bytes(b"PAR1 cut short")
     with pytest.raises(FleetError, match="no complete folder of `thermofleet run`"):
-        read_run(copied)
+        open_run(copied)
 
 
 def test_a_run_without_readings_or_with_events_of_another_fleet_is_refused(run_folder: Path, tmp_path: Path) -> None:
@@ -84,7 +83,7 @@ def test_a_run_without_readings_or_with_events_of_another_fleet_is_refused(run_f
         copied = shutil.copytree(run_folder, tmp_path / name)
         pq.write_table(table, copied / f"{name}.parquet")
         with pytest.raises(FleetError, match="has no rows" if name == "telemetry" else "No arm 'ghost'"):
-            read_run(copied)
+            open_run(copied)
 
 
 def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,429 @@
+"""A shift as it was recorded: settings and figures, readings, events, jobs and offers, and their files."""
+
+import hashlib
+import json
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cache, cached_property
+from importlib import resources
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any  # values of run.json
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fleet.bus.exchange.channel import PERFECT
+from fleet.difficulty import DifficultyModel
+from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State, World
+from fleet.env.allocation_v1 import VERSION
+from fleet.errors import FleetError
+from fleet.events import Event
+from fleet.observation import Observation
+from fleet.robot import JOINTS
+from fleet.telemetry import MODES, Telemetry
+from scenarios.result_folder import ResultKind, disk_errors
+from scenarios.run.metrics import Metrics
+from scenarios.run.schedule import Schedule, payloads, schedule
+from scenarios.spec.options import RunSpec
+from scenarios.spec.parse import scenario_hash
+from scenarios.spec.schema import Scenario
+
+RUN_FORMAT = 6
+"""Raised when run.json or the columns of the recordings change so that an earlier version cannot be read."""
+
+_LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
+
+FILES = ("run.json", "telemetry.parquet", "events.parquet", "jobs.parquet", "offers.parquet", "report.html")
+ROWS_AT_ONCE = 10_000
+RUN = ResultKind(name="run", card="run.json", files=FILES)
+
+
+JOB_STATES = {WAITING: "waiting", RUNNING: "running", DONE: "finished", GIVEN_UP: "given_up", EXPIRED: "expired"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobRecord:
+    """One job of a shift, as at its end."""
+
+    job: str
+    state: str
+    """One of `JOB_STATES`."""
+    release_s: float
+    due_s: float
+    finished_s: float | None
+    """None if it was not finished."""
+    value: float
+    payload_kg: float
+    cycles: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Offer:
+    """What one arm knew of a job at the moment it was awarded."""
+
+    time_s: float
+    job: str
+    arm: str
+    awarded: bool
+    state: str
+    """idle, working or faulted."""
+    feasible: bool
+    """Whether the arm has a plan for it."""
+    free: bool
+    """Whether it was allowed to claim it then."""
+    difficulty: float | None
+    """d of the plan that was awarded, of other arms the least of their plans; None if unknown."""
+    peak_c: float | None
+    """Predicted peak of that plan; None if unknown."""
+    p_saturation: float | None
+    """P(saturation) of that plan; None without a plan."""
+    duration_s: float | None
+    """Time for the rest of the job by that plan; None without a plan."""
+    plan: int | None = None
+    """Number of that plan: 0 is the fastest, 1 the coolest; None without a plan, and in runs of earlier versions."""
+
+
+def job_records(world: World, state: State) -> tuple[JobRecord, ...]:
+    """The jobs of env 0 in the order of the shift."""
+    jobs = world.jobs
+    return tuple(
+        JobRecord(
+            job=jobs.names[0][j],
+            state=JOB_STATES[int(state.status[0, j])],
+            release_s=float(jobs.release_s[0, j]),
+            due_s=float(jobs.due_s[0, j]),
+            finished_s=float(state.finished_s[0, j]) if state.status[0, j] == DONE else None,
+            value=float(jobs.value[0, j]),
+            payload_kg=float(jobs.payload_kg[0, j]),
+            cycles=int(jobs.repetitions[0, j]),
+        )
+        for j in np.flatnonzero(jobs.exists[0]).tolist()
+    )
+
+
+def offers_of(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int], plans: int) -> Iterator[Offer]:
+    """What each arm knew of the job of an award.
+
+    Args:
+        seen: Observation of each arm at the decision.
+        actions: Of each arm at the decision.
+        plans: Plans per slot.
+    """
+    chosen = actions[event.arm] - 1
+    slot = range(chosen // plans * plans, (chosen // plans + 1) * plans)
+    for arm, own in seen.items():
+        able = [option for option in slot if own.feasible[option]]
+        known = [option for option in able if own.known[option]]
+        best = chosen if arm == event.arm else min(known or able, key=lambda o: own.difficulty[o], default=-1)
+        peak_c = float(own.peak_c[best])
+        yield Offer(
+            time_s=event.time_s,
+            job=event.job,
+            arm=arm,
+            awarded=arm == event.arm,
+            state="faulted" if own.faulted else "working" if own.working else "idle",
+            feasible=bool(able),
+            free=bool(any(own.action_mask[1 + option] for option in slot)),
+            difficulty=float(own.difficulty[best]) if best in known else None,
+            peak_c=peak_c if able and peak_c else None,
+            p_saturation=float(own.p_saturation[best]) if able else None,
+            duration_s=float(own.duration_s[best]) if able else None,
+            plan=best % plans if able else None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RunLog:
+    """A recorded shift, from `run` or from its folder."""
+
+    card: Mapping[str, Any]
+    """Settings, versions, figures: the content of run.json. It holds no clock time, so a seed gives the same file."""
+    scenario: Scenario
+    readings: Telemetry
+    """Sensor readings as arrays; without samples if none were kept, or the shift ended before its first step."""
+    events: tuple[Event, ...]
+    jobs: tuple[JobRecord, ...]
+    offers: tuple[Offer, ...]
+    """Of all arms, at every award."""
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Names of the arms."""
+        return tuple(arm.name for arm in self.scenario.arms)
+
+    @property
+    def finished(self) -> bool:
+        """False if the shift was interrupted."""
+        return self.card["status"] == "finished"
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time at the end."""
+        return self.card["time_s"]
+
+    @property
+    def reward(self) -> float:
+        """Sum of all rewards."""
+        return self.card["reward"]
+
+    @cached_property
+    def metrics(self) -> Metrics:
+        """Figures of the shift."""
+        return Metrics(**self.card["metrics"])
+
+    @cached_property
+    def telemetry(self) -> pa.Table:
+        """Readings as a table, a row for each arm and moment."""
+        return telemetry_table(self.readings, list(self.arms))
+
+    @cached_property
+    def plan(self) -> Schedule:
+        """Which arm worked on what."""
+        return schedule(self.events, self.arms, float(self.readings.time_s[-1]))
+
+    @cached_property
+    def load_kg(self) -> np.ndarray:
+        """Payload in each hand, kg, [sample, arm]."""
+        return payloads(self.readings, self.plan, self.arms, {job.job: job.payload_kg for job in self.jobs})
+
+    def page(self, *, meshes: bool = False) -> str:
+        """The report as one HTML page.
+
+        Args:
+            meshes: Show Kinova's shells instead of primitives.
+
+        Raises:
+            FleetError: the meshes are not available.
+        """
+        from fleet.arm.cell import cell_model
+        from scenarios.show.run_page import report_html
+
+        robots, limits = [arm.robot() for arm in self.scenario.arms], self.scenario.limits
+        return report_html(
+            self.card,
+            self.readings,
+            self.events,
+            self.arms,
+            warning_c=limits.warning_c,
+            error_c=limits.error_c,
+            model=cell_model(robots, self.scenario.places, self.scenario.fixtures, meshes=meshes),
+            payload_of={job.job: job.payload_kg for job in self.jobs},
+            offers=self.offers,
+        )
+
+    def write(self, folder: Path) -> None:
+        """Write the files of the run to an existing folder.
+
+        Raises:
+            FleetError: the folder cannot be written.
+        """
+        with disk_errors(folder):
+            card = json.dumps(self.card, indent=1, allow_nan=False) + "\n"
+            (folder / "run.json").write_text(card, encoding="utf-8")
+            pq.write_table(event_table(self.events), folder / "events.parquet")
+            pq.write_table(record_table(JobRecord, self.jobs), folder / "jobs.parquet")
+            pq.write_table(record_table(Offer, self.offers), folder / "offers.parquet")
+            if not len(self.readings.time_s):
+                return
+            _write_telemetry(self.readings, list(self.arms), folder / "telemetry.parquet")
+            (folder / "report.html").write_text(self.page(), encoding="utf-8")
+
+    def _repr_html_(self) -> str:
+        from scenarios.show.run_page import run_html
+
+        return run_html(self.card, self.events, self.offers)
+
+
+def card_of(
+    spec: RunSpec,
+    scenario: Scenario,
+    metrics: Metrics,
+    twins: Mapping[str, Mapping[str, Any]],
+    *,
+    finished: bool,
+    time_s: float,
+    reward: float,
+) -> dict[str, Any]:
+    """The content of run.json.
+
+    Args:
+        twins: `provenance` of each arm's difficulty model.
+        time_s: Simulated time at the end.
+    """
+    return {
+        "format": RUN_FORMAT,
+        "environment": VERSION,
+        "status": "finished" if finished else "interrupted",
+        "time_s": time_s,
+        "scenario": asdict(scenario),
+        "scenario_hash": scenario_hash(scenario),
+        **asdict(replace(spec, channel=PERFECT)),
+        "channel": scenario.channel(spec.channel).described(),
+        "twins": twins,
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
+        "code_hash": code_hash(),
+        "reward": reward,
+        "metrics": asdict(metrics),
+    }
+
+
+def open_run(folder: str | Path) -> RunLog:
+    """Read the folder of a run.
+
+    Raises:
+        FleetError: it is no folder of a run, not of this version, or damaged.
+    """
+    folder = Path(folder)
+    try:
+        card = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        check_format(card, folder)
+        scenario = msgspec.convert(card["scenario"], Scenario)
+        tables = {name: pq.read_table(folder / f"{name}.parquet") for name in ("telemetry", "events", "jobs", "offers")}
+        stored = RunLog(
+            card,
+            scenario,
+            _readings(tables["telemetry"], len(scenario.arms)),
+            tuple(Event(**_without_nulls(row)) for row in tables["events"].to_pylist()),
+            tuple(JobRecord(**row) for row in tables["jobs"].to_pylist()),
+            tuple(Offer(**row) for row in tables["offers"].to_pylist()),
+        )
+        if not len(stored.readings.time_s):
+            raise ValueError("telemetry.parquet has no rows")
+        _ = stored.plan  # raises for events that contradict each other or the fleet
+        return stored
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowInvalid) as error:
+        raise FleetError(
+            f"'{folder}' is no complete folder of `thermofleet run` ({type(error).__name__}: {error})."
+        ) from error
+
+
+def _readings(table: pa.Table, arms: int) -> Telemetry:
+    samples = table.num_rows // arms
+    readings = {name: np.stack([table[f"{name}_{j + 1}"].to_numpy() for j in range(JOINTS)], axis=-1) for name in UNITS}
+    modes = table["mode"].combine_chunks()
+    numbers = np.array([MODES.index(mode) for mode in modes.dictionary.to_pylist()])[modes.indices.to_numpy()]
+    return Telemetry(
+        time_s=table["time_s"].to_numpy()[::arms],
+        mode=numbers.reshape(samples, arms),
+        **{name: values.reshape(samples, arms, JOINTS) for name, values in readings.items()},
+    )
+
+
+def _without_nulls(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: float("nan") if value is None else value for name, value in row.items()}
+
+
+def _write_telemetry(telemetry: Telemetry, arms: list[str], path: Path) -> None:
+    """Some rows at a time, as a table of all takes as much memory as the readings."""
+    samples = max(1, ROWS_AT_ONCE // len(arms))
+    first = telemetry_table(_part(telemetry, slice(0, samples)), arms)
+    with pq.ParquetWriter(path, first.schema) as writer:
+        writer.write_table(first)
+        for i in range(samples, len(telemetry.time_s), samples):
+            writer.write_table(telemetry_table(_part(telemetry, slice(i, i + samples)), arms))
+
+
+def _part(telemetry: Telemetry, rows: slice) -> Telemetry:
+    return Telemetry(**{name: values[rows] for name, values in vars(telemetry).items()})
+
+
+def check_format(run: Mapping[str, Any], folder: Path) -> None:
+    """Check that this version can read a run.
+
+    Args:
+        run: The content of its run.json.
+
+    Raises:
+        FleetError: it is of another format.
+    """
+    if run["format"] != RUN_FORMAT:
+        raise FleetError(
+            f"'{folder}' is a run of format {run['format']} in {run.get('environment', 'allocation_v0')}; this "
+            f"version reads {RUN_FORMAT}, {VERSION}. Run the scenario again."
+        )
+
+
+UNITS = {"q": "rad", "qd": "rad/s", "tau": "N·m", "current_a": "A", "temp_c": "°C"}
+"""Units of the readings of each joint, also in the metadata of the columns."""
+
+
+def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:
+    """One row per arm and moment: time_s, arm, mode, then the readings of `UNITS` for joints 1..7."""
+    samples, count = telemetry.mode.shape
+    columns: dict[str, Any] = {
+        "time_s": np.repeat(telemetry.time_s, count),
+        "arm": pa.array(arms * samples).dictionary_encode(),
+        "mode": pa.DictionaryArray.from_arrays(pa.array(telemetry.mode.ravel(), pa.int8()), pa.array(MODES)),
+    }
+    units: dict[str, str] = {"time_s": "s"}
+    for name, unit in UNITS.items():
+        values = getattr(telemetry, name).reshape(samples * count, JOINTS).astype(np.float32)
+        for joint in range(JOINTS):
+            columns[f"{name}_{joint + 1}"] = values[:, joint]
+            units[f"{name}_{joint + 1}"] = unit
+    table = pa.table(columns)
+    described = [
+        field.with_metadata({"unit": units[field.name]}) if field.name in units else field for field in table.schema
+    ]
+    return table.cast(pa.schema(described))
+
+
+def event_table(events: tuple[Event, ...]) -> pa.Table:
+    """One row per event: the fields of `Event` without the env."""
+    number, text = pa.float64(), pa.string()
+    types = {
+        "time_s": number,
+        "kind": text,
+        "arm": text,
+        "job": text,
+        "joint": pa.int8(),
+        "value": number,
+        "reason": text,
+    }
+    return pa.table({name: pa.array([getattr(e, name) for e in events], kind) for name, kind in types.items()})
+
+
+def record_table(kind: type, records: Sequence[object]) -> pa.Table:
+    """One row per record: the fields of a dataclass of text, numbers and booleans."""
+    types = {
+        "str": pa.string(),
+        "bool": pa.bool_(),
+        "int": pa.int64(),
+        "int | None": pa.int64(),
+        "float": pa.float64(),
+        "float | None": pa.float64(),
+    }
+    names = {field.name: types[getattr(field.type, "__name__", str(field.type))] for field in fields(kind)}
+    return pa.table({name: pa.array([getattr(r, name) for r in records], kind) for name, kind in names.items()})
+
+
+def provenance(model: DifficultyModel) -> dict[str, Any]:
+    """Version of a difficulty model; for a twin also the hash of its training data, and its seed.
+
+    The version is that in `thermofleet twin score`, in the checkpoint's `twin.json` and in the arm's messages.
+    """
+    fields = {"twin": ("version", "data_hash", "seed"), "saturation": ("version", "data_hash", "jobs", "passed")}
+    parts: dict[str, object] = {"twin": getattr(model, "twin", model), "saturation": getattr(model, "saturation", None)}
+    found = {name: part for name, part in parts.items() if hasattr(part, "data_hash")}
+    return {"version": model.version} | {
+        name: {field: getattr(part, field) for field in fields[name]} for name, part in found.items()
+    }
+
+
+PACKAGES = ("fleet", "twin", "agents", "scenarios")
+
+
+@cache
+def code_hash() -> str:
+    """Hash of the Python files of the project as they are installed: paths and contents."""
+    digest = hashlib.sha256()
+    for package in PACKAGES:
+        root = Path(str(resources.files(package)))
+        for path in sorted(root.rglob("*.py")):
+            content = path.read_bytes()
+            digest.update(f"{package}/{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:16]
