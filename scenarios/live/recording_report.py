@@ -29,7 +29,7 @@ from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
 from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
-from scenarios.run.log import Offer
+from scenarios.run.records import Offer
 from scenarios.run.schedule import SAME_MOMENT_DIGITS
 from scenarios.spec.schema import Scenario
 

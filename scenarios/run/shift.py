@@ -19,8 +19,9 @@ from scenarios.policy_loader import OnBus, blaming, policy_at
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.result_folder import new_folder
-from scenarios.run.log import RUN, Offer, RunLog, card_of, job_records, offers_of, provenance
+from scenarios.run.log import RUN, RunLog, card_of, provenance
 from scenarios.run.metrics import HeatUse, metrics_of
+from scenarios.run.records import Offer, job_records, offers_of
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RunSpec
 from scenarios.spec.schema import Scenario

@@ -17,7 +17,7 @@ from urllib.parse import quote
 from fleet.env.render.picture import heat_scale
 from fleet.events import Event
 from fleet.telemetry import Telemetry
-from scenarios.run.log import Offer
+from scenarios.run.records import Offer
 from scenarios.run.schedule import Assignment, Outage, Schedule, payloads, schedule
 from scenarios.show.page import Chart, Page, Replay
 from scenarios.show.replay import packed

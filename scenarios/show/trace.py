@@ -12,7 +12,8 @@ from fleet.errors import FleetError, nearest
 from fleet.events import EVENT_KINDS, MEANINGS, Event
 from scenarios.live.recording import CARD, read_card, read_parts
 from scenarios.live.recording_report import offers_of
-from scenarios.run.log import JobRecord, Offer, RunLog, open_run
+from scenarios.run.log import RunLog, open_run
+from scenarios.run.records import JobRecord, Offer
 from scenarios.show.table import Table
 from scenarios.show.words import CANNOT, by_joint, clock
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from fleet.events import Event
-from scenarios.run.log import Offer
+from scenarios.run.records import Offer
 
 CANNOT = "cannot do it"
 SEVERITY = {

@@ -80,7 +80,7 @@ def test_the_process_does_what_the_same_rule_does_in_python(fleet, served, same_
     assert any(shift.finished for shift in shifts)
     spec = RunSpec(policy=on_bus, seed=2, bus="memory", difficulty="blind")
     one, other = run(fleet, spec, record=False), run(fleet, replace(spec, policy=same_rule), record=False)
-    assert (one.total_reward, one.metrics) == (other.total_reward, other.metrics)
+    assert (one.reward, one.metrics) == (other.reward, other.metrics)
     assert one.metrics.finished
 
 

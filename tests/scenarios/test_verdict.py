@@ -3,7 +3,7 @@
 import pytest
 
 from fleet.events import Event
-from scenarios.run.log import Offer
+from scenarios.run.records import Offer
 from scenarios.run.schedule import schedule
 from scenarios.show.run_page import verdict
 
