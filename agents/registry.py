@@ -44,47 +44,45 @@ _SSI, _KUHN = "Koenig et al. 2006", "Kuhn 1955"
 RULES: dict[str, Rule] = {
     "random": Rule("rules:RandomLegal", "none", scope="arm"),
     "round_robin": Rule("rules:RoundRobin", "none"),
-    "fifo": Rule("dispatching:Fifo", "release, then duration", "Pinedo 2022"),
-    "edd": Rule("dispatching:Edd", "due date, then duration", "Jackson 1955"),
-    "spt": Rule("dispatching:Spt", "duration", "Smith 1956"),
-    "atc": Rule("dispatching:Atc", "time per value, later due dates discounted", "Vepsalainen & Morton 1987"),
-    "least_loaded": Rule("dispatching:LeastLoaded", "work of the arm in the shift", "Pinedo 2022"),
+    "fifo": Rule("rules:Fifo", "release, then duration", "Pinedo 2022"),
+    "edd": Rule("rules:Edd", "due date, then duration", "Jackson 1955"),
+    "spt": Rule("rules:Spt", "duration", "Smith 1956"),
+    "atc": Rule("rules:Atc", "time per value, later due dates discounted", "Vepsalainen & Morton 1987"),
+    "least_loaded": Rule("rules:LeastLoaded", "work of the arm in the shift", "Pinedo 2022"),
     "coolest_first": Rule("rules:CoolestFirst", "hottest motor"),
     "least_difficulty": Rule("rules:LeastDifficulty", _RELATIVE, scope="arm"),
-    "consensus": Rule("consensus:Consensus", _RELATIVE, "Choi, Brunet & How 2009", scope="arm"),
+    "consensus": Rule("auction:Consensus", _RELATIVE, "Choi, Brunet & How 2009", scope="arm"),
     "wspt": Rule("rules:Wspt", "time per value", "Smith 1956"),
     "wspt_cool": Rule("rules:WsptCool", "time per value, P(saturation) ≤ 0.5", "Smith 1956"),
-    "thermometer": Rule("heat_rules:Thermometer", "time per value, headroom suits the load", _KUHN),
-    "wsept": Rule("heat_rules:Wsept", "time per expected worth", "Rothkopf 1966"),
-    "wsept_ahead": Rule(
-        "heat_rules:WseptAhead", "time per expected worth, with arms that are home soon", "Rothkopf 1966"
-    ),
+    "thermometer": Rule("heat:Thermometer", "time per value, headroom suits the load", _KUHN),
+    "wsept": Rule("heat:Wsept", "time per expected worth", "Rothkopf 1966"),
+    "wsept_ahead": Rule("heat:WseptAhead", "time per expected worth, with arms that are home soon", "Rothkopf 1966"),
     "wsept_local": Rule(
-        "heat_rules:WseptLocal", "time per expected worth, each arm for itself", "Rothkopf 1966", scope="arm"
+        "heat:WseptLocal", "time per expected worth, each arm for itself", "Rothkopf 1966", scope="arm"
     ),
-    "wsept_untrained": Rule("pair_scores:WseptUntrained", "time per worth with the first parameters of a training"),
-    "wsept_learned": Rule("pair_scores:WseptLearned", "time per learned worth", "Salimans et al. 2017"),
+    "wsept_untrained": Rule("pairs:WseptUntrained", "time per worth with the first parameters of a training"),
+    "wsept_learned": Rule("pairs:WseptLearned", "time per learned worth", "Salimans et al. 2017"),
     "wsept_learned_local": Rule(
-        "pair_scores:WseptLearnedLocal",
+        "pairs:WseptLearnedLocal",
         "time per learned worth, each arm for itself",
         "Salimans et al. 2017",
         scope="arm",
     ),
     "auction": Rule("auction:Auction", "time per expected worth, within n · ε", "Bertsekas 1988"),
     "rolling_horizon": Rule(
-        "rolling_horizon:RollingHorizon", "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"
+        "planners:RollingHorizon", "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"
     ),
     "mpc": Rule(
-        "mpc:Mpc",
+        "planners:Mpc",
         "discounted reward of the rest of the shift, in a simulator of the cell",
         "Mayne et al. 2000",
         plans=True,
     ),
-    "ssi": Rule("assignment:Ssi", _THERMAL, _SSI),
-    "matching": Rule("assignment:Matching", _THERMAL, _KUHN),
-    "matching_ahead": Rule("assignment:MatchingAhead", "thermal, with arms that are home soon", _KUHN),
-    "quickest_ssi": Rule("assignment:QuickestSsi", _TIME, _SSI),
-    "quickest_matching": Rule("assignment:QuickestMatching", _TIME, _KUHN),
+    "ssi": Rule("rules:Ssi", _THERMAL, _SSI),
+    "matching": Rule("rules:Matching", _THERMAL, _KUHN),
+    "matching_ahead": Rule("rules:MatchingAhead", "thermal, with arms that are home soon", _KUHN),
+    "quickest_ssi": Rule("rules:QuickestSsi", _TIME, _SSI),
+    "quickest_matching": Rule("rules:QuickestMatching", _TIME, _KUHN),
 }
 """The policies, simple ones first."""
 
@@ -106,15 +104,11 @@ class Wrapper:
 
 
 WRAPPERS: dict[str, Wrapper] = {
-    "limited": Wrapper(
-        "heat_guards:TorqueLimiter", "torque limit that falls with the temperature", "Singh et al. 2021"
-    ),
+    "limited": Wrapper("heat:TorqueLimiter", "torque limit that falls with the temperature", "Singh et al. 2021"),
     "shutdown": Wrapper(
-        "heat_guards:Shutdown", "no claims from the warning limit until the arm has cooled by 10 K", "IEC 60034-11"
+        "heat:Shutdown", "no claims from the warning limit until the arm has cooled by 10 K", "IEC 60034-11"
     ),
-    "fuzzy": Wrapper(
-        "heat_guards:FuzzySpeed", "speed by fuzzy rules about temperature and its tendency", "Afaq et al."
-    ),
+    "fuzzy": Wrapper("heat:FuzzySpeed", "speed by fuzzy rules about temperature and its tendency", "Afaq et al."),
 }
 
 
