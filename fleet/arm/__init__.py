@@ -1,1 +1,1 @@
-"""MuJoCo models of the arm and the cell, and the plant that simulates them."""
+"""One arm and its cell in MuJoCo: models, kinematics, motion plans, exclusion of motions, plant."""

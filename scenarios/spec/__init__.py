@@ -1,0 +1,1 @@
+"""Scenario files: schema, parsing, job streams, and the options of commands."""
