@@ -304,14 +304,6 @@ def _verified(
     )
 
 
-def propose(twin: Twin, source: Plan, s: float, rng: np.random.Generator, model: ArmModel) -> Plan | None:
-    """One motion near a known one; None beyond a joint or torque limit. Clearance and heat are not checked."""
-    try:
-        return planned(vary(twin, source, s, rng), source, model)
-    except Rejected:
-        return None
-
-
 def planned(made: Variation, source: Plan, model: ArmModel) -> Plan:
     """The plan of a variation with the torque of inverse dynamics; raises Rejected beyond a joint or torque limit."""
     phases = []

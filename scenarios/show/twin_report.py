@@ -69,7 +69,7 @@ QUANTILES = {"lowerfence": 5, "q1": 25, "median": 50, "q3": 75, "upperfence": 95
 COOL, BETWEEN, HOT = 0, 1, 2
 """Kinds of jobs and windows."""
 TEST_JOBS = 5
-"""Spawn key, different from those of `scenarios.prepare.twins` and `calibrate_twins` for the same arm."""
+"""Spawn key, different from those of `scenarios.prepare.twins` and `calibrate` for the same arm."""
 LOADED_JOINT = 1
 """The joint whose temperature divides logs into cool and hot, index 0..6: joint 2 carries a standing arm."""
 LOG_HOT_C = 40.0
