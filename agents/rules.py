@@ -1,18 +1,12 @@
-"""Dispatching rules. Except `wspt_cool` they are non-idling: a free arm that may claim a job does so.
+"""Dispatching rules, and policies that assign jobs by a cost matrix [arm, option].
 
-Cost of giving each job to each arm by each plan: matrices [arm, option] from the observations of all arms.
+Except `wspt_cool` the rules are non-idling: a free arm that may claim a job does so. Costs are +inf where an arm may
+not claim a job; lower is better, and only differences count.
 
-+inf where the arm may not claim the job. Lower is better, and only differences count.
+Assignments may pair two jobs that share a station, or two plans that exclude each other. As with any claims, the arm
+with the lower difficulty then gets its job, and the other arm chooses again.
 
-Central policies that assign jobs by a cost matrix [arm, option] of `agents.rules`.
-
-They may assign two jobs that share a station, or two plans that exclude each other. As with any claims, the arm with
-the lower difficulty then gets its job, and the other arm chooses again.
-
-Dispatching rules of the textbook, without heat: each is an index of jobs, or an order of arms.
-
-They are non-idling: a free arm that may claim a job does so. Source of all: Pinedo, Scheduling, 6th ed., Springer 2022,
-chapter 14.
+Source of the rules: Pinedo, Scheduling, 6th ed., Springer 2022, chapter 14.
 """
 
 from collections.abc import Mapping, Sequence

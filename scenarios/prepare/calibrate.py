@@ -1,13 +1,8 @@
-"""Simulated past jobs of an arm, with the records that a real arm would have of them.
+"""P(saturation) of a scenario's arms, from simulated past jobs with the records that real arms would have of them.
 
-Each job begins as warm as earlier work left the arm, in any of the ambient temperatures of its hall. The records hold
-what is known before the job (measured motors, estimated housings, ambient temperature), and the hottest temperatures
-during it.
-
-Give a scenario's twins a predicted peak and a probability of saturation, from simulated past jobs of their arms.
-
-An arm that has worked for weeks has such jobs in its records. Here they are simulated: the arm's own work and random
-work with heavy payloads, in every ambient temperature of its hall, from cold, idle and hot starts.
+An arm that has worked for weeks has such jobs. Here they are its own work and random work with heavy payloads, in every
+ambient temperature of its hall, from cold, idle and hot starts. Records hold what is known before the job (measured
+motors, estimated housings, ambient temperature), and the hottest temperatures during it.
 """
 
 import hashlib

@@ -1,9 +1,4 @@
-"""From a scenario to a fleet of arms with plans and twins, and to the environment.
-
-A cell as its arms know it, for policies that plan in a simulator.
-
-Scenarios for the batched environment: fleets planned and scored once, shifts drawn as arrays.
-"""
+"""From a scenario to a fleet of arms with plans and twins, and to its environment, single or batched."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,4 @@
-"""Simulated logs of an arm at work, and its thermal network identified from them.
-
-The thermal network of each arm of a scenario, identified from simulated logs of its own cool work.
-"""
+"""The thermal network of each arm of a scenario, identified from simulated logs of its own cool work."""
 
 import hashlib
 from collections.abc import Callable, Sequence

@@ -1,16 +1,8 @@
-"""Which motion stays cool, judged by the true motors, and what of it a twin is trained on.
+"""Twins of the arms of a scenario, or of logs of a real arm: trained on motion that stays cool, cached, and saved.
 
-Motion is cool if it can repeat over a whole horizon from a cold start. The temperature of the moment does not count:
-a heavy job begins cool, too.
-
-Models kept on disk: loaded where they are intact, made in parallel where they are missing.
-
-Train the twin of every arm on motion whose whole horizon stays cool.
-
-Training data hold the motion of the arm's work and random light motions of other kinds. Without the latter, every new
-motion would score as difficult. `benchmarks/paper/saturation.py` measures the gain.
-
-Folders of twins that were trained on request, from a scenario or from logs of a real arm.
+Planned motion is cool if it can repeat over a whole horizon from a cold start, judged by the true motors: a heavy job
+begins cool, too. Training data hold the arm's own cool motion and random light motions of other kinds. Without the
+latter, every new motion would score as difficult.
 """
 
 import hashlib

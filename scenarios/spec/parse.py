@@ -1,10 +1,6 @@
-"""Readable errors for scenario files and for names among several.
+"""Parse the content of scenario files: a `Scenario`, or an error of one sentence; and hash scenarios.
 
 `kind` is a type annotation such as `float | None`, for which Python has no type (hence Any).
-
-Parse the content of scenario files: a `Scenario`, or an error of one sentence.
-
-Hash of a scenario.
 """
 
 import dataclasses

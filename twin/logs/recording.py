@@ -1,9 +1,4 @@
-"""Sensor readings of one arm over time.
-
-Recordings at a regular rate: averaged, unwrapped, and split at gaps.
-
-Heat of an arm's motors in steps of some seconds, from its recordings: the input of identification and estimation.
-"""
+"""Sensor readings of one arm over time, at any rate or at a regular one, and the heat of its motors in steps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,14 +1,8 @@
-"""The predicted peak of a plan, and P(saturation) from it, by the thermal network of an arm.
+"""The physical twin: an arm's thermal network, nominal or identified, with predicted peaks and P(saturation) of plans.
 
 In each phase of a plan the drive is constant. Heat is linearised about a warm motor: copper loss is linear in the
 winding's temperature anyway, and that of the magnets changes it by a percent per five kelvin. So the temperature of
 each motor at each moment is affine in the temperatures known at the start, and the peak is a maximum of affine pieces.
-
-The physical twin: an arm's thermal network, nominal or identified, which predicts motor temperatures of a plan.
-
-It implements the same protocol as the learned twin, and also predicts temperatures.
-
-A learned twin with a predicted peak and P(saturation): what scores the plans of an arm.
 """
 
 from collections.abc import Iterable, Sequence

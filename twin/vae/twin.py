@@ -1,6 +1,6 @@
 """The twin of one arm: the distance of motion from the arm's training motion, joint by joint.
 
-A twin in a folder: `weights.safetensors` and `twin.json`, neither of which can run code when read.
+Its folder holds `weights.safetensors` and `twin.json`, neither of which can run code when read.
 """
 
 import hashlib
