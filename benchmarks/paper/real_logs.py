@@ -34,10 +34,9 @@ from scenarios.evaluate.statistics import Interval, percentile_interval
 from scenarios.json_rows import Row
 from scenarios.prepare.twins import LOG_INPUT, train_or_load
 from twin.logs.reader import read_folder
-from twin.logs.recording import READINGS, HeatLog, Recording, Stretch, heat_logs, stretches
+from twin.logs.recording import READINGS, HeatLog, Recording, Stretch, cool_stretches, heat_logs, stretches
 from twin.thermal.identify import HeatModel, Identified, Noise, ParameterVector, Problem, identify
 from twin.thermal.thermal_twin import RcTwin
-from twin.training_data import cool_stretches
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Calibration, Features
 from twin.vae.twin import Twin
@@ -160,7 +159,7 @@ def study_of(
 ) -> LogStudy:
     """A twin trained on the cool parts of the named recordings, and its errors on all others; as `log_study`."""
     training, test = ([r for r in recordings if (r.name in names) == wanted] for wanted in (True, False))
-    normal = cool_stretches(training, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(CARRIER,))
+    normal = cool_stretches(training, config.rate_hz, cool_c=HOT_C, joints=(CARRIER,))
     records = [stretch.profile for stretch in normal]
     own = np.random.SeedSequence(seed)
     twin = train_or_load(records, config, own, arm="logged", folder=folder or cache_folder())

@@ -32,8 +32,7 @@ from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario, TwinSpec
-from twin.logs.recording import Recording
-from twin.training_data import NothingCool, cool_stretches
+from twin.logs.recording import NothingCool, Recording, cool_stretches
 from twin.vae.config import TwinConfig, training_key
 from twin.vae.measures import Features
 from twin.vae.train import train
@@ -356,7 +355,7 @@ def train_log(
     reserved = {recording.name for recording in held_out}
     own = [recording for recording in recordings if recording.name not in reserved]
     least_s = config.window / config.rate_hz
-    cool = cool_stretches(own, config.rate_hz, cool_c=cool_c, horizon_s=np.inf, joints=LOADED, least_s=least_s)
+    cool = cool_stretches(own, config.rate_hz, cool_c=cool_c, joints=LOADED, least_s=least_s)
     progress("learning the log", 0.0)
     twin = train(
         [stretch.profile for stretch in cool],
@@ -388,7 +387,7 @@ def _is_cool(recording: Recording, config: TwinConfig, cool_c: float) -> bool:
         return False
     try:
         least_s = config.window / config.rate_hz
-        cool_stretches([recording], config.rate_hz, cool_c=cool_c, horizon_s=np.inf, joints=LOADED, least_s=least_s)
+        cool_stretches([recording], config.rate_hz, cool_c=cool_c, joints=LOADED, least_s=least_s)
     except NothingCool:
         return False
     return True
