@@ -71,7 +71,7 @@ def true_score(load: np.ndarray, duration_s: np.ndarray, temp_c: np.ndarray) -> 
 def world(jobs: int, seed: int) -> tuple[Past, np.ndarray]:
     """Past jobs, and the probability with which each passed the limit."""
     rng = np.random.default_rng(seed)
-    load = rng.exponential(0.8, (jobs, 7))
+    load = rng.exponential(0.8, (jobs, 7, PARTS))[..., 3]
     duration, temp = np.exp(rng.uniform(np.log(180), np.log(2700), jobs)), rng.uniform(20, 50, (jobs, KNOWN))
     p = 1 / (1 + np.exp(-true_score(load, duration, temp)))
     return {"load": load, "duration_s": duration, "known_c": temp, "passed": rng.random(jobs) < p}, p
