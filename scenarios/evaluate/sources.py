@@ -80,15 +80,50 @@ class PlannedFleet:
         spec = self.scenario.twin
         config = (TwinConfig.quick() if spec.size == "quick" else TwinConfig()).changed(**changes or {})
         seed = training_seed(self.scenario, training)
-        twins = train_twins(
-            self.scenario,
-            self.arms,
-            self.folder,
-            self.progress,
-            config=config if trained else untrained_config(config),
-            seed=seed,
-        )
-        return with_regressions(self.scenario, self.arms, twins, self.folder, self.progress, evidence=evidence)
+        config = config if trained else untrained_config(config)
+        twins = train_twins(self.scenario, self.arms, self.folder, self.progress, config=config, seed=seed)
+        return self.with_regressions(twins, evidence=evidence)
+
+    def with_regressions(
+        self, twins: "Sequence[Twin]", *, evidence: "Evidence" = "excess", jobs: int | None = None
+    ) -> "list[Learned]":
+        """Every arm's twin with a regression on its past jobs, which is cached.
+
+        A twin whose past jobs say too little about saturation gets no regression; a warning says why.
+
+        Args:
+            jobs: Past jobs of each arm; default: `scenarios.prepare.calibrate.PAST_JOBS`.
+        """
+        from scenarios.prepare.calibrate import PAST_JOBS, nominal_network, past_key, simulate_past
+        from scenarios.prepare.twins import CachedModel, load_or_make
+        from twin.baselines import LoadRegression, fit_regression, load_regression, save_regression
+        from twin.thermal.thermal_twin import NotEnoughExperience
+
+        scenario, count = self.scenario, jobs or PAST_JOBS
+
+        def load(home: Path) -> LoadRegression | None:
+            return load_regression(home) if home.is_dir() else None
+
+        def model(arm: PlannedArm, twin: "Twin") -> "CachedModel[LoadRegression | None]":
+            heat = nominal_network(scenario, arm)
+
+            def make(home: Path, _report: Callable[[float], None]) -> str | None:
+                past = simulate_past(scenario, arm, heat.heat_model, jobs=count)
+                features = twin.features(past.plans, past.repetitions.tolist())
+                try:
+                    fitted = fit_regression(features, past.duration_s, past.known_c, past.passed, evidence=evidence)
+                except NotEnoughExperience as error:
+                    name = arm.hardware.robot.name
+                    return f"{scenario.name}: arm '{name}' gets no probability of saturation. {error}"
+                save_regression(fitted, home)
+                return None
+
+            key = past_key(scenario, arm, f"{evidence}-{twin.version}-{heat.version}", count)
+            return CachedModel(self.folder / "saturation" / key, load, make)
+
+        models = [model(arm, twin) for arm, twin in zip(self.arms, twins, strict=True)]
+        fitted = load_or_make(models, "calibrating", self.progress)
+        return [Learned(twin, regression) for twin, regression in zip(twins, fitted, strict=True)]
 
     def scored(self, models: Sequence[DifficultyModel]) -> Fleet:
         """The fleet with these difficulty models."""
@@ -115,55 +150,6 @@ class Learned:
         features, duration_s = self.twin.features([plan], [repetitions]), np.array([plan.duration_s(repetitions)])
         risk = None if self.regression is None else self.regression.risk(features, duration_s)[0]
         return Difficulty(features.difficulty[0], risk=risk, weight=self.twin.joint_weight)
-
-
-def with_regressions(
-    scenario: Scenario,
-    arms: Sequence[PlannedArm],
-    twins: "Sequence[Twin]",
-    folder: Path,
-    progress: Progress,
-    *,
-    evidence: "Evidence" = "excess",
-    jobs: int | None = None,
-) -> list[Learned]:
-    """Every arm's twin with a regression on its past jobs, which are cached in the folder.
-
-    A twin whose past jobs say too little about saturation gets no regression; a warning says why.
-
-    Args:
-        arms: With their plans for all motion of the scenario, light loads included.
-        jobs: Past jobs of each arm; default: `scenarios.prepare.calibrate.PAST_JOBS`.
-    """
-    from scenarios.prepare.calibrate import PAST_JOBS, nominal_network, past_key, simulate_past
-    from scenarios.prepare.twins import CachedModel, load_or_make
-    from twin.baselines import LoadRegression, fit_regression, load_regression, save_regression
-    from twin.thermal.thermal_twin import NotEnoughExperience
-
-    count = jobs or PAST_JOBS
-
-    def load(home: Path) -> LoadRegression | None:
-        return load_regression(home) if home.is_dir() else None
-
-    def model(arm: PlannedArm, twin: "Twin") -> "CachedModel[LoadRegression | None]":
-        heat = nominal_network(scenario, arm)
-
-        def make(home: Path, _report: Callable[[float], None]) -> str | None:
-            past = simulate_past(scenario, arm, heat.heat_model, jobs=count)
-            features = twin.features(past.plans, past.repetitions.tolist())
-            try:
-                fitted = fit_regression(features, past.duration_s, past.known_c, past.passed, evidence=evidence)
-            except NotEnoughExperience as error:
-                return f"{scenario.name}: arm '{arm.hardware.robot.name}' gets no probability of saturation. {error}"
-            save_regression(fitted, home)
-            return None
-
-        key = past_key(scenario, arm, f"{evidence}-{twin.version}-{heat.version}", count)
-        return CachedModel(folder / "saturation" / key, load, make)
-
-    models = [model(arm, twin) for arm, twin in zip(arms, twins, strict=True)]
-    fitted = load_or_make(models, "calibrating", progress)
-    return [Learned(twin, regression) for twin, regression in zip(twins, fitted, strict=True)]
 
 
 @dataclass(frozen=True)

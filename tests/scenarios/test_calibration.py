@@ -8,7 +8,7 @@ import pytest
 
 from fleet.motion import drive
 from fleet.robot import ThermalLimits
-from scenarios.evaluate.sources import with_regressions
+from scenarios.evaluate.sources import PlannedFleet
 from scenarios.prepare.arms import PlannedArm, air_offsets, hardware_of
 from scenarios.prepare.calibrate import calibrate_networks, simulate_past
 from scenarios.progress import quiet
@@ -31,7 +31,9 @@ class Seer:
 
 
 def calibrate(scenario, hardware, twin, folder: Path, *, jobs=60):
-    (learned,) = with_regressions(scenario, [PlannedArm(0, hardware, {})], [twin], folder, quiet, jobs=jobs)
+    planned = PlannedFleet(scenario, folder)
+    vars(planned)["arms"] = [PlannedArm(0, hardware, {})]
+    (learned,) = planned.with_regressions([twin], jobs=jobs)
     return learned
 
 
