@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 
 from agents.policy import WAIT, legal_options, per_option, plans_of
-from agents.staleness import Trust, advantage, known_difficulty
+from agents.staleness import advantage, free_peers, known_difficulty
 from fleet.observation import Observation
 
 Array = np.ndarray
@@ -96,9 +96,6 @@ class LeastDifficulty(Stateless):
     scope: ClassVar = "arm"
     only_choices = True
 
-    def __init__(self, trust: Trust | None = None) -> None:
-        self._trust = trust or Trust()
-
     def choose(self, observation: Observation, place: int) -> int:
         """This arm's claim under the assumption that its peers follow the same rule."""
         mine = legal_options(observation)
@@ -106,8 +103,8 @@ class LeastDifficulty(Stateless):
             return WAIT
         plans = plans_of(observation)
         slots = list(dict.fromkeys(option // plans for option in mine))
-        relative = advantage(observation, place, _open(observation, slots), self._trust)
-        free = self._trust.free(observation)
+        relative = advantage(observation, place, _open(observation, slots))
+        free = free_peers(observation)
         able = ~np.isnan(relative) & np.insert(free, place, True)[:, None]
         for arm, slot in cheapest_pairs(np.where(able, relative, np.inf).round(9)):
             if arm == place:
