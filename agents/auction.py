@@ -197,5 +197,5 @@ class Consensus(LeastDifficulty):
         legal = np.any(observation.action_mask[1:-1].reshape(len(observation.offered), -1), axis=1)
         if not legal.any():
             return np.full(len(legal), np.inf)
-        relative = advantage(observation, place, legal, self._trust)[place]
+        relative = advantage(observation, place, legal)[place]
         return np.where(legal, np.where(np.isnan(relative), _UNKNOWN, relative), np.inf).round(9)

@@ -1,14 +1,11 @@
-"""Features of pairs of arm and option, the inputs of a learned score, for many envs at once.
+"""A learned score of pairs of arm and option: `wsept` with learned weights, matched as `wsept` matches.
+
+score = rate · exp(f) + g · mean rate, where `rate` is the expected worth per time with learned prices (`Worth`), and f
+and g are weighted sums of the pair's numbers. All parameters are one vector; zeros give `wsept` exactly.
 
 Numbers of one option come from one arm's observation; numbers of the set (alternatives of the job, other jobs of the
 arm, arms that are home soon) come from the observations of all arms. They do not depend on the order or number of arms
 and slots.
-
-A learned score of pairs of arm and option: `wsept` with learned weights, matched as `wsept` matches.
-
-score = rate · exp(f) + g · mean rate, where `rate` is the expected worth per time with learned prices
-(`agents.pairs.Worth`), and f and g are weighted sums of the pair's numbers. All parameters are one vector; zeros give
-`wsept` exactly.
 """
 
 import json

@@ -1,18 +1,12 @@
-"""Dispatching rules. Except `wspt_cool` they are non-idling: a free arm that may claim a job does so.
+"""Dispatching rules, and policies that assign jobs by a cost matrix [arm, option].
 
-Cost of giving each job to each arm by each plan: matrices [arm, option] from the observations of all arms.
+Except `wspt_cool` the rules are non-idling: a free arm that may claim a job does so. Costs are +inf where an arm may
+not claim a job; lower is better, and only differences count.
 
-+inf where the arm may not claim the job. Lower is better, and only differences count.
+Assignments may pair two jobs that share a station, or two plans that exclude each other. As with any claims, the arm
+with the lower difficulty then gets its job, and the other arm chooses again.
 
-Central policies that assign jobs by a cost matrix [arm, option] of `agents.rules`.
-
-They may assign two jobs that share a station, or two plans that exclude each other. As with any claims, the arm with
-the lower difficulty then gets its job, and the other arm chooses again.
-
-Dispatching rules of the textbook, without heat: each is an index of jobs, or an order of arms.
-
-They are non-idling: a free arm that may claim a job does so. Source of all: Pinedo, Scheduling, 6th ed., Springer 2022,
-chapter 14.
+Source of the rules: Pinedo, Scheduling, 6th ed., Springer 2022, chapter 14.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 
 from agents.policy import WAIT, legal_options, per_option, plans_of
-from agents.staleness import Trust, advantage, known_difficulty
+from agents.staleness import advantage, free_peers, known_difficulty
 from fleet.observation import Observation
 
 Array = np.ndarray
@@ -102,9 +96,6 @@ class LeastDifficulty(Stateless):
     scope: ClassVar = "arm"
     only_choices = True
 
-    def __init__(self, trust: Trust | None = None) -> None:
-        self._trust = trust or Trust()
-
     def choose(self, observation: Observation, place: int) -> int:
         """This arm's claim under the assumption that its peers follow the same rule."""
         mine = legal_options(observation)
@@ -112,8 +103,8 @@ class LeastDifficulty(Stateless):
             return WAIT
         plans = plans_of(observation)
         slots = list(dict.fromkeys(option // plans for option in mine))
-        relative = advantage(observation, place, _open(observation, slots), self._trust)
-        free = self._trust.free(observation)
+        relative = advantage(observation, place, _open(observation, slots))
+        free = free_peers(observation)
         able = ~np.isnan(relative) & np.insert(free, place, True)[:, None]
         for arm, slot in cheapest_pairs(np.where(able, relative, np.inf).round(9)):
             if arm == place:

@@ -2,10 +2,8 @@
 
 A difficulty describes a job and fades: at an age its weight is exp(−age / fading), both in the fleet's average and in
 the peer's distance from that average. So old scores have little influence on an assignment. A state describes a moment
-and expires: a peer whose last message is older than `expiry_s` counts as busy, so no job is left to it.
+and expires: a peer whose last message is older than `EXPIRY_S` counts as busy, so no job is left to it.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,28 +12,21 @@ from fleet.observation import Observation
 Array = np.ndarray
 
 
-@dataclass(frozen=True, kw_only=True)
-class Trust:
-    """Time scales on which peer messages lose their weight."""
+FADING_S = 60.0
+"""Age at which a difficulty has the weight 1/e."""
+EXPIRY_S = 60.0
+"""Age from which a peer's state is ignored."""
 
-    fading_s: float = 60.0
-    """Age at which a difficulty has the weight 1/e."""
-    expiry_s: float = 60.0
-    """Age from which a peer's state is ignored."""
 
-    def __post_init__(self) -> None:
-        for name in ("fading_s", "expiry_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"Trust.{name} must be > 0 (got {getattr(self, name)}).")
+def fading_weights(observation: Observation) -> Array:
+    """Weight of each peer's difficulties, from 0 to 1, [peer]."""
+    return np.exp(-observation.peer_age_s.astype(float) / FADING_S)
 
-    def weights(self, observation: Observation) -> Array:
-        """Weight of each peer's difficulties, from 0 to 1, [peer]."""
-        return np.exp(-observation.peer_age_s.astype(float) / self.fading_s)
 
-    def free(self, observation: Observation) -> Array:
-        """Peers that are free by their last messages, bool, [peer]."""
-        current = (observation.peer_heard > 0) & (observation.peer_age_s < self.expiry_s)
-        return current & (observation.peer_working == 0) & (observation.peer_faulted == 0)
+def free_peers(observation: Observation) -> Array:
+    """Peers that are free by their last messages, bool, [peer]."""
+    current = (observation.peer_heard > 0) & (observation.peer_age_s < EXPIRY_S)
+    return current & (observation.peer_working == 0) & (observation.peer_faulted == 0)
 
 
 def known_difficulty(observation: Observation) -> Array:
@@ -43,7 +34,7 @@ def known_difficulty(observation: Observation) -> Array:
     return np.where(observation.known > 0, observation.difficulty, np.nan)
 
 
-def advantage(observation: Observation, place: int, open_slots: Array, trust: Trust) -> Array:
+def advantage(observation: Observation, place: int, open_slots: Array) -> Array:
     """Least difficulty of each job for each arm relative to the fleet's average, as this arm knows it, [arm, slot].
 
     Args:
@@ -54,7 +45,7 @@ def advantage(observation: Observation, place: int, open_slots: Array, trust: Tr
     peers = np.where(observation.peer_known > 0, observation.peer_difficulty, np.nan)
     shared = np.insert(peers.astype(float), place, own, axis=0)  # [arm, slot], in the fleet's order
     shared[:, ~open_slots] = np.nan
-    weight = np.insert(trust.weights(observation), place, 1.0)[:, None]
+    weight = np.insert(fading_weights(observation), place, 1.0)[:, None]
     counts = np.where(np.isnan(shared), 0.0, weight)
     total = counts.sum(axis=0)
     average = np.where(np.isnan(shared), 0.0, counts * shared).sum(axis=0) / np.where(total > 0, total, 1.0)

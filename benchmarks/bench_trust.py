@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.table import Table
 from sklearn.metrics import average_precision_score, roc_auc_score
 
+from benchmarks.paper.saturation import brier, reliability
 from scenarios.cli.terminal import progress_bar
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.spec.load import load
-from twin.p_saturation import brier, reliability
 
 POLICY = "round_robin"
 UNKNOWN = 0.5

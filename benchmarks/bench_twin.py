@@ -7,7 +7,7 @@ CPU time on one core, medians; ours and the others alternate. Plain is a bare `n
 layers, decoder, loss and backward pass, or the forward pass alone. The lower bound ("floor") is the matrix
 multiplications of the same passes, as `torch.mm` of their shapes. Training is extrapolated from its steps; --full runs
 it on random smooth motion. A job of the target lasts 16 s; a real plan has the median number of the quickstart's.
---arms trains that many twins of the quick size side by side in two processes, and has them score 1 000 jobs each;
+--arms trains that many twins of the quick size in two processes, and has them score 1 000 jobs each;
 beside it a training of one twin network after network with `nn.LSTM` (peer), extrapolated.
 """
 
@@ -33,13 +33,15 @@ from twin.vae.config import TwinConfig
 from twin.vae.inference import reconstruct
 from twin.vae.model import LstmVae, build, weights_of
 from twin.vae.onnx import export_onnx
-from twin.vae.train import SIDE_BY_SIDE, Motion, Run, train, train_all
+from twin.vae.train import Run, train
 from twin.vae.twin import Fit, Twin, save
 from twin.vae.window import Scaler, cut, resample, starts
 
 JOINTS = 7
 RUNS = 15
-BESIDE = (1, 7, SIDE_BY_SIDE, 28)
+RESTARTED = 14
+"""Networks of the joints of an arm, each with two restarts."""
+BESIDE = (1, 7, RESTARTED, 28)
 """Numbers of networks trained side by side."""
 JOBS = 1000
 JOB_S = 16.0
@@ -125,9 +127,9 @@ def training(config: TwinConfig, name: str) -> None:
     ours = {count: took[str(count)] / count for count in BESIDE}
     steps = nets * -(-config.max_windows // config.batch)
     trial = round(config.trial * config.epochs) if config.restarts > 1 else 0
-    whole_s = ours[SIDE_BY_SIDE] * steps * (config.epochs + trial * (config.restarts - 1))
+    whole_s = ours[RESTARTED] * steps * (config.epochs + trial * (config.restarts - 1))
     cells = "".join(f"{1e3 * each:>9.1f}" for each in (*ours.values(), took["plain"], took["floor"]))
-    print(f"{name:<26}{cells}{ours[SIDE_BY_SIDE] / took['plain']:>8.2f}   all joints and restarts: {whole_s:.0f} s")
+    print(f"{name:<26}{cells}{ours[RESTARTED] / took['plain']:>8.2f}   all joints and restarts: {whole_s:.0f} s")
 
 
 def _epochs_of(count: int, config: TwinConfig, channels: int) -> Callable[[], object]:
@@ -194,12 +196,13 @@ def some_arms(first: int, count: int) -> tuple[float, float, int]:
     for arm in range(first, first + count):
         rng = np.random.default_rng(arm)
         records = [smooth(rng, 12.0) for _ in range(90)]
-        motions.append(Motion(arm=f"arm_{arm}", records=records, seed=np.random.SeedSequence(arm)))
+        motions.append(records)
         parts = [cut(resample(r, RATE_HZ, config.rate_hz), config.window, config.score_stride) for r in records]
         windows.append(np.concatenate(parts))
-    train_all(motions[:1], replace(config, epochs=1, allow_collapse=True))  # loads compiled code
+    draw = np.random.SeedSequence(first)
+    train(motions[0], replace(config, epochs=1, allow_collapse=True), draw, arm="")  # loads compiled code
     twins: list[Twin] = []
-    training_s = seconds(lambda: twins.extend(train_all(motions, config)))
+    training_s = seconds(lambda: twins.extend(train(records, config, draw, arm="arm") for records in motions))
     scoring_s = 0.0
     for twin, own in zip(twins, windows, strict=True):
         drawn = own[np.random.default_rng(0).integers(0, len(own), JOBS * windows_in(JOB_S, config))]

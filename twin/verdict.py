@@ -1,7 +1,4 @@
-"""Uncritical or anomalous: a threshold on a twin's cumulative error with a bounded rate of false alarms.
-
-Features of recordings under a twin, window by window and as a mean over the recording.
-"""
+"""Uncritical or anomalous: a threshold on a twin's cumulative error with a bounded rate of false alarms."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,7 @@
-"""Evolution strategy with antithetic samples: a gradient of ranked fitness, followed by Adam.
+"""Evolution strategy with antithetic samples (ranked fitness, followed by Adam), and length and log of a training.
 
 Sources: Salimans et al., arXiv 1703.03864 (antithetic samples, ranked fitness, common random numbers); Kingma & Ba,
 ICLR 2015 (Adam); Polyak & Juditsky, SIAM Journal on Control and Optimization 30, 1992 (average of the iterates).
-
-Length and log of a training: JSON lines, and TensorBoard by TorchRL's logger where both are installed.
 """
 
 import json

@@ -1,11 +1,7 @@
-"""Network inputs from observation vectors: scaled, and arranged as sets of options and peers.
-
-The shared network: one actor for every arm of every fleet, and the critics that train it.
+"""A trained policy of all arms and fleets: its inputs, its network with the critics that train it, and its files.
 
 Deep sets (Zaheer et al., NeurIPS 2017): small shared networks encode options and peers, and their outputs are pooled.
 So the logits are equivariant in the options, and invariant to the order and number of peers.
-
-A trained policy: the shared actor as a `Policy`, saved as safetensors and JSON.
 """
 
 import json

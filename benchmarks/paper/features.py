@@ -39,10 +39,11 @@ from fleet.motion import Plan
 from fleet.seeding import child
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
-from scenarios.motion.generate import MOST_DRAWS, GenerationError, Verification, propose
+from scenarios.motion.generate import MOST_DRAWS, GenerationError, Rejected, Verification, planned
 from scenarios.prepare.twins import cold_peaks, records
 from twin.baselines import untrained_config
 from twin.vae.config import TwinConfig
+from twin.vae.generate import vary
 from twin.vae.train import train
 from twin.vae.twin import Twin
 from twin.vae.window import JobWindows, cut_jobs
@@ -316,7 +317,10 @@ def synthetic_motion(
     model, barren = ArmModel(study.robot), 0
     while barren < MOST_DRAWS * len(sources):
         source = sources[int(rng.integers(len(sources)))]
-        plan = propose(twin, source, s, rng, model)
+        try:
+            plan = planned(vary(twin, source, s, rng), source, model)
+        except Rejected:
+            plan = None
         if plan is not None and nominal.peak_c(plan).max() <= nominal.cool_c - nominal.margin_k:
             barren = 0
             yield plan

@@ -35,6 +35,7 @@ from benchmarks.paper.harness import (
     size_options,
     whole,
 )
+from benchmarks.paper.saturation import wilson
 from benchmarks.paper.subjects import ALARM_RATE, SCENARIOS, Sample, Study, arm_of, cached_twin, jobs_of, make_study
 from fleet.arm.model import ArmModel
 from fleet.errors import FleetError
@@ -44,7 +45,6 @@ from scenarios.json_rows import Row
 from scenarios.motion.generate import Rejected, planned
 from scenarios.prepare.twins import cold_peaks
 from scenarios.spec.schema import Scenario
-from twin.p_saturation import wilson
 from twin.vae.config import TwinConfig
 from twin.vae.generate import Variation, vary
 from twin.vae.measures import TAU, Calibration, Features, largest_p_value, p_value

@@ -11,6 +11,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import repeat
 from pathlib import Path
 
 import msgspec
@@ -26,17 +27,16 @@ from benchmarks.paper.subjects import CARRIER
 from fleet.difficulty import difficulty_of_error
 from fleet.errors import FleetError, LogError
 from fleet.files import cache_folder
-from fleet.heat.thermal import HOUSING, WINDING
-from fleet.motion import CHANNELS
+from fleet.heat.thermal import HOUSING, NODES, WINDING, drive_heat, temperature_steps
+from fleet.motion import CHANNELS, Drive
 from fleet.robot import JOINTS
 from scenarios.evaluate.statistics import Interval, percentile_interval
 from scenarios.json_rows import Row
 from scenarios.prepare.twins import LOG_INPUT, train_or_load
 from twin.logs.reader import read_folder
-from twin.logs.recording import READINGS, Recording, Stretch, heat_logs, stretches
+from twin.logs.recording import READINGS, HeatLog, Recording, Stretch, cool_stretches, heat_logs, stretches
 from twin.thermal.identify import HeatModel, Identified, Noise, ParameterVector, Problem, identify
-from twin.thermal.thermal_twin import RcTwin, continued_peaks, filter_log, planned_peaks
-from twin.training_data import cool_stretches
+from twin.thermal.thermal_twin import RcTwin
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Calibration, Features
 from twin.vae.twin import Twin
@@ -159,7 +159,7 @@ def study_of(
 ) -> LogStudy:
     """A twin trained on the cool parts of the named recordings, and its errors on all others; as `log_study`."""
     training, test = ([r for r in recordings if (r.name in names) == wanted] for wanted in (True, False))
-    normal = cool_stretches(training, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(CARRIER,))
+    normal = cool_stretches(training, config.rate_hz, cool_c=HOT_C, joints=(CARRIER,))
     records = [stretch.profile for stretch in normal]
     own = np.random.SeedSequence(seed)
     twin = train_or_load(records, config, own, arm="logged", folder=folder or cache_folder())
@@ -479,6 +479,109 @@ def forecasts(study: LogStudy, recordings: dict[str, Recording], twin: RcTwin) -
             ):
                 out[mine[here]] = peaks[edge[here], CARRIER]
     return continued, planned
+
+
+def planned_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float) -> Array:
+    """Peaks within `ahead_s` after each edge of the log's steps, with the load of the log's coming steps.
+
+    The load of a planned motion is known in advance.
+
+    Args:
+        states_c: Estimated temperatures at each edge, °C, [step + 1, node].
+
+    Returns:
+        °C, [step + 1, joint]; nan where the log ends before.
+    """
+    load = _drive(twin, log)
+    edges = np.arange(len(log.time_s))
+    until = np.searchsorted(log.time_s, log.time_s + ahead_s - 1e-9)  # first edge at or after the horizon
+    temp_c = states_c.astype(float)
+    peak_c = temp_c[:, WINDING]
+    for ahead in range(int(np.max(until - edges, initial=0))):
+        step = np.minimum(edges + ahead, len(log.dt_s) - 1)
+        heat_w = drive_heat(temp_c, load.current_sq[step], load.friction_w[step], twin.motors)
+        within = (edges + ahead < np.minimum(until, len(log.dt_s)))[:, None]
+        temp_c = np.where(within, twin.thermal.step(temp_c, heat_w, twin.ambient_c, log.dt_s[step]), temp_c)
+        peak_c = np.maximum(peak_c, temp_c[:, WINDING])
+    return np.where((until < len(edges))[:, None], peak_c, np.nan)
+
+
+def continued_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float, *, past_s: float) -> Array:
+    """The same if the mean load of the last `past_s` continues, without knowledge of the future.
+
+    Returns:
+        °C, [step + 1, joint]; nan at edges with less past than `past_s`.
+    """
+    load = _drive(twin, log)
+    step_s = float(np.median(log.dt_s))
+    past, count = max(1, round(past_s / step_s)), max(1, int(np.ceil(ahead_s / step_s)))
+    peak_c = np.full((len(log.time_s), load.current_sq.shape[1]), np.nan)
+    if len(load.current_sq) >= past:
+        mean = Drive(_trailing_mean(load.current_sq, past), _trailing_mean(load.friction_w, past))
+        rows = temperature_steps(
+            repeat(mean, count),
+            ahead_s / count,
+            motors=twin.motors,
+            thermal=twin.thermal,
+            start_c=states_c[past:],
+            ambient_c=twin.ambient_c,
+        )
+        peak_c[past:] = np.max([temp_c[:, WINDING] for temp_c in rows], axis=0)
+    return peak_c
+
+
+def _drive(twin: RcTwin, log: HeatLog) -> Drive:
+    """Mean drive of each step, [step, joint]."""
+    friction = (twin.motors.coulomb_nm, twin.motors.viscous_nms_per_rad)
+    return Drive(log.current_sq(*friction), log.friction_w(*friction))
+
+
+def _trailing_mean(values: Array, steps: int) -> Array:
+    """Mean over the `steps` steps before each edge after them, [edge, joint]."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    return (total[steps:] - total[:-steps]) / steps
+
+
+HOUSING_SD_K = 5.0
+"""Standard deviation of a housing from its winding at the start."""
+SENSOR_SD_K = 0.05
+"""Noise and slow drift of the motor temperature; larger than the noise at rest, which no model follows."""
+HEAT_NOISE_W2S = 10.0
+"""Intensity of unmodelled heat, W²·s, at every node: half a watt that lasts 20 s, three watts for one."""
+
+
+def filter_log(twin: RcTwin, log: HeatLog) -> Array:
+    """Temperatures of all nodes at the edges of a log's steps, each from the past alone, °C, [step + 1, node].
+
+    Housings start as warm as their windings.
+    """
+    temp = twin.likely_start(log.temp_c[0])
+    spread = np.diag(np.append(np.full(JOINTS, SENSOR_SD_K**2), np.full(JOINTS, HOUSING_SD_K**2)))
+    temps = [temp]
+    lengths, which = np.unique(np.round(log.dt_s, 2), return_inverse=True)
+    steps = [twin.thermal.step_matrices(dt) for dt in lengths]
+    # A recorded current does not depend on the magnets.
+    motors = twin.motors if log.source == "torque" else replace(twin.motors, alpha_kt_per_k=0.0)
+    square = log.current_sq(motors.coulomb_nm, motors.viscous_nms_per_rad)
+    friction = log.friction_w(motors.coulomb_nm, motors.viscous_nms_per_rad)
+    for k, length in enumerate(which):
+        phi, gamma = steps[length]
+        heat_w = drive_heat(temp, square[k], friction[k], motors)
+        temp = phi @ temp + gamma @ (heat_w + twin.thermal.to_ambient * twin.ambient_c)
+        # White heat noise over dt is like an independent constant heat of variance intensity/dt in each step.
+        spread = phi @ spread @ phi.T + gamma @ gamma.T * (HEAT_NOISE_W2S / log.dt_s[k])
+        temp, spread = _correct(temp, spread, log.temp_c[k + 1])
+        temps.append(temp)
+    return np.array(temps)
+
+
+def _correct(temp: Array, spread: Array, measured_c: Array) -> tuple[Array, Array]:
+    """State and covariance after a reading of all windings (Joseph's form keeps the covariance symmetric)."""
+    of_reading = spread[WINDING, WINDING] + np.eye(JOINTS) * SENSOR_SD_K**2
+    gain = np.linalg.solve(of_reading, spread[WINDING]).T  # [node, joint]
+    rest = np.eye(NODES)
+    rest[:, WINDING] -= gain
+    return temp + gain @ (measured_c - temp[WINDING]), rest @ spread @ rest.T + gain @ gain.T * SENSOR_SD_K**2
 
 
 def _passing(study: LogStudy, scores: dict[str, Array], chosen: Array) -> Row:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
+from scipy.stats import norm
 from sklearn.metrics import roc_auc_score
 
 from agents.policy import WAIT
@@ -37,17 +38,87 @@ from fleet.robot import ThermalLimits
 from scenarios.evaluate.sources import drawn
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
-from scenarios.prepare.calibrate import PastJobs, experience, past_jobs
+from scenarios.prepare.calibrate import PastJobs, past_jobs
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
 from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.parse import choose
 from scenarios.spec.schema import Scenario
-from twin.p_saturation import EVIDENCE, METHODS, Experience, brier, fit_saturation, reliability
+from twin.baselines import EVIDENCE, fit_regression
 from twin.thermal.thermal_twin import RcTwin
+from twin.vae.measures import Features
 from twin.vae.twin import Twin
 
 Array = np.ndarray
+
+BINS = 10
+"""Default number of bins of equal mass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Stated probabilities against outcomes, by bins of equal mass without those that ties leave empty."""
+
+    mean_p: Array
+    """Mean stated probability, [bin], ascending."""
+    share: Array
+    """Share of jobs with the event, [bin]."""
+    count: Array
+    """Jobs, int [bin]."""
+    low: Array
+    """Lower end of the Wilson interval of the share, [bin]."""
+    high: Array
+    """Upper end, [bin]."""
+
+    @property
+    def error(self) -> float:
+        """Expected calibration error: mean over jobs of |share − stated probability| of their bin (Naeini et al.,
+        AAAI 2015, with bins of equal mass)."""
+        return float(np.average(np.abs(self.share - self.mean_p), weights=self.count))
+
+
+def reliability(p: Array, event: Array, *, bins: int = BINS, confidence: float = 0.95) -> Reliability:
+    """The reliability table of stated probabilities [job] against outcomes, bool [job].
+
+    Raises:
+        ValueError: no jobs, unequal lengths, or probabilities outside [0, 1].
+    """
+    p, event = _checked(p, event)
+    if bins < 1:
+        raise ValueError(f"A reliability table needs at least one bin (got {bins}).")
+    edges = np.percentile(p, np.linspace(0.0, 1.0, bins + 1) * 100)  # rounds as scikit-learn does
+    of_job = np.searchsorted(edges[1:-1], p)
+    count = np.bincount(of_job, minlength=bins)
+    filled = count > 0
+    some = np.maximum(count, 1)
+    share = np.bincount(of_job, weights=event, minlength=bins) / some
+    mean_p = np.bincount(of_job, weights=p, minlength=bins) / some
+    low, high = wilson(share[filled], count[filled], confidence)
+    return Reliability(mean_p[filled], share[filled], count[filled], low, high)
+
+
+def wilson(share: Array, count: Array, confidence: float = 0.95) -> tuple[Array, Array]:
+    """Confidence interval of a probability from the share of `count` draws (Wilson, JASA 22, 1927), both ends."""
+    z = float(norm.ppf(0.5 + 0.5 * confidence))
+    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+    return np.clip(middle - half, 0.0, 1.0), np.clip(middle + half, 0.0, 1.0)
+
+
+def brier(p: Array, event: Array) -> float:
+    """Mean squared distance of stated probabilities [job] from outcomes, bool [job]; 0 is perfect."""
+    p, event = _checked(p, event)
+    return float(np.mean(np.square(p - event)))
+
+
+def _checked(p: Array, event: Array) -> tuple[Array, Array]:
+    p, event = np.asarray(p, dtype=float), np.asarray(event)
+    if p.ndim != 1 or p.shape != event.shape or len(p) == 0:
+        raise ValueError(f"Probabilities and events must be [job], at least one (got {p.shape}, {event.shape}).")
+    if not ((p >= 0) & (p <= 1)).all():
+        raise ValueError("Probabilities must lie in [0, 1].")
+    return p, event.astype(bool).astype(float)
+
 
 MEASURES = {"auroc": "AUROC", "brier": "Brier", "ece": "ECE", "peak_error_k": "error of the peak, K"}
 ALARMS = {"false_alarms": "false alarms", "false_novel": "alarms on light new motion", "caught": "jobs found"}
@@ -105,23 +176,20 @@ def judged(p: Array, passed: Array, peak_error_k: float = np.nan) -> Row:
 
 
 def judge_twin(work: PastWork, twin: Twin) -> tuple[dict[str, Row], dict[str, Row]]:
-    """Every prediction of saturation from a learned twin, by `EVIDENCE, METHOD`, and the alarm on P by evidence."""
-    past = experience(twin, work.jobs)
-    fit, setting, rest, novel = (past.part(rows) for rows in (work.fit, work.watched, work.held_out, work.novel))
-    calm, critical, calm_novel = rest.part(~rest.passed), rest.part(rest.passed), novel.part(~novel.passed)
+    """Every prediction of saturation by a regression on the features of a learned twin, and the alarm on its score."""
+    jobs, (fit, rest) = work.jobs, (work.fit, work.held_out)
+    packed = twin.features(jobs.plans, jobs.repetitions.tolist()).packed
+    calm = [work.watched, work.held_out, work.novel]
+    setting, calm_rest, calm_novel = (rows[~jobs.passed[rows]] for rows in calm)
+    groups_of_alarms = (calm_rest, calm_novel, rest[jobs.passed[rest]])
     predictions, alarms = dict[str, Row](), dict[str, Row]()
     for evidence in EVIDENCE:
-        for method in METHODS:
-            model = fit_saturation(fit, evidence=evidence, method=method)
-            p = model.risk(rest.features, rest.duration_s).at(rest.known_c)
-            predictions[f"{evidence}, {method}"] = judged(p, rest.passed)
-        model = fit_saturation(fit, evidence=evidence)
-
-        def score(jobs: Experience, model=model) -> Array:
-            return model.score(jobs.features, jobs.duration_s, jobs.known_c)
-
-        threshold = alarm_threshold(score(setting.part(~setting.passed)))
-        shares = (raised(score(jobs), threshold) for jobs in (calm, calm_novel, critical))
+        past = (Features(packed[fit]), jobs.duration_s[fit], jobs.known_c[fit], jobs.passed[fit])
+        risk = fit_regression(*past, evidence=evidence).risk(Features(packed), jobs.duration_s)
+        predictions[evidence] = judged(risk.at(jobs.known_c)[rest], jobs.passed[rest])
+        score = risk.value(jobs.known_c)  # ranks jobs also where P rounds to 0 or 1
+        threshold = alarm_threshold(score[setting])
+        shares = (raised(score[rows], threshold) for rows in groups_of_alarms)
         alarms[evidence] = dict(zip(ALARMS, shares, strict=True))
     return predictions, alarms
 

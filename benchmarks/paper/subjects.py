@@ -28,7 +28,7 @@ from scenarios.prepare.arms import ArmHardware
 from scenarios.prepare.twins import cold_peaks, records, train_or_load
 from scenarios.spec.schema import Scenario
 from twin.vae.config import TwinConfig
-from twin.vae.measures import allowed, fewest
+from twin.vae.measures import fewest
 from twin.vae.twin import Twin
 from twin.vae.window import windows_of
 
@@ -236,6 +236,11 @@ def jobs_of(sample: Sample, horizon_s: float) -> Jobs:
 
 class TooFewJobs(FleetError):
     """Too few jobs for the false-alarm rate."""
+
+
+def allowed(count: int, alpha: float) -> int:
+    """floor(α (n + 1)): a new score is an alarm if fewer than so many of the n reference scores reach it."""
+    return int(np.floor(alpha * (count + 1) + 1e-9))
 
 
 def alarm_threshold(scores: Sequence[float] | Array, alpha: float = ALARM_RATE) -> float:

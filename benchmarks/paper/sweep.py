@@ -52,7 +52,7 @@ from scenarios.json_rows import Row
 from scenarios.prepare.twins import records
 from twin.vae.config import RECIPE, TwinConfig
 from twin.vae.model import one_thread
-from twin.vae.train import Motion, train, train_all
+from twin.vae.train import train
 from twin.vae.twin import Twin
 from twin.vae.window import cut_jobs, windows_of
 
@@ -154,9 +154,7 @@ def sweep_rows(
         source = study if configuration.data == "cool" else subject.any_motion()
         plans = subject.seen(source.train.plans, carrier_of(study))
         start_s = time.process_time()
-        (twin,) = train_all(
-            [Motion(arm=subject.name, records=records(plans), seed=subject.entropy)], configuration.config
-        )
+        twin = train(records(plans), configuration.config, subject.entropy, arm=subject.name)
         cpu_s = round(time.process_time() - start_s, 2)
         card = {"configuration": name, "subject": subject.name, **measures(twin, subject, study)}
         yield key, card | {"epochs": configuration.config.epochs, "cpu_s": cpu_s}

@@ -51,8 +51,7 @@ from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.prepare.identify import own_logs
 from scenarios.prepare.twins import records
-from twin.logs.recording import Recording, stretches
-from twin.training_data import cool_stretches
+from twin.logs.recording import Recording, cool_stretches, stretches
 from twin.vae.config import TwinConfig, hash_records, seed_text
 from twin.vae.model import one_thread
 from twin.vae.train import Run, train
@@ -317,11 +316,7 @@ def cool_files(recordings: Sequence[Recording], config: TwinConfig) -> list[list
     """
     cool = [r for r in recordings if r.temp_c is not None and r.temp_c[:, CARRIER].max(initial=-np.inf) < HOT_C]
     parts = [
-        [
-            part.profile
-            for part in cool_stretches([r], config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(CARRIER,))
-        ]
-        for r in cool
+        [part.profile for part in cool_stretches([r], config.rate_hz, cool_c=HOT_C, joints=(CARRIER,))] for r in cool
     ]
     parts = [some for some in parts if any(len(profile) >= config.window for profile in some)]
     least = FILES[-1] + LEAST_HELD_OUT

@@ -3,7 +3,8 @@
 import json
 from dataclasses import asdict
 
-from scenarios.spec.schema import ArrivalSpec, JobStream, Scenario, Spread, TwinSpec
+from fleet.arrivals import Arrivals
+from scenarios.spec.schema import JobStream, Scenario, Spread, TwinSpec
 from scenarios.suite.instances import layout_of
 
 SHOWN = ("name", "position_m", "tilt_deg", "home")
@@ -25,7 +26,7 @@ def hall(
             name=f"sort_{i:03d}",
             kind="sort",
             places=tuple(place.name for place in group),
-            arrivals=ArrivalSpec(kind="poisson", every_s=every_s),
+            arrivals=Arrivals(kind="poisson", every_s=every_s),
             payload_kg=(1.0, 2.0),
             repetitions=cycles,
             due_s=1800.0,

@@ -1,9 +1,4 @@
-"""The cell in three dimensions, as plain values that every way to show it shares.
-
-Shows recorded postures of a cell in MuJoCo: as pictures without a display, or in its viewer.
-
-Contacts between arms, floor, fixtures and payloads, found in recorded postures with MuJoCo.
-"""
+"""A cell in MuJoCo: plain values for every way to show it, pictures and viewer of recorded postures, and contacts."""
 
 import base64
 import threading
@@ -121,10 +116,6 @@ def _pose(position_m: Sequence[float], matrix: np.ndarray) -> dict[str, Any]:
 
 def _rounded(values: Sequence[float] | np.ndarray) -> list[float]:
     return [round(float(value), DIGITS) for value in values]
-
-
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 Array = np.ndarray
@@ -288,10 +279,6 @@ def _least(across: Array, depth: Array, low: float, high: float) -> float:
 def _middle(across: Array, ahead: Array, low: float, high: float) -> float:
     """The camera's place across, so that as much room is left on both sides."""
     return float((across + ROOM_M - ahead * high).max() + (across - ROOM_M - ahead * low).min()) / 2
-
-
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 Pair = tuple[int, int]

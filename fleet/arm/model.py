@@ -1,9 +1,4 @@
-"""Constants of the Gen3 model that plans depend on; importing them loads no physics.
-
-Kinova's shells for rendering: replaces the primitives of `gen3.xml` by the meshes of MuJoCo Menagerie.
-
-MuJoCo models: the cell with all its arms, and the rigid-body dynamics of a single arm.
-"""
+"""MuJoCo models: the cell with all its arms, with primitives or Kinova's shells, and the dynamics of a single arm."""
 
 from collections.abc import Sequence
 from importlib import import_module, resources
@@ -17,6 +12,9 @@ from fleet.errors import FleetError, install
 from fleet.job import MOST_PAYLOAD_M, Fixture, Place, payload_radius_m
 from fleet.robot import GEN3, JOINTS, Robot, rotation
 
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 GRAVITY_M_S2 = 9.81
 ELBOW_ANGLES_DEG = (0.0, 60.0, -60.0, 120.0, -120.0, 180.0, 30.0, -30.0, 90.0, -90.0, 150.0, -150.0)
 """Angles of the elbow about the line from shoulder to wrist, in the order in which the planner tries them; at 0 the
@@ -26,10 +24,6 @@ elbow is furthest along the base axis."""
 def gen3_xml() -> bytes:
     """MJCF model of one Gen3."""
     return resources.files("fleet").joinpath("arm/assets/gen3.xml").read_bytes()
-
-
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 MESH_OF_GEOM = {
@@ -90,10 +84,6 @@ def mesh_folder() -> Path:
     if missing:
         raise FleetError(f"Meshes missing in {folder}: {', '.join(missing)}.")
     return folder
-
-
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 Array = np.ndarray

@@ -1,7 +1,4 @@
-"""Approach, cycle and retreat of each kind of work, as moves and pauses with what the hand carries and presses.
-
-Plans of one arm for a work: several elbow postures and speeds, as sampled motion with torque.
-"""
+"""Plans of one arm for a work: several elbow postures and speeds, as sampled motion with torque."""
 
 import logging
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,4 @@
-"""Servo control: the planned samples of one tick, and the control signal that follows them between the samples.
-
-Plant that simulates all arms in one MuJoCo scene, each under computed-torque control along its plan.
-"""
+"""Plant that simulates all arms in one MuJoCo scene, each under computed-torque control along its plan."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,6 +20,9 @@ from fleet.job import Fixture, Place
 from fleet.motion import RATE_HZ, Drive, Plan
 from fleet.robot import JOINTS, Robot, rotation
 from fleet.telemetry import FAULTED, WORKING
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
 
 Array = np.ndarray
 
@@ -104,10 +104,6 @@ def control(references: list[Reference], steps: int, kp: Array, kv: Array) -> Ar
 def _same_load(r: Reference) -> Array:
     """Whether the load is the same at each sample and the next, bool [sample]."""
     return (np.diff(r.payload_kg) == 0) & (np.diff(r.force_n, axis=0) == 0).all(axis=1)
-
-
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 TIMESTEP_S = 0.002

@@ -1,15 +1,11 @@
 """Space of a cell: which plans of two arms exclude each other, and which plans come too close to an arm at home.
 
-The space of a plan is the volume through which the links and the payload move, from home to home. Plans of one arm
-through the same postures share one volume, with the heaviest payload; speed and dwell have no effect. A table numbers
-the volumes of a cell.
+The space of a plan is the volume through which the links and the payload move, from home to home: capsules at closely
+spaced postures. Plans of one arm through the same postures share one volume, with the heaviest payload; speed and dwell
+have no effect. A table numbers the volumes of a cell.
 
-Space of an arm along a plan: its links as capsules at closely spaced postures.
-
-Smallest distance between two arms over all pairs of positions on their paths.
-
-A search through trees of bounding boxes finds the closest capsules. The distance of two capsules is that of their axes,
-which are segments, minus the radii (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
+A search through trees of bounding boxes finds the closest capsules of two arms. The distance of two capsules is that of
+their axes, which are segments, minus the radii (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
 """
 
 import hashlib
@@ -29,6 +25,9 @@ from fleet.arm.trajectory import check_time
 from fleet.job import Work, payload_radius_m
 from fleet.motion import Plan, distinct
 from fleet.robot import Robot
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
 
 Array = np.ndarray
 PlanKey = tuple[str, Work, int, float]
@@ -275,10 +274,6 @@ def _home_reason(sweep: "Sweep", homes: Sequence[tuple[str, "Sweep"]], margin_m:
 
 def _distance(near: "Clearance", margin_m: float) -> str:
     return "collides with" if near.distance_m <= 0 else f"comes within {margin_m * 1e3:g} mm of"
-
-
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 STEP_RAD = 0.02

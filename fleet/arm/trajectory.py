@@ -1,13 +1,4 @@
-"""Check of a sampled motion against the arm's limits of torque, velocity, acceleration and joint position.
-
-Jerk-limited motion from rest to rest, sampled at RATE_HZ, and the torque that it needs.
-
-A limit on the time that one plan may take, checked between the pieces of the work; each thread has its own.
-
-It counts processor time of the thread: a process that was stopped, or had to wait for others, loses none of it.
-
-Check of postures and paths for collisions of an arm with its own base, the floor and the fixtures.
-"""
+"""Jerk-limited motion from rest to rest with its torque, and checks of it: limits, collisions, and time to plan."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +14,9 @@ from fleet.arm.model import ArmModel, links_of, payload_bodies, set_payload_ball
 from fleet.errors import InfeasibleJob
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3, JOINTS
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
 
 Array = np.ndarray
 
@@ -181,10 +175,6 @@ def check_time() -> None:
     """
     if (limit := _limit.get()) is not None and thread_time() > limit[1]:
         raise PlanningTimeout(f"planning took more than {limit[0]:g} s of processor time")
-
-
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 ALLOWED_DEPTH_M = 0.005

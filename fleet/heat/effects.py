@@ -1,107 +1,59 @@
-"""Thermal ageing of winding insulation: rate of ageing at a temperature, and the rated life that a shift uses.
+"""Effects of heat besides faults: ageing of winding insulation, surfaces that people touch, drift of the tool point.
 
-Two laws of one rate, relative to that at the temperature of the thermal class:
-
-- Montsinger (Trans. AIEE 49, 1930): the life halves with every 10 K.
-- Arrhenius (Dakin, Trans. AIEE 67, 1948; the law behind IEC 60216): rate = exp(E/k · (1/T_class − 1/T)). The activation
-  energy E is the one for which the life halves 10 K above the temperature of the class.
-
-Thermal classes are those of IEC 60085; 20,000 h is the time base of IEC 60216. Kinova does not publish the class of the
-Gen3's windings. Class 155 (F) is assumed, which is usual for servo motors. Both laws are extrapolated far below the
-temperatures of ageing tests; there Arrhenius gives the slower ageing, as its halving interval falls with T².
-
-Temperature of the surfaces that people touch, and the burn thresholds of skin on hot metal.
+Ageing follows Arrhenius (Dakin, Trans. AIEE 67, 1948; the law behind IEC 60216): rate = exp(E/k · (1/T_class − 1/T)),
+relative to that at the temperature of the thermal class. The activation energy E is the one for which the life halves
+10 K above that temperature. Thermal classes are those of IEC 60085; 20,000 h is the time base of IEC 60216. Kinova does
+not publish the class of the Gen3's windings. Class 155 (F) is assumed, which is usual for servo motors. The law is
+extrapolated far below the temperatures of ageing tests.
 
 The surface of a link has the temperature of its housing node: for an aluminium shell of 5 mm in still air the Biot
 number h·L/k is below 0.001, so less than a thousandth of the rise falls across the shell (Incropera & DeWitt, ch. 5.1).
 The joints of a Gen3 are normally covered in plastic rings (user guide p. 16), which only make the surface cooler.
 
-Thermal drift of the tool point: links grow with the temperature of the housings at their ends.
-
-Linear expansion ΔL = α L ΔT of every link of the chain, as in Sigron, Aschwanden & Bambach, "Compensation of geometric,
-backlash, and thermal drift errors using a universal industrial robot model" (IEEE Trans. Automation Science and
-Engineering). Only the lengths change here: bending by a temperature gradient across a link is left out.
+Links grow with the temperature of the housings at their ends by ΔL = α L ΔT, as in Sigron, Aschwanden & Bambach,
+"Compensation of geometric, backlash, and thermal drift errors using a universal industrial robot model" (IEEE Trans.
+Automation Science and Engineering). Bending by a temperature gradient across a link is left out.
 
 Kinova does not publish the material of the load path. Aluminium is assumed; a shell of carbon fibre grows by less than
 a tenth of that, so the figures are upper bounds.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from fleet.errors import check_between, check_positive
 from fleet.heat.thermal import HOUSING
 from fleet.robot import JOINTS
 
 Array = np.ndarray
 
 KELVIN_AT_0_C = 273.15
-BOLTZMANN_EV_PER_K = 8.617333262e-5
+RATED_C, RATED_LIFE_H = 155.0, 20_000.0
+"""Temperature of the thermal class, and the life of a winding at it."""
+HALVING_K = 10.0
+"""Rise above that temperature which halves the life."""
+_RATED_K = RATED_C + KELVIN_AT_0_C
+ACTIVATION_K = float(np.log(2.0)) * _RATED_K * (_RATED_K + HALVING_K) / HALVING_K
+"""Activation energy over the Boltzmann constant."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Insulation:
-    """Insulation system of a winding."""
-
-    rated_c: float = 155.0
-    """Temperature of the thermal class, °C."""
-    rated_life_h: float = 20_000.0
-    """Life at that temperature, h."""
-    halving_k: float = 10.0
-    """Rise above that temperature which halves the life, K."""
-
-    def __post_init__(self) -> None:
-        check_between(self, 0.0, 400.0, "rated_c")
-        check_positive(self, "rated_life_h", "halving_k")
-
-    @property
-    def activation_k(self) -> float:
-        """Activation energy over the Boltzmann constant, K."""
-        rated_k = self.rated_c + KELVIN_AT_0_C
-        return float(np.log(2.0)) * rated_k * (rated_k + self.halving_k) / self.halving_k
-
-    @property
-    def activation_ev(self) -> float:
-        """Activation energy, eV."""
-        return self.activation_k * BOLTZMANN_EV_PER_K
-
-
-_LETTERS = {105: "A", 120: "E", 130: "B", 155: "F", 180: "H"}
-CLASSES: dict[str, Insulation] = {
-    f"{rated_c} ({letter})": Insulation(rated_c=float(rated_c)) for rated_c, letter in _LETTERS.items()
-}
-"""Thermal classes of IEC 60085."""
-GEN3_INSULATION = CLASSES["155 (F)"]
-"""Assumed; see the module docstring."""
-
-
-def arrhenius_rate(winding_c: Array | float, insulation: Insulation = GEN3_INSULATION) -> Array:
+def arrhenius_rate(winding_c: Array | float) -> Array:
     """Rate of ageing relative to that at the temperature of the class, [...]; 1 at that temperature.
 
     Args:
         winding_c: Temperatures of windings, °C, [...].
     """
-    absolute_k = np.asarray(winding_c, dtype=float) + KELVIN_AT_0_C
-    return np.exp(insulation.activation_k * (1.0 / (insulation.rated_c + KELVIN_AT_0_C) - 1.0 / absolute_k))
+    return np.exp(ACTIVATION_K * (1.0 / _RATED_K - 1.0 / (np.asarray(winding_c, dtype=float) + KELVIN_AT_0_C)))
 
 
-def montsinger_rate(winding_c: Array | float, insulation: Insulation = GEN3_INSULATION) -> Array:
-    """As `arrhenius_rate`, with the same halving interval at every temperature."""
-    return np.exp2((np.asarray(winding_c, dtype=float) - insulation.rated_c) / insulation.halving_k)
-
-
-def life_used(
-    before: Array | float, after: Array | float, dt_s: Array | float, insulation: Insulation = GEN3_INSULATION
-) -> Array:
+def life_used(before: Array | float, after: Array | float, dt_s: Array | float) -> Array:
     """Share of the rated life that windings use in a time, by the trapezoidal rule, [...].
 
     Args:
         before, after: Rates of ageing at its beginning and end, [...].
         dt_s: Its length, s; short against the time constant of a winding, which is above a minute.
     """
-    return (np.asarray(before) + after) / 2.0 * dt_s / (3600.0 * insulation.rated_life_h)
+    return (np.asarray(before) + after) / 2.0 * dt_s / (3600.0 * RATED_LIFE_H)
 
 
 class Threshold(NamedTuple):
@@ -185,24 +137,12 @@ def segment_temperatures(housing_c: Array) -> Array:
     return np.concatenate([housing_c[..., :1], between, housing_c[..., -1:]], axis=-1)
 
 
-def drift_m(segments_m: Array, rise_k: Array, expansion_per_k: float = ALUMINIUM_PER_K) -> Array:
-    """Displacement of the tool point by thermal expansion in a posture, m, [..., 3].
+def most_drift_m(rise_k: Array) -> Array:
+    """Least upper bound of the displacement of the tool point over all postures, m, [...]: all segments in line.
+
+    A stretched arm comes close to it.
 
     Args:
-        segments_m: Vectors from joint to joint in that posture, m, [..., segment, 3].
         rise_k: Temperatures of the segments above those at which the arm was calibrated, K, [..., segment].
     """
-    return expansion_per_k * (np.asarray(rise_k)[..., None] * segments_m).sum(axis=-2)
-
-
-def most_drift_m(rise_k: Array, lengths_m: Array | None = None, expansion_per_k: float = ALUMINIUM_PER_K) -> Array:
-    """Least upper bound of the drift over all directions of the segments, m, [...]: all of them in line.
-
-    A stretched arm comes close to it. It needs no posture.
-
-    Args:
-        rise_k: As in `drift_m`.
-        lengths_m: Lengths of the segments, m, [segment]; default: those of a Gen3.
-    """
-    lengths = np.asarray(GEN3_SEGMENTS_M if lengths_m is None else lengths_m)
-    return expansion_per_k * (np.abs(rise_k) * lengths).sum(axis=-1)
+    return ALUMINIUM_PER_K * (np.abs(rise_k) * np.asarray(GEN3_SEGMENTS_M)).sum(axis=-1)

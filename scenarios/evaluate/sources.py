@@ -29,8 +29,8 @@ from scenarios.spec.options import DifficultyName, RiskName
 from scenarios.spec.schema import Scenario
 
 if TYPE_CHECKING:  # need the extra `twin`
-    from twin.baselines import TorqueRms
-    from twin.thermal.thermal_twin import CalibratedTwin
+    from twin.baselines import Evidence, LoadRegression, TorqueRms
+    from twin.vae.twin import Twin
 
 Array = np.ndarray
 
@@ -65,15 +65,14 @@ class PlannedFleet:
         every = range(len(self.scenario.arms))
         return plan_arms(self.scenario, every, rehearsal_works(self.scenario), self.folder, self.progress)
 
-    def calibrated(
-        self, training: int, risk: RiskName, *, trained: bool = True, changes: Mapping[str, int] | None = None
-    ) -> "list[CalibratedTwin]":
-        """The arms' twins of a training, with P(saturation) of a kind; or the same networks before training.
+    def learned(
+        self, training: int, evidence: "Evidence", *, trained: bool = True, changes: Mapping[str, int] | None = None
+    ) -> "list[Learned]":
+        """The arms' twins of a training, or the same networks before training, with P of a regression.
 
         Args:
             changes: Fields of the configuration with other values.
         """
-        from scenarios.prepare.calibrate import calibrate_twins
         from scenarios.prepare.twins import train_twins, training_seed
         from twin.baselines import untrained_config
         from twin.vae.config import TwinConfig
@@ -81,15 +80,50 @@ class PlannedFleet:
         spec = self.scenario.twin
         config = (TwinConfig.quick() if spec.size == "quick" else TwinConfig()).changed(**changes or {})
         seed = training_seed(self.scenario, training)
-        twins = train_twins(
-            self.scenario,
-            self.arms,
-            self.folder,
-            self.progress,
-            config=config if trained else untrained_config(config),
-            seed=seed,
-        )
-        return calibrate_twins(self.scenario, self.arms, twins, self.folder, self.progress, risk=risk)
+        config = config if trained else untrained_config(config)
+        twins = train_twins(self.scenario, self.arms, self.folder, self.progress, config=config, seed=seed)
+        return self.with_regressions(twins, evidence=evidence)
+
+    def with_regressions(
+        self, twins: "Sequence[Twin]", *, evidence: "Evidence" = "excess", jobs: int | None = None
+    ) -> "list[Learned]":
+        """Every arm's twin with a regression on its past jobs, which is cached.
+
+        A twin whose past jobs say too little about saturation gets no regression; a warning says why.
+
+        Args:
+            jobs: Past jobs of each arm; default: `scenarios.prepare.calibrate.PAST_JOBS`.
+        """
+        from scenarios.prepare.calibrate import PAST_JOBS, nominal_network, past_key, simulate_past
+        from scenarios.prepare.twins import CachedModel, load_or_make
+        from twin.baselines import LoadRegression, fit_regression, load_regression, save_regression
+        from twin.thermal.thermal_twin import NotEnoughExperience
+
+        scenario, count = self.scenario, jobs or PAST_JOBS
+
+        def load(home: Path) -> LoadRegression | None:
+            return load_regression(home) if home.is_dir() else None
+
+        def model(arm: PlannedArm, twin: "Twin") -> "CachedModel[LoadRegression | None]":
+            heat = nominal_network(scenario, arm)
+
+            def make(home: Path, _report: Callable[[float], None]) -> str | None:
+                past = simulate_past(scenario, arm, heat.heat_model, jobs=count)
+                features = twin.features(past.plans, past.repetitions.tolist())
+                try:
+                    fitted = fit_regression(features, past.duration_s, past.known_c, past.passed, evidence=evidence)
+                except NotEnoughExperience as error:
+                    name = arm.hardware.robot.name
+                    return f"{scenario.name}: arm '{name}' gets no probability of saturation. {error}"
+                save_regression(fitted, home)
+                return None
+
+            key = past_key(scenario, arm, f"{evidence}-{twin.version}-{heat.version}", count)
+            return CachedModel(self.folder / "saturation" / key, load, make)
+
+        models = [model(arm, twin) for arm, twin in zip(self.arms, twins, strict=True)]
+        fitted = load_or_make(models, "calibrating", self.progress)
+        return [Learned(twin, regression) for twin, regression in zip(twins, fitted, strict=True)]
 
     def scored(self, models: Sequence[DifficultyModel]) -> Fleet:
         """The fleet with these difficulty models."""
@@ -98,18 +132,24 @@ class PlannedFleet:
 
 
 @dataclass(frozen=True)
-class _WithoutPeak:
-    """The difficulty and P(saturation) of a model, without its predicted peak."""
+class Learned:
+    """The difficulty of a twin, and P(saturation) from a regression on its features; no predicted peak."""
 
-    model: DifficultyModel
+    twin: "Twin"
+    regression: "LoadRegression | None"
+    """None: the past jobs say too little about saturation, so P is unknown."""
 
     @property
     def version(self) -> str:
-        return f"{self.model.version}, no peak"
+        """Versions of the models of difficulty and P."""
+        p = "" if self.regression is None else f"+p:{self.regression.evidence}-{self.regression.version}"
+        return f"d:{self.twin.version}{p}"
 
-    def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
-        score = self.model.score(plan, repetitions)
-        return score and replace(score, peak=None)
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        """Difficulty and P of the repeated plan."""
+        features, duration_s = self.twin.features([plan], [repetitions]), np.array([plan.duration_s(repetitions)])
+        risk = None if self.regression is None else self.regression.risk(features, duration_s)[0]
+        return Difficulty(features.difficulty[0], risk=risk, weight=self.twin.joint_weight)
 
 
 @dataclass(frozen=True)
@@ -198,8 +238,7 @@ class Source:
 def _vae(
     planned: PlannedFleet, training: int, *, trained: bool = True, changes: Mapping[str, int] | None = None
 ) -> Fleet:
-    models = planned.calibrated(training, "excess", trained=trained, changes=changes)
-    return planned.scored([_WithoutPeak(model) for model in models])
+    return planned.scored(planned.learned(training, "excess", trained=trained, changes=changes))
 
 
 def _unweighted(planned: PlannedFleet, fleet: Fleet) -> Fleet:
@@ -210,7 +249,7 @@ def _torque(planned: PlannedFleet) -> Fleet:
     from scenarios.prepare.twins import exploration_records, records, require_cool_plans
     from twin.baselines import torque_over_known
 
-    scenario, twins = planned.scenario, planned.calibrated(0, "torque")
+    scenario, twins = planned.scenario, planned.learned(0, "torque")
 
     def training_records(arm: PlannedArm) -> list[Array]:
         cool = require_cool_plans(arm.all_plans, arm.hardware, scenario)
@@ -238,7 +277,7 @@ def _random(planned: PlannedFleet, training: int) -> Fleet:
 
 
 def _inverted(planned: PlannedFleet, training: int) -> Fleet:
-    return planned.scored([_Inverted(model) for model in planned.calibrated(training, "excess")])
+    return planned.scored([_Inverted(model) for model in planned.learned(training, "excess")])
 
 
 def _sized(**changes: int) -> Source:

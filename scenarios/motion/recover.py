@@ -1,4 +1,4 @@
-"""Search for an easier posture: candidates near a hold, ranked by the arm's twin and checked by its thermal model.
+"""Posture recovery: a warm arm that holds a payload moves to a nearby posture that its twin rates as easier.
 
 Candidates are drawn near the latent of the hold (decoded to positions) and near the posture in joint space, then again
 around the best of them. They are ranked by the twin's one-sided torque error of the hottest measured motor. That score
@@ -16,17 +16,8 @@ as it was. The prediction needs housing temperatures, which have no sensor. If t
 housing, they are 3 to 5 K too low, and some recoveries end warmer. Therefore the arm first measures for half a minute
 how fast its windings warm, which determines that heat flow.
 
-Posture recovery: a warm arm that holds a payload moves to a nearby posture that its twin rates as easier.
-
-`scenarios.motion.recover` proposes the posture. MuJoCo performs it here, and the same hold without recovery from
-the same temperatures. In both the arm first observes its motors for `Nearby.watch_s`.
-
-Postures as a person writes them: a name, or seven angles in degrees.
-
-One arm of a scenario with its twin and its cool motion, for generation and recovery.
-
-Write generated motion and recoveries atomically as folders; column names hold the units.
-"""
+In `recover` MuJoCo performs the posture found, and the same hold without recovery from the same temperatures. In both
+the arm first observes its motors for `Nearby.watch_s`."""
 
 import json
 from collections import Counter

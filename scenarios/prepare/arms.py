@@ -1,10 +1,7 @@
-"""One arm of a scenario: its hardware, and its plans for the scenario's work.
+"""The arms of a scenario: hardware, plans, what in a scenario cannot work, and true temperatures under a plan.
 
-Everything in a scenario that cannot work.
-
-True motor temperatures under a plan: for simulated past jobs, and for the model `oracle`, which measures regret.
-
-They follow from the parameters of the simulator, which arms and policies must not use.
+True temperatures serve simulated past jobs and the model `oracle`, which measures regret. They follow from parameters
+of the simulator, which arms and policies must not use.
 """
 
 import logging

@@ -1,13 +1,8 @@
-"""Simulated past jobs of an arm, with the records that a real arm would have of them.
+"""P(saturation) of a scenario's arms, from simulated past jobs with the records that real arms would have of them.
 
-Each job begins as warm as earlier work left the arm, in any of the ambient temperatures of its hall. The records hold
-what is known before the job (measured motors, estimated housings, ambient temperature), and the hottest temperatures
-during it.
-
-Give a scenario's twins a predicted peak and a probability of saturation, from simulated past jobs of their arms.
-
-An arm that has worked for weeks has such jobs in its records. Here they are simulated: the arm's own work and random
-work with heavy payloads, in every ambient temperature of its hall, from cold, idle and hot starts.
+An arm that has worked for weeks has such jobs. Here they are its own work and random work with heavy payloads, in every
+ambient temperature of its hall, from cold, idle and hot starts. Records hold what is known before the job (measured
+motors, estimated housings, ambient temperature), and the hottest temperatures during it.
 """
 
 import hashlib
@@ -33,21 +28,11 @@ from scenarios.prepare.identify import identify_arms
 from scenarios.prepare.twins import CachedModel, load_or_make
 from scenarios.progress import Progress
 from scenarios.spec.jobs import works_of
-from scenarios.spec.options import RiskName
+from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.schema import Scenario
-from twin.p_saturation import (
-    Evidence,
-    Experience,
-    NotEnoughExperience,
-    SaturationModel,
-    fit_saturation,
-    load_saturation,
-    save_saturation,
-)
 from twin.thermal.checkpoint import load_curve, save_curve
 from twin.thermal.identify import HeatModel, nominal_heat_model
-from twin.thermal.thermal_twin import CalibratedTwin, PeakCurve, RcTwin
-from twin.vae.twin import Twin
+from twin.thermal.thermal_twin import PeakCurve, RcTwin
 
 Array = np.ndarray
 
@@ -128,12 +113,6 @@ def past_jobs(
         peak_c=history.peaks(plans, repetitions, start, ambient),
         warning_c=limits.warning_c,
     )
-
-
-def experience(twin: Twin, jobs: PastJobs) -> Experience:
-    """The past jobs with the features that the arm's twin computes for them."""
-    repetitions = jobs.repetitions.tolist()
-    return Experience.of_jobs(twin, jobs.plans, repetitions, known_c=jobs.known_c, passed=jobs.passed)
 
 
 def repetitions_for(
@@ -275,56 +254,36 @@ AIR_MARGIN_K = 3.0
 """By how much the ambient temperature of past jobs exceeds the scenario's range at either end."""
 
 
-def calibrate_twins(
-    scenario: Scenario,
-    arms: Sequence[PlannedArm],
-    twins: Sequence[Twin],
-    folder: Path,
-    progress: Progress,
-    *,
-    risk: RiskName = "rc",
-    jobs: int = PAST_JOBS,
-) -> list[CalibratedTwin]:
-    """Every arm's twin with its predicted peak and probability of saturation, from the folder where possible.
-
-    A twin whose past jobs say too little about saturation gets no probability; a warning says why.
-
-    Args:
-        arms: With their plans for all motion of the scenario, light loads included.
-    """
-    heats = calibrate_networks(scenario, arms, folder, progress, risk=risk, jobs=jobs)
-    inputs = list(zip(arms, twins, heats, strict=True))
-    if risk in ("rc", "rc-nominal"):
-        return [CalibratedTwin(twin, heat) for _, twin, heat in inputs]
-    models = [_saturation(scenario, a, t, heat, risk, folder, jobs) for a, t, heat in inputs]
-    fitted = load_or_make(models, "calibrating", progress)
-    return [CalibratedTwin(t, heat, model) for (_, t, heat), model in zip(inputs, fitted, strict=True)]
-
-
 def calibrate_networks(
     scenario: Scenario,
     arms: Sequence[PlannedArm],
     folder: Path,
     progress: Progress,
     *,
-    risk: RiskName = "rc",
+    risk: RiskName = RISK,
     jobs: int = PAST_JOBS,
 ) -> list[RcTwin]:
-    """Every arm's thermal network, identified for `rc`, else nominal; for `rc` and `rc-nominal` with its P(saturation).
+    """Every arm's thermal network, identified for `rc`, else nominal, with its P(saturation); cached in the folder.
 
-    Arguments as in `calibrate_twins`.
+    Args:
+        arms: With their plans for all motion of the scenario, light loads included.
+        jobs: Past jobs of each arm.
     """
-    robots, ambient_c = [arm.hardware.robot for arm in arms], scenario.twin.ambient_c
     if risk == "rc":
-        heats = [RcTwin.of(found) for found in identify_arms(scenario, arms, folder, progress)]
+        identified = identify_arms(scenario, arms, folder, progress)
+        heats = [replace(RcTwin.of(each), warning_c=scenario.limits.warning_c) for each in identified]
     else:
-        heats = [RcTwin.nominal(robot.name, ambient_c=ambient_c, cooling=robot.cooling) for robot in robots]
-    heats = [replace(heat, warning_c=scenario.limits.warning_c) for heat in heats]
-    if risk not in ("rc", "rc-nominal"):
-        return heats
+        heats = [nominal_network(scenario, arm) for arm in arms]
     makers = [_curve(scenario, arm, heat, folder, jobs) for arm, heat in zip(arms, heats, strict=True)]
     curves = load_or_make(makers, "calibrating", progress)
     return [replace(heat, curve=curve) for heat, curve in zip(heats, curves, strict=True)]
+
+
+def nominal_network(scenario: Scenario, arm: PlannedArm) -> RcTwin:
+    """The thermal network of a nominal Gen3 in the arm's cooling, without P(saturation)."""
+    robot = arm.hardware.robot
+    nominal = RcTwin.nominal(robot.name, ambient_c=scenario.twin.ambient_c, cooling=robot.cooling)
+    return replace(nominal, warning_c=scenario.limits.warning_c)
 
 
 def _curve(scenario: Scenario, arm: PlannedArm, heat: RcTwin, folder: Path, jobs: int) -> CachedModel[PeakCurve]:
@@ -334,25 +293,7 @@ def _curve(scenario: Scenario, arm: PlannedArm, heat: RcTwin, folder: Path, jobs
         assert fitted.curve is not None
         save_curve(fitted.curve, home)
 
-    return CachedModel(folder / "saturation" / _key(scenario, arm, heat.version, jobs), load_curve, make)
-
-
-def _saturation(
-    scenario: Scenario, arm: PlannedArm, twin: Twin, heat: RcTwin, evidence: Evidence, folder: Path, jobs: int
-) -> CachedModel[SaturationModel | None]:
-    def load(home: Path) -> SaturationModel | None:
-        return load_saturation(home) if home.is_dir() else None
-
-    def make(home: Path, _report: Callable[[float], None]) -> str | None:
-        past = simulate_past(scenario, arm, heat.heat_model, jobs=jobs)
-        try:
-            save_saturation(fit_saturation(experience(twin, past), evidence=evidence), home)
-        except NotEnoughExperience as error:
-            return f"{scenario.name}: arm '{arm.hardware.robot.name}' gets no probability of saturation. {error}"
-        return None
-
-    version = f"{evidence}-{twin.version}-{heat.version}"
-    return CachedModel(folder / "saturation" / _key(scenario, arm, version, jobs), load, make)
+    return CachedModel(folder / "saturation" / past_key(scenario, arm, heat.version, jobs), load_curve, make)
 
 
 def simulate_past(scenario: Scenario, arm: PlannedArm, known: HeatModel, *, jobs: int = PAST_JOBS) -> PastJobs:
@@ -403,7 +344,7 @@ def _ambient_range(scenario: Scenario, index: int) -> tuple[float, float]:
     return min(temps) - AIR_MARGIN_K, max(temps) + AIR_MARGIN_K
 
 
-def _key(scenario: Scenario, arm: PlannedArm, version: str, jobs: int) -> str:
+def past_key(scenario: Scenario, arm: PlannedArm, version: str, jobs: int) -> str:
     """Cache key of a model: the version of what it calibrates, the arm's hardware and plans, and the past jobs."""
     robot, air_c = arm.hardware.robot, _ambient_range(scenario, arm.index)
     parts = [RECIPE, RANDOM_MOTIONS_VERSION, jobs, version, scenario.spread.seed, scenario.limits, robot, air_c]

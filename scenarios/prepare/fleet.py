@@ -1,9 +1,4 @@
-"""From a scenario to a fleet of arms with plans and twins, and to the environment.
-
-A cell as its arms know it, for policies that plan in a simulator.
-
-Scenarios for the batched environment: fleets planned and scored once, shifts drawn as arrays.
-"""
+"""From a scenario to a fleet of arms with plans and twins, and to its environment, single or batched."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -187,16 +182,17 @@ def _arms(
         raise ScenarioError("\n".join(problems))
     arms = list(like.arms) if like else [_blind_arm(arm, asked, folder) for arm in planned]
     if difficulty == "twin":
-        from scenarios.prepare.calibrate import calibrate_twins
+        from scenarios.prepare.calibrate import calibrate_networks
         from scenarios.prepare.twins import train_twins, training_seed
+        from twin.thermal.thermal_twin import CalibratedTwin
 
         if every_work:
             _compile_meanwhile(scenario, arms, folder)
         twins = train_twins(scenario, planned, folder, progress, seed=training_seed(scenario, training))
-        models = calibrate_twins(scenario, planned, twins, folder, progress, risk=risk)
+        heats = calibrate_networks(scenario, planned, folder, progress, risk=risk)
         arms = [
-            replace(arm, model=model, known=(model.heat.thermal, model.heat.motors))
-            for arm, model in zip(arms, models, strict=True)
+            replace(arm, model=CalibratedTwin(twin, heat), known=(heat.thermal, heat.motors))
+            for arm, twin, heat in zip(arms, twins, heats, strict=True)
         ]
     elif difficulty == "oracle":
         arms = [_with_oracle(scenario, arm) for arm in arms]

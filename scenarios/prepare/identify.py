@@ -1,7 +1,4 @@
-"""Simulated logs of an arm at work, and its thermal network identified from them.
-
-The thermal network of each arm of a scenario, identified from simulated logs of its own cool work.
-"""
+"""The thermal network of each arm of a scenario, identified from simulated logs of its own cool work."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -102,7 +99,7 @@ def _log(
 RECIPE = 1
 """Raise it whenever the same arm would get other logs or another result."""
 LOGGED = 5
-"""Spawn key, different from those of `scenarios.prepare.twins` and `calibrate_twins` for the same arm."""
+"""Spawn key, different from those of `scenarios.prepare.twins` and `calibrate` for the same arm."""
 LOGS = 4
 """Recordings, half an hour each."""
 FIT_STEP_S = 20.0

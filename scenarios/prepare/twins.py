@@ -1,16 +1,8 @@
-"""Which motion stays cool, judged by the true motors, and what of it a twin is trained on.
+"""Twins of the arms of a scenario, or of logs of a real arm: trained on motion that stays cool, cached, and saved.
 
-Motion is cool if it can repeat over a whole horizon from a cold start. The temperature of the moment does not count:
-a heavy job begins cool, too.
-
-Models kept on disk: loaded where they are intact, made in parallel where they are missing.
-
-Train the twin of every arm on motion whose whole horizon stays cool.
-
-Training data hold the motion of the arm's work and random light motions of other kinds. Without the latter, every new
-motion would score as difficult. `benchmarks/paper/saturation.py` measures the gain.
-
-Folders of twins that were trained on request, from a scenario or from logs of a real arm.
+Planned motion is cool if it can repeat over a whole horizon from a cold start, judged by the true motors: a heavy job
+begins cool, too. Training data hold the arm's own cool motion and random light motions of other kinds. Without the
+latter, every new motion would score as difficult.
 """
 
 import hashlib
@@ -40,8 +32,7 @@ from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario, TwinSpec
-from twin.logs.recording import Recording
-from twin.training_data import NothingCool, cool_stretches
+from twin.logs.recording import NothingCool, Recording, cool_stretches
 from twin.vae.config import TwinConfig, training_key
 from twin.vae.measures import Features
 from twin.vae.train import train
@@ -364,7 +355,7 @@ def train_log(
     reserved = {recording.name for recording in held_out}
     own = [recording for recording in recordings if recording.name not in reserved]
     least_s = config.window / config.rate_hz
-    cool = cool_stretches(own, config.rate_hz, cool_c=cool_c, horizon_s=np.inf, joints=LOADED, least_s=least_s)
+    cool = cool_stretches(own, config.rate_hz, cool_c=cool_c, joints=LOADED, least_s=least_s)
     progress("learning the log", 0.0)
     twin = train(
         [stretch.profile for stretch in cool],
@@ -396,7 +387,7 @@ def _is_cool(recording: Recording, config: TwinConfig, cool_c: float) -> bool:
         return False
     try:
         least_s = config.window / config.rate_hz
-        cool_stretches([recording], config.rate_hz, cool_c=cool_c, horizon_s=np.inf, joints=LOADED, least_s=least_s)
+        cool_stretches([recording], config.rate_hz, cool_c=cool_c, joints=LOADED, least_s=least_s)
     except NothingCool:
         return False
     return True

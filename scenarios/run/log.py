@@ -311,12 +311,10 @@ def provenance(model: DifficultyModel) -> dict[str, Any]:
 
     The version is that in `thermofleet twin score`, in the checkpoint's `twin.json` and in the arm's messages.
     """
-    fields = {"twin": ("version", "data_hash", "seed"), "saturation": ("version", "data_hash", "jobs", "passed")}
-    parts: dict[str, object] = {"twin": getattr(model, "twin", model), "saturation": getattr(model, "saturation", None)}
-    found = {name: part for name, part in parts.items() if hasattr(part, "data_hash")}
-    return {"version": model.version} | {
-        name: {field: getattr(part, field) for field in fields[name]} for name, part in found.items()
-    }
+    twin = getattr(model, "twin", model)
+    if not hasattr(twin, "data_hash"):
+        return {"version": model.version}
+    return {"version": model.version, "twin": {name: getattr(twin, name) for name in ("version", "data_hash", "seed")}}
 
 
 PACKAGES = ("fleet", "twin", "agents", "scenarios")

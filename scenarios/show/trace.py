@@ -257,9 +257,8 @@ def thread_table(thread: Thread) -> Table:
         row("offers", NOT_RECORDED)
     if thread.twin:
         row("twin", *_pairs({k: v for k, v in thread.twin.items() if not isinstance(v, Mapping)}))
-        for name in ("twin", "saturation"):
-            if name in thread.twin:
-                row({"twin": "trained on", "saturation": "calibrated on"}[name], *_pairs(thread.twin[name]))
+        if "twin" in thread.twin:
+            row("trained on", *_pairs(thread.twin["twin"]))
     row("configuration", *_pairs({k: v for k, v in thread.configuration.items() if k != "channel"}))
     if isinstance(channel := thread.configuration.get("channel"), Mapping):
         row("channel", *_pairs(channel))

@@ -40,8 +40,7 @@ from scenarios.show.table import Table
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario
 from twin.baselines import untrained_config
-from twin.logs.recording import Recording, stretches
-from twin.training_data import cool_stretches
+from twin.logs.recording import Recording, cool_stretches, stretches
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU, Calibration, Features
 from twin.vae.train import train
@@ -69,7 +68,7 @@ QUANTILES = {"lowerfence": 5, "q1": 25, "median": 50, "q3": 75, "upperfence": 95
 COOL, BETWEEN, HOT = 0, 1, 2
 """Kinds of jobs and windows."""
 TEST_JOBS = 5
-"""Spawn key, different from those of `scenarios.prepare.twins` and `calibrate_twins` for the same arm."""
+"""Spawn key, different from those of `scenarios.prepare.twins` and `calibrate` for the same arm."""
 LOADED_JOINT = 1
 """The joint whose temperature divides logs into cool and hot, index 0..6: joint 2 carries a standing arm."""
 LOG_HOT_C = 40.0
@@ -323,7 +322,7 @@ def log_subject(
     config, joint = config or LOG_CONFIG, LOADED_JOINT
     names = training_files(recordings, seed)
     training, test = ([r for r in recordings if (r.name in names) == wanted] for wanted in (True, False))
-    normal = cool_stretches(training, config.rate_hz, cool_c=LOG_HOT_C, horizon_s=np.inf, joints=(joint,))
+    normal = cool_stretches(training, config.rate_hz, cool_c=LOG_HOT_C, joints=(joint,))
     trained_on = [stretch.profile for stretch in normal]
     twin = train_or_load(trained_on, config, np.random.SeedSequence(seed), arm="logged", folder=folder)
     untrained = _untrained(trained_on, config, seed, "logged", folder)

@@ -122,7 +122,7 @@ class JobSampler:
         streams = scenario.jobs
         self._streams = streams
         self._works = [works_of(scenario, stream) for stream in streams]
-        self._arrivals = [stream.arrivals.arrivals() for stream in streams]
+        self._arrivals = [stream.arrivals for stream in streams]
         self._horizon_s = scenario.ticks * scenario.decision_interval_s
         self._table = arrival_table(self._arrivals, self._horizon_s)
         lowest, most = (np.array([stream.repetitions[i] for stream in streams], dtype=int) for i in (0, 1))

@@ -12,17 +12,15 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.fields import MAX_SEED, MAX_SPEED, MIN_SPEED, check, option
 
 DifficultyName = Literal["twin", "blind", "oracle"]
-RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
-"""Model of P(saturation): from the peak predicted by the identified or by the nominal thermal network of the arm, or
-a regression on features of the learned twin (`twin.p_saturation.evidence_of`)."""
+RiskName = Literal["rc", "rc-nominal"]
+"""Model of P(saturation): from the peak predicted by the identified or by the nominal thermal network of the arm."""
 RISK: RiskName = "rc"
 PlantName = Literal["profile", "mujoco"]
 BusName = Literal["zenoh", "memory"]
 DIFFICULTY_HELP = "Source of the difficulty scores: twin, oracle (simulator) or blind (none)."
 RISK_HELP = (
-    "With --difficulty twin, model of P(saturation): rc (peak predicted by the arm's own thermal network), rc-nominal "
-    "(peak predicted by that of a nominal arm), excess, load, errors (regression on errors of the learned twin), or "
-    "torque (regression on mean squared torque)."
+    "With --difficulty twin, model of P(saturation): rc (peak predicted by the arm's own thermal network) or "
+    "rc-nominal (peak predicted by that of a nominal arm)."
 )
 
 

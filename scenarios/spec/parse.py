@@ -1,10 +1,6 @@
-"""Readable errors for scenario files and for names among several.
+"""Parse the content of scenario files: a `Scenario`, or an error of one sentence; and hash scenarios.
 
 `kind` is a type annotation such as `float | None`, for which Python has no type (hence Any).
-
-Parse the content of scenario files: a `Scenario`, or an error of one sentence.
-
-Hash of a scenario.
 """
 
 import dataclasses
@@ -46,7 +42,7 @@ _MISSING = re.compile(r"Object missing required field `([^`]+)`")
 _OWN_FIELD = re.compile(r"[A-Z]\w*\.(\w.*)", re.DOTALL)
 """`Robot.tool_kg must be >= 0 (got -1.0).`"""
 _OWN = re.compile(r"[A-Z]\w* (needs? .*)", re.DOTALL)
-"""`Poisson needs 0 <= start_s <= stop_s (got 5.0, 1.0).`"""
+"""`Arrivals needs 0 <= start_s <= stop_s (got 5.0, 1.0).`"""
 _STEP = re.compile(r"\[(\d+)\]|\.?(\w+)")
 
 

@@ -1,12 +1,11 @@
 """The schema of scenario files, with the defaults that `fleet` does not define."""
 
 from dataclasses import dataclass, field
-from math import ceil
 from typing import Literal, get_args
 
 import numpy as np
 
-from fleet.arrivals import Arrivals, Batch, Poisson, Trace
+from fleet.arrivals import Arrivals
 from fleet.bus.exchange.channel import Channel, Partition, TopologyName
 from fleet.engine.batch import RewardWeights
 from fleet.env.allocation_v1 import Decisions
@@ -61,61 +60,6 @@ class ArmSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArrivalSpec:
-    """When jobs of a stream arrive."""
-
-    kind: Literal["poisson", "batch", "trace"]
-    every_s: float | None = None
-    """poisson: mean gap. batch: gap between batches; None for a single batch."""
-    count: int | None = None
-    """batch: jobs per batch."""
-    start_s: float = 0.0
-    stop_s: float | None = None
-    """poisson: no arrivals after this."""
-    times_s: tuple[float, ...] | None = None
-    """trace: the arrival times."""
-    file: str | None = None
-    """trace: a text file beside the scenario, one arrival time in seconds per line."""
-
-    def __post_init__(self) -> None:
-        kinds = {"poisson": ("every_s", "stop_s"), "batch": ("count", "every_s"), "trace": ("file", "times_s")}
-        for name in sorted({name for names in kinds.values() for name in names} - {*kinds[self.kind]}):
-            if getattr(self, name) is not None:
-                allowed = ", ".join(sorted((*kinds[self.kind], "start_s")))
-                raise ValueError(f"arrivals of kind '{self.kind}' take no '{name}'; they take {allowed}")
-        needed = kinds[self.kind][0]
-        if self.kind != "trace" and getattr(self, needed) is None:
-            raise ValueError(f"arrivals of kind '{self.kind}' need '{needed}'")
-        if self.kind == "trace" and (self.times_s is None) == (self.file is None):
-            raise ValueError("arrivals of kind 'trace' need either 'times_s' or 'file'")
-        if self.file is None:
-            self.arrivals()
-
-    def arrivals(self, from_file: tuple[float, ...] = ()) -> Arrivals:
-        """The arrival process; `from_file` are the times from the file of a trace."""
-        if self.kind == "poisson":
-            assert self.every_s is not None
-            stop_s = np.inf if self.stop_s is None else self.stop_s
-            return Poisson(every_s=self.every_s, start_s=self.start_s, stop_s=stop_s)
-        if self.kind == "batch":
-            assert self.count is not None
-            return Batch(count=self.count, start_s=self.start_s, every_s=self.every_s)
-        return Trace(times_s=tuple(t + self.start_s for t in (self.times_s or from_file)))
-
-    def expected(self, horizon_s: float) -> float:
-        """Expected number of arrivals before the horizon; 0 for a trace whose file is not read yet."""
-        if self.kind == "trace":
-            return float(sum(t + self.start_s < horizon_s for t in self.times_s or ()))
-        left_s = max(0.0, min(self.stop_s or horizon_s, horizon_s) - self.start_s)
-        if self.kind == "poisson":
-            assert self.every_s is not None
-            return left_s / self.every_s
-        assert self.count is not None
-        batches = ceil(left_s / self.every_s) if self.every_s else float(left_s > 0)
-        return self.count * batches
-
-
-@dataclass(frozen=True, kw_only=True)
 class JobStream:
     """A kind of job that arrives repeatedly; payload and repetitions are drawn for each job."""
 
@@ -123,7 +67,7 @@ class JobStream:
     kind: Kind
     places: tuple[str, ...]
     """Names of places: [from, to] for pick_place and sort, one for hold and press."""
-    arrivals: ArrivalSpec
+    arrivals: Arrivals
     payload_kg: tuple[float, ...] = (0.0,)
     repetitions: tuple[int, int] = (1, 1)
     """Fewest and most."""

@@ -28,6 +28,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 import msgspec
 import numpy as np
 
+from fleet.arrivals import Arrivals
 from fleet.bus.exchange.channel import Partition
 from fleet.job import DWELL_S, Kind, Place
 from fleet.robot import ThermalLimits, rotation
@@ -36,7 +37,6 @@ from scenarios.spec.schema import (
     SPLITS,
     Ambient,
     ArmSpec,
-    ArrivalSpec,
     BusSpec,
     JobStream,
     Scenario,
@@ -581,25 +581,25 @@ def _streams(
         return [stream]
     begin_s, end_s = (share * horizon_s for share in RUSH)
     every_s = round((end_s - begin_s) / (RUSH_SHARE * expected), 3)
-    window = ArrivalSpec(kind="poisson", every_s=every_s, start_s=begin_s, stop_s=end_s)
+    window = Arrivals(kind="poisson", every_s=every_s, start_s=begin_s, stop_s=end_s)
     after = tuple(f"rush_{name}" for name in stream.after)
     return [stream, replace(stream, name=f"rush_{stream.name}", arrivals=window, after=after)]
 
 
-def _arrivals(kind: Arriving, expected: float, horizon_s: float, rng: np.random.Generator) -> ArrivalSpec:
+def _arrivals(kind: Arriving, expected: float, horizon_s: float, rng: np.random.Generator) -> Arrivals:
     """Arrivals of about `expected` jobs in a shift, or of what is not in the rush."""
     match kind:
         case "batch":
             count = max(1, round(expected * BATCHES_S / horizon_s))
             every_s = round(horizon_s * count / expected, 3)
-            return ArrivalSpec(
+            return Arrivals(
                 kind="batch", count=count, every_s=every_s, start_s=round(every_s * float(rng.random()) ** 2, 3)
             )
         case "trace":
-            return ArrivalSpec(kind="trace", times_s=_trace(int(rng.poisson(expected)), horizon_s, rng))
+            return Arrivals(kind="trace", times_s=_trace(int(rng.poisson(expected)), horizon_s, rng))
         case "poisson" | "rush":
             share = 1.0 if kind == "poisson" else 1.0 - RUSH_SHARE
-            return ArrivalSpec(kind="poisson", every_s=round(horizon_s / (share * expected), 3))
+            return Arrivals(kind="poisson", every_s=round(horizon_s / (share * expected), 3))
 
 
 def _trace(count: int, horizon_s: float, rng: np.random.Generator) -> tuple[float, ...]:

@@ -1,6 +1,8 @@
 """Old words count for less: exactly nothing changes at age 0, and nothing old wins or loses a job for long."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agents import staleness
 from agents.policy import EveryArm
 from agents.rules import LeastDifficulty
-from agents.staleness import Trust, advantage
+from agents.staleness import advantage, fading_weights
 from fleet.env.allocation_v1 import parallel_env
 from fleet.observation import LONG_S, Layout, Observation
 
@@ -37,19 +40,29 @@ def heard(own: list[float], peers: list[list[float]], ages_s: list[float]) -> Ob
     )
 
 
-def choice(policy: LeastDifficulty, observation: Observation) -> int:
+@contextmanager
+def scales(**seconds: float) -> Iterator[None]:
+    """Other time scales, by the names of the constants."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in seconds.items():
+            patch.setattr(staleness, name, value)
+        yield
+
+
+def choice(observation: Observation) -> int:
     """The first arm's claim."""
-    return policy.choose(observation, 0)
+    return LeastDifficulty().choose(observation, 0)
 
 
 def test_a_word_counts_for_one_part_in_e_after_the_time_in_which_it_fades():
     seen = heard([0.0], [[0.0]] * 3, [0.0, 30.0, 60.0])
-    np.testing.assert_allclose(Trust(fading_s=30.0).weights(seen), [1.0, 1 / math.e, 1 / math.e**2])
+    with scales(FADING_S=30.0):
+        np.testing.assert_allclose(fading_weights(seen), [1.0, 1 / math.e, 1 / math.e**2])
 
 
 def test_advantage_is_against_the_average_by_weight_and_fades_with_it():
     """Own 1, a peer 4 told an e-folding ago: the average is (1 + 4/e) / (1 + 1/e)."""
-    found = advantage(heard([1.0], [[4.0]], [60.0]), 0, np.array([True]), Trust(fading_s=60.0))
+    found = advantage(heard([1.0], [[4.0]], [60.0]), 0, np.array([True]))
     average = (1 + 4 / math.e) / (1 + 1 / math.e)
     np.testing.assert_allclose(found[:, 0], [1.0 - average, (4.0 - average) / math.e])
 
@@ -64,41 +77,40 @@ def test_at_age_zero_every_trust_is_the_same_to_the_last_bit(told, fading_s):
     plain = np.array(told).reshape(2, 2)
     known = ~np.isnan(plain)
     average = np.where(known, plain, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    np.testing.assert_array_equal(advantage(seen, 0, slots, Trust(fading_s=fading_s)), plain - average)
+    with scales(FADING_S=fading_s):
+        np.testing.assert_array_equal(advantage(seen, 0, slots), plain - average)
 
 
 @given(st.floats(0, 7), st.floats(0, 7), st.floats(0, 1e4), st.floats(0, 1e4))
 def test_an_old_word_is_nearer_to_nothing(own, told, age_s, more_s):
-    at = [
-        abs(advantage(heard([own], [[told]], [age]), 0, np.array([True]), Trust())) for age in (age_s, age_s + more_s)
-    ]
+    at = [abs(advantage(heard([own], [[told]], [age]), 0, np.array([True]))) for age in (age_s, age_s + more_s)]
     assert (at[1] <= at[0] + 1e-9).all()
 
 
 def test_a_job_is_left_to_a_better_peer_only_as_long_as_it_may_be_free():
-    policy = LeastDifficulty(Trust(fading_s=60.0, expiry_s=45.0))
-    assert choice(policy, heard([2.0], [[1.0]], [0.0])) == 0
-    assert choice(policy, heard([2.0], [[1.0]], [40.0])) == 0
-    assert choice(policy, heard([2.0], [[1.0]], [45.0])) == 1
+    with scales(EXPIRY_S=45.0):
+        assert choice(heard([2.0], [[1.0]], [0.0])) == 0
+        assert choice(heard([2.0], [[1.0]], [40.0])) == 0
+        assert choice(heard([2.0], [[1.0]], [45.0])) == 1
 
 
 @pytest.mark.parametrize("state", ["peer_working", "peer_faulted"])
 def test_nothing_is_left_to_a_peer_that_is_not_free(state):
-    assert choice(LeastDifficulty(), replace(heard([2.0], [[1.0]], [0.0]), **{state: np.ones(1)})) == 1
+    assert choice(replace(heard([2.0], [[1.0]], [0.0]), **{state: np.ones(1)})) == 1
 
 
 def test_a_peer_with_an_old_claim_gives_way_to_one_with_a_fresh_one():
     """Two jobs; the peer told that it finds the second easier by 2, ages ago, this arm by 1 now."""
-    policy = LeastDifficulty(Trust(fading_s=10.0, expiry_s=1e9))
-    assert choice(policy, heard([1.0, 1.0], [[4.0, 1.0]], [0.0])) == 1
-    assert choice(policy, heard([3.0, 2.0], [[3.0, 1.8]], [0.0])) == 1
-    # Now its claim on the second counts for e^-8: this arm takes what it finds easiest against the average.
-    assert choice(policy, heard([3.0, 1.9], [[2.9, 2.0]], [80.0])) == 2
+    with scales(FADING_S=10.0, EXPIRY_S=1e9):
+        assert choice(heard([1.0, 1.0], [[4.0, 1.0]], [0.0])) == 1
+        assert choice(heard([3.0, 2.0], [[3.0, 1.8]], [0.0])) == 1
+        # Now its claim on the second counts for e^-8: this arm takes what it finds easiest against the average.
+        assert choice(heard([3.0, 1.9], [[2.9, 2.0]], [80.0])) == 2
 
 
-def test_a_shift_with_fresh_words_does_not_depend_on_trust(small):
-    def trace(trust: Trust | None = None) -> list[dict[str, int]]:
-        policy = EveryArm(lambda: LeastDifficulty(trust))
+def test_a_shift_with_fresh_words_does_not_depend_on_the_scales(small):
+    def trace() -> list[dict[str, int]]:
+        policy = EveryArm(LeastDifficulty)
         env = parallel_env(small.Shifts(arms=3, jobs=15, ticks=80))
         env.reset(seed=2)
         said = []
@@ -107,11 +119,7 @@ def test_a_shift_with_fresh_words_does_not_depend_on_trust(small):
             env.step(said[-1])
         return said
 
-    assert trace() == trace(Trust(fading_s=0.1, expiry_s=0.1))
-    assert trace() == trace(Trust(fading_s=1e12, expiry_s=math.inf))
-
-
-@pytest.mark.parametrize("changes", [{"fading_s": 0.0}, {"expiry_s": -1.0}, {"fading_s": math.nan}])
-def test_trust_that_cannot_be_is_refused(changes):
-    with pytest.raises(ValueError, match=f"Trust.{next(iter(changes))} must be > 0"):
-        Trust(**changes)
+    usual = trace()
+    for seconds in ({"FADING_S": 0.1, "EXPIRY_S": 0.1}, {"FADING_S": 1e12, "EXPIRY_S": math.inf}):
+        with scales(**seconds):
+            assert trace() == usual

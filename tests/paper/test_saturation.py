@@ -45,10 +45,10 @@ def judged(study: Study, work: PastWork):
 
 def test_who_sees_the_heat_is_trusted_and_who_sees_noise_is_not(judged, work) -> None:
     (noise, _), (heat, _) = judged
-    assert heat["excess, logistic"]["auroc"] > 0.97
-    assert heat["excess, logistic"]["brier"] < 0.06
+    assert heat["excess"]["auroc"] > 0.97
+    assert heat["excess"]["brier"] < 0.06
     # Duration and temperature remain to who sees noise: better than chance, and no more.
-    assert 0.5 < noise["excess, logistic"]["auroc"] < 0.9
+    assert 0.5 < noise["excess"]["auroc"] < 0.9
     assert len(work.held_out) == 140
 
 

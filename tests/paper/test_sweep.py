@@ -40,7 +40,7 @@ def rows_of(subject, configurations):
 
 def test_only_the_asked_rows_are_trained(subjects, monkeypatch):
     trained = []
-    monkeypatch.setattr(sweep, "train_all", lambda motions, config: trained.append(1) or train_all(motions, config))
+    monkeypatch.setattr(sweep, "train", lambda *args, **names: trained.append(1) or train(*args, **names))
     both = rows_of(subjects[0], TWO)
     assert len(trained) == len(both) == 2
     ((key, alone),) = sweep_rows(subjects[0], TWO, [key_of("short", TWO["short"].config, subjects[0])])
@@ -49,7 +49,7 @@ def test_only_the_asked_rows_are_trained(subjects, monkeypatch):
     assert {**alone, "cpu_s": 0} == {**both[1], "cpu_s": 0}
 
 
-train_all = sweep.train_all
+train = sweep.train
 
 
 def test_networks_up_to_the_carrier_only(subjects):

@@ -8,8 +8,9 @@ import pytest
 
 from fleet.motion import drive
 from fleet.robot import ThermalLimits
+from scenarios.evaluate.sources import PlannedFleet
 from scenarios.prepare.arms import PlannedArm, air_offsets, hardware_of
-from scenarios.prepare.calibrate import calibrate_twins, simulate_past
+from scenarios.prepare.calibrate import calibrate_networks, simulate_past
 from scenarios.progress import quiet
 from scenarios.spec.load import load
 from twin.thermal.identify import nominal_heat_model
@@ -29,9 +30,11 @@ class Seer:
         return Features(np.repeat(heat[..., None], PARTS, axis=-1))
 
 
-def calibrate(scenario, hardware, twin, folder: Path, *, risk="excess", jobs=60, index=0):
-    arms = [PlannedArm(index, hardware, {})]
-    return calibrate_twins(scenario, arms, [twin], folder, quiet, risk=risk, jobs=jobs)
+def calibrate(scenario, hardware, twin, folder: Path, *, jobs=60):
+    planned = PlannedFleet(scenario, folder)
+    vars(planned)["arms"] = [PlannedArm(0, hardware, {})]
+    (learned,) = planned.with_regressions([twin], jobs=jobs)
+    return learned
 
 
 @pytest.fixture(scope="module")
@@ -61,50 +64,41 @@ def test_a_rehearsal_has_the_air_of_the_hall() -> None:
     assert 17.0 < air_c.min() - offset_k < 22.0 < 36.0 < air_c.max() - offset_k < 41.0
 
 
-def test_a_calibrated_twin_is_kept_for_the_same_arm_only(scenario, tmp_path: Path, caplog) -> None:
+def test_a_regression_is_kept_for_the_same_arm_only(scenario, tmp_path: Path, caplog) -> None:
     hardware = hardware_of(scenario, 0)
-    first = calibrate_twins(
-        scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, risk="excess", jobs=60
-    )
+    seer = Seer(hardware.motors)
+    first = calibrate(scenario, hardware, seer, tmp_path)
     (home,) = (tmp_path / "saturation").iterdir()
     (home / "saturation.json").touch()
     stamp = (home / "saturation.json").stat().st_mtime_ns
-    again = calibrate_twins(
-        scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, risk="excess", jobs=60
-    )
-    assert again[0].saturation == first[0].saturation
+    assert calibrate(scenario, hardware, seer, tmp_path).regression == first.regression
     assert (home / "saturation.json").stat().st_mtime_ns == stamp
     other = hardware_of(scenario, 1)
-    calibrate(scenario, other, Seer(other.motors), tmp_path, jobs=60)
+    calibrate(scenario, other, Seer(other.motors), tmp_path)
     assert len(list((tmp_path / "saturation").iterdir())) == 2
     (home / "saturation.json").write_text("{")
-    mended = calibrate_twins(
-        scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, risk="excess", jobs=60
-    )
-    assert mended[0].saturation == first[0].saturation
+    assert calibrate(scenario, hardware, seer, tmp_path).regression == first.regression
     assert "making it again" in caplog.text
 
 
 def test_an_arm_that_nothing_heats_keeps_its_twin_and_says_why(scenario, tmp_path: Path, caplog) -> None:
     hardware, twin = hardware_of(scenario, 0), Seer(hardware_of(scenario, 0).motors)
     lax = replace(scenario, limits=ThermalLimits(warning_c=500.0, error_c=600.0))
-    (kept,) = calibrate(lax, hardware, twin, tmp_path, jobs=40)
+    kept = calibrate(lax, hardware, twin, tmp_path, jobs=40)
     assert kept.twin is twin
-    assert kept.saturation is None
+    assert kept.regression is None
     assert f"quickstart: arm '{hardware.robot.name}' gets no probability of saturation" in caplog.text
     assert "(got 40; passed in 0)" in caplog.text
     assert not (tmp_path / "saturation").exists()
 
 
 def test_a_curve_is_kept_for_the_same_arm_only(scenario, tmp_path: Path) -> None:
-    def curve_of(index: int):
-        hardware = hardware_of(scenario, index)
-        seer = Seer(hardware.motors)
-        return calibrate(scenario, hardware, seer, tmp_path, risk="rc-nominal", index=index)[0]
+    def network(index: int):
+        arm = PlannedArm(index, hardware_of(scenario, index), {})
+        return calibrate_networks(scenario, [arm], tmp_path, quiet, risk="rc-nominal", jobs=60)[0]
 
-    first = curve_of(0)
-    assert first.saturation is None
-    assert first.heat.curve is not None
-    assert curve_of(0).version == first.version
-    assert curve_of(1).version != first.version
+    first = network(0)
+    assert first.curve is not None
+    assert network(0).version == first.version
+    assert network(1).version != first.version
     assert len(list((tmp_path / "saturation").iterdir())) == 2

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet.arrivals import Arrivals
 from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.spec.load import load
-from scenarios.spec.schema import ArrivalSpec, Scenario
+from scenarios.spec.schema import Scenario
 
 
 @pytest.fixture
@@ -52,7 +53,7 @@ def test_every_job_is_one_its_stream_asks_for(small):
 
 def test_payloads_and_repetitions_are_drawn_evenly(small):
     """Against the binomial and uniform laws at four standard deviations."""
-    many = with_stream(small, 1, arrivals=ArrivalSpec(kind="batch", count=3000))
+    many = with_stream(small, 1, arrivals=Arrivals(kind="batch", count=3000))
     jobs = [job for job in drawn(many, 0) if job.name.startswith("sort")]
     light = sum(job.work.payload_kg == 0.2 for job in jobs)
     assert abs(light - 1500) < 4 * np.sqrt(3000 / 4)
@@ -75,7 +76,7 @@ def test_a_further_stream_disturbs_none_of_the_others(small):
 
 
 def test_a_stream_after_another_waits_for_the_job_of_the_same_number(small):
-    chained = with_stream(small, 1, after=("hold",), arrivals=ArrivalSpec(kind="batch", count=3))
+    chained = with_stream(small, 1, after=("hold",), arrivals=Arrivals(kind="batch", count=3))
     after = {job.name: job.after for job in drawn(chained, 0)}
     assert after["sort-001"] == ("hold-001",)
     assert after["sort-002"] == ("hold-002",)

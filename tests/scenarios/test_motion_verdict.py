@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from scenarios.prepare.twins import train_log
-from twin.logs.recording import Recording
-from twin.training_data import cool_stretches
+from twin.logs.recording import Recording, cool_stretches
 from twin.vae.config import TwinConfig, hash_records
 from twin.verdict import log_features
 
@@ -43,7 +42,7 @@ def test_a_twin_of_logs_is_calibrated_on_whole_recordings_that_it_was_not_traine
     held_out = [name for name, packed in own.items() if any(np.allclose(packed, each) for each in known)]
     assert len(held_out) == 7
     rest = [r for r in COOL if r.name not in held_out]
-    cool = cool_stretches(rest, RATE_HZ, cool_c=40.0, horizon_s=np.inf, joints=(0, 1, 2, 3))
+    cool = cool_stretches(rest, RATE_HZ, cool_c=40.0, joints=(0, 1, 2, 3))
     assert twin.data_hash == hash_records([stretch.profile for stretch in cool])
     assert train_log([*COOL[:5], WARM], TINY, 3, cool_c=40.0).calibration is None  # a third of 5 are too few
 

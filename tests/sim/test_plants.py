@@ -6,13 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.arm.plant import MujocoPlant
+from fleet.arrivals import Arrivals
 from fleet.engine.profile_plant import sample, sample_row
 from fleet.heat.motor import gen3_motors
 from fleet.job import KINDS
 from fleet.motion import RATE_HZ
 from fleet.telemetry import FAULTED, IDLE
 from scenarios.prepare.fleet import make_env
-from scenarios.spec.schema import ArmSpec, ArrivalSpec, JobStream, Planning, Scenario
+from scenarios.spec.schema import ArmSpec, JobStream, Planning, Scenario
 
 # The profile plant
 
@@ -138,7 +139,7 @@ def test_a_scenario_chooses_its_plant(cell, tmp_path):
         places=cell.places,
         jobs=(
             JobStream(
-                name="sort", kind="sort", places=("near", "far"), arrivals=ArrivalSpec(kind="trace", times_s=(0.0,))
+                name="sort", kind="sort", places=("near", "far"), arrivals=Arrivals(kind="trace", times_s=(0.0,))
             ),
         ),
         planning=Planning(elbows=1, speeds=(1.0,)),

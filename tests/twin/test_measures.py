@@ -19,7 +19,6 @@ from twin.vae.measures import (
     Features,
     latent_moments,
     measures_of,
-    score_of,
 )
 from twin.vae.twin import CARD, load, save
 from twin.vae.window import cut, cut_jobs, resample
@@ -149,21 +148,6 @@ def test_cool_jobs_raise_false_alarms_as_often_as_asked():
     alarms = np.concatenate([calibrated(packed(39, rng)).p_value(packed(20, rng), np.ones(7)) for _ in range(300)])
     for alpha in (0.05, 0.1, 0.25):
         assert np.mean(alarms <= alpha) == pytest.approx(alpha, abs=0.012)
-
-
-@pytest.mark.parametrize("name", ["sum", "load", "load_max", "excess"])
-def test_more_error_never_scores_lower(calibration, rng, name):
-    less = packed(50, rng)
-    more = Features(less.packed + rng.gamma(1.0, 0.3, less.packed.shape))
-    assert np.all(score_of(more, name) >= score_of(less, name))
-    assert score_of(less, name).shape == (50,)
-
-
-def test_a_score_may_be_one_joint_and_must_exist(calibration, rng):
-    features = packed(3, rng)
-    np.testing.assert_array_equal(score_of(features, "joint_2"), features.difficulty[:, 1])
-    with pytest.raises(ValueError, match="No score 'joint_8'; did you mean 'joint_"):
-        score_of(features, "joint_8")
 
 
 @pytest.mark.parametrize("shape", [(1, 7, PARTS), (7, PARTS)])

@@ -1,4 +1,4 @@
-"""Networks trained side by side, against torch.nn.LSTM, torch's optimisers, and trainings alone."""
+"""Networks trained side by side, against torch.nn.LSTM and torch's optimisers."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import torch
 from twin.vae.config import TwinConfig
 from twin.vae.inference import tanh
 from twin.vae.model import build, negative_elbo
-from twin.vae.train import Motion, Run, SideBySide, train, train_all
+from twin.vae.train import Run, SideBySide
 
 
 def drawn(seed: int, *shape: int) -> torch.Tensor:
@@ -83,23 +83,6 @@ def test_a_training_is_that_of_torch_with_the_same_draws(optimizer):
                     schedule.step()
         for name, weight in net.state_dict().items():
             np.testing.assert_allclose(run.nets.weights_of(n)[name], weight.numpy(), atol=2e-4)
-
-
-@pytest.mark.parametrize("scope", ["joint", "arm"])
-def test_arms_side_by_side_are_the_arms_alone(records, scope):
-    """With other data, other numbers of windows, and other restarts that win."""
-    config = TwinConfig(
-        scope=scope, hidden=8, max_windows=64, epochs=4, batch=32, restarts=2, trial=0.5, allow_collapse=True
-    )
-    parts = records[:8], records[8:16], [record[:160] for record in records[16:20]]
-    motions = [Motion(arm=f"arm_{i}", records=part, seed=np.random.SeedSequence(i)) for i, part in enumerate(parts)]
-    together = train_all(motions, config)
-    for motion, twin in zip(motions, together, strict=True):
-        alone = train(motion.records, config, motion.seed, arm=motion.arm)
-        assert [fit.restart for fit in twin.fits] == [fit.restart for fit in alone.fits]
-        for name, tensor in alone.tensors().items():
-            np.testing.assert_allclose(twin.tensors()[name], tensor, atol=1e-4)
-    assert {fit.restart for twin in together for fit in twin.fits} == {0, 1}
 
 
 def test_a_selection_goes_on_as_if_nothing_had_happened():

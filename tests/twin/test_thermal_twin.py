@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from fleet.difficulty import SETTLING_S, known_temperatures
+from benchmarks.paper.real_logs import continued_peaks, filter_log, planned_peaks
+from benchmarks.paper.saturation import brier, reliability
+from fleet.difficulty import KNOWN, SETTLING_S, known_temperatures
 from fleet.heat.motor import friction_heat, reference_current
 from fleet.heat.thermal import (
     HOUSING,
@@ -21,10 +23,15 @@ from fleet.motion import RATE_HZ, drive, drives
 from fleet.robot import JOINTS
 from scenarios.prepare.arms import peaks
 from twin.logs.recording import Recording, heat_logs
-from twin.p_saturation import NotEnoughExperience, brier, reliability
 from twin.thermal.checkpoint import load_twin, save
 from twin.thermal.identify import HeatModel, identify, nominal_heat_model
-from twin.thermal.thermal_twin import PeakCurve, RcTwin, continued_peaks, filter_log, fit_curve, planned_peaks
+from twin.thermal.thermal_twin import (
+    CalibratedTwin,
+    NotEnoughExperience,
+    PeakCurve,
+    RcTwin,
+    fit_curve,
+)
 
 AIR_C = 22.0
 FULL_REACH_NM = np.array([0.0, 50.1, 0.0, 21.3, 0.0, 1.0, 0.0])
@@ -272,3 +279,14 @@ def test_the_warm_end_is_where_newton_says_it_settles(holds):
     end = steady_state(twin.thermal, load.current_sq, load.friction_w, twin.motors, AIR_C)
     _, temp_c = twin.predict(plan, 15000, np.full(JOINTS, 30.0))
     np.testing.assert_allclose(temp_c[-1], end[WINDING], atol=0.05)
+
+
+def test_a_calibrated_twin_states_what_each_model_states(twin, plan) -> None:
+    known_c = np.linspace(20.0, 50.0, KNOWN)
+    heat = replace(RcTwin.nominal(), curve=PeakCurve(knots=((0.0, 0.25), (200.0, 0.25)), jobs=30))
+    calibrated = CalibratedTwin(twin, heat)
+    score = calibrated.score(plan, 40)
+    np.testing.assert_array_equal(score.per_joint, twin.score(plan, 40).per_joint)
+    assert score.peak_at(known_c) == heat.peak(plan, 40).value(known_c)
+    assert score.p_at(known_c) == 0.25
+    assert calibrated.version == f"d:{twin.version}+peak:{heat.version}"

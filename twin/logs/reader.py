@@ -1,13 +1,4 @@
-"""The numbers of a log as a table, and its damaged lines.
-
-Read a CSV log, plain or gzip, as a table of numbers with a list of its damaged lines.
-
-The two CSV formats of logs: their columns, units, and conversion to SI.
-
-The telemetry.parquet of a run as one table per arm.
-
-Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet.
-"""
+"""Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet."""
 
 import gzip
 import logging

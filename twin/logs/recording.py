@@ -1,9 +1,4 @@
-"""Sensor readings of one arm over time.
-
-Recordings at a regular rate: averaged, unwrapped, and split at gaps.
-
-Heat of an arm's motors in steps of some seconds, from its recordings: the input of identification and estimation.
-"""
+"""Sensor readings of one arm over time, at any rate or at a regular one, and the heat of its motors in steps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from fleet.errors import FleetError
 from fleet.heat.motor import Motors, friction_heat, reference_current
 
 Array = np.ndarray
@@ -193,6 +189,63 @@ def at_rate(time_s: Array, values: Array, rate_hz: float) -> tuple[Array, Array]
         return time_s[0] + at_s, line(at_s)
     width_s = np.diff(at_s).reshape(-1, *(1,) * (values.ndim - 1))
     return time_s[0] + (at_s[1:] + at_s[:-1]) / 2.0, np.diff(line.antiderivative()(at_s), axis=0) / width_s
+
+
+class NothingCool(FleetError):
+    """No part of the recordings stayed cool for long enough, so there is no training data."""
+
+
+def cool_stretches(
+    recordings: Sequence[Recording], rate_hz: float, *, cool_c: float, joints: Sequence[int], least_s: float = 0.0
+) -> list[Stretch]:
+    """The stretches after every moment of which no motor reaches `cool_c` in the rest of its recording.
+
+    They are chosen by the later temperatures, not by those at the time: a heavy job begins cool too.
+
+    Args:
+        cool_c: °C.
+        joints: Index 0..6 of the motors that count: idle wrists of a Gen3 are at 40 to 43 °C.
+        least_s: Least length of a stretch, such as a twin's window.
+
+    Raises:
+        NothingCool: there is no such stretch, which names the warm motors, or all are shorter than `least_s`.
+        ValueError: no recordings, one without temperatures, or unknown joints.
+    """
+    if not recordings:
+        raise ValueError("Training data needs at least one recording (got none).")
+    unknown = [j for j in joints if not 0 <= j < recordings[0].joints]
+    if unknown or not joints:
+        raise ValueError(f"joints must be some of 0 … {recordings[0].joints - 1} (got {tuple(joints)}).")
+    cool_parts, whole = list[Stretch](), True
+    for recording in recordings:
+        if recording.temp_c is None:
+            raise ValueError(f"Recording '{recording.name}' has no motor temperatures, so its cool parts are unknown.")
+        hot = np.flatnonzero((recording.temp_c[:, list(joints)] >= cool_c).any(axis=1))
+        begin = int(hot[-1]) + 1 if len(hot) else 0
+        whole &= begin == 0
+        cool_parts += stretches(recording.part(slice(begin, None)), rate_hz)
+    if not cool_parts:
+        raise NothingCool(_no_cool_moment(recordings, cool_c, joints))
+    long = [s for s in cool_parts if len(s.time_s) >= least_s * rate_hz]
+    if not long:
+        longest_s = max(len(s.time_s) for s in cool_parts) / rate_hz
+        what = "The recording" if whole else "The part that stays cool"
+        raise NothingCool(
+            f"{what} is shorter than one window: {least_s:.4g} s are needed, the longest stretch has {longest_s:.4g} "
+            "s. Record for longer, or choose a smaller window (--window)."
+        )
+    return long
+
+
+def _no_cool_moment(recordings: Sequence[Recording], cool_c: float, joints: Sequence[int]) -> str:
+    coolest = np.min([r.temp_c.min(axis=0) for r in recordings if r.temp_c is not None and len(r.time_s)], axis=0)
+    always = [f"{j + 1} ({coolest[j]:.1f} °C)" for j in joints if coolest[j] >= cool_c]
+    return (
+        f"At no moment of {len(recordings)} recording(s) do the motors {', '.join(str(j + 1) for j in joints)} stay "
+        f"below {cool_c:g} °C for the rest of its recording."
+        + (f" Always above: {', '.join(always)}, the coolest sample." if always else "")
+        + " Raise the limit (--cool), or record light work."
+    )
 
 
 CurrentSource = Literal["current", "torque"]

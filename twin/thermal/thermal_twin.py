@@ -1,18 +1,8 @@
-"""The predicted peak of a plan, and P(saturation) from it, by the thermal network of an arm.
+"""The physical twin: an arm's thermal network, nominal or identified, with predicted peaks and P(saturation) of plans.
 
 In each phase of a plan the drive is constant. Heat is linearised about a warm motor: copper loss is linear in the
 winding's temperature anyway, and that of the magnets changes it by a percent per five kelvin. So the temperature of
 each motor at each moment is affine in the temperatures known at the start, and the peak is a maximum of affine pieces.
-
-The physical twin: an arm's thermal network, nominal or identified, which predicts motor temperatures of a plan.
-
-It implements the same protocol as the learned twin, and also predicts temperatures.
-
-Peak motor temperatures in the next minutes, from every moment of a log.
-
-Housing temperatures, which have no sensor, from an arm's recent log: a Kalman filter on its thermal network.
-
-A learned twin with a predicted peak and P(saturation): what scores the plans of an arm.
 """
 
 from collections.abc import Iterable, Sequence
@@ -24,15 +14,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from fleet.difficulty import KNOWN, SETTLING_S, Difficulty, Forecast, difficulty_of_error
+from fleet.errors import FleetError
 from fleet.heat.motor import Motors, copper_loss, magnet_factor
-from fleet.heat.thermal import NODES, STEP_S, WINDING, ThermalModel, drive_heat, node_heat, temperature_steps
+from fleet.heat.thermal import NODES, STEP_S, WINDING, ThermalModel, node_heat, temperature_steps
 from fleet.motion import Drive, Plan, drives
 from fleet.robot import JOINTS, Cooling, ThermalLimits
-from twin.logs.recording import HeatLog
-from twin.p_saturation import LEAST_JOBS, NotEnoughExperience, SaturationModel
-from twin.plan_cache import PlanCache
 from twin.thermal.identify import AMBIENT_C, HeatModel, Identified, nominal_heat_model
-from twin.vae.twin import Twin
+from twin.vae.twin import PlanCache, Twin
 from twin.vae.window import check_jobs
 
 Array = np.ndarray
@@ -49,6 +37,12 @@ _LEVELS = np.array([0.003, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.997])
 """Probabilities at the knots of a curve."""
 BAND_K = 12.0
 """Past jobs whose predicted peak is this close to the limit show how far off a prediction is there."""
+LEAST_JOBS = 30
+"""Least past jobs from which P(saturation) is fitted."""
+
+
+class NotEnoughExperience(FleetError):
+    """Too few past jobs to fit P(saturation)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +230,7 @@ class RcTwin:
         """Node temperatures for measured motor temperatures, °C, [..., joint] to [..., node].
 
         Housings have no sensor and are taken as warm as their windings: true after some minutes of rest, cautious right
-        after work. `twin.thermal.thermal_twin.filter_log` estimates them better from a log.
+        after work.
         """
         return np.concatenate([temp_c, temp_c], axis=-1)
 
@@ -348,140 +342,21 @@ class RcTwin:
                 raise ValueError(f"The thermal network has {JOINTS} joints (got {plan.cycle.profile.shape[-1]}).")
 
 
-def planned_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float) -> Array:
-    """Peaks within `ahead_s` after each edge of the log's steps, with the load of the log's coming steps.
-
-    The load of a planned motion is known in advance.
-
-    Args:
-        states_c: Estimated temperatures at each edge, °C, [step + 1, node].
-
-    Returns:
-        °C, [step + 1, joint]; nan where the log ends before.
-    """
-    load = _drive(twin, log)
-    edges = np.arange(len(log.time_s))
-    until = np.searchsorted(log.time_s, log.time_s + ahead_s - 1e-9)  # first edge at or after the horizon
-    temp_c = states_c.astype(float)
-    peak_c = temp_c[:, WINDING]
-    for ahead in range(int(np.max(until - edges, initial=0))):
-        step = np.minimum(edges + ahead, len(log.dt_s) - 1)
-        heat_w = drive_heat(temp_c, load.current_sq[step], load.friction_w[step], twin.motors)
-        within = (edges + ahead < np.minimum(until, len(log.dt_s)))[:, None]
-        temp_c = np.where(within, twin.thermal.step(temp_c, heat_w, twin.ambient_c, log.dt_s[step]), temp_c)
-        peak_c = np.maximum(peak_c, temp_c[:, WINDING])
-    return np.where((until < len(edges))[:, None], peak_c, np.nan)
-
-
-def continued_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float, *, past_s: float) -> Array:
-    """The same if the mean load of the last `past_s` continues, without knowledge of the future.
-
-    Returns:
-        °C, [step + 1, joint]; nan at edges with less past than `past_s`.
-    """
-    load = _drive(twin, log)
-    step_s = float(np.median(log.dt_s))
-    past, count = max(1, round(past_s / step_s)), max(1, int(np.ceil(ahead_s / step_s)))
-    peak_c = np.full((len(log.time_s), load.current_sq.shape[1]), np.nan)
-    if len(load.current_sq) >= past:
-        mean = Drive(_trailing_mean(load.current_sq, past), _trailing_mean(load.friction_w, past))
-        rows = temperature_steps(
-            repeat(mean, count),
-            ahead_s / count,
-            motors=twin.motors,
-            thermal=twin.thermal,
-            start_c=states_c[past:],
-            ambient_c=twin.ambient_c,
-        )
-        peak_c[past:] = np.max([temp_c[:, WINDING] for temp_c in rows], axis=0)
-    return peak_c
-
-
-def _drive(twin: RcTwin, log: HeatLog) -> Drive:
-    """Mean drive of each step, [step, joint]."""
-    friction = (twin.motors.coulomb_nm, twin.motors.viscous_nms_per_rad)
-    return Drive(log.current_sq(*friction), log.friction_w(*friction))
-
-
-def _trailing_mean(values: Array, steps: int) -> Array:
-    """Mean over the `steps` steps before each edge after them, [edge, joint]."""
-    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    return (total[steps:] - total[:-steps]) / steps
-
-
-HOUSING_SD_K = 5.0
-"""Standard deviation of a housing from its winding at the start."""
-SENSOR_SD_K = 0.05
-"""Noise and slow drift of the motor temperature; larger than the noise at rest, which no model follows."""
-HEAT_NOISE_W2S = 10.0
-"""Intensity of unmodelled heat, W²·s, at every node: half a watt that lasts 20 s, three watts for one."""
-
-
-def filter_log(twin: RcTwin, log: HeatLog) -> Array:
-    """Temperatures of all nodes at the edges of a log's steps, each from the past alone, °C, [step + 1, node].
-
-    Housings start as warm as their windings.
-    """
-    temp = twin.likely_start(log.temp_c[0])
-    spread = np.diag(np.append(np.full(JOINTS, SENSOR_SD_K**2), np.full(JOINTS, HOUSING_SD_K**2)))
-    temps = [temp]
-    lengths, which = np.unique(np.round(log.dt_s, 2), return_inverse=True)
-    steps = [twin.thermal.step_matrices(dt) for dt in lengths]
-    # A recorded current does not depend on the magnets.
-    motors = twin.motors if log.source == "torque" else replace(twin.motors, alpha_kt_per_k=0.0)
-    square = log.current_sq(motors.coulomb_nm, motors.viscous_nms_per_rad)
-    friction = log.friction_w(motors.coulomb_nm, motors.viscous_nms_per_rad)
-    for k, length in enumerate(which):
-        phi, gamma = steps[length]
-        heat_w = drive_heat(temp, square[k], friction[k], motors)
-        temp = phi @ temp + gamma @ (heat_w + twin.thermal.to_ambient * twin.ambient_c)
-        # White heat noise over dt is like an independent constant heat of variance intensity/dt in each step.
-        spread = phi @ spread @ phi.T + gamma @ gamma.T * (HEAT_NOISE_W2S / log.dt_s[k])
-        temp, spread = _correct(temp, spread, log.temp_c[k + 1])
-        temps.append(temp)
-    return np.array(temps)
-
-
-def _correct(temp: Array, spread: Array, measured_c: Array) -> tuple[Array, Array]:
-    """State and covariance after a reading of all windings (Joseph's form keeps the covariance symmetric)."""
-    of_reading = spread[WINDING, WINDING] + np.eye(JOINTS) * SENSOR_SD_K**2
-    gain = np.linalg.solve(of_reading, spread[WINDING]).T  # [node, joint]
-    rest = np.eye(NODES)
-    rest[:, WINDING] -= gain
-    return temp + gain @ (measured_c - temp[WINDING]), rest @ spread @ rest.T + gain @ gain.T * SENSOR_SD_K**2
-
-
 @dataclass(frozen=True, eq=False)
 class CalibratedTwin:
-    """A twin with P(saturation); implements `fleet.difficulty.DifficultyModel`."""
+    """A learned twin with a thermal network; implements `fleet.difficulty.DifficultyModel`."""
 
     twin: Twin
     """Gives the difficulty d."""
     heat: RcTwin
-    """Gives the predicted peak and, if it has a curve and there is no other model, P(saturation)."""
-    saturation: SaturationModel | None = None
-    """Gives P(saturation) from the features of the twin."""
-
-    def __post_init__(self) -> None:
-        if self.saturation is not None and self.saturation.twin != self.twin.version:
-            raise ValueError(
-                f"The saturation model was fitted on twin {self.saturation.twin}, this is {self.twin.version}; "
-                "fit it again on this twin's features."
-            )
+    """Gives the predicted peak and, if it has a curve, P(saturation)."""
 
     @property
     def version(self) -> str:
-        """Versions of the models that give difficulty, predicted peak, and P if it is another one."""
-        parts = {"d": self.twin.version, "peak": self.heat.version}
-        if self.saturation is not None:
-            parts["p"] = f"{self.saturation.evidence}-{self.saturation.version}"
-        return "+".join(f"{name}:{version}" for name, version in parts.items())
+        """Versions of the models that give difficulty and predicted peak."""
+        return f"d:{self.twin.version}+peak:{self.heat.version}"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        """Difficulty, predicted peak and risk of the repeated plan."""
-        features = self.twin.features([plan], [repetitions])
-        risk = None
-        if self.saturation is not None:
-            risk = self.saturation.risk(features, np.array([plan.duration_s(repetitions)]))[0]
-        peak = self.heat.peak(plan, repetitions)
-        return Difficulty(features.difficulty[0], risk=risk, peak=peak, weight=self.twin.joint_weight)
+        """Difficulty and predicted peak of the repeated plan."""
+        difficulty = self.twin.features([plan], [repetitions]).difficulty[0]
+        return Difficulty(difficulty, peak=self.heat.peak(plan, repetitions), weight=self.twin.joint_weight)

@@ -1,7 +1,4 @@
-"""Input, size and training of a twin's networks.
-
-Cache key of everything that determines the weights of a training.
-"""
+"""Input, size and training of a twin's networks, and the cache key of a training."""
 
 import hashlib
 from collections.abc import Sequence

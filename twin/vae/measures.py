@@ -1,9 +1,7 @@
-"""p-values of split conformal prediction, and the rate of false alarms that they imply.
+"""Measures of a job from a twin's errors: difficulty per joint, its cause, and a p-value against cool jobs.
 
-Source: Vovk, Gammerman & Shafer, Algorithmic Learning in a Random World, 2005, prop. 2.8; Vovk, Conditional validity of
-inductive conformal predictors, ACML 2012, prop. 2a.
-
-Measures of a job from a twin's errors: difficulty per joint, its cause, and a p-value against cool jobs.
+p-values are those of split conformal prediction: Vovk, Gammerman & Shafer, Algorithmic Learning in a Random World,
+2005, prop. 2.8.
 
 The paper's difficulty d_k is in `fleet.difficulty`. It is far from zero even for normal jobs, since a latent of two
 numbers cannot encode a window exactly. The calibrated measures start from the median of held-out cool jobs instead.
@@ -14,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import betaincinv
 
 from fleet.difficulty import difficulty_of_error
 from fleet.errors import nearest
@@ -47,26 +44,9 @@ def largest_p_value(reference: Array, group: Array, score: Array) -> Array:
     return np.max([p_value(np.sort(reference[group == g]), score) for g in np.unique(group)], axis=0)
 
 
-def allowed(count: int, alpha: float) -> int:
-    """floor(α (n + 1)): a new score is an alarm if fewer than so many of the n reference scores reach it."""
-    return int(np.floor(alpha * (count + 1) + 1e-9))
-
-
 def fewest(alpha: float) -> int:
     """Fewest reference jobs with which any p-value can be ≤ α."""
     return int(np.ceil(1 / alpha - 1 - 1e-9))
-
-
-def rate_interval(count: int, alpha: float, confidence: float = 0.9) -> tuple[float, float]:
-    """Interval of the rate of false alarms of one calibration with n jobs, for scores without ties.
-
-    Given the calibration, the rate is Beta(m, n + 1 − m), m = floor(α (n + 1)). Its mean over calibrations is
-    m / (n + 1).
-    """
-    m = allowed(count, alpha)
-    tail = 0.5 * (1 - confidence)
-    low, high = betaincinv(m, count + 1 - m, [tail, 1 - tail])
-    return float(low), float(high)
 
 
 ERROR_CAP = 30.0
@@ -334,29 +314,6 @@ def measures_of(features: Features, calibration: Calibration | None, *, weight: 
         p_value=None if calibration is None else calibration.p_value(features, weight),
         version=version,
     )
-
-
-def score_of(features: Features, score: str) -> Array:
-    """One number per job, [...]: any of `SCORES`, or `joint_k` for d of joint k, counted from one.
-
-    Raises:
-        ValueError: another name.
-    """
-    if score in SCORES:
-        return SCORES[score](features)
-    joints = {f"joint_{k + 1}": k for k in range(features.packed.shape[-2])}
-    if score not in joints:
-        raise ValueError(f"No score '{score}'{nearest(score, [*SCORES, *joints])}")
-    return features.difficulty[..., joints[score]]
-
-
-SCORES: Mapping[str, Callable[[Features], Array]] = {
-    "sum": lambda features: features.difficulty.sum(axis=-1),
-    "load": lambda features: features.load.sum(axis=-1),
-    "load_max": lambda features: features.load.max(axis=-1),
-    "excess": lambda features: features.excess_sq.sum(axis=-1),
-}
-"""The paper's d; sum and maximum over joints of the one-sided torque difficulty; sum of the excess tau²."""
 
 
 def _saturated(error: Array) -> Array:

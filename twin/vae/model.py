@@ -1,13 +1,11 @@
-"""The network: an LSTM encoder of a window to a Gaussian latent, and an LSTM decoder back to the window.
-
-Source: E. Guiffo Kaigom, arXiv 2509.12740.
-
-The evidence lower bound of a window, in nats, and whether the latent is used.
+"""The network: an LSTM encoder of a window to a Gaussian latent, and an LSTM decoder back to the window; and its loss.
 
 −ELBO = ½ Σ (x − x̂)² + β·KL(q(z|x) ‖ N(0, I)), a Gaussian likelihood of unit variance without its constant.
 The sum over the window matters: with a mean the KL outweighs it and the posterior collapses.
-Windows are [time, net, channel, batch], latents [net, latent, batch], as in `twin.vae.train`.
-Source: Kingma & Welling, arXiv 1312.6114, eq. 10 and appendix B; β: Higgins et al., ICLR 2017.
+Windows of the loss are [time, net, channel, batch], latents [net, latent, batch], as in `twin.vae.train`.
+
+Sources: E. Guiffo Kaigom, arXiv 2509.12740; Kingma & Welling, arXiv 1312.6114, eq. 10 and appendix B; β: Higgins et
+al., ICLR 2017.
 """
 
 from collections.abc import Iterator

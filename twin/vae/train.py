@@ -1,7 +1,7 @@
-"""Train the twins of arms on motion that stayed cool.
+"""Train the twin of an arm on motion that stayed cool.
 
-The networks of all joints and restarts, and of several arms, are trained side by side, with a network axis in front;
-a training can stop and continue. Windows are [time, net, channel, batch]: with the batch last, each gate of a cell is
+The networks of all joints and restarts are trained side by side, with a network axis in front; a training can stop and
+continue. Windows are [time, net, channel, batch]: with the batch last, each gate of a cell is
 one block of memory. Between the matrix products, `twin.vae.inference.forward` computes a whole time step at once.
 torch.nn.LSTM takes three times as long for windows this small (`benchmarks/bench_twin.py`), and `torch.vmap` does not
 run it.
@@ -25,7 +25,6 @@ import torch
 from torch import Tensor
 
 from fleet.errors import FleetError
-from fleet.robot import JOINTS
 from fleet.seeding import child
 from twin.vae import inference
 from twin.vae.config import LOGVAR_RANGE, TwinConfig, hash_records, seed_text
@@ -325,10 +324,6 @@ class Run:
 
 Array = np.ndarray
 
-SIDE_BY_SIDE = 14
-"""Networks trained at a time: enough that Python's share is small, few enough for the cache; see
-`benchmarks/bench_twin.py`."""
-
 
 class CollapsedPosterior(FleetError):
     """The decoder of a network ignores the latent and decodes every window alike."""
@@ -336,19 +331,6 @@ class CollapsedPosterior(FleetError):
 
 class Diverged(FleetError):
     """No training of a network ended with finite weights."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Motion:
-    """Training data of the twin of one arm."""
-
-    arm: str
-    records: Sequence[Array]
-    """Profiles [time, 3, joint] at `config.record_hz`. The phases of a plan, given one by one, are cut and padded as
-    they will be when scored."""
-    seed: np.random.SeedSequence
-    data_hash: str | None = None
-    """Name of the data in the checkpoint; by default the hash of the records."""
 
 
 def train(
@@ -360,19 +342,14 @@ def train(
     data_hash: str | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Twin:
-    """A twin trained on motion of an arm that stayed cool for the whole horizon; arguments and errors as `train_all`.
+    """A twin trained on motion of an arm that stayed cool for the whole horizon.
 
     Uses one thread and no global random state, so the result is the same in any process.
-    """
-    return train_all([Motion(arm=arm, records=records, seed=seed, data_hash=data_hash)], config, progress=progress)[0]
-
-
-def train_all(
-    motions: Sequence[Motion], config: TwinConfig, *, progress: Callable[[float], None] = lambda share: None
-) -> list[Twin]:
-    """A twin for each motion, trained side by side; each is what a training alone gives, but for rounding.
 
     Args:
+        records: Profiles [time, 3, joint] at `config.record_hz`. The phases of a plan, given one by one, are cut and
+            padded as they will be when scored.
+        data_hash: Name of the data in the checkpoint; by default the hash of the records.
         progress: Called with the share done, 0 to 1, after every epoch.
 
     Raises:
@@ -380,81 +357,45 @@ def train_all(
         CollapsedPosterior: the latent of a network is unused although its joints moved in training.
         Diverged: no training of a network ended with finite weights.
     """
-    at_once = max(1, SIDE_BY_SIDE // (config.networks(JOINTS) * config.restarts))
-    blocks = [motions[first : first + at_once] for first in range(0, len(motions), at_once)]
-    twins: list[Twin] = []
-    with one_thread():
-        for done, block in enumerate(blocks):
-            arms = [_Arm(motion, config) for motion in block]
-            _train_block(arms, config, lambda share, done=done: progress((done + share) / len(blocks)))
-            twins += [arm.twin() for arm in arms]
-    return twins
-
-
-class _Arm:
-    """The windows of an arm, and its networks as they are trained."""
-
-    def __init__(self, motion: Motion, config: TwinConfig) -> None:
-        self.motion, self.config = motion, config
-        windows = windows_of(motion.records, config)
-        draw = np.random.SeedSequence(_child(motion.seed, windows.shape[2], 0))
-        windows = draw_windows(windows, config.max_windows, draw)
-        self.scaler = Scaler.fit(windows)
-        self.names = net_names(config, self.scaler.joints)
-        noise = (np.array(config.noise) / self.scaler.std).astype(np.float32)
-        self.noise = torch.from_numpy(noise.reshape(len(self.names), -1))  # [net, channel]
-        z = torch.from_numpy(self.scaler.to_z(windows)).flatten(2)  # [batch, time, channel]
-        self.x = [part.permute(1, 2, 0).contiguous() for part in z.chunk(len(self.names), dim=2)]
-        self.results: list[tuple[Fit, Weights] | None] = [None] * len(self.names)
-
-    def twin(self) -> Twin:
-        """The trained twin; raises as `train_all`."""
-        still = [bool(part.all()) for part in np.split(self.scaler.still, len(self.names))]
-        nets, fits = [], []
-        for name, result, is_still in zip(self.names, self.results, still, strict=True):
-            label = "the whole arm" if name == "arm" else name.replace("_", " ")
-            if result is None:
-                raise Diverged(
-                    f"The training of {label} of '{self.motion.arm}' ended without finite weights. Lower "
-                    "learning_rate or clip."
-                )
-            fit, weights = result
-            kl_nats = fit.kl if self.config.kind == "vae" else None
-            if collapsed(kl_nats, fit.active_units) and not (self.config.allow_collapse or is_still):
-                raise CollapsedPosterior(
-                    f"Posterior collapse of {label} in the twin of '{self.motion.arm}': KL {fit.kl:.2f} nat, "
-                    f"{fit.active_units} active latent unit(s). Lower beta, train longer (epochs, max_windows), or set "
-                    "allow_collapse to keep it as a baseline."
-                )
-            nets.append(weights)
-            fits.append(fit)
-        motion = self.motion
-        data = hash_records(motion.records) if motion.data_hash is None else motion.data_hash
-        seed = seed_text(motion.seed)
-        return Twin(self.config, self.scaler, nets, arm=motion.arm, data_hash=data, seed=seed, fits=tuple(fits))
-
-
-def _train_block(arms: Sequence[_Arm], config: TwinConfig, progress: Callable[[float], None]) -> None:
-    """Train all networks of some arms; those with equally many windows side by side."""
-    by_windows: dict[int, list[tuple[_Arm, int]]] = {}
-    for arm in arms:
-        for n, x in enumerate(arm.x):
-            by_windows.setdefault(x.shape[2], []).append((arm, n))
-    epochs, done = len(by_windows) * config.epochs, count(1)
+    done = count(1)
 
     def report() -> None:
-        progress(min(next(done) / epochs, 1.0))  # a diverged restart costs more epochs
+        progress(min(next(done) / config.epochs, 1.0))  # a diverged restart costs more epochs
 
-    for nets in by_windows.values():
-        noise = torch.stack([arm.noise[n] for arm, n in nets])
-        seeds = [[_child(arm.motion.seed, n, restart) for restart in range(config.restarts)] for arm, n in nets]
-        best = _best_of([arm.x[n] for arm, n in nets], noise, config, seeds, report)
-        for (arm, n), result in zip(nets, best, strict=True):
-            arm.results[n] = result
+    with one_thread():
+        windows = windows_of(records, config)
+        draw = np.random.SeedSequence(_child(seed, windows.shape[2], 0))
+        windows = draw_windows(windows, config.max_windows, draw)
+        scaler = Scaler.fit(windows)
+        names = net_names(config, scaler.joints)
+        noise = (np.array(config.noise) / scaler.std).astype(np.float32).reshape(len(names), -1)  # [net, channel]
+        z = torch.from_numpy(scaler.to_z(windows)).flatten(2)  # [batch, time, channel]
+        x = [part.permute(1, 2, 0).contiguous() for part in z.chunk(len(names), dim=2)]
+        seeds = [[_child(seed, n, restart) for restart in range(config.restarts)] for n in range(len(names))]
+        results = _best_of(x, torch.from_numpy(noise), config, seeds, report)
+    still = [bool(part.all()) for part in np.split(scaler.still, len(names))]
+    checked = [_checked(*each, arm, config) for each in zip(names, results, still, strict=True)]
+    fits, nets = zip(*checked, strict=True)
+    data = hash_records(records) if data_hash is None else data_hash
+    return Twin(config, scaler, list(nets), arm=arm, data_hash=data, seed=seed_text(seed), fits=fits)
 
 
-def _trial_epochs(config: TwinConfig) -> int:
-    return max(1, round(config.trial * config.epochs)) if config.restarts > 1 else 0
+def _checked(
+    name: str, result: tuple[Fit, Weights] | None, is_still: bool, arm: str, config: TwinConfig
+) -> tuple[Fit, Weights]:
+    """Fit and weights of a network of this name; raises as `train`."""
+    label = "the whole arm" if name == "arm" else name.replace("_", " ")
+    if result is None:
+        raise Diverged(f"The training of {label} of '{arm}' ended without finite weights. Lower learning_rate or clip.")
+    fit, _ = result
+    kl_nats = fit.kl if config.kind == "vae" else None
+    if collapsed(kl_nats, fit.active_units) and not (config.allow_collapse or is_still):
+        raise CollapsedPosterior(
+            f"Posterior collapse of {label} in the twin of '{arm}': KL {fit.kl:.2f} nat, {fit.active_units} active "
+            "latent unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to keep it as a "
+            "baseline."
+        )
+    return result
 
 
 def _best_of(
@@ -472,7 +413,8 @@ def _best_of(
     Returns:
         Fit and weights of each network; None where all restarts diverge.
     """
-    restarts, trial = config.restarts, _trial_epochs(config)
+    restarts = config.restarts
+    trial = max(1, round(config.trial * config.epochs)) if restarts > 1 else 0
     every = [(n, restart) for n in range(len(x)) for restart in range(restarts)]
     run = Run([x[n] for n, _ in every], noise[[n for n, _ in every]], config, [seeds[n][r] for n, r in every])
     run.train(trial, report)

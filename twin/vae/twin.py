@@ -1,6 +1,6 @@
 """The twin of one arm: the distance of motion from the arm's training motion, joint by joint.
 
-A twin in a folder: `weights.safetensors` and `twin.json`, neither of which can run code when read.
+Its folder holds `weights.safetensors` and `twin.json`, neither of which can run code when read.
 """
 
 import hashlib
@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import msgspec
 import numpy as np
@@ -20,7 +22,6 @@ from fleet.files import atomic_path
 from fleet.motion import CHANNELS, Plan
 from fleet.robot import JOINTS
 from twin.json_file import check_version, read_card, write_card
-from twin.plan_cache import PlanCache
 from twin.vae import inference
 from twin.vae.config import TwinConfig
 from twin.vae.inference import shapes
@@ -31,6 +32,15 @@ Array = np.ndarray
 
 _CHUNK = 128
 """Plans per pass: bounds the memory for their windows and keeps it in cache."""
+
+Value = TypeVar("Value")
+
+
+class PlanCache(WeakKeyDictionary[Plan, Value]):
+    """Values by plan, kept while the plan is alive; empty in a copy and in another process."""
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return PlanCache, ()
 
 
 @dataclass(frozen=True, kw_only=True)

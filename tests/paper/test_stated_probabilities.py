@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss
 
-from twin.p_saturation import brier, reliability, wilson
+from benchmarks.paper.saturation import brier, reliability, wilson
 
 jobs = st.builds(
     lambda seed, n, steps: (
