@@ -1,1 +1,1 @@
-"""MuJoCo models of the arm and the cell, and the plant that simulates them."""
+"""The Gen3 in MuJoCo: models, plans, space, and the plant that simulates them."""

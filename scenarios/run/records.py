@@ -1,4 +1,4 @@
-"""What a run keeps of its jobs and of the offers behind each award."""
+"""Records of a run: its jobs, and the offers behind each award."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ JOB_STATES = {WAITING: "waiting", RUNNING: "running", DONE: "finished", GIVEN_UP
 
 @dataclass(frozen=True, kw_only=True)
 class JobRecord:
-    """One job of a shift, as at its end."""
+    """State of one job at the end of the shift."""
 
     job: str
     state: str
@@ -22,7 +22,7 @@ class JobRecord:
     release_s: float
     due_s: float
     finished_s: float | None
-    """None if it was not finished."""
+    """None for an unfinished job."""
     value: float
     payload_kg: float
     cycles: int
@@ -30,7 +30,7 @@ class JobRecord:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Offer:
-    """What one arm knew of a job at the moment it was awarded."""
+    """Predictions of one arm for a job at its award."""
 
     time_s: float
     job: str
@@ -41,15 +41,15 @@ class Offer:
     feasible: bool
     """Whether the arm has a plan for it."""
     free: bool
-    """Whether it was allowed to claim it then."""
+    """Whether the arm was allowed to claim it."""
     difficulty: float | None
-    """d of the plan that was awarded, of other arms the least of their plans; None if unknown."""
+    """d of the awarded plan; of the lowest plan of another arm; None if unknown."""
     peak_c: float | None
     """Predicted peak of that plan; None if unknown."""
     p_saturation: float | None
     """P(saturation) of that plan; None without a plan."""
     duration_s: float | None
-    """Time for the rest of the job by that plan; None without a plan."""
+    """Duration of the rest of the job by that plan; None without a plan."""
     plan: int | None = None
     """Number of that plan: 0 is the fastest, 1 the coolest; None without a plan, and in runs of earlier versions."""
 
@@ -73,7 +73,7 @@ def job_records(world: World, state: State) -> tuple[JobRecord, ...]:
 
 
 def offers_of(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int], plans: int) -> Iterator[Offer]:
-    """What each arm knew of the job of an award.
+    """Offers of all arms for the job of an award.
 
     Args:
         seen: Observation of each arm at the decision.
