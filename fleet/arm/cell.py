@@ -1,4 +1,4 @@
-"""The cell in MuJoCo: its shapes as plain values, pictures of recorded postures, and contacts in them."""
+"""A cell in MuJoCo: plain values for every way to show it, pictures and viewer of recorded postures, and contacts."""
 
 import base64
 import threading

@@ -1,7 +1,8 @@
 """Inverse kinematics of the Gen3: closed-form postures as seeds, refined on the exact model.
 
-Gravity and the floor are the same at every mounting position and heading, so a plan depends only on places and fixtures
-relative to the base. Equal arms with equal relative places share one plan.
+A work as its arm sees it: arms of one kind that stand alike before their places have the same work, and one plan.
+Gravity and the floor are the same wherever an arm stands and whichever way it faces, so a plan depends on where places
+and fixtures are relative to the base alone.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,4 @@
-"""MuJoCo models: the cell with all its arms, the rigid-body dynamics of one arm, and Kinova's meshes for rendering.
-
-Importing the constants, on which plans depend, loads no physics.
-"""
+"""MuJoCo models: the cell with all its arms, with primitives or Kinova's shells, and the dynamics of a single arm."""
 
 from collections.abc import Sequence
 from importlib import import_module, resources

@@ -1,4 +1,4 @@
-"""Plans of one arm for a task: several elbow postures and speeds, as sampled motion with torque."""
+"""Plans of one arm for a work: several elbow postures and speeds, as sampled motion with torque."""
 
 import logging
 from collections.abc import Iterator, Sequence

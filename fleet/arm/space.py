@@ -1,12 +1,11 @@
 """Space of a cell: which plans of two arms exclude each other, and which plans come too close to an arm at home.
 
-The space of a plan is the volume through which the links and the payload move, from home to home. Plans of one arm
-through the same postures share one volume, with the heaviest payload; speed and dwell have no effect. A table numbers
-the volumes of a cell.
+The space of a plan is the volume through which the links and the payload move, from home to home: capsules at closely
+spaced postures. Plans of one arm through the same postures share one volume, with the heaviest payload; speed and dwell
+have no effect. A table numbers the volumes of a cell.
 
-The links are capsules at closely spaced postures. A search through trees of bounding boxes finds the closest capsules.
-The distance of two capsules is that of their axes, which are segments, minus the radii (C. Ericson, Real-Time Collision
-Detection, 2005, section 5.1.9).
+A search through trees of bounding boxes finds the closest capsules of two arms. The distance of two capsules is that of
+their axes, which are segments, minus the radii (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
 """
 
 import hashlib

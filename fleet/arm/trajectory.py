@@ -1,9 +1,4 @@
-"""Motion of one arm: jerk-limited moves from rest to rest, sampled at RATE_HZ, with their torque.
-
-It is checked against the limits of torque, velocity, acceleration and joint position, and for collisions of the arm
-with its own base, the floor and the fixtures. A limit on the processor time of a plan is checked between its parts, for
-each thread; waiting for other processes does not count.
-"""
+"""Jerk-limited motion from rest to rest with its torque, and checks of it: limits, collisions, and time to plan."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

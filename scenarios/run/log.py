@@ -307,9 +307,9 @@ def record_table(kind: type, records: Sequence[object]) -> pa.Table:
 
 
 def provenance(model: DifficultyModel) -> dict[str, Any]:
-    """Version of a difficulty model; for a twin also its seed and the hash of its training data.
+    """Version of a difficulty model; for a twin also the hash of its training data, and its seed.
 
-    `thermofleet twin score`, the checkpoint's `twin.json` and the arm's messages state the same version.
+    The version is that in `thermofleet twin score`, in the checkpoint's `twin.json` and in the arm's messages.
     """
     fields = {"twin": ("version", "data_hash", "seed"), "saturation": ("version", "data_hash", "jobs", "passed")}
     parts: dict[str, object] = {"twin": getattr(model, "twin", model), "saturation": getattr(model, "saturation", None)}
