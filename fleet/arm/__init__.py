@@ -1,1 +1,1 @@
-"""The Gen3 in MuJoCo: models, plans, space, and the plant that simulates them."""
+"""One arm and its cell in MuJoCo: models, kinematics, motion plans, exclusion of motions, plant."""

@@ -1,4 +1,4 @@
-"""The record of a shift: settings, figures, readings, events, jobs and offers, and their files."""
+"""A shift as it was recorded: settings and figures, readings, events, jobs and offers, and their files."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ from scenarios.spec.parse import scenario_hash
 from scenarios.spec.schema import Scenario
 
 RUN_FORMAT = 6
-"""Version of run.json and of the columns of the tables; increment it when an earlier version cannot read them."""
+"""Raised when run.json or the columns of the recordings change so that an earlier version cannot be read."""
 
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 
@@ -43,17 +43,17 @@ RUN = ResultKind(name="run", card="run.json", files=FILES)
 
 @dataclass(frozen=True, eq=False)
 class RunLog:
-    """A recorded shift, from `run` or `open_run`."""
+    """A recorded shift, from `run` or from its folder."""
 
     card: Mapping[str, Any]
-    """Content of run.json: settings, versions, figures; no time of day, so equal seeds give equal files."""
+    """Settings, versions, figures: the content of run.json. It holds no clock time, so a seed gives the same file."""
     scenario: Scenario
     readings: Telemetry
-    """Sensor readings as arrays; without samples if recording was off or the shift ended before its first step."""
+    """Sensor readings as arrays; without samples if none were kept, or the shift ended before its first step."""
     events: tuple[Event, ...]
     jobs: tuple[JobRecord, ...]
     offers: tuple[Offer, ...]
-    """Offers of all arms at every award."""
+    """Of all arms, at every award."""
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -82,12 +82,12 @@ class RunLog:
 
     @cached_property
     def telemetry(self) -> pa.Table:
-        """Readings as a table with a row for each arm and sample."""
+        """Readings as a table, a row for each arm and moment."""
         return telemetry_table(self.readings, list(self.arms))
 
     @cached_property
     def plan(self) -> Schedule:
-        """Assignments and outages of each arm."""
+        """Which arm worked on what."""
         return schedule(self.events, self.arms, float(self.readings.time_s[-1]))
 
     @cached_property
@@ -180,7 +180,7 @@ def open_run(folder: str | Path) -> RunLog:
     """Read the folder of a run.
 
     Raises:
-        FleetError: it is no folder of a run, was written by another version, or is damaged.
+        FleetError: it is no folder of a run, not of this version, or damaged.
     """
     folder = Path(folder)
     try:
@@ -223,7 +223,7 @@ def _without_nulls(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _write_telemetry(telemetry: Telemetry, arms: list[str], path: Path) -> None:
-    """Write the table in parts: a table of all rows takes as much memory as the readings."""
+    """Some rows at a time, as a table of all takes as much memory as the readings."""
     samples = max(1, ROWS_AT_ONCE // len(arms))
     first = telemetry_table(_part(telemetry, slice(0, samples)), arms)
     with pq.ParquetWriter(path, first.schema) as writer:
@@ -257,7 +257,7 @@ UNITS = {"q": "rad", "qd": "rad/s", "tau": "N·m", "current_a": "A", "temp_c": "
 
 
 def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:
-    """One row per arm and sample: time_s, arm, mode, then the readings of `UNITS` for joints 1..7."""
+    """One row per arm and moment: time_s, arm, mode, then the readings of `UNITS` for joints 1..7."""
     samples, count = telemetry.mode.shape
     columns: dict[str, Any] = {
         "time_s": np.repeat(telemetry.time_s, count),
@@ -278,7 +278,7 @@ def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:
 
 
 def event_table(events: tuple[Event, ...]) -> pa.Table:
-    """One row per event, with the fields of `Event` except the env."""
+    """One row per event: the fields of `Event` without the env."""
     number, text = pa.float64(), pa.string()
     types = {
         "time_s": number,
@@ -293,7 +293,7 @@ def event_table(events: tuple[Event, ...]) -> pa.Table:
 
 
 def record_table(kind: type, records: Sequence[object]) -> pa.Table:
-    """One row per record, with the fields of its dataclass, which are text, numbers and booleans."""
+    """One row per record: the fields of a dataclass of text, numbers and booleans."""
     types = {
         "str": pa.string(),
         "bool": pa.bool_(),
@@ -324,7 +324,7 @@ PACKAGES = ("fleet", "twin", "agents", "scenarios")
 
 @cache
 def code_hash() -> str:
-    """Hash of the paths and contents of the installed Python files of the project."""
+    """Hash of the Python files of the project as they are installed: paths and contents."""
     digest = hashlib.sha256()
     for package in PACKAGES:
         root = Path(str(resources.files(package)))

@@ -1,4 +1,4 @@
-"""Records of a run: its jobs, and the offers behind each award."""
+"""What a run keeps of its jobs and of the offers behind each award."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ JOB_STATES = {WAITING: "waiting", RUNNING: "running", DONE: "finished", GIVEN_UP
 
 @dataclass(frozen=True, kw_only=True)
 class JobRecord:
-    """State of one job at the end of the shift."""
+    """One job of a shift, as at its end."""
 
     job: str
     state: str
@@ -22,7 +22,7 @@ class JobRecord:
     release_s: float
     due_s: float
     finished_s: float | None
-    """None for an unfinished job."""
+    """None if it was not finished."""
     value: float
     payload_kg: float
     cycles: int
@@ -30,7 +30,7 @@ class JobRecord:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Offer:
-    """Predictions of one arm for a job at its award."""
+    """What one arm knew of a job at the moment it was awarded."""
 
     time_s: float
     job: str
@@ -41,15 +41,15 @@ class Offer:
     feasible: bool
     """Whether the arm has a plan for it."""
     free: bool
-    """Whether the arm was allowed to claim it."""
+    """Whether it was allowed to claim it then."""
     difficulty: float | None
-    """d of the awarded plan; of the lowest plan of another arm; None if unknown."""
+    """d of the plan that was awarded, of other arms the least of their plans; None if unknown."""
     peak_c: float | None
     """Predicted peak of that plan; None if unknown."""
     p_saturation: float | None
     """P(saturation) of that plan; None without a plan."""
     duration_s: float | None
-    """Duration of the rest of the job by that plan; None without a plan."""
+    """Time for the rest of the job by that plan; None without a plan."""
     plan: int | None = None
     """Number of that plan: 0 is the fastest, 1 the coolest; None without a plan, and in runs of earlier versions."""
 
@@ -73,7 +73,7 @@ def job_records(world: World, state: State) -> tuple[JobRecord, ...]:
 
 
 def offers_of(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int], plans: int) -> Iterator[Offer]:
-    """Offers of all arms for the job of an award.
+    """What each arm knew of the job of an award.
 
     Args:
         seen: Observation of each arm at the decision.

@@ -581,7 +581,7 @@ def _streams(
 
 
 def _arrivals(kind: Arriving, expected: float, horizon_s: float, rng: np.random.Generator) -> ArrivalSpec:
-    """Arrivals of about `expected` jobs in a shift, outside the rush if there is one."""
+    """Arrivals of about `expected` jobs in a shift, or of what is not in the rush."""
     match kind:
         case "batch":
             count = max(1, round(expected * BATCHES_S / horizon_s))
