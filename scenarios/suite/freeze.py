@@ -1,7 +1,7 @@
-"""Compute the manifests of the suite again: python -m scenarios.suite.freeze [CELL …].
+"""Compute the suite anew: python -m scenarios.suite.freeze [CELL …]. What is frozen must not change any more.
 
-Published instances must not change. Time loads are computed for the named cells and for cells without any; then all
-manifests are written. It plans every cell (minutes) and needs no twins.
+Time loads are computed for the named cells, and for those without any; then all manifests are written. It plans every
+cell (minutes) and needs no twins.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Splits of the suite: instances, and manifests of their hashes, which `scenarios.suite.freeze` writes."""
+"""The frozen splits: instances with a manifest of hashes, which `scenarios.suite.freeze` writes."""
 
 import json
 from collections.abc import Iterator
@@ -17,9 +17,9 @@ from scenarios.spec.schema import SPLITS, Scenario, SplitName
 from scenarios.suite.instances import CELLS, Axes, Cell, draw_axes, scenario_of
 
 SUITE = 17
-"""Seed of the suite."""
+"""Seed of all draws of the suite."""
 DIGITS = 3
-"""Decimals of times, s, in a hash of jobs: the last bits of a logarithm differ between platforms."""
+"""Decimals of times in a hash of jobs, s: the last bits of a logarithm differ between platforms."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Instance:
     """As `test/0017`."""
     scenario: Scenario
     seed: int
-    """Seed of jobs and sensor noise."""
+    """Of its jobs and its sensors' noise."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,16 @@ class Row:
     scenario: str
     """Hash of the scenario, see `scenarios.spec.parse`."""
     jobs: str
-    """Hash of the sampled jobs, see `jobs_content`."""
+    """Hash of the drawn jobs, see `jobs_content`."""
     count: int
-    """Number of jobs of the shift."""
+    """Jobs of the shift."""
 
 
 @lru_cache(maxsize=len(SPLITS))
 def split(name: str) -> tuple[Instance, ...]:
     """The instances of a split: train, validation, test or sizes.
 
-    Instances of one cell have equal plans, space and twins. The first instances are of different cells.
+    Cells that several instances share have equal plans, space and twins. The first instances are of different cells.
 
     Raises:
         ScenarioError: there is no such split.
@@ -76,7 +76,7 @@ def instance(name: str) -> Instance:
 
 @lru_cache(maxsize=len(SPLITS))
 def manifest(name: str) -> tuple[Row, ...]:
-    """The manifest of a split.
+    """The frozen lines of a split.
 
     Raises:
         ScenarioError: there is no such split.
@@ -100,7 +100,7 @@ def cell_name(instance: str) -> str:
 
 
 def drawn_rows(name: SplitName) -> Iterator[Row]:
-    """The manifest of a split, sampled again: instances of each cell in turn."""
+    """The lines of a split, drawn anew: in turns from each of its cells."""
     cells = [cell for cell in CELLS if cell.split == name]
     turns = range(max(cell.instances for cell in cells))
     chosen = [cell for turn in turns for cell in cells if turn < cell.instances]
