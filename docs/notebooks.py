@@ -22,6 +22,9 @@ def execute(path: Path, folder: Path) -> nbformat.NotebookNode:
         cell.metadata.pop("execution", None)  # times of the run
         if cell.cell_type == "code":
             cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+            for output in cell.outputs:
+                if "text/html" in output.get("data", {}):
+                    output.data.pop("text/plain", None)  # the repr beside it is long
     return notebook
 
 

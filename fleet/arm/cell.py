@@ -27,7 +27,7 @@ SHAPES = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
-"""Shapes of links; sizes are MuJoCo's: radius, half length along z, or half lengths along x, y and z."""
+"""Kinds of shapes; sizes as in MuJoCo: radius, half length along z, or half lengths along x, y and z."""
 HIDDEN = 3
 """MuJoCo's geom group of the primitives that meshes replace."""
 DIGITS = 5
@@ -126,17 +126,17 @@ NO_OPENGL = (
 )
 FRAME_S = 1 / 30
 AZIMUTH_DEG, ELEVATION_DEG = 128.0, -36.0
-"""Direction of the camera."""
+"""Viewing direction of the camera."""
 ROOM_M = 0.12
-"""From the middle of a link to what must be seen round it."""
+"""Margin of the view around the middle of a link."""
 LABEL_M = 0.08
-"""From the foot of an arm to its name, away from the arm."""
+"""Distance of the name of an arm from its base."""
 PLACE_RGB = (0.48, 0.36, 0.65)
-"""A place must not look like a warm motor."""
+"""Colour of places, unlike that of any motor."""
 
 
 class CellPlayer:
-    """A model of a cell that takes any posture.
+    """A model of a cell in any posture.
 
     Args:
         meshes: Kinova's shells instead of primitives, see `fleet.arm.model.build_cell`.
@@ -158,7 +158,7 @@ class CellPlayer:
         self._payloads = payload_bodies(self.model, robots)
         self._mounts_m = np.array([robot.mount.position_m for robot in robots])
         self.labels_m = self._mounts_m - LABEL_M * np.array([robot.mount.rotation()[:, 2] for robot in robots])
-        """Places for the names of the arms, m, [arm, 3]."""
+        """Positions of the names of the arms, m, [arm, 3]."""
         self._fixed_m = np.array([thing.position_m for thing in (*places, *fixtures)]).reshape(-1, 3)
         self.model.geom("floor").size[:2] = 0.0  # drawn without an edge
         for place in places:
@@ -168,7 +168,7 @@ class CellPlayer:
         self.model.site_group[self._motors] = 0
 
     def show(self, q: Array, motor_rgb: Array, motor_m: Array, payload_kg: Array) -> None:
-        """Take postures [arm, joint] in rad and payloads [arm] in kg, with a sphere at each motor.
+        """Set postures [arm, joint] in rad and payloads [arm] in kg, with a sphere at each motor.
 
         Args:
             motor_rgb: Colours of the spheres, 0 to 1, [arm, joint, 3].
@@ -181,7 +181,7 @@ class CellPlayer:
         mujoco.mj_forward(self.model, self.data)
 
     def extent(self, q: Array) -> Array:
-        """Points to see, m, [point, 3]: links in postures [sample, arm, joint] in rad, mounts, places and fixtures."""
+        """Points in view, m, [point, 3]: links in postures [sample, arm, joint] in rad, mounts, places and fixtures."""
         points = [self._mounts_m, self._fixed_m]
         for posture in q:
             self.data.qpos[:] = posture.ravel()
@@ -207,11 +207,11 @@ class CellPlayer:
 
 
 class CellCamera:
-    """Takes pictures of a cell without a display; a context manager.
+    """Renders pictures of a cell without a display; a context manager.
 
     Args:
-        points_m: What must be seen, [point, 3], as `CellPlayer.extent` gives it.
-        top, bottom: Shares of the picture's height that are kept free at its edges.
+        points_m: Points in view, [point, 3], as from `CellPlayer.extent`.
+        top, bottom: Shares of the picture's height that stay free at its edges.
 
     Raises:
         FleetError: OpenGL is not available.
@@ -245,7 +245,7 @@ class CellCamera:
         self._camera.lookat[:] = self._eye @ self._axes + ahead
 
     def pixels(self, points_m: Array) -> Array:
-        """Where points [point, 3] in m are in the picture: px from its left and its upper edge, [point, 2]."""
+        """Pixel positions of points [point, 3] in m, from the left and the upper edge, [point, 2]."""
         x, y, depth = self._axes @ points_m.T - self._eye[:, None]
         return (np.stack((x, -y)) / (depth * self._tangent) * self._size[1] / 2 + self._size[:, None] / 2).T
 
@@ -258,7 +258,7 @@ class CellCamera:
         self._renderer.close()
 
     def picture(self) -> Array:
-        """The cell as it stands, uint8 [height, width, 3]."""
+        """A picture of the current posture, uint8 [height, width, 3]."""
         self._renderer.update_scene(self._player.data, self._camera)
         for slow in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._renderer.scene.flags[slow] = 0
@@ -266,18 +266,18 @@ class CellCamera:
 
 
 def _slopes(tangent: float, low: float, high: float) -> tuple[float, float]:
-    """Slopes of the lower and the upper edge of a view, whose parts `low` and `high` of the picture stay free."""
+    """Slopes of the lower and upper edge of a view, with shares `low` and `high` of the picture left free."""
     return tangent * (2.0 * low - 1.0), tangent * (1.0 - 2.0 * high)
 
 
 def _least(across: Array, depth: Array, low: float, high: float) -> float:
-    """Least distance at which all points are between two slopes, wherever the camera is across."""
+    """Least distance at which all points are between two slopes, for any position of the camera across."""
     room = max(0.0, float((across + ROOM_M - depth * high).max() - (across - ROOM_M - depth * low).min()))
     return max(0.3, room / (high - low), ROOM_M * 2 - float(depth.min()))
 
 
 def _middle(across: Array, ahead: Array, low: float, high: float) -> float:
-    """The camera's place across, so that as much room is left on both sides."""
+    """Position of the camera across, with equal margins on both sides."""
     return float((across + ROOM_M - ahead * high).max() + (across - ROOM_M - ahead * low).min()) / 2
 
 
@@ -285,14 +285,14 @@ Pair = tuple[int, int]
 """Ids of two geoms, the lower first."""
 
 APART_S = 1.0
-"""A contact of two links that were apart for longer than this is a new event."""
+"""Two links apart for longer than this begin a new contact event."""
 
 
 class ContactFinder:
     """Finds the contacts of a shift, from one stretch of recorded postures to the next.
 
     Args:
-        model: Of the cell; see `fleet.arm.model.build_cell`. It stays as it is.
+        model: Of the cell; see `fleet.arm.model.build_cell`. It is not changed.
         robots: The arms in the order of the model.
     """
 
@@ -304,15 +304,15 @@ class ContactFinder:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all contacts: a new shift begins."""
+        """Delete all contacts, for a new shift."""
         self._latest_s: dict[Pair, float] = {}
-        """When two geoms were last in contact."""
+        """Time of the last contact of two geoms."""
 
     def events(self, time_s: Array, q: Array, payload_kg: Array) -> list[Event]:
-        """Contacts that begin in a stretch of a shift, each with its greatest depth in this stretch.
+        """Contacts that begin in a part of a shift, each with its greatest depth in this part.
 
         Args:
-            time_s: Rising, from the end of the stretch before, [sample].
+            time_s: Rising, from the end of the previous part, [sample].
             q: rad, [sample, arm, joint].
             payload_kg: Payload in the hand of each arm, [sample, arm].
 
@@ -331,13 +331,13 @@ class ContactFinder:
                 if now_s - self._latest_s.get(pair, -np.inf) > APART_S:
                     began_s[pair] = now_s
                 self._latest_s[pair] = now_s
-                if pair in began_s:  # not one that began in an earlier stretch
+                if pair in began_s:  # not one that began in an earlier part
                     episode = (pair, began_s[pair])
                     depth_m[episode] = max(depth_m.get(episode, 0.0), deep_m)
         return [self._event(pair, at_s, deep_m) for (pair, at_s), deep_m in depth_m.items()]
 
     def _in_contact(self, q: Array) -> dict[Pair, float]:
-        """Depth of the geoms that are inside each other, m, in one posture."""
+        """Penetration depth of overlapping geoms in one posture, m."""
         model, data = self._model, self._data
         data.qpos[:] = q.ravel()
         mujoco.mj_kinematics(model, data)
@@ -360,7 +360,7 @@ class ContactFinder:
 
 
 def _described(geom: str) -> tuple[str, str]:
-    """What a geom is in the words of an event, and its arm, if any."""
+    """Name of a geom for an event, and its arm, if any."""
     owner, _, name = geom.partition("/")
     if not name:
         return f"the {geom}", ""

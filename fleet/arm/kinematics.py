@@ -31,13 +31,13 @@ REACH_M = UPPER_ARM_M + FOREARM_M + HAND_M
 
 POSITION_TOLERANCE_M = 1e-3
 ANGLE_TOLERANCE_RAD = np.deg2rad(0.5)
-# Tighter than the tolerances above, which must hold after rounding to float32.
+# Tighter than the tolerances above, which hold after rounding to float32.
 _SOLVED_M = 1e-5
 _SOLVED_RAD = 1e-5
 _STEPS = 40
 _STEP_RAD = 0.3
 _SEEDS = 3
-_SEED_SLACK_M = 0.001  # The sideward offsets of the links, 25 mm in all, lengthen the arm by half of this.
+_SEED_SLACK_M = 0.001  # Half of this is the lengthening by the lateral offsets of the links, 25 mm in all.
 _SEED_SLACK_RAD = 0.1
 _WRIST_M = UPPER_ARM_M + FOREARM_M
 _FULL = 0.985  # Share of the reach beyond which a miss is reported as out of reach.
@@ -60,7 +60,7 @@ class Pose:
 
 
 class Unreachable(Exception):
-    """No joint positions put the tool at the pose; the message gives the reason with its numbers."""
+    """No joint positions put the tool at the pose; the message states the reason with its numbers."""
 
 
 class InverseKinematics:
@@ -171,8 +171,8 @@ class InverseKinematics:
 
 
 def _travel_s(q: Array, near: Array) -> tuple[float, float]:
-    """Time of the slowest joint and of all joints together, s, rounded: often several flips differ in other joints
-    than the slowest, and then the last digit, which depends on the processor, must not choose."""
+    """Time of the slowest joint and sum over the joints, s, rounded: often several flips differ in other joints
+    than the slowest, and the choice must not depend on the last digit, which depends on the processor."""
     times_s = np.abs(q - near) / GEN3.velocity
     return round(float(times_s.max()), 6), round(float(times_s.sum()), 6)
 
@@ -191,7 +191,7 @@ def nearest_turn(q: Array, near: Array) -> Array:
 
 
 def angle_between(a: Array, b: Array) -> float:
-    """Angle of the rotation between two frames, rad; exact also for small angles."""
+    """Angle of the rotation between two frames, rad; exact for small angles too."""
     return float(2 * np.arcsin(min(1.0, np.linalg.norm(a - b) / np.sqrt(8.0))))
 
 
@@ -209,7 +209,7 @@ def _elbow(wrist: Array, elbow_deg: float, near: Array) -> Array:
     along = (UPPER_ARM_M**2 - FOREARM_M**2 + distance**2) / (2 * max(distance, 1e-9))
     along = float(np.clip(along, -UPPER_ARM_M, UPPER_ARM_M))
     up = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
-    if np.linalg.norm(up) < 1e-6:  # The wrist is on the base axis: every elbow angle is alike.
+    if np.linalg.norm(up) < 1e-6:  # The wrist is on the base axis: all elbow angles are equivalent.
         up = np.array([-np.cos(near[0]), np.sin(near[0]), 0.0])
     up /= np.linalg.norm(up)
     turn = np.deg2rad(elbow_deg)

@@ -89,9 +89,9 @@ def mesh_folder() -> Path:
 Array = np.ndarray
 
 SAME_PLACE_M = 0.01
-"""Bases closer than this count as the same place."""
+"""Bases closer than this count as one position."""
 BELOW_FLOOR_M = 0.005
-"""A base deeper than this below z = 0 means that the height of the cell's floor is unknown; nothing touches it then."""
+"""With a base deeper than this below z = 0, the height of the floor is unknown, and nothing touches it."""
 
 
 def build_cell(
@@ -174,7 +174,7 @@ def links_of(model: mujoco.MjModel, arm: str) -> tuple[str, ...]:
 
 
 def set_payload_balls(model: mujoco.MjModel, bodies: Array, payload_kg: Array) -> None:
-    """Give the payloads in some hands the size of their mass; without mass there is none. Masses stay as they are.
+    """Set the sizes of payload balls by their mass; a mass of 0 hides the ball. Masses are not changed.
 
     Args:
         bodies: Ids of payload bodies, int [arm].
@@ -182,7 +182,7 @@ def set_payload_balls(model: mujoco.MjModel, bodies: Array, payload_kg: Array) -
     """
     balls = model.body_geomadr[bodies]
     radius_m = np.array([payload_radius_m(kg) for kg in payload_kg])
-    # Bounding boxes stay those of the largest ball; it has all smaller ones inside, as all touch the flange.
+    # Bounding boxes stay those of the largest ball: it contains all smaller ones, as all touch the flange.
     model.geom_size[balls, 0] = model.geom_rbound[balls] = np.maximum(radius_m, 1e-6)
     model.geom_pos[balls, 2] = radius_m
     model.geom_contype[balls] = model.geom_conaffinity[balls] = np.asarray(payload_kg) > 0
@@ -192,7 +192,7 @@ class ArmModel:
     """Rigid-body kinematics and dynamics of a single arm on its mount; torques include the reflected rotor inertia.
 
     Args:
-        fixtures: Boxes that stand in the cell; they matter for distances alone.
+        fixtures: Boxes in the cell; they matter for distances only.
     """
 
     def __init__(self, robot: Robot, fixtures: Sequence[Fixture] = ()) -> None:
@@ -250,7 +250,7 @@ class ArmModel:
         jacobian = np.empty((3, JOINTS))
         try:
             for i in range(samples):
-                # Only the spatial inertias use this mass, and each call computes them again.
+                # Only the spatial inertias use this mass; each call computes them again.
                 model.body_mass[self._payload] = mass_kg[i]
                 data.qpos[:], data.qvel[:], data.qacc[:] = q[i], qd[i], qdd[i]
                 mujoco.mj_inverse(model, data)

@@ -31,16 +31,16 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 _written: dict[Path, int] = {}
-"""Bytes that this process wrote to a folder since it looked at its files; no folder that it never looked at."""
+"""Bytes that this process wrote to a folder since it last listed its files, by folder."""
 
 PLANNER_VERSION = 4
 """Increment it whenever the plans of the same work change."""
 MAX_CACHE_BYTES = 2_000_000_000
-"""Of all files in a folder; after new ones the least recently used ones are removed."""
+"""Size of all files in a folder; beyond it the least recently used ones are removed."""
 LOOK_EVERY = 0.01
-"""Share of these bytes that a process writes before it looks at all files again."""
+"""Share of these bytes that a process writes before it lists all files again."""
 MAX_SAMPLES = 1_000_000
-"""Of one phase in a file; a longer one is damage."""
+"""Samples of one phase in a file; a longer phase counts as damage."""
 
 
 LoadedPlans = dict[Path, tuple[Plan, ...] | InfeasibleJob]
@@ -66,8 +66,7 @@ class CachedPlanner:
         """Load nothing yet.
 
         Args:
-            loaded: Where planners of several arms keep what they read, so that like arms share its memory; None: not
-                kept.
+            loaded: Loaded plans in memory, shared by the planners of equal arms; None: not kept.
         """
         self._loaded = loaded
         self._name, self._frame = robot.name, OwnFrame(robot.mount)
@@ -146,7 +145,7 @@ def cached_arrays(
 
 
 def _torque_key(robot: Robot) -> dict[str, object]:
-    """Everything that determines the torques of an arm."""
+    """All that determines the torques of an arm."""
     return {
         "model": hashlib.sha256(gen3_xml()).hexdigest(),
         "gravity": GRAVITY_M_S2,
@@ -187,7 +186,7 @@ def _write(path: Path, arrays: Mapping[str, Array]) -> None:
 
 
 def _remove_oldest(folder: Path) -> None:
-    """Remove the least recently used files of a folder that has grown too large; others may do so meanwhile."""
+    """Remove the least recently used files of a folder that is too large; other processes may do so at once."""
     files: list[tuple[float, int, str]] = []
     with os.scandir(folder) as entries:
         for entry in entries:
@@ -224,7 +223,7 @@ def _pack(plans: tuple[Plan, ...] | InfeasibleJob) -> dict[str, Array]:
 
 
 def _phase(length: int, profile: Array, payload_kg: Array) -> Phase:
-    """The phase of stored samples: all of them, or the one that all are equal to."""
+    """Phase of stored samples: all of them, or one to which all are equal."""
     if len(profile) < length:
         profile = np.broadcast_to(profile[0], (length, *profile.shape[1:]))
         payload_kg = np.broadcast_to(payload_kg[0], (length,))

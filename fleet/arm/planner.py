@@ -32,14 +32,14 @@ class Segment:
 
     to: Stop | None
     pause_s: float = 0.0
-    """Zero: a move."""
+    """0 for a move."""
     carries: bool = False
     presses: bool = False
 
 
 @dataclass(frozen=True)
 class TaskPhases:
-    """The segments of a plan's three phases; each phase begins where the one before ends, the first at home."""
+    """Segments of a plan's three phases; each phase begins where the previous one ends, the first at home."""
 
     approach: tuple[Segment, ...]
     cycle: tuple[Segment, ...]
@@ -130,7 +130,7 @@ Array = np.ndarray
 log = logging.getLogger(__name__)
 
 SAME_ELBOW_M = 0.05
-"""Variants whose elbows are closer than this at every stop load the joints alike and count as one."""
+"""Variants with elbows closer than this at every stop load the joints equally and count as one."""
 _COLLISION_STAGE = 100
 _LIMIT_STAGE = 101
 
@@ -168,7 +168,7 @@ class Planner:
         """All variants: elbow postures in order of duration, each from the highest speed down.
 
         Raises:
-            PlanningTimeout: the `fleet.arm.trajectory` of this thread has passed.
+            PlanningTimeout: the time limit of this thread has passed (`fleet.arm.trajectory.time_limit`).
             InfeasibleJob: no variant is within reach, joint stops and torque limits and free of collision; reports
                 the variant that came furthest.
         """

@@ -124,10 +124,10 @@ class MujocoPlant:
     is braked in its posture, without current and with an empty hand, since its job returned to the queue. It recovers
     at home, where the operator who cleared the fault has jogged it.
 
-    Arms, payloads, floor and fixtures that meet push each other. Finish times do not change by it; `contacts` reports
-    it.
+    Arms, payloads, floor and fixtures in contact push each other, which changes no finish times; `contacts` reports
+    contacts.
 
-    Ticks must be driven in order, from tick 0.
+    Ticks must be simulated in order, from tick 0.
 
     Args:
         robots: The arms in the order of the world.
@@ -203,7 +203,7 @@ class MujocoPlant:
         return Drive((turning * current_sq)[None], (turning * friction_w)[None])
 
     def motion(self, world: World, record: StepRecord, offsets_s: Array) -> Array:
-        """Joint motion at moments of the step last driven, [1, sample, arm, channel, joint].
+        """Joint motion at times in the last simulated step, [1, sample, arm, channel, joint].
 
         Args:
             offsets_s: Moments within the step, [sample], in (0, dt_s].
@@ -223,7 +223,7 @@ class MujocoPlant:
         return motion[None]
 
     def contacts(self, world: World, record: StepRecord) -> list[Event]:
-        """Contacts that began in the step last driven; called for each step once, in order.
+        """Contacts that began in the last simulated step; called for each step once, in order.
 
         Raises:
             ValueError: another step.
@@ -247,7 +247,7 @@ class MujocoPlant:
         return samples
 
     def _follow(self, world: World, state: State, samples: int) -> None:
-        """Apply the faults and recoveries of the tick before: brake arms, or place at home those that were moved."""
+        """Apply the faults and recoveries of the previous tick: brake arms, or place moved ones at home."""
         tick = int(state.tick[0])
         if tick == 0:
             self._reset()

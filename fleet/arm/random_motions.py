@@ -22,14 +22,14 @@ Array = np.ndarray
 log = logging.getLogger(__name__)
 
 RANDOM_MOTIONS_VERSION = 2
-"""Raised whenever the same seed gives other motions."""
+"""Version; increment it when the same seed gives other motions."""
 MAX_DRAWS = 50
-"""Draws per requested job; where more fail, the arm hardly has room to move."""
+"""Samples per requested job; if all fail, the arm hardly has room to move."""
 
 TYPICAL_MIX = (0.4, 0.3, 0.3)
-"""Shares of moves there and back, of the same with a wait under load at the end, and of holds."""
+"""Shares of moves to a place and back, of the same with a wait under load at the end, and of holds."""
 REACH = (0.6, 0.6)
-"""Beta distribution of the reach, 0 near, 1 nearly outstretched: cells are laid out for either, less often between."""
+"""Beta distribution of the reach, 0 near to 1 nearly outstretched: most cells use one of the ends."""
 FOLDED = np.array([0.0, -0.35, np.pi, -2.35, 0.0, -0.87, 1.57])
 """Near Kinova's `retract`, far enough from the stop of joint 4 to move."""
 _SCATTER = np.array([1.2, 0.25, 0.3, 0.3, 0.4, 0.6, 0.8])
@@ -151,7 +151,7 @@ def light_jobs(robot: Robot, count: int, rng: np.random.Generator, *, name: str 
 
 
 def _feasible(arm: ArmModel, count: int, name: str, draw: Callable[[str], Plan]) -> tuple[Plan, ...]:
-    """`count` feasible draws; infeasible ones are repeated."""
+    """`count` feasible samples; infeasible ones are repeated."""
     if count < 0:
         raise ValueError(f"The number of jobs must be >= 0 (got {count}).")
     plans: list[Plan] = []

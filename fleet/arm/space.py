@@ -31,7 +31,7 @@ from fleet.robot import Robot
 
 Array = np.ndarray
 PlanKey = tuple[str, Work, int, float]
-"""Arm, work, elbow and speed of a plan; the same in all processes."""
+"""Arm, task, elbow and speed of a plan; equal in all processes."""
 
 SPACE_VERSION = 1
 """Increment it whenever the space of the same plans changes."""
@@ -123,7 +123,7 @@ def space_table(
 def conflicts_with_homes(
     robot: Robot, others: Sequence[Robot], plans: Sequence[Plan], margin_m: float, cache_dir: Path
 ) -> list[str | None]:
-    """Reason why each plan comes too close to other arms at home; None if it does not.
+    """Reason why each plan comes too close to other arms at home, or None.
 
     Args:
         plans: Plans of `robot`; the result for one plan does not depend on the other plans.
@@ -203,7 +203,7 @@ class _Paths:
         return self._capsules().of_plan(self.plan[row], payload_kg)
 
     def content(self) -> dict[str, object]:
-        """Everything that determines the space of the paths, for cache keys."""
+        """All that determines the space of the paths, for cache keys."""
         paths = hashlib.sha256(b"".join(_stops(plan).tobytes() for plan in self.plan)).hexdigest()
         return {**_geometry(self.robot), "paths": paths, "payload_kg": self.heaviest}
 
@@ -216,7 +216,7 @@ def _stops(plan: Plan) -> Array:
 
 
 def _geometry(robot: Robot) -> dict[str, object]:
-    """Everything that determines the space of an arm in a posture, and its home."""
+    """All that determines the space of an arm in a posture, and its home."""
     return {
         "space": SPACE_VERSION,
         "model": hashlib.sha256(gen3_xml()).hexdigest(),
@@ -262,7 +262,7 @@ def _home(robot: Robot) -> "Sweep":
 
 
 def _home_reason(sweep: "Sweep", homes: Sequence[tuple[str, "Sweep"]], margin_m: float) -> str:
-    """Sentence that names the arms at home to which a sweep comes too close; empty if none."""
+    """A sentence with the arms at home to which a sweep comes too close; empty if none."""
 
     near = [(name, clearance(sweep, home, margin_m)) for name, home in homes]
     return " and ".join(
@@ -391,7 +391,7 @@ def _capsule_of(model: mujoco.MjModel, geom: int) -> tuple[int, float, float]:
 
 
 CHUNK = 512
-"""Pairs of nodes that are looked at together."""
+"""Number of pairs of nodes compared at once."""
 
 
 @dataclass(frozen=True)
@@ -475,7 +475,7 @@ def segment_distance(a: Array, b: Array) -> Array:
     aa, bb, ab, ar, br = ((x * y).sum(axis=-1) for x, y in ((u, u), (v, v), (u, v), (u, r), (v, r)))
     determinant = aa * bb - ab * ab
     is_point_a, is_point_b = aa <= 1e-12, bb <= 1e-12
-    # Nearest point on each segment, 0 to 1.
+    # Closest point on each segment, 0 to 1.
     skew = determinant > 1e-12
     s = np.where(skew, np.clip((ab * br - ar * bb) / np.where(skew, determinant, 1.0), 0.0, 1.0), 0.0)
     t = np.where(is_point_b, 0.0, (ab * s + br) / np.where(is_point_b, 1.0, bb))

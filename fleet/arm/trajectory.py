@@ -24,7 +24,7 @@ _TOLERANCE = 1e-6
 
 
 def limit_violation(q: Array, qd: Array, qdd: Array, tau: Array, position_range: Array) -> tuple[int, str] | None:
-    """The sample that exceeds a limit most, with the reason in words; None if all limits are kept.
+    """The sample that exceeds a limit most, with the reason as text; None if all limits are kept.
 
     Args:
         q, qd, qdd, tau: Motion and torque, [time, joint].
@@ -49,7 +49,7 @@ def limit_violation(q: Array, qd: Array, qdd: Array, tau: Array, position_range:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Sampled joint motion; it ends one sample after the last row, where the next motion begins."""
+    """Sampled joint motion; the next motion begins one sample after the last row."""
 
     q: Array
     """rad, [time, joint]."""
@@ -99,7 +99,7 @@ def move(start: Array, end: Array, speed: float) -> Motion:
 
 
 def rest(q: Array, seconds: float) -> Motion:
-    """Standstill at `q`, to the nearest whole number of samples."""
+    """Standstill at `q` for the nearest whole number of samples."""
     shape = (round(seconds * RATE_HZ), JOINTS)  # stored once, however long
     still = np.broadcast_to(0.0, shape)
     return Motion(np.broadcast_to(q, shape), still, still)
@@ -143,14 +143,14 @@ def _torque(arm: ArmModel, part: LoadedMotion) -> Array:
     motion = part.motion
     force_n = -part.pressing_n * np.asarray(part.direction)  # of the environment on the tool
     if len(motion) and not motion.qd.any():
-        # A standstill needs one torque, and it is often most of the samples.
+        # A standstill needs one torque, and is often most of the samples.
         motion = Motion(motion.q[:1], motion.qd[:1], motion.qdd[:1])
     tau = arm.inverse_dynamics(motion.q, motion.qd, motion.qdd, part.payload_kg, force_n)
     return np.broadcast_to(tau, (len(part.motion), JOINTS)) if len(motion) == 1 else tau
 
 
 class PlanningTimeout(Exception):
-    """A plan took longer than `time_limit` allows."""
+    """A plan exceeded `time_limit`."""
 
 
 _limit: ContextVar[tuple[float, float] | None] = ContextVar("planning_limit", default=None)
@@ -159,7 +159,7 @@ _limit: ContextVar[tuple[float, float] | None] = ContextVar("planning_limit", de
 
 @contextmanager
 def time_limit(limit_s: float) -> Iterator[None]:
-    """Have `check_time` raise in this thread once the block has taken this long, seconds of processor time."""
+    """Limit the processor time of the block in this thread, s: afterwards `check_time` raises."""
     token = _limit.set((limit_s, thread_time() + limit_s))
     try:
         yield
@@ -168,7 +168,7 @@ def time_limit(limit_s: float) -> Iterator[None]:
 
 
 def check_time() -> None:
-    """Go on if there is time left, or no limit.
+    """Check the time limit of this thread, if there is one.
 
     Raises:
         PlanningTimeout: the limit has passed.
@@ -178,15 +178,15 @@ def check_time() -> None:
 
 
 ALLOWED_DEPTH_M = 0.005
-"""Of a link in the arm's own base or shoulder: the primitives are in some places a little larger than the shells."""
+"""Allowed depth of a link in the arm's own base or shoulder: some primitives are larger than the shells."""
 GAP_M = 0.002
-"""Smallest distance to floor and fixtures: for what the arm deviates from its plan, and for the way between two
-checked postures."""
+"""Smallest distance to floor and fixtures: a margin for deviations from the plan and for motion between two checked
+postures."""
 CHECK_STEP_RAD = 0.02
 """Largest joint step between two checked postures of a path: 18 mm at the end of an outstretched arm."""
 HALF_MM = 5e-4
 FAR_M = 0.5
-"""Largest distance that is measured."""
+"""Distances above this are not measured."""
 _BASE_LINKS = ("forearm", "wrist_1", "wrist_2", "bracelet")
 
 
@@ -215,7 +215,7 @@ class CollisionChecker:
         self._ball = payload_bodies(model, [arm.robot])
 
     def deepest_collision(self, q: Array, payload_kg: float = 0.0) -> str | None:
-        """Description of the deepest collision among the postures [posture, joint]; None if there is none."""
+        """Description of the deepest collision among postures [posture, joint], or None."""
         model, data = self._arm.model, self._arm.data
         set_payload_balls(model, self._ball, np.array([payload_kg]))
         pairs = [pair for pair in self._pairs if pair[2] != "payload" or payload_kg > 0]
@@ -235,6 +235,6 @@ class CollisionChecker:
         return deepest
 
     def on_path(self, start: Array, end: Array, payload_kg: float = 0.0) -> str | None:
-        """Reason why the straight path in joint space between two postures collides; None if it is clear."""
+        """Reason why the straight path in joint space between two postures collides, or None."""
         collision = self.deepest_collision(straight_line(start, end, CHECK_STEP_RAD), payload_kg)
         return collision and f"collision: {collision} on the way"

@@ -1,1 +1,1 @@
-"""The PettingZoo environment over the kernel."""
+"""The PettingZoo environment on the simulation engine."""

@@ -1,14 +1,11 @@
-"""Seeds, counts and actions as callers give them, checked alike wherever they are given.
+"""Thermal job allocation, version 1: a PettingZoo `ParallelEnv` on the engine `fleet.engine.step`.
 
-Spaces of one arm, for the single environment and the batch.
+Agents are the arms, fixed for the whole episode. Actions are Discrete(slots · plans + 2): 0 waits or continues and is
+always legal, 1 + slot · plans + plan claims the job in a slot by one of the arm's plans for it, and the last action
+returns the current job after its cycle. Of two claims for one job, station or space the lower difficulty wins, then the
+lower index.
 
-Thermal job allocation, version 1: arms claim jobs, heat up, and must not fault.
-
-A PettingZoo `ParallelEnv` as a thin view of the one engine `fleet.engine.step`. Agents are the arms, fixed for the
-whole episode. At every step each answers Discrete(slots · plans + 2): 0 waits or goes on and is always legal,
-1 + slot · plans + plan claims the job in a slot by one of the arm's plans for it, the last action gives the current job
-back after the present cycle. Of two claims for one job, station or space the lower difficulty wins, then the lower
-index.
+Seeds, counts and actions of callers are checked here for the batch and the adapters too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,13 +33,13 @@ from fleet.observation import Layout, Observation
 from fleet.telemetry import MODES
 
 Decisions = Literal["interval", "events"]
-"""Length of a step: one decision interval, or until an arm may claim a job."""
+"""Length of a step: one decision interval, or until an arm may claim a job or passes its warning limit at work."""
 
 _LARGEST = 2**62
 
 
 def seed_of(seed: object) -> np.random.SeedSequence:
-    """The seed of a shift, of any size.
+    """Seed of a shift, of any size.
 
     Raises:
         ValueError: no integer, or one below 0.
@@ -53,7 +50,7 @@ def seed_of(seed: object) -> np.random.SeedSequence:
 
 
 def seeds_of(seed: object, envs: int) -> list[np.random.SeedSequence]:
-    """The seeds of a batch: counted up from one, or one each, or by chance where there is none.
+    """Seeds of a batch: consecutive from one seed, one for each env, or random without any.
 
     Raises:
         ValueError: neither one seed nor one for each env.
@@ -79,10 +76,10 @@ def at_least_one(name: str, value: object) -> int:
 
 
 def switch(name: str, value: object) -> bool:
-    """A choice of yes or no.
+    """A boolean.
 
     Raises:
-        ValueError: neither.
+        ValueError: no boolean.
     """
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False (got {value!r}).")
@@ -102,7 +99,7 @@ def decisions_of(value: object) -> Decisions:
 
 
 def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:
-    """What each agent does, int64 [agent]; one that is left out waits.
+    """Action of each agent, int64 [agent]; an omitted agent waits.
 
     Raises:
         ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
@@ -121,10 +118,10 @@ def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:
 
 
 def agent_of(agents: Sequence[str], agent: object) -> str:
-    """An agent that is there.
+    """A live agent.
 
     Raises:
-        ValueError: it is not; names those that are.
+        ValueError: there is no such agent; names those that exist.
     """
     if agent not in agents:
         raise ValueError(f"No agent '{agent}' in this fleet. Agents: {', '.join(agents)}.")
@@ -132,7 +129,7 @@ def agent_of(agents: Sequence[str], agent: object) -> str:
 
 
 def _integer(agent: str, action: object) -> int:
-    """One integer; those beyond 64 bits stand for one that no action space has, so their agents wait."""
+    """One integer; one beyond 64 bits becomes an action that no action space has, so the agent waits."""
     if type(action) is not int:
         value = np.asarray(action)
         if value.size == 1 and np.issubdtype(value.dtype, np.integer):
@@ -150,7 +147,7 @@ def _whole(value: object) -> TypeGuard[int]:
 
 
 def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:
-    """What one arm observes, and what it may answer."""
+    """Observation and action space of one arm."""
     low, high = layout.bounds
     observation = spaces.Dict(
         {
@@ -162,7 +159,7 @@ def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:
 
 
 def spaces_like(first: tuple[spaces.Dict, spaces.Discrete]) -> tuple[spaces.Dict, spaces.Discrete]:
-    """Spaces with a random generator of their own that share the bounds of others, which are large with many arms."""
+    """Copies of spaces with their own random generator; they share the bounds, which are large with many arms."""
     observation, action = first
     return spaces.Dict({name: copy(space) for name, space in observation.items()}), copy(action)
 
@@ -173,7 +170,7 @@ VERSION = "allocation_v1"
 MaskPlace = Literal["obs", "info", "both"]
 RENDER_MODES = ("ansi", "rgb_array", "human")
 FRAMES_PER_S = 10
-"""Of a rendered episode, in decision intervals per second."""
+"""Frame rate of a rendered episode, decision intervals per second."""
 
 
 class AllocationEnv(ParallelEnv[str, Any, Any]):
@@ -255,7 +252,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     @property
     def world(self) -> World:
-        """The world of the current episode (simulator truth: not for policies)."""
+        """World of the current episode (true state: not for policies)."""
         return self._episode.world
 
     @property
@@ -265,17 +262,17 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     @property
     def truth(self) -> State:
-        """A copy of the simulator's state (not for policies)."""
+        """A copy of the true state (not for policies)."""
         return self._begun("looking at its state").state.copy()
 
     @property
     def tick(self) -> int:
-        """Decision intervals of this episode that are over."""
+        """Elapsed decision intervals of this episode."""
         return self._begun("counting steps").tick
 
     @property
     def messages(self) -> int:
-        """Messages delivered to a peer in this episode."""
+        """Number of messages delivered to peers in this episode."""
         return self._begun("counting messages").messages
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -336,7 +333,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         )
 
     def advance(self, actions: dict[str, Any]) -> tuple[Array, float, bool, bool]:
-        """As `step`, without making observations, for callers that read `knowledge` when they need it.
+        """As `step`, without observations, for callers that read `knowledge` when they need it.
 
         Returns the weighted terms of the reward, float [term], their sum, and whether all jobs are done and whether
         the time is over.
@@ -356,7 +353,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         return parts, reward, finished, over
 
     def state(self) -> Array:
-        """What all arms know together: their vectors one after the other, float32."""
+        """Vectors of all arms, concatenated, float32."""
         return self._begun("state()").vectors.reshape(-1).copy()
 
     @property
@@ -365,12 +362,12 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         return bool(self._begun("may_claim").mask[:, 1:-1].any())
 
     def knowledge(self) -> dict[str, Observation]:
-        """The present observation of every arm by name, as policies read it."""
+        """Current observation of every arm by name, as policies read it."""
         shift = self._begun("knowledge()")
         return self.layout.read_each(self.possible_agents, shift.vectors.copy(), shift.mask.copy())
 
     def lookahead(self, simulator: CellSimulator) -> Lookahead:
-        """For a policy that plans: a simulator of the cell, tied to the current episode."""
+        """A simulator of the cell in the current episode, for policies that plan."""
         return Lookahead(simulator, self._begun("looking ahead").engine)
 
     def render(self) -> Array | str | None:
@@ -454,15 +451,15 @@ def _table(world: World, state: State) -> str:
 
 
 def parallel_env(make_episode: EpisodeFactory, **options: Any) -> AllocationEnv:  # passed on
-    """The `ParallelEnv`; options as in `AllocationEnv`."""
+    """The `ParallelEnv`, with the options of `AllocationEnv`."""
     return AllocationEnv(make_episode, **options)
 
 
 class InTurns(parallel_to_aec_wrapper[str, Any, Any]):
-    """The same for agents that act one after the other; the step is made when the last of them has answered."""
+    """The same for agents that act in turn; the step follows the action of the last agent."""
 
     def step(self, action: Any) -> None:  # as PettingZoo has it
-        """One agent's answer.
+        """Action of one agent.
 
         Raises:
             ValueError: no integer; refused before anybody else is asked. After the end, anything but None.

@@ -1,9 +1,8 @@
 """Simulate schedules from the present to the end of a shift, with what the dispatcher of a cell knows.
 
-It knows the plans of the arms and the space they take, which arm works on what, the jobs in the slots, and of each arm
-the measured motor temperatures, its estimate of the housings and its thermal network as identified. It does not know
-the jobs without a slot and those that arrive later, how the air of the cell will change, which sensors err, or the true
-temperatures.
+It has the plans and space of all arms, their current jobs, the jobs in the slots, and of each arm the measured motor
+temperatures, the estimated housings and the identified thermal network. It has no jobs without a slot, no future jobs,
+no future ambient temperature, no sensor errors and no true temperatures.
 """
 
 from collections.abc import Mapping
@@ -21,14 +20,14 @@ from fleet.observation import Layout, Observation
 Array = np.ndarray
 
 SIDE_BY_SIDE = 32
-"""Schedules that are simulated at a time."""
+"""Number of schedules simulated at once."""
 _DERIVED = ("queue", "head", "unfinished", "given_up", "current_kind", "pending")
 """Fields of the offers that a simulation changes, and `run` restores."""
 
 
 @dataclass(frozen=True, eq=False)
 class Present:
-    """The jobs of a shift at a moment; entries of jobs without a slot are meaningless."""
+    """Jobs of a shift at one time; entries of jobs without a slot are undefined."""
 
     now_s: float
     open: Array
@@ -43,7 +42,7 @@ class CellSimulator:
     """Simulates schedules of a cell, for any number of its shifts one after the other.
 
     Args:
-        tables: The fleet as the arms know themselves.
+        tables: The fleet with the models that the arms have of themselves.
         arms, slots: Number of arms and of slots.
         weights: Of the reward terms.
         compiled: As in `Engine`.
@@ -63,14 +62,14 @@ class CellSimulator:
         self._engine.play((none.astype(int), none.astype(int), none, none), np.zeros(0))  # compiles
 
     def with_limits(self, warning_c: float, error_c: float) -> "CellSimulator":
-        """A simulator of the same cell in which motors have other limits, °C, as to plan with a margin."""
+        """A simulator of the same cell with other limits of the motors, °C, for a margin."""
         engine = self._engine
         tables = engine.tables._replace(warning_c=warning_c, error_c=error_c, ambient_c=self._ambient_c)
         return CellSimulator(tables, engine.layout.arms, engine.layout.slots, self._weights)
 
     @property
     def rows(self) -> int:
-        """Most schedules at a time."""
+        """Maximum number of schedules at once."""
         return self._engine.envs
 
     @property
@@ -84,10 +83,10 @@ class CellSimulator:
         return self._engine.tables.ticks * self.dt_s
 
     def look(self, engine: Engine, env: int, seen: Mapping[str, Observation]) -> Present:
-        """Begin at the present of a row of another engine with the same kinds of jobs.
+        """Start from the current state of a row of another engine with the same task types.
 
         Args:
-            seen: What its arms observe.
+            seen: Observations of its arms.
         """
         jobs, state, slot_job = engine.jobs, engine.state, engine.offers.slot_job[env]
         row, count, open_ = slice(env, env + 1), int(jobs.number[env]), slot_job[slot_job >= 0]
@@ -115,7 +114,7 @@ class CellSimulator:
         return Present(tick * self.dt_s, open_, can, stations)
 
     def run(self, schedules: Plans, discount: Array) -> Executed:
-        """What comes of at most `rows` schedules from the moment of the last look.
+        """Results of at most `rows` schedules from the time of the last `look`.
 
         Args:
             schedules: An `agents.schedules.Schedules`.
@@ -138,7 +137,7 @@ class CellSimulator:
 
 
 def _check(schedules: Plans, discount: Array, rows: int, work: tuple[int, ...], jobs: int, ticks: int) -> None:
-    """Refuse what the compiled loop would read beyond its arrays; `work` has the shape [fleet, arm, kind, option]."""
+    """Check the indices that the compiled loop reads; `work` has the shape [fleet, arm, kind, option]."""
     arm, option = schedules[:2]
     shapes = [np.shape(each) for each in schedules]
     if len(shapes[0]) != 2 or shapes[0][1] != jobs or shapes[0][0] > rows or len(set(shapes)) != 1:
@@ -160,7 +159,7 @@ def _check(schedules: Plans, discount: Array, rows: int, work: tuple[int, ...], 
 
 
 class Lookahead:
-    """The simulator of a cell, tied to one of its shifts."""
+    """The simulator of a cell for one of its shifts."""
 
     def __init__(self, simulator: CellSimulator, engine: Engine, env: int = 0) -> None:
         self.simulator, self._engine, self._env = simulator, engine, env
@@ -172,13 +171,13 @@ class Lookahead:
 
     @property
     def now_s(self) -> float:
-        """Time since the shift began."""
+        """Time since the start of the shift."""
         return float(self._engine.state.tick[self._env]) * self.simulator.dt_s
 
     def with_limits(self, warning_c: float, error_c: float) -> "Lookahead":
-        """The same shift, ahead with other limits of the motors; see `CellSimulator.with_limits`."""
+        """The same shift with other limits of the motors; see `CellSimulator.with_limits`."""
         return Lookahead(self.simulator.with_limits(warning_c, error_c), self._engine, self._env)
 
     def look(self, seen: Mapping[str, Observation]) -> Present:
-        """Begin at the present; see `CellSimulator.look`."""
+        """Start from the current state; see `CellSimulator.look`."""
         return self.simulator.look(self._engine, self._env, seen)

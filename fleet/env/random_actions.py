@@ -8,10 +8,10 @@ Array = np.ndarray
 
 
 def random_legal(mask: Array, rng: np.random.Generator) -> Array:
-    """One action of each arm, uniform over the legal ones.
+    """One action of each arm, uniform over its legal actions.
 
     Args:
-        mask: Legal actions, int8 or bool [..., action]; where none is legal, the answer is 0 (wait).
+        mask: Legal actions, int8 or bool [..., action]; the action is 0 (wait) if none is legal.
 
     Returns:
         int64 [...].

@@ -1,11 +1,9 @@
-"""Arrays that are given out again once nobody holds them any more.
+"""Many shifts at once: the batched environment for trainers.
 
-A large array that is new at every step costs more in pages the system must first clear than in what is written to it.
+It has the engine of `fleet.env.allocation_v1` with a leading env axis: a row equals that env bit for bit, for any
+number of rows.
 
-Many shifts at once: the batched environment, as trainers want it.
-
-The same engine as the single environment, `fleet.env.allocation_v1`, with a leading env axis: a row is that env, bit
-for bit, whatever the number of rows.
+Large arrays are reused when nobody holds them any more: clearing the pages of a new array costs more than filling it.
 """
 
 import ctypes
@@ -32,21 +30,21 @@ Array = np.ndarray
 
 
 def _references(arrays: list[Array], place: int) -> int:
-    """References to an array of a list, as this function sees them."""
+    """Reference count of an array in a list, measured within this function."""
     array = arrays[place]
     return sys.getrefcount(array)
 
 
 _ALONE = _references([np.empty(0)], 0)
-"""Of an array that only the list knows: measured, for interpreters count differently. Whoever looks at an array, or at
-a part of it, holds one more."""
+"""Reference count of an array that only the list holds, measured because interpreters count differently. A view of an
+array adds one."""
 
 
 class Shelf:
-    """Hands out arrays of one shape and type with anything in them.
+    """A pool of arrays of one shape and type, with undefined content.
 
     Args:
-        keep: At most so many are kept for another time.
+        keep: Maximum number of arrays kept for reuse.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: type, *, keep: int = 4) -> None:
@@ -54,7 +52,7 @@ class Shelf:
         self._arrays: list[Array] = []
 
     def take(self) -> Array:
-        """An array that nobody else has."""
+        """An array that nobody else holds."""
         for place in range(len(self._arrays)):
             if _references(self._arrays, place) == _ALONE:
                 return self._arrays[place]
@@ -64,7 +62,7 @@ class Shelf:
         return array
 
     def __getstate__(self) -> dict[str, object]:
-        """Without the arrays, which those that hold them take along themselves."""
+        """State for pickling, without the arrays, which their holders pickle."""
         return {**vars(self), "_arrays": []}
 
 
@@ -74,14 +72,14 @@ _MOST = 2**31 - 1
 
 
 def keep_pages() -> bool:
-    """Have this process keep the memory of arrays that are gone, for those that come.
+    """Keep the memory of freed arrays in this process for new ones.
 
-    For trainers that stack every rollout into new arrays of some hundred megabytes: glibc gives such arrays back to the
-    system when they are freed, which clears their pages anew for the next ones, and that costs as much as the steps.
-    It holds for the whole process, which then stays as large as it once was.
+    For trainers that stack every rollout into new arrays of some hundred megabytes: glibc returns freed arrays to the
+    system, which clears their pages again for the next ones, and that costs as much as the steps. The whole process is
+    affected, and its memory does not shrink any more.
 
     Returns:
-        Whether it does now: False where the C library is not glibc.
+        Whether it worked: False if the C library is not glibc.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     return mallopt is not None and all(mallopt(which, _MOST) == 1 for which in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))
@@ -93,7 +91,7 @@ Obs = dict[str, Array]
 
 @dataclass(frozen=True, eq=False)
 class Library:
-    """Fleets with plans and scores, and a sampler of their shifts."""
+    """Fleets with plans and predictions, and a sampler of their shifts."""
 
     arms: tuple[str, ...]
     slots: int
@@ -106,19 +104,19 @@ class Library:
 class BatchEnv:
     """`num_envs` shifts side by side; all arms of an env share its reward.
 
-    An env whose shift ended begins the next one in the same step (unless `autoreset` is off): its observation is then
-    the first of the new shift, and the last of the old one is in `info["final_obs"]`.
+    An env whose shift ended begins the next one in the same step (unless `autoreset` is off): its observation is the
+    first of the new shift, and the last one of the old shift is in `info["final_obs"]`.
 
     Args:
-        library: Where the shifts come from.
+        library: Source of the shifts.
         num_envs: Number of rows, >= 1.
-        seed: Of the first `reset`, which takes another if it is given one.
+        seed: Seed of the first `reset` without a seed.
         weights: Of the reward terms.
         max_cycles: Ends a shift earlier than its horizon, in decision intervals.
-        autoreset: Begin a new shift by itself; otherwise `reset(rows=…)` must, before the next step.
-        stagger: Cut the first shift of env e after (e + 1) / num_envs of its length, so that from then on the envs are
-            spread over the hours of a shift, as a learner wants them that sees a few hours at a time.
-        threads: Step the envs on this many threads; results do not depend on it. Pays from a few hundred envs on.
+        autoreset: Begin the next shift automatically; otherwise call `reset(rows=…)` before the next step.
+        stagger: Truncate the first shift of env e after (e + 1) / num_envs of its length, so that short rollouts of a
+            learner cover the whole shift.
+        threads: Number of threads; results do not depend on it. Useful from a few hundred envs on.
         exchanges: What carries the messages of the arms of each env; perfect and immediate if not given.
         decisions: Length of a step: one decision "interval", or until an arm may claim a job ("events"), which takes no
             exchanges.
@@ -146,10 +144,10 @@ class BatchEnv:
         autoreset, stagger = switch("autoreset", autoreset), switch("stagger", stagger)
         ticks = library.tables.ticks
         self._whole = ticks if max_cycles is None else min(ticks, at_least_one("max_cycles", max_cycles))
-        """Decision intervals of a shift that is not cut."""
+        """Decision intervals of a whole shift."""
         share = (np.arange(num_envs) + 1) / num_envs if stagger else np.ones(num_envs)
         self._last_tick = np.ceil(self._whole * share).astype(int)
-        """Of the present shift of each env."""
+        """Number of decision intervals of the current shift of each env."""
         self.single_observation_space, self.single_action_space = arm_spaces(self.layout)
         """Of one arm."""
         self.autoreset = autoreset
@@ -172,11 +170,11 @@ class BatchEnv:
         """Length of the last step of each env."""
         self._exchanges = exchanges
         self._delivered = None if exchanges is None else self._no_vectors()
-        """What the arms know with the messages that reached them; only with exchanges."""
+        """Knowledge of the arms with their received messages; only with exchanges."""
 
     @property
     def state(self) -> State:
-        """The simulator's truth of all envs, in arrays of its own (not for policies)."""
+        """Copy of the true state of all envs (not for policies)."""
         self._check_begun("looking at its state")
         return self._engine.state.copy()
 
@@ -193,13 +191,13 @@ class BatchEnv:
 
         Args:
             seed: Env e begins the shift of `seed + e`, or of `seed[e]`; without one, the next of its row's seed.
-            rows: Only in these envs, int [n] or bool [env]; the others go on.
+            rows: Only in these envs, int [n] or bool [env]; the others continue.
 
         Returns:
-            What all arms know, and the infos of `step`.
+            Observations, and the infos of `step`.
 
         Raises:
-            ValueError: a seed or a row that cannot be.
+            ValueError: an invalid seed or row.
         """
         if seed is not None:
             if rows is not None:
@@ -220,8 +218,8 @@ class BatchEnv:
         """One step of every env.
 
         Args:
-            actions: int [env, arm]: 0 waits or goes on, k claims option k - 1, the last action
-                gives the job back; what is outside the mask is a wait.
+            actions: int [env, arm]: 0 waits or continues, k claims option k - 1, the last action returns the job; an
+                illegal action is a wait.
 
         Returns:
             What the arms know; the reward, float64 [env]; terminated and truncated, bool [env]; and infos of the step
@@ -230,7 +228,7 @@ class BatchEnv:
             their arms knew at its end, [n, arm, …].
 
         Raises:
-            RuntimeError: before reset, or of an env whose shift is over.
+            RuntimeError: before reset, or after the end of the shift of an env.
             ValueError: actions of another type or shape.
         """
         self._check_begun("step()")
@@ -257,18 +255,18 @@ class BatchEnv:
         return self._obs(), reward.copy(), finished, truncated, info
 
     def knowledge(self) -> Observation:
-        """What the arms know now by name, leading axes [env, arm], as policies read it."""
+        """Current observations by field, leading axes [env, arm], as policies read them."""
         self._check_begun("knowledge()")
         vectors = self._no_vectors()  # the caller may have written into the last ones
         self._observe(np.arange(self.num_envs), vectors)
         return self.layout.read(vectors, self._engine.mask.copy())
 
     def lookahead(self, simulator: CellSimulator, env: int) -> Lookahead:
-        """For a policy that plans: a simulator of the cell, tied to the shifts of an env."""
+        """A simulator of the cell for the shifts of an env, for policies that plan."""
         return Lookahead(simulator, self._engine, env)
 
     def close(self) -> None:
-        """Release nothing: a batch holds no resources."""
+        """Do nothing: a batch holds no resources."""
 
     def _begin(self, rows: Array) -> None:
         if not len(rows):
@@ -283,14 +281,14 @@ class BatchEnv:
         self._deliver(rows, self._vectors)
 
     def _observe(self, rows: Array, vectors: Array) -> None:
-        """Put what the arms of some envs know now into `vectors` once more."""
+        """Write the current observations of some envs into `vectors` again."""
         if self._delivered is None:
             self._engine.observe(rows, vectors)
         else:
             vectors[rows] = self._delivered[rows]
 
     def _deliver(self, rows: Array, vectors: Array) -> None:
-        """Replace what arms observe of their peers by what the exchanges delivered."""
+        """Replace the peers' fields of the observations by the delivered messages."""
         if self._exchanges is None or self._delivered is None:
             return
         names = [str(j) for j in range(self._engine.jobs.kind.shape[1])]
@@ -324,7 +322,7 @@ class BatchEnv:
         }
 
     def _no_vectors(self) -> Array:
-        """An array for vectors: one of an earlier step that is no longer in use, if there is one."""
+        """An array for vectors: an unused one of an earlier step, if there is one."""
         return self._shelf.take()
 
     def _checked(self, actions: object) -> Array:
@@ -359,7 +357,7 @@ class BatchEnv:
 
 
 def _check_memory(num_envs: int, layout: Layout) -> None:
-    """Refuse a batch whose observations alone do not fit: it would be killed."""
+    """Check that the observations fit into memory; otherwise the system would kill the process."""
     needed = num_envs * layout.arms * (layout.size * np.dtype(np.float32).itemsize + layout.actions)
     held = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > held:

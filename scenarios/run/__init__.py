@@ -1,1 +1,1 @@
-"""Run, compare and record shifts; train policies."""
+"""Run one shift: the loop, its record, schedule and metrics."""

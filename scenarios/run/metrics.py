@@ -1,9 +1,4 @@
-"""Metrics of one shift.
-
-What the heat of a shift does: insulation life that is used, drift of the tool points, surfaces too hot to touch.
-
-From the end of a shift to its metrics.
-"""
+"""Metrics of one shift: jobs, faults, energy, and the effects of heat on windings, tool points and surfaces."""
 
 import math
 from collections.abc import Sequence
@@ -20,32 +15,32 @@ from fleet.heat.thermal import HOUSING, WINDING
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics:
-    """Metrics of one shift; times from its beginning."""
+    """Metrics of one shift; times count from its start."""
 
     jobs: int
-    """Released before the horizon."""
+    """Number of jobs released before the horizon."""
     finished: int
     value: float
-    """Of the finished jobs."""
+    """Value of the finished jobs."""
     value_offered: float
     given_up: int
-    """Jobs that faulted too often, and those that waited for one that was given up or expired."""
+    """Number of abandoned jobs: arms faulted in them too often, or a predecessor was abandoned or expired."""
     expired: int
-    """Jobs that waited at their hard due date."""
+    """Number of jobs that still waited at their hard due date."""
     on_time: int
-    """Finished by their due time."""
+    """Number of jobs finished by their due date."""
     tardiness_min: float
     """Sum over finished jobs of max(0, finish − due)."""
     mean_wait_s: float
-    """From release to the first award, mean over the awarded jobs."""
+    """Time from release to the first award, mean over the awarded jobs."""
     makespan_s: float
     """Time at which the last job was finished."""
     jobs_per_hour: float
     faults: int
     moved_home: int
-    """How often a person moved a faulted arm home."""
+    """Number of times a person moved a faulted arm home."""
     contacts: int | None
-    """Of arms and payloads with other arms, the floor or fixtures; None if the plant does not look for them."""
+    """Contacts of arms and payloads with other arms, the floor or fixtures; None if the plant does not detect them."""
     above_warning_min: float
     """Sum over arms of the time with a motor above the warning limit."""
     peak_c: dict[str, float]
@@ -57,18 +52,18 @@ class Metrics:
     energy_wh: float
     """Energy turned to heat in the motors of all arms."""
     heat_gini: float
-    """Gini coefficient of the arms' shares of that heat: 0 all equal, near 1 one arm has all."""
+    """Gini coefficient of the arms' shares of that energy: 0 if equal, near 1 if one arm has all."""
     insulation_ppb: dict[str, float]
-    """Of each arm: billionths of the rated life that its most aged winding used; see `fleet.heat.effects`."""
+    """Billionths of the rated life used by the most aged winding of each arm; see `fleet.heat.effects`."""
     tool_drift_mm: dict[str, float]
-    """Of each arm: the most that heat moved its tool point since the beginning of the shift, if it is stretched; see
+    """Largest displacement by heat of the tool point of each arm, stretched, since the start of the shift; see
     `fleet.heat.effects`."""
     hot_surface_min: float
     """Sum over arms of the time with a surface above the burn threshold of the scenario's `people.contact_s`."""
     surface_c: dict[str, float]
-    """Hottest surface of each arm that can be touched; see `fleet.heat.effects`."""
+    """Highest temperature of an accessible surface of each arm; see `fleet.heat.effects`."""
     messages: int
-    """Messages delivered to a peer."""
+    """Number of messages delivered to peers."""
     lost_claims: int
     illegal_actions: int
 
@@ -96,7 +91,7 @@ class HeatUse:
     """Sums over the recorded temperatures of a shift, with any leading axes.
 
     Args:
-        temp_c: Temperatures at the beginning, °C, [..., arm, node]. The tool points are calibrated there.
+        temp_c: Temperatures at the start, °C, [..., arm, node], at which the tool points are calibrated.
         burn_c: Temperature above which a surface is too hot to touch.
     """
 
@@ -111,7 +106,7 @@ class HeatUse:
         self._drift_m = np.zeros(self._rate.shape[:-1])
 
     def add(self, temp_c: Array, dt_s: float) -> None:
-        """Take the temperatures `dt_s` later, °C, [..., arm, node]."""
+        """Add a step of `dt_s` that ends at these temperatures, °C, [..., arm, node]."""
         rate = arrhenius_rate(temp_c[..., WINDING])
         self._used += life_used(self._rate, rate, dt_s)
         self._rate = rate
@@ -124,17 +119,17 @@ class HeatUse:
 
     @property
     def insulation_ppb(self) -> Array:
-        """Billionths of the rated life that the most aged winding of each arm used, [..., arm]."""
+        """Billionths of the rated life used by the most aged winding of each arm, [..., arm]."""
         return 1e9 * self._used.max(axis=-1)
 
     @property
     def tool_drift_mm(self) -> Array:
-        """The most that the tool point of the stretched arm drifted, mm, [..., arm]."""
+        """Largest drift of the tool point of the stretched arm, mm, [..., arm]."""
         return 1e3 * self._drift_m
 
     @property
     def hot_surface_min(self) -> Array:
-        """Time with a surface too hot to touch, min, [..., arm]."""
+        """Time with a surface above the burn threshold, min, [..., arm]."""
         return self._hot_s / 60.0
 
 
@@ -151,7 +146,7 @@ def metrics_of(
 
     Args:
         heat: Of the whole shift, [arm].
-        finds_contacts: Whether the plant looks for contacts.
+        finds_contacts: Whether the plant detects contacts.
     """
     time_s = float(state.tick[0] * world.dt_s)
     jobs = slice(int(world.jobs.exists[0].sum()))
@@ -192,7 +187,7 @@ def metrics_of(
 
 
 def common_figures(state: State, env: int, value: Array, due_s: Array, dt_s: float) -> dict[str, Any]:
-    """The figures that metrics of a run and of a comparison share, by name (Any: numbers).
+    """Figures shared by the metrics of a run and of a comparison, by name (Any: numbers).
 
     Args:
         value, due_s: Of each job of this env, [job].

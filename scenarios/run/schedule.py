@@ -25,27 +25,27 @@ SAME_MOMENT_DIGITS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Assignment:
-    """One arm on one job, from the award until it is home again or faults."""
+    """One arm on one job, from the award until it is at home or faults."""
 
     arm: str
     job: str
     start_s: float
     end_s: float
-    """Time of arrival home or of the fault, or the horizon."""
+    """Time of arrival at home or of the fault; at most the horizon."""
     finished_s: float | None = None
-    """End of the last cycle; None if it was not reached."""
+    """End of the last cycle; None if not reached."""
     outcome: Outcome
-    """finished: all cycles done, even if the arm was not home yet; returned: it is back in the queue, after a fault,
-    because the policy gave it back, or because a live arm had to return it;
-    given_up: the job faulted too often."""
+    """finished: all cycles done, even if the arm was not at home yet; returned: back in the queue, after a fault,
+    by the policy, or because a live arm had to return it;
+    given_up: abandoned after too many faults."""
     late_s: float | None = None
     """Tardiness of a finished job; 0 if on time."""
     faulted: bool = True
-    """Of a returned or given-up job: a fault was the reason."""
+    """Whether a fault was the reason that the job was returned or abandoned."""
     cycles_kept: int | None = None
-    """Cycles of a returned or given-up job that this arm has done and that count."""
+    """Cycles of a returned or abandoned job that this arm has done and that count."""
     difficulty: float = float("nan")
-    """Score of the award."""
+    """Of the job for the arm, at the award."""
     prediction: str = ""
     """Predicted peak temperature and P(saturation) at the award, in words."""
 

@@ -27,7 +27,7 @@ from scenarios.spec.options import RunSpec
 from scenarios.spec.schema import Scenario
 
 AT_ONCE = 20_000
-"""Readings of an arm that are computed at a time."""
+"""Number of readings of an arm computed at once."""
 
 
 def run(
@@ -41,13 +41,13 @@ def run(
     out: str | Path | None = None,
     **options: Any,  # one type per field
 ) -> RunLog:
-    """Run one shift; once `stopped` returns True it ends early, between two steps.
+    """Run one shift; it ends early, between two steps, once `stopped` returns True.
 
     Args:
         fleet: A prepared fleet, or a scenario (a library name, a .toml file, a `Scenario`), which is prepared first.
-        spec: What to run; without it, `options` are its fields, and messages stay in memory (`bus="memory"`).
+        spec: What to run; without it, `options` are its fields, and nothing is published (`bus="memory"`).
         record: Keep telemetry.
-        endpoint: Zenoh router on loopback, for other listeners; by default the fleet has its own.
+        endpoint: Zenoh router on loopback that publishes the shift; by default a router in this process.
         out: Folder for the files of the run; it must not exist yet.
 
     Raises:
@@ -125,7 +125,7 @@ def run(
 
 
 def _with_prediction(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int]) -> Event:
-    """An award with the predicted peak and P(saturation) of its plan as reason; other events as they are."""
+    """The event; an award with the predicted peak and P(saturation) of its plan as reason."""
     if event.kind != "award":
         return event
     option = actions[event.arm] - 1
@@ -134,7 +134,7 @@ def _with_prediction(event: Event, seen: Mapping[str, Observation], actions: Map
 
 
 class _Recorder:
-    """Keeps the record of every step, and reads the sensors several times in each.
+    """Records every step, and reads the sensors several times in each.
 
     Args:
         env: The environment of the shift; set before its reset.
@@ -164,7 +164,7 @@ class _Recorder:
             self._read()
 
     def readings(self) -> Telemetry:
-        """All readings; no samples before the first step, or without reading."""
+        """All readings; no samples before the first step or without `reads`."""
         if self._records:
             self._read()
         return self._kept.telemetry() or Telemetry.empty(self._arms)

@@ -1,1 +1,1 @@
-"""The suite: a generator of scenarios with named axes, and frozen splits of instances."""
+"""The suite: a generator of scenarios with named axes, and fixed splits of instances."""

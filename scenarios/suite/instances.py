@@ -1,18 +1,12 @@
-"""Layouts of cells of any number of arms, with groups of stations that two neighbours reach.
+"""Instances of the suite: layouts of cells, tasks of real trades, cells, and the axes on which instances differ.
 
-A group lies between two neighbours. Its station `a` is nearer to the one, `b` to the other, `c` to neither. The
-dimensions keep arms at home apart, and let each arm work in a group while its neighbour works in the next one.
+A *group* of stations lies between two neighbouring arms. Its station `a` is nearer to one, `b` to the other, `c` to
+neither. The dimensions keep arms at home apart, and let each arm work in a group while its neighbour works in the next.
 
-Job mixes of real trades: the tasks that arrive at every group of stations.
+Masses, forces and times of the tasks are engineering estimates within the rating of the Gen3.
 
-Engineering estimates of masses, forces and times, within the rating of the Gen3.
-
-The cells of the suite: arms, stations and trade. Many instances share a cell, and no two splits do.
-
-What needs preparation belongs to the cell: its plans, its space, its twins. Instances differ in what arrives, in the
-ambient temperature, in faults and in the bus.
-
-The axes on which the instances of a cell differ, and the scenario of a cell at given values.
+A cell determines all that is prepared: plans, space and twins. Many instances share a cell; no two splits do. Instances
+of a cell differ in jobs, ambient temperature, faults and bus.
 """
 
 import json
@@ -50,18 +44,18 @@ HOME = "retract"
 DIGITS = 4
 MOST_IN_ROW = 16
 APART_M = 2.6
-"""Distance between two rows of a line, out of each other's reach."""
+"""Distance between two rows of a line, beyond the reach of the arms."""
 SIDE_M = 0.15
 """Distance of the stations a and b from the middle of their group."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Mounted arms, and stations in groups."""
+    """Mounted arms and groups of stations."""
 
     arms: tuple[ArmSpec, ...]
     groups: tuple[tuple[Place, ...], ...]
-    """The stations of each group: a, b, and c if there are three."""
+    """Stations of each group: a, b, and c if there are three."""
 
     @property
     def places(self) -> tuple[Place, ...]:
@@ -79,7 +73,7 @@ def layout_of(name: LayoutName, arms: int, stations: int = 2, *, pitch_m: float 
         front_m: Distance of the stations in front of the line between two neighbours.
 
     Raises:
-        ValueError: the layout cannot have so many arms or stations.
+        ValueError: the layout does not exist for this number of arms or stations.
     """
     least = 4 if name in ("bench", "ring") else 2
     if arms < least or (name == "bench" and arms % 2):
@@ -101,7 +95,7 @@ def _line(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
 
 
 def _bench(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
-    """Two rows of arms that face each other across a bench; each group has stations on both sides of its middle."""
+    """Two rows of arms facing each other across a bench; each group has stations on both sides of its middle."""
     across_m, columns = front_m + 0.15, arms // 2
     mounted = [
         _arm(2 * i + row, (x, side * across_m, 0.0), (0.0, 0.0, -90.0 * side))
@@ -117,7 +111,7 @@ def _bench(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
 
 
 def _ring(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
-    """Arms in a circle that face outwards; the stations are around it."""
+    """Arms in a circle, facing outwards; the stations are around it."""
     radius_m = pitch_m / 2 / sin(pi / arms)
     around = [2 * pi * i / arms for i in range(arms)]
     bases = [(radius_m * cos(a), radius_m * sin(a), 0.0) for a in around]
@@ -129,7 +123,7 @@ def _ring(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
 
 
 def _gantry(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
-    """Arms that hang from a beam in a row; the stations are in front of it, below."""
+    """Arms hanging from a beam in a row; the stations are below, in front of it."""
     along = _along(arms, pitch_m)
     mounted = tuple(_arm(i, (x, 0.0, 1.2), (180.0, 0.0, 90.0)) for i, x in enumerate(along))
     middles = [((x + next_x) / 2, front_m - 0.08) for x, next_x in pairwise(along)]
@@ -137,7 +131,7 @@ def _gantry(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
 
 
 def _wall_ceiling(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
-    """Arms in turns on a wall and on the ceiling; the stations are between wall and beam."""
+    """Arms alternately on a wall and on the ceiling; the stations are between wall and beam."""
     wall, ceiling = ((1.0, 0.5), (90.0, 0.0, 0.0)), ((0.1, 1.2), (180.0, 0.0, 90.0))
     along = _along(arms, pitch_m)
     mounts = [(x, *(wall, ceiling)[i % 2]) for i, x in enumerate(along)]
@@ -156,7 +150,7 @@ _LAYOUTS: dict[LayoutName, Callable[[int, int, float, float], Layout]] = {
 
 
 def _along(arms: int, pitch_m: float) -> list[float]:
-    """Coordinates of a row of arms about its middle, m."""
+    """Coordinates of a row of arms, centred at 0, m."""
     return [(i - (arms - 1) / 2) * pitch_m for i in range(arms)]
 
 
@@ -187,12 +181,12 @@ Letter = Literal["a", "b", "c"]
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One kind of job at a group of stations."""
+    """One task type at a group of stations."""
 
     name: str
     kind: Kind
     at: tuple[Letter, ...]
-    """Stations of the group; c is b where a group has two."""
+    """Stations of the group; c stands for b in a group of two."""
     payload_kg: tuple[float, ...] = (0.0,)
     repetitions: tuple[int, int]
     dwell_s: float = DWELL_S
@@ -200,9 +194,9 @@ class Task:
     value: float
     due_s: float
     heats: bool = False
-    """Whether it is one of the tasks that load a few joints for long: their share grows with the heat severity."""
+    """Whether the task loads a few joints for long; the share of such tasks grows with the heat severity."""
     after: str = ""
-    """With precedence, the task whose job of the same number must finish first."""
+    """With precedence: the task whose job of the same number must be finished first."""
 
 
 def _hold(name: str, at: Letter, kg: tuple[float, ...], minutes: tuple[int, int], after: str = "") -> Task:
@@ -281,7 +275,7 @@ TRADES: dict[TradeName, tuple[Task, ...]] = {
 
 
 JUDGED = SPLITS[1:]
-"""On which policies are judged."""
+"""Splits whose results are reported."""
 Unlike = Literal["alike", "usual", "mixed"]
 SPREAD: dict[Unlike, float] = {"alike": 0.2, "usual": 0.7, "mixed": 0.7}
 """`spread.scale` of the arms."""
@@ -297,7 +291,7 @@ class Cell:
     arms: int
     trade: TradeName
     stations: int = 2
-    """In each group between two neighbours."""
+    """Number of stations in each group."""
     unlike: Unlike = "usual"
     """alike and usual: deviations by chance, small or as among Gen3 arms. mixed: besides, some arms are worn, some cool
     badly, one has a fan, and some carry less."""
@@ -307,11 +301,11 @@ class Cell:
     slots: int = 24
     instances: int = 17
     seed: int = 0
-    """Of the arms' deviations: one with which every idle arm stays near or below the warning limit."""
+    """Seed of the arms' deviations, with which every idle arm stays near or below the warning limit."""
 
     @property
     def stations_per_arm(self) -> float:
-        """Stations of the cell over its arms."""
+        """Number of stations divided by that of arms."""
         return len(layout(self).places) / self.arms
 
 
@@ -325,7 +319,7 @@ def layout(cell: Cell) -> Layout:
 
 
 def _altered(arm: ArmSpec, number: int) -> ArmSpec:
-    """The arm as a mixed fleet has it: every eighth has a fan, and so on."""
+    """The arm with the properties of its index in a mixed fleet: every eighth has a fan, and so on."""
     match number % 8:
         case 1 | 6:
             return replace(arm, wear=0.6)
@@ -384,7 +378,7 @@ CELLS: tuple[Cell, ...] = (
         _of("ring", 32, "gluing", seed=4307, pitch_m=0.82, hours=1.0, slots=64, unlike="mixed", instances=8),
         _of("line", 64, "screwdriving", seed=29308, pitch_m=0.79, hours=1.0, slots=96, instances=6),
     ),
-    # No other split has cells of these sizes.
+    # Sizes that no other split has.
     *_cells(
         "sizes",
         _of("line", 7, "gluing", seed=400, instances=4),
@@ -413,10 +407,10 @@ Bus = Literal["perfect", "late", "lossy", "ring", "cut"]
 
 
 class Severity(NamedTuple):
-    """What a heat severity asks of the arms, as time loads of the expected jobs (`scenarios.prepare.load_factor`)."""
+    """Time loads of the expected jobs by heat severity (`scenarios.prepare.load_factor`)."""
 
     heating: float
-    """Of the tasks that heat."""
+    """Time load of the tasks that heat."""
     rest: float
 
 
@@ -426,11 +420,11 @@ SEVERITY: dict[Heat, Severity] = {
     "hot": Severity(0.75, 0.55),
     "severe": Severity(1.0, 0.55),
 }
-"""The thermal load factor that follows depends on cell and ambient temperature; `thermofleet show` tells it."""
+"""The resulting thermal load factor depends on cell and ambient temperature; `thermofleet show` prints it."""
 LEAST_JOBS = 0.25
 """Fewest expected jobs of a stream and payload, so that every task occurs."""
 DUE: dict[Due, float] = {"loose": 2.0, "usual": 1.0, "tight": 0.5, "hard": 0.75}
-"""Factor on the due times of the tasks. hard: jobs that wait then expire."""
+"""Factor on the due times of the tasks; with `hard`, jobs that still wait at their due date expire."""
 AIR_C: dict[Air, tuple[float, float]] = {
     "cool": (22.0, 22.0),
     "warm": (26.0, 26.0),
@@ -439,15 +433,15 @@ AIR_C: dict[Air, tuple[float, float]] = {
 }
 """Ambient temperature at the beginning and, after two thirds of the shift, at the end, °C."""
 PAST_AIR_C = (22.0, 31.0)
-"""In the arms' past jobs, the same for all instances of a cell."""
+"""Range of the past jobs of the arms, the same for all instances of a cell."""
 LIMITS = ThermalLimits(warning_c=52.0, error_c=59.0, restart_c=43.0)
-"""Lower than usual, as users set them where people work beside the arms: heat then decides within an hour."""
+"""Lower than the defaults, as for arms beside people, so that heat matters within an hour."""
 UNATTENDED_S = 2400.0
-"""unattended: time until somebody clears a fault of an arm that is cool again, and moves it home."""
+"""unattended: time until a person clears the fault of a cooled arm and moves it home."""
 NOISE_K = 2.0
 """noisy: standard deviation of the temperature readings of every second arm."""
 BATCHES_S = 1500.0
-"""batch: about the time between two batches."""
+"""batch: approximate time between two batches."""
 RUSH, RUSH_SHARE = (0.35, 0.55), 0.5
 """rush: a share of all jobs arrives in this part of the shift."""
 BUSES: dict[Bus, BusSpec] = {
@@ -457,12 +451,12 @@ BUSES: dict[Bus, BusSpec] = {
     "ring": BusSpec(topology="ring", delay_s=10.0),
     "cut": BusSpec(),
 }
-"""cut: besides, the fleet falls into two halves in the middle third of the shift."""
+"""cut: also, two halves of the fleet exchange no messages in the middle third of the shift."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axes:
-    """Where an instance lies on the axes of its cell."""
+    """Values of an instance on the axes of its cell."""
 
     heat: Heat
     due: Due
@@ -478,7 +472,7 @@ OFTEN = {"faults": "attended", "bus": "perfect"}
 
 
 def draw_axes(rng: np.random.Generator) -> Axes:
-    """Values drawn independently of each other."""
+    """Values sampled independently."""
     values: dict[str, Any] = {}  # literals of several types
     for name, kind in get_type_hints(Axes).items():
         choices = list(get_args(kind))
@@ -498,16 +492,16 @@ def time_loads() -> dict[str, tuple[float, float]]:
 
 
 def expected_jobs(cell: Cell, heat: Heat) -> tuple[float, float]:
-    """Expected jobs of each stream and payload in a shift: of the tasks that heat, and of the others."""
+    """Expected number of jobs of each stream and payload in a shift: of tasks that heat, of the others."""
     heating, rest = (wanted / one for wanted, one in zip(SEVERITY[heat], time_loads()[cell.name], strict=True))
     return max(LEAST_JOBS, heating), max(LEAST_JOBS, rest)
 
 
 def scenario_of(name: str, cell: Cell, axes: Axes, seed: int, jobs: tuple[float, float] | None = None) -> Scenario:
-    """The scenario of a cell at these values, checked like a file.
+    """Scenario of a cell at these values, checked like a file.
 
     Args:
-        seed: Of what a trace draws.
+        seed: Of the sampled times of a trace.
         jobs: Expected jobs of each stream and payload, see `expected_jobs`; default: those.
     """
     horizon_s = 3600.0 * cell.hours
@@ -544,7 +538,7 @@ def scenario_of(name: str, cell: Cell, axes: Axes, seed: int, jobs: tuple[float,
 
 
 def describe(cell: Cell, axes: Axes) -> str:
-    """A sentence about an instance."""
+    """Description of an instance in a sentence."""
     values = ", ".join(f"{name} {value}" for name, value in asdict(axes).items())
     return f"{cell.trade.replace('_', ' ')} by {cell.arms} {cell.unlike} arms ({cell.layout}): {values}."
 
@@ -603,7 +597,7 @@ def _arrivals(kind: Arriving, expected: float, horizon_s: float, rng: np.random.
 
 
 def _trace(count: int, horizon_s: float, rng: np.random.Generator) -> tuple[float, ...]:
-    """Times of a shift with two busy spells and a break between them, s."""
+    """Arrival times of a shift with two busy periods and a break between them, s."""
     spells = ((0.2, 0.12), (0.65, 0.12))
     means, deviations = np.array(spells)[rng.integers(2, size=count)].T if count else (np.zeros(0), np.zeros(0))
     shares = np.clip(means + deviations * rng.standard_normal(count), 0.0, 0.95)

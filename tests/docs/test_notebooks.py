@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 SHOWN = {
     "quick_look": r"arm_1 stopped.*jobs finished",
-    "evaluate_policies": r"<td>round_robin</td>.*<td>wsept</td>",
+    "evaluate_policies": r">round_robin</td>.*>wsept</td>",
     "twin_on_own_logs": r"arm_2: 3600 samples",
 }
 """What the HTML or text outputs of each notebook contain."""

@@ -12,32 +12,32 @@ SHARE = 1 / 6
 """Least share of figures among the cells of a table of figures, without the first column."""
 
 BY_HAND = {
-    (
-        "docs/concepts/cooling.md",
-        "parameter, per J/K of the winding",
-    ): "parameters in the code; the command prints them",
     ("docs/concepts/cooling.md", "°C"): "published limits",
     ("docs/concepts/cooling.md", "contact"): "published limits",
     ("docs/faults.md", "fault"): "`make chaos` prints it: half an hour of real processes",
-    ("docs/faults.md", "broken rule"): "`make simulate MUTATIONS=all` prints it: half an hour",
     ("docs/identification.md", "question"): "`benchmarks.paper` prints it, from logs that are not in the repository",
     (
         "docs/performance.md",
         "env steps per CPU-second, unless a unit is given",
     ): "times of one machine; `make bench-env`",
     ("docs/performance.md", ""): "times of one machine; the commands beside the tables print them",
+    ("docs/performance.md", "what"): "times of one machine; the commands in the table print them",
     ("docs/performance.md", "arms"): "times of one machine; `benchmarks/bench_exchange.py` prints them",
+    (
+        "docs/results/twin.md",
+        "scenario",
+    ): "`benchmarks.paper reliability` prints it: an hour",
+    ("docs/results/twin.md", "question"): "hours; the commands are beside it",
     ("docs/ros2.md", "ROS 2"): "settings",
     ("docs/scaling.md", ""): "to be made from files",
     ("docs/scaling.md", "arms, sites"): "to be made from files",
+    ("docs/scaling.md", "what fails first"): "calculated from the table above it",
     ("docs/scaling.md", "asked"): "to be made from files",
     ("docs/security.md", ""): "times of one machine; `benchmarks/bench_tls.py` prints them",
     ("docs/several_machines.md", "fault"): "`make mesh` prints it: 256 arms",
     ("docs/suite.md", "split"): "the definition of the suite",
     ("docs/suite.md", "axis of a cell"): "the definition of the suite",
     ("docs/trainers.md", "trainer"): "versions",
-    ("docs/twin.md", "scenario"): "`benchmarks.paper reliability` prints it: an hour; labelled with its revision",
-    ("docs/twin.md", "question"): "hours; labelled with its revision, the commands are beside it",
 }
 """Tables that are kept by hand, by page and first heading, and why."""
 

@@ -11,7 +11,10 @@ from scenarios.json_rows import Rows
 
 ROOT = Path(__file__).parents[2]
 LOGS = ROOT / "../shared/data/gen3_logs"
-PAGES = ("paper.md", "twin.md", "twin_studies.md", "identification.md", "concepts/cooling.md")
+PAGES = (
+    *("paper.md", "twin.md", "twin_studies.md", "identification.md", "concepts/cooling.md"),
+    *("results/paper.md", "results/twin.md"),
+)
 COMMAND = re.compile(r"python -m benchmarks\.paper ([\w-]+)((?: [^`#\n>]+)?)")
 RESULTS = "docs/results/"
 

@@ -1,1 +1,1 @@
-"""The environment as each trainer wants it: one file per trainer, loaded by nobody but its user."""
+"""The environment for each trainer: one file per trainer, imported by its users only."""

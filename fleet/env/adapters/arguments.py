@@ -1,4 +1,4 @@
-"""Checks of the environments and batches that adapters take, and the numbers that they pass on."""
+"""Checks of the environments and batches given to adapters, and the infos that adapters pass on."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -23,7 +23,7 @@ def check_batch(adapter: str, batch: object, *, autoreset: bool | None = None) -
     """The batch, or a wrapper of one.
 
     Args:
-        autoreset: What the adapter needs; None if either will do.
+        autoreset: Value that the adapter needs; None for any.
 
     Raises:
         ValueError: it is neither, or resets otherwise.
@@ -53,7 +53,7 @@ def check_env(adapter: str, env: object) -> Env:
 
 
 def arm_space(env: Env, arm: str) -> spaces.Dict:
-    """Observation space of an arm of an environment that `check_env` took."""
+    """Observation space of an arm of an environment checked by `check_env`."""
     space = env.observation_space(arm)
     assert isinstance(space, spaces.Dict)
     return space

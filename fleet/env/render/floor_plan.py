@@ -1,7 +1,4 @@
-"""What a picture of the fleet shows: the fixed cell, and one moment of a shift in it.
-
-Pixel positions of arms, stations and labels in a picture of the cell, arranged so that they do not overlap.
-"""
+"""The content of a picture of the fleet: the cell, one moment of a shift, and pixel positions without overlap."""
 
 import math
 from dataclasses import dataclass
@@ -28,7 +25,7 @@ MountKind = Literal["floor", "wall", "ceiling", "tilted"]
 Point = tuple[float, float, float]
 """World coordinates, m."""
 LEVEL_DEG = 10.0
-"""Largest tilt at which a base still counts as level, upright or upside down."""
+"""Largest tilt of a base that counts as level, upright or upside down."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +36,7 @@ class Cell:
     mounts_m: tuple[Point, ...]
     """Base of each arm."""
     kinds: tuple[MountKind, ...]
-    """What each arm is fixed to."""
+    """Mount of each arm."""
     stations: tuple[tuple[str, Point], ...]
     """Name and tool point of each station."""
     fixtures: tuple[Fixture, ...] = ()
@@ -57,7 +54,7 @@ class Cell:
 
 
 def mount_kind(mount: Mount) -> MountKind:
-    """What an arm is fixed to, from the direction of its base."""
+    """Mount of an arm, from the direction of its base."""
     up = float(mount.rotation()[2, 2])
     level = math.cos(math.radians(LEVEL_DEG))
     if abs(up) > level:
@@ -82,7 +79,7 @@ def grid_cell(arms: tuple[str, ...], stations: tuple[str, ...]) -> Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class QueuedJob:
-    """A job that can be claimed."""
+    """A job in a slot."""
 
     job: str
     payload_kg: float
@@ -114,9 +111,9 @@ class Scene:
     at: tuple[tuple[str, ...], ...]
     """Stations each arm occupies."""
     queue: tuple[QueuedJob, ...]
-    """Jobs on offer, in the order of the slots."""
+    """Jobs in the slots, in their order."""
     waiting: int
-    """Released jobs that no arm works on, on offer or not."""
+    """Number of released jobs that no arm works on, with or without a slot."""
     finished: int
     faults: int
     title: str = ""
@@ -200,7 +197,7 @@ ROUNDS = 150
 
 
 def drawable(text: str) -> str:
-    """The text with □ for every character that the font does not have, and a space for one that cannot be printed."""
+    """The text with □ for characters missing in the font and a space for unprintable ones."""
     glyphs = get_font(findfont(FontProperties(family=FONT))).get_charmap()
     return "".join((c if ord(c) in glyphs else "□") if c.isprintable() else " " for c in text)
 
@@ -222,7 +219,7 @@ def text_width(text: str, size_px: int, bold: bool = False) -> int:
 
 @lru_cache(maxsize=4096)
 def shortened(text: str, size_px: int, room_px: float, bold: bool = False) -> str:
-    """The text on one line, its middle replaced by … where it is too wide; empty if nothing fits."""
+    """The text on one line, with … in the middle if it is too wide; empty if nothing fits."""
     line = drawable(text)
     if text_width(line, size_px, bold) <= room_px:
         return line
@@ -243,9 +240,9 @@ class FloorPlan:
     rows: int
     """Lines of text below an arm."""
     bases: Array
-    """True position of each arm, [arm, 2]."""
+    """Position of each arm, [arm, 2]."""
     centres: Array
-    """Where each arm is drawn, [arm, 2]."""
+    """Position of the drawing of each arm, moved where arms overlap, [arm, 2]."""
     room: Array
     """Width of the text below each arm, [arm]."""
     stations: Array
@@ -253,7 +250,7 @@ class FloorPlan:
     fixtures: tuple[Array, ...]
     """Outline of each fixture from above, [corner, 2]; it may reach beyond the floor."""
     labels: tuple[tuple[str, Pixel, Pixel], ...]
-    """Station names that have room: text, left end of its middle line, position of the station."""
+    """Station names with enough room: text, left end of its middle line, position of the station."""
 
     @property
     def motor(self) -> int:
@@ -302,7 +299,7 @@ def floor_plan(cell: Cell, size: Pixel = NORMAL) -> FloorPlan:
     bases, stations = at[:arms], at[arms:]
     centres = _apart(bases, stations, (corner - 6, np.maximum(corner - 6, other + 6)), reach, below)
     x, y = centres.T
-    # A text keeps clear of the edges, of arms beside or below it, and of the texts of those.
+    # A text overlaps neither the edges, nor arms beside or below it, nor their texts.
     room = np.minimum(2 * reach + 5 * text, 2 * np.minimum(x - floor[0], floor[2] - x) - 4)
     apart, down = np.abs(x[:, None] - x), y - y[:, None]
     crossed = (down > -reach - below) & (down < 2 * reach + below) & ~np.eye(arms, dtype=bool)
@@ -333,11 +330,11 @@ def _outline(fixture: Fixture) -> Array:
 
 def _apart(bases: Array, stations: Array, corners: tuple[Array, Array], reach: int, below: int) -> Array:
     """Positions near the bases at which arms cover neither each other nor, where possible, a station, int [arm, 2]."""
-    turn = 2.399963 * np.arange(len(bases))  # arms at one place part in different directions
+    turn = 2.399963 * np.arange(len(bases))  # arms at one position move apart in different directions
     at = home = bases + 0.5 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     for i in range(ROUNDS):
         at = at + 0.08 * (1 - i / ROUNDS) * (home - at)
-        for others, shift, clear, norm, share in (  # a station keeps clear of the text too: nearly a rectangle
+        for others, shift, clear, norm, share in (  # a station overlaps no text either: nearly a rectangle
             (stations, below / 2, [reach + 14.0, reach + below / 2 + 14.0], 4, 0.4),
             (at, 0.0, [2.0 * reach + 4, 2.0 * reach + below + 2], 2, 0.5),
         ):
@@ -352,7 +349,7 @@ def _apart(bases: Array, stations: Array, corners: tuple[Array, Array], reach: i
 def _labels(
     names: list[str], centres: Array, stations: Array, floor: Box, reach: int, below: int, text: int
 ) -> tuple[tuple[str, Pixel, Pixel], ...]:
-    """Names of stations, each at the nearest place where it covers nothing; without such a place it is left out."""
+    """Names of stations, each at the nearest free position; a name without one is left out."""
     half, line, labels = text // 2, text // 2 + 1, []
     taken = [(x - reach, y - reach, x + reach, y + reach + below) for x, y in centres.tolist()]
     taken += [(x - half, y - half, x + half, y + half) for x, y in stations.tolist()]

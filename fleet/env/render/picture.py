@@ -1,11 +1,8 @@
-"""Frames of an environment, as arrays or in a window. matplotlib is loaded with the first frame.
+"""The fleet as a picture: the cell from above, each arm a ring of seven motors coloured by their temperature.
 
-The colour scale of motor temperatures, shared by every picture and page.
-
-The fleet as a picture: the cell from above, each arm a ring of seven motors coloured by their temperature.
-
-Drawn on matplotlib's Agg canvas, so no display is needed. What stays the same in a cell is drawn once and restored for
-every frame.
+Frames are arrays, or shown in a window. They are drawn on matplotlib's Agg canvas, so no display is needed; matplotlib
+is loaded with the first frame. The unchanged parts of a cell are drawn once and restored for every frame. All pictures
+and pages share the colour scale.
 """
 
 import logging
@@ -65,7 +62,7 @@ class Renderer:
         self._picture: Picture | None = None
         self._figure: Figure | None = None
         self._closed = False
-        """By the user, or never opened for lack of a display."""
+        """Whether the user closed the window, or there is no display."""
 
     def frame(self, world: World, state: State) -> np.ndarray:
         """Env 0 as uint8 [height, width, 3].
@@ -82,7 +79,7 @@ class Renderer:
         return self._picture.frame(scene_of(world, state, self._cell))
 
     def show(self, frame: np.ndarray) -> bool:
-        """Show a frame, uint8 [height, width, 3], in the window; False where nobody can see it.
+        """Show a frame, uint8 [height, width, 3], in the window; return whether there is a window.
 
         The first frame opens the window. A window that the user closed stays closed. Without a display a warning is
         logged once.
@@ -119,7 +116,7 @@ class Renderer:
         from matplotlib.backends.registry import BackendFilter, backend_registry
 
         try:
-            backend = matplotlib.get_backend()  # where none was chosen, the first that has a display, else agg
+            backend = matplotlib.get_backend()  # if none was chosen, the first one with a display, else agg
             if backend.lower() not in map(str.lower, backend_registry.list_builtin(BackendFilter.INTERACTIVE)):
                 log.warning(NO_WINDOW, f"matplotlib's backend is {backend}")
                 return None
@@ -139,8 +136,8 @@ class Renderer:
 Array = np.ndarray
 
 HEAT = ("#aef2a6", "#ecd070", "#e08a00", "#cc2222", "#4d0a2a")
-"""Cool, halfway to the warning limit, warning, error, beyond: green to red, and ever darker, so that they can be told
-apart without colour vision."""
+"""Cool, halfway to the warning limit, warning, error, beyond: green to red and always darker, so that they differ
+without colour vision."""
 COOL_C, BEYOND_K = 20.0, 10.0
 """The scale begins at `COOL_C` and ends `BEYOND_K` above the error limit."""
 
@@ -169,7 +166,7 @@ WORK, FAULT = "#4477aa", "#cc2222"
 PLATES = ("#ffffff", "#dfe9f3", "#f9d9d9")
 """Background of an idle, a working and a faulted arm."""
 MOUNTS: dict[MountKind, str] = {"floor": "■", "wall": "▬", "ceiling": "○", "tilted": "◆"}
-"""Symbol of what an arm is fixed to."""
+"""Symbol of the mount of an arm."""
 MOST_MARKS = 12
 """With more arms, the queue counts those that can take a job instead of marking each."""
 
@@ -249,7 +246,7 @@ class Picture:
         self._draw_texts()
 
     def _draw_fixtures(self, scene: Scene) -> None:
-        """Outlines and names of the fixtures, as far as they are on the floor."""
+        """Outlines and names of the fixtures, cut at the edges of the floor."""
         plan, text = self.plan, self.plan.text
         left, top, right, bottom = plan.floor
         for fixture, outline in zip(scene.cell.fixtures, plan.fixtures, strict=True):
@@ -327,7 +324,7 @@ class Picture:
         self._box((0, bottom - 3, round(share * wide), bottom), FAINT)
 
     def _draw_queue(self, scene: Scene) -> None:
-        """The jobs on offer, oldest first, beside the cell; the last line counts those without room."""
+        """The jobs in the slots, oldest first, beside the cell; the last line counts those without room."""
         plan, text, line = self.plan, self.plan.text, round(1.35 * self.plan.text)
         x, right, y = plan.floor[2] + text // 2 + 2, plan.size[0] - text // 2 - 2, plan.floor[1] + text + 2
         self._write((x, y), "Queue" if scene.queue else "Queue: nothing on offer", INK, bold=True)
@@ -358,7 +355,7 @@ class Picture:
         ha: str = "left",
         ground: bool = False,
     ) -> None:
-        """Write one line of text, its middle at `at`; drawn by `_draw_texts`. `ground` covers what is behind it."""
+        """Write one line of text, centred at `at`; drawn by `_draw_texts`. `ground` covers the background."""
         size = size or self.plan.text
         wide = text_width(text, size, bold)
         x = at[0] - {"left": 0.0, "center": wide / 2, "right": wide}[ha]
@@ -431,7 +428,7 @@ def _arc(centre: Array, radius: float, share: float) -> Array:
 
 
 def _common_part_dropped(names: tuple[str, ...], plan: FloorPlan) -> list[str]:
-    """Names of arms that fit below them; where some do not, all lose their common beginning."""
+    """Names of arms that fit below them; if some do not, all lose their common prefix."""
     room = plan.room.tolist()
     if any(text_width(name, plan.text) > wide for name, wide in zip(names, room, strict=True)):
         same = next((i for i, letters in enumerate(zip(*names, strict=False)) if len(set(letters)) > 1), 0)
