@@ -106,7 +106,7 @@ def _stretch_rows(twin: Twin, stretch: Stretch, first: Array, features: Features
     return rows
 
 
-def _scores(twin: Twin, measures: Measures, **more: float | None) -> Row:
+def _scores(twin: Twin, measures: Measures, **more: float | Array | None) -> Row:
     """The scores of one job or window, further figures, and their origin."""
     figures = {"d": measures.total, **{f"d_{j + 1}": d for j, d in enumerate(measures.difficulty)}}
     figures |= {"load": measures.total_load, "latent": measures.total_latent, **more}
