@@ -24,7 +24,8 @@ from playwright.sync_api import Browser, sync_playwright
 from fleet.arm.cell import cell_model
 from fleet.robot import Mount, Robot
 from fleet.telemetry import Telemetry
-from scenarios.run.log import RunLog, open_run, run_html
+from scenarios.run.log import RunLog, open_run
+from scenarios.run.records import ShiftLog
 from scenarios.show.run_page import report_html
 
 CHROMIUM = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -59,7 +60,7 @@ PICTURES = """(scrub) => new Promise((done) => {
 
 def page_of(run: RunLog) -> str:
     """The report of a run."""
-    return run_html(run.card, run.scenario, run.readings, run.events, run.jobs, run.offers)
+    return run.page()
 
 
 def enlarged(run: RunLog, arms: int) -> str:
@@ -86,15 +87,14 @@ def enlarged(run: RunLog, arms: int) -> str:
         Robot(name=name, mount=Mount(position_m=(1.6 * (i % 10) - 7.2, 1.6 * (i // 10) - 7.2, 0.0)))
         for i, name in enumerate(names)
     ]
-    return report_html(
-        run.card,
-        Telemetry(time_s=telemetry.time_s, **recorded),
-        events,
-        names,
-        warning_c=run.scenario.limits.warning_c,
-        error_c=run.scenario.limits.error_c,
-        model=cell_model(robots),
+    log = ShiftLog(
+        card=run.card,
+        arms=names,
+        limits=run.limits,
+        readings=Telemetry(time_s=telemetry.time_s, **recorded),
+        events=tuple(events),
     )
+    return report_html(log, cell_model(robots))
 
 
 def measure(browser: Browser, html: str, loads: int) -> dict[str, float]:

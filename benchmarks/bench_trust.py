@@ -12,13 +12,13 @@ import argparse
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from sklearn.metrics import average_precision_score, roc_auc_score
 
 from benchmarks.paper.saturation import brier, reliability
 from scenarios.cli.terminal import progress_bar
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
+from scenarios.show.table import Table
 from scenarios.spec.load import load
 
 POLICY = "round_robin"
@@ -77,21 +77,18 @@ def main() -> None:
     if not 0 < share < 1:
         console.print("All jobs have the same outcome: there is nothing to rank.")
         return
-    table = Table("", "P(saturation)", "d (paper)", "constant", box=None)
-    table.add_row("AUROC", f"{roc_auc_score(event, p):.3f}", f"{roc_auc_score(event, d):.3f}", "0.500")
-    table.add_row(
-        "AUPRC", f"{average_precision_score(event, p):.3f}", f"{average_precision_score(event, d):.3f}", f"{share:.3f}"
-    )
-    table.add_row("Brier", f"{brier(p, event):.4f}", "", f"{share * (1 - share):.4f}")
-    table.add_row("ECE", f"{reliability(p, event).error:.4f}", "", "0.0000")
-    console.print(table)
-    bins = Table("mean P", "share that passed", "95 % interval", "awards", box=None)
     found = reliability(p, event)
-    for mean_p, shared, low, high, count in zip(
-        found.mean_p, found.share, found.low, found.high, found.count, strict=True
-    ):
-        bins.add_row(f"{mean_p:.3f}", f"{shared:.3f}", f"{low:.3f} to {high:.3f}", str(int(count)))
-    console.print(bins)
+    precision = [f"{average_precision_score(event, score):.3f}" for score in (p, d)]
+    rows = (
+        ("AUROC", f"{roc_auc_score(event, p):.3f}", f"{roc_auc_score(event, d):.3f}", "0.500"),
+        ("AUPRC", *precision, f"{share:.3f}"),
+        ("Brier", f"{brier(p, event):.4f}", "", f"{share * (1 - share):.4f}"),
+        ("ECE", f"{found.error:.4f}", "", "0.0000"),
+    )
+    console.print(Table(head=("", "P(saturation)", "d (paper)", "constant"), rows=rows))
+    bins = zip(found.mean_p, found.share, found.low, found.high, found.count, strict=True)
+    rows = tuple((f"{mean:.3f}", f"{s:.3f}", f"{low:.3f} to {high:.3f}", str(int(n))) for mean, s, low, high, n in bins)
+    console.print(Table(head=("mean P", "share that passed", "95 % interval", "awards"), rows=rows))
 
 
 if __name__ == "__main__":

@@ -3,14 +3,21 @@
 import re
 
 from fleet.events import Event
-from scenarios.show.run_page import Side, other_choices, pair_page
+from fleet.robot import ThermalLimits
+from fleet.telemetry import Telemetry
+from scenarios.run.records import ShiftLog
+from scenarios.show.run_page import other_choices, pair_page
 
-ARMS = ["arm_a", "arm_b"]
+ARMS = ("arm_a", "arm_b")
 
 
 def side(policy, *events, **run):
-    return Side(run={"policy": policy, "status": "finished", **run}, events=events, arms=ARMS, time_s=1000.0,
-                report=f"{policy}/report.html")  # fmt: skip
+    card = {"policy": policy, "status": "finished", "time_s": 1000.0, **run}
+    return ShiftLog(card=card, arms=ARMS, limits=ThermalLimits(), readings=Telemetry.empty(2), events=events)
+
+
+def reports(*sides):
+    return {f"{each.policy}/report.html": each for each in sides}
 
 
 def event(time_s, kind, arm="arm_a", job="crate", **more):
@@ -30,7 +37,7 @@ SPARED = side(
 
 
 def test_each_side_says_what_happened_and_what_became_of_the_job_on_the_other():
-    page = pair_page("two", "a shift", (BURNED, SPARED))
+    page = pair_page("two", "a shift", reports(BURNED, SPARED))
     burned, spared = re.findall(r"<section>(.*?)</section>", page, re.S)
     assert "<h2>round_robin</h2>" in burned
     assert "status bad" in burned
@@ -44,7 +51,7 @@ def test_each_side_says_what_happened_and_what_became_of_the_job_on_the_other():
 
 def test_names_stay_text():
     odd = '<img src=x onerror="a()">\x1b[2J'
-    page = pair_page(odd, odd, (side(odd, event(1.0, "fault", job=odd, reason=odd)), SPARED))
+    page = pair_page(odd, odd, reports(side(odd, event(1.0, "fault", job=odd, reason=odd)), SPARED))
     assert "<img" not in page
     assert 'onerror="' not in page
     assert "\x1b" not in page

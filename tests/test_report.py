@@ -18,8 +18,9 @@ from hypothesis.extra.numpy import arrays
 from plotly.offline import get_plotlyjs
 
 from fleet.events import Event
+from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
-from scenarios.run.schedule import schedule
+from scenarios.run.records import ShiftLog
 from scenarios.show.run_page import ROWS, report_html
 from scenarios.show.timeline import decimate, figure, stream_of
 
@@ -78,7 +79,14 @@ def page(
     readings: Telemetry | None = None,
 ) -> str:
     readings = telemetry(arms=len(arms)) if readings is None else readings
-    return report_html(run, readings, events, arms, warning_c=60.0, error_c=75.0)
+    return report_html(log_of(readings, arms, events, run))
+
+
+def log_of(
+    readings: Telemetry, arms: tuple[str, ...], events: tuple[Event, ...] = (), card: dict[str, Any] | None = None
+) -> ShiftLog:
+    limits = ThermalLimits(warning_c=60.0, error_c=75.0)
+    return ShiftLog(card=card or {}, arms=arms, limits=limits, readings=readings, events=events)
 
 
 def held(text: str, key: str) -> str:
@@ -277,7 +285,7 @@ def test_a_long_name_leaves_room_for_the_figure_and_is_no_template() -> None:
 def test_a_short_spike_of_a_long_shift_is_drawn() -> None:
     readings = telemetry(28_800, 1)
     readings.temp_c[12_345, 0, 1] = 99.0
-    shown = figure(schedule((), ("a",), 28_800.0), readings, (), ("a",), warning_c=60.0, error_c=75.0)
+    shown = figure(log_of(readings, ("a",)))
     (lane,) = [t for t in shown["data"] if t["name"] == "joint 2"]
     x, y = (np.frombuffer(base64.b64decode(lane[axis]["bdata"]), dtype="<f4") for axis in "xy")
     assert len(x) == len(y) <= 2000
@@ -290,7 +298,7 @@ def test_a_large_fleet_gets_a_heat_map_and_lanes_of_its_hottest_arms() -> None:
     readings = telemetry(7200, 64)
     readings.temp_c[:] = np.minimum(readings.temp_c, 79.0)
     readings.temp_c[3000, 41, 5] = 88.0
-    shown = figure(schedule((), arms, 7200.0), readings, (), arms, warning_c=60.0, error_c=75.0)
+    shown = figure(log_of(readings, arms))
     lines = [t for t in shown["data"] if t["type"] == "scatter"]
     assert len(lines) == 5 * 7
     assert "arm_41 joint 1" in lines[0]["hovertemplate"]

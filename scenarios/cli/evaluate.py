@@ -23,8 +23,9 @@ from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
 from scenarios.cli.options import JsonOption, RandomiseOption, number, parse_randomisation
-from scenarios.cli.terminal import KEPT, echo, out_console, plain_table, print_json, progress_bar, say
+from scenarios.cli.terminal import KEPT, echo, out_console, print_json, progress_bar, say
 from scenarios.result_folder import disk_errors
+from scenarios.show.table import Table
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import choose
 
@@ -52,20 +53,19 @@ def suite_command(
         if as_json:
             print_json([asdict(row) for row in rows])
             return
-        table = plain_table("instance", "cell", "axes", "jobs", numbers=False)
-        for row in rows:
-            axes = ", ".join(f"{name} {value}" for name, value in asdict(row.axes).items())
-            table.add_row(row.name, row.cell, axes, str(row.count))
-        out_console.print(table)
+        axes = (", ".join(f"{name} {value}" for name, value in asdict(row.axes).items()) for row in rows)
+        lines = tuple((row.name, row.cell, text, str(row.count)) for row, text in zip(rows, axes, strict=True))
+        out_console.print(Table(head=("instance", "cell", "axes", "jobs"), rows=lines, numbers=False))
         return
     if as_json:
         print_json({cell.name: {**asdict(cell), "stations_per_arm": cell.stations_per_arm} for cell in CELLS})
         return
-    table = plain_table("split", "cell", "arms are", "stations per arm", "hours", "instances", numbers=False)
-    for cell in CELLS:
-        numbers = (f"{cell.stations_per_arm:.2g}", f"{cell.hours:g}", str(cell.instances))
-        table.add_row(cell.split, cell.name, cell.unlike, *numbers)
-    out_console.print(table)
+    head = ("split", "cell", "arms are", "stations per arm", "hours", "instances")
+    lines = tuple(
+        (cell.split, cell.name, cell.unlike, f"{cell.stations_per_arm:.2g}", f"{cell.hours:g}", str(cell.instances))
+        for cell in CELLS
+    )
+    out_console.print(Table(head=head, rows=lines, numbers=False))
 
 
 def train_command(
@@ -481,10 +481,8 @@ def bounds_command(
     if format_ == "markdown":
         echo(reference_table(found))
         return
-    shown = plain_table(*heads_of(found))
-    for each in found:
-        shown.add_row(*cells(each)[: len(shown.columns)])
-    out_console.print(shown)
+    head = heads_of(found)
+    out_console.print(Table(head=head, rows=tuple(cells(each)[: len(head)] for each in found)))
     if not show_only:
         say(f"Written to {out}.")
 

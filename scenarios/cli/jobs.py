@@ -7,7 +7,8 @@ import typer
 from fleet.errors import FleetError
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, JsonOption, check_name, number
-from scenarios.cli.terminal import out_console, plain_table, print_json
+from scenarios.cli.terminal import out_console, print_json
+from scenarios.show.table import Table
 
 if TYPE_CHECKING:  # slow to import
     from fleet.bus.protocol.operator import Action
@@ -98,10 +99,11 @@ def list_command(endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = "", a
     if as_json:
         print_json(jobs)
         return
-    table = plain_table("job", "state", "arm", "cycles", "reason", numbers=False)
-    for job in jobs:
-        table.add_row(job.job, job.state.replace("_", " "), job.arm, f"{job.cycles} of {job.repetitions}", job.reason)
-    out_console.print(table)
+    rows = tuple(
+        (each.job, each.state.replace("_", " "), each.arm, f"{each.cycles} of {each.repetitions}", each.reason)
+        for each in jobs
+    )
+    out_console.print(Table(head=("job", "state", "arm", "cycles", "reason"), rows=rows, numbers=False))
 
 
 def cancel_command(

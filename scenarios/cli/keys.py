@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated, get_args
 
 import typer
-from rich.table import Table
 
 from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, of_arms, read_roster, rights
 from fleet.errors import FleetError, nearest
 from scenarios.cli.options import JsonOption, number
-from scenarios.cli.terminal import out_console, plain_table, print_json, say
+from scenarios.cli.terminal import out_console, print_json, say
+from scenarios.show.table import Table
 
 DAYS, MAX_DAYS = 365, 3650
 
@@ -93,13 +93,13 @@ def participant_of(text: str) -> Participant:
 def _table(roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table:
     from fleet.bus.security.certificates import CA, format_time
 
-    table = plain_table("participant", "role", "certificate ends", numbers=False)
     now = datetime.now(UTC)
-    rows = [("(authority)", "", spans[CA]), *((one.name, one.role, spans[one.name]) for one in roster.participants)]
-    for name, role, (begin, end) in rows:
+    rows = list[tuple[str, str, str]]()
+    held = [("(authority)", "", spans[CA]), *((one.name, one.role, spans[one.name]) for one in roster.participants)]
+    for name, role, (begin, end) in held:
         not_now = ", expired" if end < now else ", not yet valid" if begin > now else ""
-        table.add_row(name, role, format_time(end) + not_now)
-    return table
+        rows.append((name, role, format_time(end) + not_now))
+    return Table(head=("participant", "role", "certificate ends"), rows=tuple(rows), numbers=False)
 
 
 def _plain(roster: Roster, ends: dict[str, datetime]) -> dict[str, object]:

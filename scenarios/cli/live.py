@@ -314,7 +314,7 @@ def gateway_command(
     shown = None
     if page:
         from scenarios.live.gateway import LivePage
-        from scenarios.show.replay import three_js
+        from scenarios.show.page import three_js
         from scenarios.spec.load import load
 
         three_js()  # if it is missing, say so at once

@@ -15,7 +15,8 @@ from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING, Cooling
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
+from scenarios.cli.terminal import out_console, print_json, progress_bar, say
+from scenarios.show.table import Table
 from scenarios.spec.options import Shot
 
 SMALLEST, LARGEST = 160, 3840
@@ -118,10 +119,8 @@ def _list_library(as_json: bool) -> None:
     if as_json:
         print_json({name: s.description for name, s in scenarios.items()})
         return
-    table = plain_table("scenario", "arms", "hours", "description", numbers=False)
-    for name, s in scenarios.items():
-        table.add_row(name, str(len(s.arms)), f"{s.horizon_s / 3600:g}", s.description)
-    out_console.print(table)
+    rows = tuple((n, str(len(s.arms)), f"{s.horizon_s / 3600:g}", s.description) for n, s in scenarios.items())
+    out_console.print(Table(head=("scenario", "arms", "hours", "description"), rows=rows, numbers=False))
 
 
 def layout_command(
@@ -344,7 +343,7 @@ def report_command(
 ) -> None:
     """Write the report of a live recording, as `run` writes one of a simulated shift, or that of a run anew."""
     from fleet.files import atomic_path
-    from scenarios.live.recording_report import recording_html
+    from scenarios.live.recording_report import open_recording
     from scenarios.result_folder import disk_errors
     from scenarios.run.log import open_run
     from scenarios.spec.load import load
@@ -354,7 +353,7 @@ def report_command(
         html = run.page(meshes=meshes)
     else:
         path = out or folder.parent / "report.html"
-        html = recording_html(folder, None if scenario is None else load(scenario))
+        html = open_recording(folder, None if scenario is None else load(scenario)).page()
     with disk_errors(path), atomic_path(path) as draft:
         draft.write_text(html, encoding="utf-8")
     say(f"Open {path} in a browser.", out_console)

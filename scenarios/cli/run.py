@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, plain_table, print_json, progress_bar, say
+from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, print_json, progress_bar, say
+from scenarios.show.table import Table
 from scenarios.spec.options import RunSpec
 
 if TYPE_CHECKING:  # slow to import
@@ -98,7 +98,7 @@ def demo_command(
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
     from scenarios.result_folder import disk_errors
-    from scenarios.show.run_page import Side, pair_page
+    from scenarios.show.run_page import pair_page
     from scenarios.spec.load import load
 
     chosen = load("quickstart")
@@ -112,26 +112,16 @@ def demo_command(
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result
-    first, second = (
-        Side(
-            run=result.card,
-            events=result.events,
-            arms=[arm.name for arm in chosen.arms],
-            time_s=result.time_s,
-            report=f"{policy}/report.html",
-            offers=result.offers,
-        )
-        for policy, result in results.items()
-    )
+    reports = {f"{policy}/report.html": result for policy, result in results.items()}
     with disk_errors(out):
-        page = pair_page(f"{chosen.name} · seed {seed} · two policies", chosen.description, (first, second))
+        page = pair_page(f"{chosen.name} · seed {seed} · two policies", chosen.description, reports)
         (out / PAIR).write_text(page, encoding="utf-8")
     say(f"{chosen.name}, seed {seed}: {chosen.description}", out_console)
     out_console.print(metrics_table({policy: result.metrics for policy, result in results.items()}))
-    for side in sorted((first, second), key=lambda side: -len(side.faults)):
-        count = len(side.faults)
-        how = f"{count} fault{'s' * (count > 1)}, of {_named(side.faults)}" if count else "no fault"
-        say(f"{side.name}: {how}. {out / side.report}", out_console)
+    for report, result in sorted(reports.items(), key=lambda each: -len(each[1].faults)):
+        count = len(result.faults)
+        how = f"{count} fault{'s' * (count > 1)}, of {_named(result.faults)}" if count else "no fault"
+        say(f"{result.policy}: {how}. {out / report}", out_console)
     say(f"Open {out / PAIR} in a browser to see both side by side.", out_console)
 
 
@@ -187,8 +177,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 def metrics_table(results: "dict[str, Metrics]") -> Table:
     """Key figures, one column per policy."""
-    table = plain_table("", *results)
-    rows: list[tuple[str, Callable[[Metrics], str]]] = [
+    figures: list[tuple[str, Callable[[Metrics], str]]] = [
         ("jobs finished", lambda m: f"{m.finished} of {m.jobs}"),
         ("value", lambda m: f"{m.value:g} of {m.value_offered:g}"),
         ("on time", lambda m: str(m.on_time)),
@@ -204,9 +193,9 @@ def metrics_table(results: "dict[str, Metrics]") -> Table:
         ("tool drift, mm", lambda m: f"{max(m.tool_drift_mm.values()):.2f}"),
     ]
     if any(m.contacts for m in results.values()):
-        rows.append(("contacts", lambda m: "-" if m.contacts is None else str(m.contacts)))
-    for figure, text in rows:
-        table.add_row(figure, *(text(m) for m in results.values()))
-    for arm in next(iter(results.values())).peak_c:
-        table.add_row(f"peak {arm}, °C", *(f"{m.peak_c[arm]:.1f}" for m in results.values()))
-    return table
+        figures.append(("contacts", lambda m: "-" if m.contacts is None else str(m.contacts)))
+    figures += [
+        (f"peak {arm}, °C", lambda m, arm=arm: f"{m.peak_c[arm]:.1f}") for arm in next(iter(results.values())).peak_c
+    ]
+    rows = tuple((name, *(text(m) for m in results.values())) for name, text in figures)
+    return Table(head=("", *results), rows=rows)

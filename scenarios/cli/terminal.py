@@ -12,7 +12,6 @@ from typing import Any
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
-from rich.table import Table
 from rich.text import Text
 
 from fleet.errors import FleetError, visible
@@ -160,24 +159,6 @@ def print_json(value: object) -> None:
     import msgspec
 
     echo(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
-
-
-MOST_LABEL = 40
-"""Characters of a row's label, so that a long name of an arm leaves room for the figures."""
-
-
-def plain_table(*heads: str, numbers: bool = True, title: str | None = None, caption: str | None = None) -> Table:
-    """An empty table without lines; with `numbers` all columns but the first are aligned to the right."""
-    table = Table(box=None, pad_edge=False, title=title, caption=caption, title_justify="left", caption_justify="left")
-    for column, head in enumerate(heads):
-        named = numbers and not column
-        table.add_column(
-            head,
-            justify="right" if numbers and column else "left",
-            no_wrap=named,
-            max_width=MOST_LABEL if named else None,
-        )
-    return table
 
 
 WIDE = 200

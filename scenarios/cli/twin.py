@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
 from fleet.errors import FleetError
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.terminal import echo, out_console, plain_table, print_json, print_wide, progress_bar, say
+from scenarios.cli.terminal import echo, out_console, print_json, print_wide, progress_bar, say
 from scenarios.result_folder import check_file, check_overwrite, disk_errors
+from scenarios.show.table import Table
 from scenarios.spec.load import load
 from scenarios.spec.parse import choose
 from twin.thermal.identify import AMBIENT_C
@@ -89,11 +89,17 @@ def identify_command(
 def parameter_table(network: "Identified") -> Table:
     """The parameters of an identified thermal network with their intervals."""
     caption = f"version {network.version}, data {network.data_hash}; informed: whether the logs say more than the prior"
-    table = plain_table("parameter", "joint", "value", "95 % from", "to", "prior", "informed", caption=caption)
-    for p in network.parameters:
-        numbers = (f"{v:.4g}" for v in (p.value, p.low, p.high, p.prior))
-        table.add_row(p.name, "–" if p.joint is None else str(p.joint), *numbers, "yes" if p.informed else "no")
-    return table
+    rows = tuple(
+        (
+            p.name,
+            "–" if p.joint is None else str(p.joint),
+            *(f"{v:.4g}" for v in (p.value, p.low, p.high, p.prior)),
+            "yes" if p.informed else "no",
+        )
+        for p in network.parameters
+    )
+    head = ("parameter", "joint", "value", "95 % from", "to", "prior", "informed")
+    return Table(head=head, rows=rows, notes=(caption,))
 
 
 def generate_command(
@@ -496,15 +502,17 @@ def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> Twin
 
 def quality_table(twin: dict[str, Any]) -> Table:  # JSON of twins.json
     """Fit of each network of a twin, with the version and the data of the twin."""
-    caption = f"data {twin['data_hash']}, seed {twin['seed']}, calibrated on {twin['calibrated_on']} held-out jobs"
+    note = f"data {twin['data_hash']}, seed {twin['seed']}, calibrated on {twin['calibrated_on']} held-out jobs"
     title = f"Twin of {twin['arm']}: version {twin['version']}"
-    table = plain_table("network", "ELBO, nat", "KL, nat", "active units", "MSE, σ²", title=title, caption=caption)
-    for fit in twin["networks"]:
-        numbers = (
+    rows = tuple(
+        (
+            fit["name"].replace("_", " "),
             f"{fit['elbo']:.1f}",
             f"{fit['kl']:.2f}",
             str(fit["active_units"]),
             f"{fit['mean_squared_error']:.3f}",
         )
-        table.add_row(fit["name"].replace("_", " "), *numbers)
-    return table
+        for fit in twin["networks"]
+    )
+    head = ("network", "ELBO, nat", "KL, nat", "active units", "MSE, σ²")
+    return Table(head=head, rows=rows, caption=title, notes=(note,))

@@ -116,7 +116,7 @@ class LivePage:
     @cached_property
     def contents(self) -> Mapping[str, bytes]:
         """The page and its files by name, compressed."""
-        from scenarios.show.replay import three_js
+        from scenarios.show.page import three_js
         from scenarios.show.table import static
 
         texts = {name: static(name) for name in (PAGE, *FILES)}

@@ -1,4 +1,4 @@
-"""The report of a live recording: the page that a run has, from what was recorded of arms and auctioneer.
+"""A live recording as the log of a shift, from what was recorded of arms and auctioneer, and its report.
 
 A live log has what a simulated one has not: awards that queue, jobs that are returned without a fault, arms that crash
 and messages that are lost. `order_events` turns it into a sequence that a schedule can have.
@@ -9,9 +9,9 @@ import math
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any  # values of the report
+from typing import Any  # values of a card
 
 import msgspec
 import numpy as np
@@ -29,8 +29,10 @@ from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
 from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
-from scenarios.run.records import Offer
+from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import SAME_MOMENT_DIGITS
+from scenarios.show.run_page import report_html
+from scenarios.show.words import clock
 from scenarios.spec.schema import Scenario
 
 Array = np.ndarray
@@ -43,33 +45,43 @@ _ENDED = ("waiting", "given_up", "unfinished", "cancelled")
 """States of a job in which the arm that had it has it no more."""
 
 
-def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
-    """The report of a recording, which may still grow, as one HTML page.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordingLog(ShiftLog):
+    """A live recording as the log of a shift: its last epoch, without jobs."""
+
+    model: Mapping[str, Any] | None
+    """`fleet.arm.cell.cell_model`; None if the cell is not known."""
+
+    def page(self) -> str:
+        """The report as one HTML page."""
+        return report_html(self, self.model)
+
+
+def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingLog:
+    """Read a recording, which may still grow.
 
     Args:
         scenario: Gives the limits and the cell of the fleet; by default they are those that the recording has from
-            the auctioneer. With neither, nothing is shown in 3-D.
+            the auctioneer. With neither, there is no model of the cell.
 
     Raises:
         FleetError: it is no recording, has no states of arms yet, or has arms that the scenario does not have.
     """
-    from scenarios.show.run_page import report_html
-
     card = read_card(folder)
     epochs = dict.fromkeys(epoch for count in card.speakers.values() for epoch in count.epochs)
     table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in MESSAGES)
-    arms = sorted(set(table["arm"].to_pylist()))
+    arms = tuple(sorted(set(table["arm"].to_pylist())))
     if not arms:
         raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
-    warning_c, error_c, model = _cell(scenario, card.cell, arms)
-    events = order_events(_arm_events(log), _returns(results))
-    events = [event for event in events if event.arm in arms]
+    limits, model = _cell(scenario, card.cell, arms)
+    ordered = order_events(arm_events(log), _returns(results))
+    events = tuple(event for event in ordered if event.arm in arms)
     telemetry = telemetry_of(table, arms)
-    run = {
+    shown = {
         "status": {"recording": "interrupted"}.get(card.status, card.status),
         "scenario": {"name": card.fleet},
         "policy": "live recording",
-        "metrics": _metrics(telemetry, events, results, arms, warning_c) | heat_use(table, arms),
+        "metrics": _metrics(telemetry, events, results, arms, limits.warning_c) | heat_use(table, arms),
         "messages": {
             sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.speakers.items()
         },
@@ -78,32 +90,31 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
         "requests": [_describe_request(row) for row in operations.to_pylist()],
     }
     if len(epochs) > 1:
-        run["epochs"] = f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}"
-    return report_html(
-        run,
-        telemetry,
-        events,
-        arms,
-        warning_c=warning_c,
-        error_c=error_c,
+        shown["epochs"] = f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}"
+    return RecordingLog(
+        card=shown,
+        arms=arms,
+        limits=limits,
+        readings=telemetry,
+        events=events,
+        offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
         model=model,
-        offers=[offer for row in results.to_pylist() for offer in offers_of(row)],
     )
 
 
 def _cell(
     scenario: Scenario | None, described: Cell | None, arms: Sequence[str]
-) -> tuple[float, float, dict[str, Any] | None]:
-    """Temperatures of warning and fault, and the cell in three dimensions."""
+) -> tuple[ThermalLimits, dict[str, Any] | None]:
+    """Limits of the motors, and the cell in three dimensions."""
     if scenario is not None:
-        return scenario.limits.warning_c, scenario.limits.error_c, _model(scenario, arms)
+        return scenario.limits, _model(scenario, arms)
     limits, model = ThermalLimits(), None
     if described is not None:
         with suppress(ValueError):  # of numbers that no cell has, or of arms that joined later
             restart_c = min(limits.restart_c, described.warning_c - 1.0)
             limits = ThermalLimits(warning_c=described.warning_c, error_c=described.error_c, restart_c=restart_c)
             model = described_model(described, arms)
-    return limits.warning_c, limits.error_c, model
+    return limits, model
 
 
 def _model(scenario: Scenario, arms: Sequence[str]) -> dict[str, Any]:
@@ -204,7 +215,8 @@ def _order_of_arm(log: list[Event]) -> list[Event]:
     return out
 
 
-def _arm_events(table: pa.Table) -> list[Event]:
+def arm_events(table: pa.Table) -> list[Event]:
+    """Events as the arms reported them, in the order of their rows."""
     rows = (row for row in table.to_pylist() if row["kind"] in EVENT_KINDS)
     names = ("time_s", "kind", "arm", "job", "joint", "reason")
     return [
@@ -230,7 +242,7 @@ def _returns(results: pa.Table) -> list[Event]:
     return out
 
 
-def telemetry_of(table: pa.Table, arms: list[str]) -> Telemetry:
+def telemetry_of(table: pa.Table, arms: Sequence[str]) -> Telemetry:
     """Telemetry of a recording on common times: at each, the last reading of every arm, or NaN if it was absent."""
     all_s = table["time_s"].to_numpy()
     names = np.array(table["arm"].to_pylist())
@@ -277,7 +289,7 @@ def offers_of(row: Mapping[str, Any]) -> Iterator[Offer]:
 
 
 def _metrics(
-    telemetry: Telemetry, events: list[Event], results: pa.Table, arms: list[str], warning_c: float
+    telemetry: Telemetry, events: Sequence[Event], results: pa.Table, arms: Sequence[str], warning_c: float
 ) -> dict[str, Any]:
     """Key figures, named as in a run; what only the simulator knows is left out."""
     late_s = [event.value for event in events if event.kind == "finish"]
@@ -352,8 +364,6 @@ def _submitters(results: pa.Table) -> Mapping[str, int]:
 
 def _describe_request(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Time, action, what it concerns, and who asked."""
-    from scenarios.show.words import clock
-
     action = json.loads(row["content"])["action"]
     details = (
         f"{key.removesuffix('_s')} {action[key]}".removeprefix("outcome ")

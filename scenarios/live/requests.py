@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import msgspec
-from rich.table import Table
 
 from fleet.bus.client import BusClient, NoReply, Replies
 from fleet.bus.protocol import keys
@@ -44,6 +43,7 @@ from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import the_fleet
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, out_console, say
+from scenarios.show.table import Column, Table
 
 REPLY_S, ATTEMPTS = 5.0, 3
 """Real seconds to wait for a reply, and number of attempts: the same request again is carried out once."""
@@ -238,20 +238,17 @@ def one_job(
 
 def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
     """All estimates: jobs in the given order, and under each job the arms."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("job")
-    table.add_column("arm")
-    for column in ("plan", "peak °C", "gained K", "P", "d", "duration s", "finish in s"):
-        table.add_column(column, justify="right")
-    table.add_column("")
-    for index, job in enumerate(jobs):
-        estimates = [(arm, each) for arm, quote in quotes.items() for each in quote.estimates if each.job == job.name]
-        rows = [(arm, row) for arm, estimate in estimates for row in rows_of(estimate)]
-        for line, (arm, row) in enumerate(rows):
-            again = line > 0 and rows[line - 1][0] == arm
-            last = line == len(rows) - 1 and index > 0
-            table.add_row("" if line else job.name, "" if again else arm, *row, end_section=last)
-    return table
+    rows = list[tuple[str, ...]]()
+    for job in jobs:
+        name = job.name
+        for arm, quote in quotes.items():
+            plans = [cells for each in quote.estimates if each.job == job.name for cells in rows_of(each)]
+            for number, cells in enumerate(plans):
+                rows.append((name, "" if number else arm, *cells))
+                name = ""
+    figures = ("plan", "peak °C", "gained K", "P", "d", "duration s", "finish in s")
+    head = ("job", Column("arm", words=True), *figures, Column("", words=True))
+    return Table(head=head, rows=tuple(rows))
 
 
 def rows_of(estimate: JobEstimate) -> list[list[str]]:

@@ -9,7 +9,6 @@ from typing import cast, get_args
 
 import msgspec
 import numpy as np
-from rich.table import Table
 
 from fleet.errors import FleetError, nearest
 from fleet.heat.motor import Motors, current, gen3_motors, thermal_data
@@ -29,6 +28,7 @@ from fleet.job import BOUNDS
 from fleet.motion import static_drive
 from fleet.robot import GEN3, JOINTS, RATING, Cooling, Robot, ThermalLimits
 from scenarios.motion.recover import parse_posture
+from scenarios.show.table import Table
 
 Array = np.ndarray
 PerJoint = tuple[float, ...]
@@ -202,26 +202,24 @@ def as_json(result: HoldResult) -> dict[str, object]:
 def as_table(result: HoldResult) -> Table:
     """The result for people: one row per joint."""
     tool = f" and a tool of {result.tool_kg:g} kg" if result.tool_kg else ""
-    table = Table(
-        title=f"Holding {result.payload_kg:g} kg{tool}, {result.posture}, {result.ambient_c:g} °C, {result.cooling}",
-        caption=f"{result.note}\nMinutes from a cold start | from idle-warm; – is never.",
-        caption_justify="left",
-    )
-    for heading in ("joint", "torque N·m", "current A", "settles °C", "min to 60 °C", "min to 75 °C"):
-        table.add_column(heading, justify="right")
     cold, warm = result.cold, result.idle_warm
-    for j in range(JOINTS):
-        style = "red" if cold.t75_min[j] is not None else "yellow" if cold.t60_min[j] is not None else ""
-        table.add_row(
+    rows = tuple(
+        (
             str(j + 1),
             f"{cold.torque_nm[j]:.1f}",
             f"{cold.current_a[j]:.2f} | {warm.current_a[j]:.2f}",
             _cell(cold.steady_c[j]),
             f"{_cell(cold.t60_min[j])} | {_cell(warm.t60_min[j])}",
             f"{_cell(cold.t75_min[j])} | {_cell(warm.t75_min[j])}",
-            style=style,
         )
-    return table
+        for j in range(JOINTS)
+    )
+    return Table(
+        caption=f"Holding {result.payload_kg:g} kg{tool}, {result.posture}, {result.ambient_c:g} °C, {result.cooling}",
+        head=("joint", "torque N·m", "current A", "settles °C", "min to 60 °C", "min to 75 °C"),
+        rows=rows,
+        notes=(result.note, "Minutes from a cold start | from idle-warm; – is never."),
+    )
 
 
 def _check_torque(tau: Array, payload_kg: float, posture: str) -> None:

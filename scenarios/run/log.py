@@ -1,4 +1,4 @@
-"""A shift as it was recorded: settings and figures, readings, events, jobs and offers, and their files."""
+"""The record of a shift: settings, figures, readings, events, jobs and offers, and their files."""
 
 import hashlib
 import json
@@ -25,8 +25,7 @@ from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
 from scenarios.result_folder import ResultKind, disk_errors
 from scenarios.run.metrics import Metrics
-from scenarios.run.records import JobRecord, Offer
-from scenarios.run.schedule import Schedule, payloads, schedule
+from scenarios.run.records import JobRecord, Offer, ShiftLog
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import scenario_hash
 from scenarios.spec.schema import Scenario
@@ -41,24 +40,11 @@ ROWS_AT_ONCE = 10_000
 RUN = ResultKind(name="run", card="run.json", files=FILES)
 
 
-@dataclass(frozen=True, eq=False)
-class RunLog:
-    """A recorded shift, from `run` or from its folder."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunLog(ShiftLog):
+    """A recorded shift, from `run` or `open_run`; its card has no time of day, so equal seeds give equal files."""
 
-    card: Mapping[str, Any]
-    """Settings, versions, figures: the content of run.json. It holds no clock time, so a seed gives the same file."""
     scenario: Scenario
-    readings: Telemetry
-    """Sensor readings as arrays; without samples if none were kept, or the shift ended before its first step."""
-    events: tuple[Event, ...]
-    jobs: tuple[JobRecord, ...]
-    offers: tuple[Offer, ...]
-    """Of all arms, at every award."""
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """Names of the arms."""
-        return tuple(arm.name for arm in self.scenario.arms)
 
     @property
     def finished(self) -> bool:
@@ -85,40 +71,25 @@ class RunLog:
         """Readings as a table, a row for each arm and moment."""
         return telemetry_table(self.readings, list(self.arms))
 
-    @cached_property
-    def plan(self) -> Schedule:
-        """Which arm worked on what."""
-        return schedule(self.events, self.arms, float(self.readings.time_s[-1]))
-
-    @cached_property
-    def load_kg(self) -> np.ndarray:
-        """Payload in each hand, kg, [sample, arm]."""
-        return payloads(self.readings, self.plan, self.arms, {job.job: job.payload_kg for job in self.jobs})
-
-    def page(self, *, meshes: bool = False) -> str:
-        """The report as one HTML page.
+    def cell_model(self, *, meshes: bool = False) -> dict[str, Any]:
+        """The cell in three dimensions, as `fleet.arm.cell.cell_model`.
 
         Args:
-            meshes: Show Kinova's shells instead of primitives.
+            meshes: Kinova's shells instead of primitives.
 
         Raises:
             FleetError: the meshes are not available.
         """
         from fleet.arm.cell import cell_model
+
+        robots = [arm.robot() for arm in self.scenario.arms]
+        return cell_model(robots, self.scenario.places, self.scenario.fixtures, meshes=meshes)
+
+    def page(self, *, meshes: bool = False) -> str:
+        """The report as one HTML page; arguments and errors as those of `cell_model`."""
         from scenarios.show.run_page import report_html
 
-        robots, limits = [arm.robot() for arm in self.scenario.arms], self.scenario.limits
-        return report_html(
-            self.card,
-            self.readings,
-            self.events,
-            self.arms,
-            warning_c=limits.warning_c,
-            error_c=limits.error_c,
-            model=cell_model(robots, self.scenario.places, self.scenario.fixtures, meshes=meshes),
-            payload_of={job.job: job.payload_kg for job in self.jobs},
-            offers=self.offers,
-        )
+        return report_html(self, self.cell_model(meshes=meshes))
 
     def write(self, folder: Path) -> None:
         """Write the files of the run to an existing folder.
@@ -140,7 +111,7 @@ class RunLog:
     def _repr_html_(self) -> str:
         from scenarios.show.run_page import run_html
 
-        return run_html(self.card, self.events, self.offers)
+        return run_html(self)
 
 
 def card_of(
@@ -189,12 +160,14 @@ def open_run(folder: str | Path) -> RunLog:
         scenario = msgspec.convert(card["scenario"], Scenario)
         tables = {name: pq.read_table(folder / f"{name}.parquet") for name in ("telemetry", "events", "jobs", "offers")}
         stored = RunLog(
-            card,
-            scenario,
-            _readings(tables["telemetry"], len(scenario.arms)),
-            tuple(Event(**_without_nulls(row)) for row in tables["events"].to_pylist()),
-            tuple(JobRecord(**row) for row in tables["jobs"].to_pylist()),
-            tuple(Offer(**row) for row in tables["offers"].to_pylist()),
+            card=card,
+            scenario=scenario,
+            arms=tuple(arm.name for arm in scenario.arms),
+            limits=scenario.limits,
+            readings=_readings(tables["telemetry"], len(scenario.arms)),
+            events=tuple(Event(**_without_nulls(row)) for row in tables["events"].to_pylist()),
+            jobs=tuple(JobRecord(**row) for row in tables["jobs"].to_pylist()),
+            offers=tuple(Offer(**row) for row in tables["offers"].to_pylist()),
         )
         if not len(stored.readings.time_s):
             raise ValueError("telemetry.parquet has no rows")

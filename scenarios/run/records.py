@@ -1,13 +1,18 @@
-"""What a run keeps of its jobs and of the offers behind each award."""
+"""A shift as it was recorded: readings, events, jobs, and the offers behind each award."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any  # values of a card
 
 import numpy as np
 
 from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State, World
 from fleet.events import Event
 from fleet.observation import Observation
+from fleet.robot import ThermalLimits
+from fleet.telemetry import Telemetry
+from scenarios.run.schedule import Schedule, payloads, schedule
 
 JOB_STATES = {WAITING: "waiting", RUNNING: "running", DONE: "finished", GIVEN_UP: "given_up", EXPIRED: "expired"}
 
@@ -52,6 +57,53 @@ class Offer:
     """Time for the rest of the job by that plan; None without a plan."""
     plan: int | None = None
     """Number of that plan: 0 is the fastest, 1 the coolest; None without a plan, and in runs of earlier versions."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShiftLog:
+    """A shift of a simulated or of a live fleet, as its readers need it."""
+
+    card: Mapping[str, Any]
+    """Settings and figures: of a run, the content of run.json; of a recording, those that are known."""
+    arms: tuple[str, ...]
+    """Names of the arms."""
+    limits: ThermalLimits
+    readings: Telemetry
+    """Sensor readings as arrays, arms in the order of `arms`; without samples if recording was off or the shift ended
+    before its first step."""
+    events: tuple[Event, ...]
+    jobs: tuple[JobRecord, ...] = ()
+    offers: tuple[Offer, ...] = ()
+    """Offers of all arms at every award."""
+
+    @property
+    def policy(self) -> str:
+        """Name of its policy."""
+        return str(self.card.get("policy", "unknown policy"))
+
+    @property
+    def faults(self) -> list[Event]:
+        """In order of time."""
+        return sorted((event for event in self.events if event.kind == "fault"), key=lambda event: event.time_s)
+
+    @cached_property
+    def plan(self) -> Schedule:
+        """Which arm worked on what, until the last reading or event.
+
+        Raises:
+            ValueError: as `schedule`.
+        """
+        ends_s = [float(self.readings.time_s[-1])] if len(self.readings.time_s) else []
+        if not ends_s and "time_s" in self.card:
+            ends_s.append(float(self.card["time_s"]))
+        ends_s += [event.time_s for event in self.events]
+        horizon_s = float(self.card.get("scenario", {}).get("horizon_s", 0.0))
+        return schedule(self.events, self.arms, max(ends_s, default=horizon_s))
+
+    @cached_property
+    def load_kg(self) -> np.ndarray:
+        """Payload in each hand, kg, [sample, arm]."""
+        return payloads(self.readings, self.plan, self.arms, {job.job: job.payload_kg for job in self.jobs})
 
 
 def job_records(world: World, state: State) -> tuple[JobRecord, ...]:

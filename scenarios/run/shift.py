@@ -121,7 +121,16 @@ def run(
         time_s=float(state.tick[0] * world.dt_s),
         reward=reward,
     )
-    return RunLog(card, fleet.scenario, recorder.readings(), events, job_records(world, state), tuple(offers))
+    return RunLog(
+        card=card,
+        scenario=fleet.scenario,
+        arms=tuple(arm.name for arm in fleet.scenario.arms),
+        limits=fleet.scenario.limits,
+        readings=recorder.readings(),
+        events=events,
+        jobs=job_records(world, state),
+        offers=tuple(offers),
+    )
 
 
 def _with_prediction(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int]) -> Event:

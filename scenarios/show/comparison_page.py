@@ -17,6 +17,7 @@ from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, plain
 from scenarios.show.table import Column, Table
+from scenarios.show.words import value_text
 
 Array = np.ndarray
 Range = tuple[float, float, float]
@@ -214,15 +215,14 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
         figure = result.figures[compared]["reward"]
         span = figure.to_base.text(1)
         significant = figure.to_base.excludes_zero and _significant(figure.p, len(others))
+        doubt = "" if significant else ", which is not significant"
         if best == base:
-            doubt = "" if significant else ", which is not significant"
             yield (
                 f"{where}no policy has more reward than the baseline {label(base)} ({reward}); "
                 f"the difference of {label(compared)} to it is {span}{doubt}."
             )
-            continue
-        doubt = "" if significant else ", which is not significant"
-        yield f"{where}{label(best)} has the most reward, {reward}; {span} more reward than {label(base)}{doubt}."
+        else:
+            yield f"{where}{label(best)} has the most reward, {reward}; {span} more reward than {label(base)}{doubt}."
 
 
 def _score_charts(judged: Judged) -> list[Chart]:
@@ -302,19 +302,13 @@ def _failure_text(each: Failed) -> str:
 def _card_table(card: Mapping[str, Any]) -> Table:
     """Code, versions, settings and policies of a study."""
     rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
-    rows += [(name, _plain(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
+    rows += [(name, value_text(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
     rows += [(f"policy {label(name)}", digest or _without_file(name)) for name, digest in card["policies"].items()]
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 
 def _without_file(policy: str) -> str:
     return "in another process, no file" if is_on_bus(policy) else "of the code"
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items())
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least: float, marked: str = "") -> Figure:

@@ -8,12 +8,11 @@ from typing import Any  # plain values of a cell model
 
 import numpy as np
 
-from fleet.arm.cell import cell_model
 from fleet.env.render.picture import heat_colour, heat_marks
 from fleet.job import payload_radius_m
 from fleet.robot import ThermalLimits
 from scenarios.run.log import RunLog
-from scenarios.show.replay import HEAT_STEP_S
+from scenarios.show.page import HEAT_STEP_S
 from scenarios.show.words import SEVERITY, event_text, offers_text
 
 Array = np.ndarray
@@ -55,14 +54,12 @@ class Moments:
     """
 
     def __init__(self, run: RunLog, every_s: float | None = None) -> None:
-        scenario, readings = run.scenario, run.readings
-        self.run, self.limits = run, scenario.limits
-        robots = [arm.robot() for arm in scenario.arms]
-        self.model: Mapping[str, Any] = cell_model(robots, scenario.places, scenario.fixtures)
-        time_s = readings.time_s
+        time_s = run.readings.time_s
+        self.run, self.limits = run, run.limits
+        self.model: Mapping[str, Any] = run.cell_model()
         self.sample_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
         wanted = 1 if every_s is None else round(every_s / self.sample_s)
-        size, free = readings.mode.size, every_s is None
+        size, free = run.readings.mode.size, every_s is None
         stride = max(1, wanted, -(-size // MOST_POSES) if free else 1)
         heat = max(stride, round(HEAT_STEP_S / self.sample_s), -(-size // MOST_HEATS) if free else 1)
         self.pose_s = stride * self.sample_s

@@ -6,28 +6,19 @@ The report of a run, the two reports of a demo side by side, and a run in a note
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import (
-    TYPE_CHECKING,  # values of run.json
-    Any,  # values of run.json
-)
+from typing import Any  # values of a card
 from urllib.parse import quote
 
 from fleet.env.render.picture import heat_scale
 from fleet.events import Event
-from fleet.telemetry import Telemetry
-from scenarios.run.records import Offer
-from scenarios.run.schedule import Assignment, Outage, Schedule, payloads, schedule
-from scenarios.show.page import Chart, Page, Replay
-from scenarios.show.replay import packed
+from scenarios.run.records import Offer, ShiftLog
+from scenarios.run.schedule import Assignment, Outage, Schedule
+from scenarios.show.page import Chart, Page, Replay, packed
 from scenarios.show.table import Moment, Table, render
 from scenarios.show.timeline import figure, time_unit
-from scenarios.show.words import CANNOT, by_joint, clock, duration, kind_text, scores_text
-
-if TYPE_CHECKING:
-    from markupsafe import Markup
-
+from scenarios.show.words import CANNOT, by_joint, clock, duration, kind_text, scores_text, value_text
 
 MOST_FAULTS = 2
 """Faults with a sentence of their own."""
@@ -53,17 +44,13 @@ class Verdict:
     """That some of the sentences are about."""
 
 
-def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, offers: Sequence[Offer] = ()) -> Verdict:
+def verdict(log: ShiftLog) -> Verdict:
     """The outcome of a shift: its jobs, each fault with its cause, and what to look at.
 
-    Args:
-        run: Content of `run.json`; what is missing is left out.
-        events: In order of time.
-        offers: What each arm knew at each award; without them nothing is said about other choices.
+    What is missing in its card is left out; without offers nothing is said about other choices.
     """
-    metrics = run.get("metrics") or {}
-    faults = [event for event in events if event.kind == "fault"]
-    contacts = sum(event.kind == "contact" for event in events)
+    metrics, plan, offers, faults = log.card.get("metrics") or {}, log.plan, log.offers, log.faults
+    contacts = sum(event.kind == "contact" for event in log.events)
     about = {_fault(fault, plan): fault for fault in faults[:MOST_FAULTS]}
     sentences = [*_jobs(metrics)]
     for sentence, fault in about.items():
@@ -71,16 +58,16 @@ def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, off
     if len(faults) > MOST_FAULTS:
         of = sorted({fault.arm for fault in faults})
         arms = ", ".join(of[:MOST_NAMED_ARMS]) + (
-            f" and {len(of) - MOST_ARMS} more" if len(of) > MOST_NAMED_ARMS else ""
+            f" and {len(of) - MOST_NAMED_ARMS} more" if len(of) > MOST_NAMED_ARMS else ""
         )
         sentences.append(f"{len(faults)} faults in all, of {arms}: see the events below.")
     elif not faults:
         sentences.append(_hottest(metrics))
-    if run.get("policy") != WEIGHS_PEAK:
+    if log.policy != WEIGHS_PEAK:
         sentences += _foreseen(faults, plan, offers)
     if contacts:
         sentences.append(f"Arms touched something {_times(contacts)}: see the events below.")
-    status = str(run.get("status", "unknown"))
+    status = str(log.card.get("status", "unknown"))
     if status == "interrupted":
         badge = f"Interrupted after {duration(plan.horizon_s)}: everything here covers that part only"
     elif faults:
@@ -223,7 +210,6 @@ def _times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
 
 
-NO_PAYLOADS: Mapping[str, float] = {}
 ROWS = 300
 """Most rows of the event table, and of the table of requests."""
 BEFORE_S = 5.0
@@ -233,19 +219,6 @@ NOTABLE = ("fault", "contact", "recover", "return", "warning", "torque_warning",
 MOST_AWARDS = 300
 MOST_ARMS = 8
 """With more arms, the columns of an award are the best other offers instead of the arms."""
-
-
-@dataclass(frozen=True)
-class EventTable:
-    """The notable events by time."""
-
-    counts: str
-    omitted: str
-    """Why some are not listed; "" if all are."""
-    lost: bool
-    """Whether claims were lost, whose rows are hidden at first."""
-    only_lost: bool
-    rows: "Markup"
 
 
 @dataclass(frozen=True)
@@ -259,78 +232,50 @@ class Tile:
     bad: bool
 
 
-def report_html(
-    run: Mapping[str, Any],
-    telemetry: Telemetry,
-    events: Sequence[Event],
-    arms: Sequence[str],
-    *,
-    warning_c: float,
-    error_c: float,
-    model: Mapping[str, Any] | None = None,
-    payload_of: Mapping[str, float] = NO_PAYLOADS,
-    offers: Sequence[Offer] = (),
-) -> str:
-    """The report of a run as one HTML page; the same input gives the same text.
+def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
+    """The report of a shift as one HTML page; the same input, with events in any order, gives the same text.
 
     Args:
-        run: Content of `run.json`; missing metrics are left out of the report.
-        telemetry: Arms in the order of `arms`; may be empty.
-        events: Event log of the run, in any order.
-        warning_c, error_c: Limits of the motor temperature.
+        log: Missing figures of its card are left out of the report.
         model: `fleet.arm.cell.cell_model` with the same arms; without it nothing is shown in 3-D.
-        payload_of: Payload of each job, kg.
-        offers: What each arm knew at each award.
 
     Raises:
         ValueError: the telemetry has another number of arms, or the events contradict each other.
     """
-    if telemetry.temp_c.shape[1] != len(arms):
-        raise ValueError(f"The telemetry has {telemetry.temp_c.shape[1]} arms, the fleet {len(arms)}.")
-    events = sorted(events, key=lambda e: (e.time_s, e.arm, e.kind, e.job))
-    last = [*telemetry.time_s[-1:].tolist(), *(e.time_s for e in events)]
-    reached_s = max(last, default=float(run.get("scenario", {}).get("horizon_s", 0.0)))
-    plan = schedule(events, arms, reached_s)
-    drawing = figure(plan, telemetry, events, arms, warning_c=warning_c, error_c=error_c)
-    replay = None
-    if model is not None and len(telemetry.time_s):
-        playback = packed(telemetry, payloads(telemetry, plan, arms, payload_of))
-        shown = {**model, "heat": heat_scale(warning_c, error_c)}
-        replay = Replay(model=shown, playback=playback, unit_s=time_unit(plan.horizon_s)[1])
-    scenario = run.get("scenario", {})
-    name = scenario.get("name", "unnamed scenario")
-    told = verdict(run, events, plan, offers)
+    if log.readings.temp_c.shape[1] != len(log.arms):
+        raise ValueError(f"The telemetry has {log.readings.temp_c.shape[1]} arms, the fleet {len(log.arms)}.")
+    log = replace(log, events=tuple(sorted(log.events, key=lambda e: (e.time_s, e.arm, e.kind, e.job))))
+    card, replay, limits = log.card, None, log.limits
+    if model is not None and len(log.readings.time_s):
+        shown = {**model, "heat": heat_scale(limits.warning_c, limits.error_c)}
+        unit_s = time_unit(log.plan.horizon_s)[1]
+        replay = Replay(model=shown, playback=packed(log.readings, log.load_kg), unit_s=unit_s)
+    scenario = card.get("scenario", {})
+    told = verdict(log)
     moments = {sentence: _before(fault) for sentence, fault in told.faults.items()}
     content = {
         "verdict": told,
         "moments": moments,
         "first": next(iter(moments.values()), None),
         "description": str(scenario.get("description") or ""),
-        "how": " · ".join(_settings(run, arms)),
-        "tiles": key_figures(run.get("metrics") or {}),
+        "how": " · ".join(_settings(card, log.arms)),
+        "tiles": key_figures(card.get("metrics") or {}),
         "replay": replay is not None,
-        "events": _event_table(events),
-        "awards": _award_table(offers, arms),
-        "requests": _request_table(run.get("requests") or ()),
-        "provenance": _provenance(run),
+        "events": _event_table(log.events),
+        "awards": _award_table(log.offers, log.arms),
+        "requests": _request_table(card.get("requests") or ()),
+        "provenance": _provenance(card),
     }
-    title = f"{name} · {run.get('policy', 'unknown policy')}" + (f" · seed {run['seed']}" if "seed" in run else "")
-    chart = Chart(key="drawn", figure=drawing, alt="Work and motor temperatures of each arm over the shift")
+    seed = f" · seed {card['seed']}" if "seed" in card else ""
+    title = f"{scenario.get('name', 'unnamed scenario')} · {log.policy}{seed}"
+    chart = Chart(key="drawn", figure=figure(log), alt="Work and motor temperatures of each arm over the shift")
     return Page(title=title, template="run.html", content=content, charts=(chart,), replay=replay).html()
 
 
-def run_html(run: Mapping[str, Any], events: Sequence[Event], offers: Sequence[Offer]) -> str:
-    """A run in words, and its key figures, as a notebook shows them.
-
-    Args:
-        run: Content of `run.json`.
-        events: In order of time.
-        offers: What each arm knew at each award.
-    """
-    arms = [arm["name"] for arm in run["scenario"]["arms"]]
-    told = verdict(run, events, schedule(events, arms, run["time_s"]), offers)
-    title = f"{run['scenario']['name']} · {run['policy']} · seed {run['seed']}"
-    return str(render("notebook.html", title=title, verdict=told, tiles=key_figures(run["metrics"])))
+def run_html(log: ShiftLog) -> str:
+    """A run in words, and its key figures, as a notebook shows them."""
+    title = f"{log.card['scenario']['name']} · {log.policy} · seed {log.card['seed']}"
+    return str(render("notebook.html", title=title, verdict=verdict(log), tiles=key_figures(log.card["metrics"])))
 
 
 def _settings(run: Mapping[str, Any], arms: Sequence[str]) -> list[str]:
@@ -380,8 +325,8 @@ def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
     return tiles
 
 
-def _event_table(events: Sequence[Event]) -> EventTable | None:
-    """The notable events; None if there are none."""
+def _event_table(events: Sequence[Event]) -> Mapping[str, object] | None:
+    """The notable events by time, how many there are, and which are left out; None if there are none."""
     notable = [e for e in events if e.kind in NOTABLE]
     if not notable:
         return None
@@ -397,13 +342,13 @@ def _event_table(events: Sequence[Event]) -> EventTable | None:
         numbers=False,
     )
     kinds, moments = [e.kind for e in listed], [_before(event) for event in listed]
-    return EventTable(
-        counts=f"{_counted(counts)}.",
-        omitted=left_out if rest else "",
-        lost=bool(counts["lost"]),
-        only_lost=len(counts) == 1,
-        rows=table.html(style="events", key="events", kinds=kinds, moments=moments),
-    )
+    return {
+        "counts": f"{_counted(counts)}.",
+        "omitted": left_out if rest else "",
+        "lost": bool(counts["lost"]),  # the page hides their rows at first
+        "only_lost": len(counts) == 1,
+        "rows": table.html(style="events", key="events", kinds=kinds, moments=moments),
+    }
 
 
 def _before(event: Event) -> Moment:
@@ -471,79 +416,42 @@ def _provenance(run: Mapping[str, Any]) -> Table:
     rest = {k: v for k, v in run.items() if k not in ("scenario", "status", "policy", "seed", "requests")}
     for key, value in (rest | scenario).items():
         parts = value.items() if isinstance(value, Mapping) else [("", value)]
-        rows += [(f"{key} {part}".strip(), _plain(inner)) for part, inner in parts]
+        rows += [(f"{key} {part}".strip(), value_text(inner)) for part, inner in parts]
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 
-def _plain(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items())
-    if isinstance(value, list | tuple) and any(isinstance(inner, Mapping | list | tuple) for inner in value):
-        return f"list of {len(value)}"
-    return ", ".join(map(_plain, value)) if isinstance(value, list | tuple) else str(value)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Side:
-    """One of two runs of the same jobs."""
-
-    run: Mapping[str, Any]
-    """Content of its run.json."""
-    events: Sequence[Event]
-    arms: Sequence[str]
-    time_s: float
-    """Simulated time at its end."""
-    report: str
-    """Path of its report, relative to the page."""
-    offers: Sequence[Offer] = field(default=())
-
-    @property
-    def name(self) -> str:
-        """Name of its policy."""
-        return str(self.run.get("policy", "unknown policy"))
-
-    @property
-    def faults(self) -> list[Event]:
-        """Its faults, in order of time."""
-        return sorted((event for event in self.events if event.kind == "fault"), key=lambda event: event.time_s)
-
-    @property
-    def verdict(self) -> Verdict:
-        """What happened, in words."""
-        return verdict(self.run, self.events, schedule(self.events, self.arms, self.time_s), self.offers)
-
-
-def pair_page(title: str, description: str, sides: tuple[Side, Side]) -> str:
-    """Two runs of the same jobs side by side: verdicts, key figures and links to their reports, as one HTML page.
+def pair_page(title: str, description: str, reports: Mapping[str, ShiftLog]) -> str:
+    """Two shifts of the same jobs side by side: verdicts, key figures and links to their reports, as one HTML page.
 
     The same input gives the same text.
+
+    Args:
+        reports: The two shifts, each by the path of its report relative to the page.
     """
     columns = [
         {
-            "name": side.name,
-            "verdict": side.verdict,
-            "other_choices": other_choices(side, other),
-            "tiles": key_figures(side.run.get("metrics") or {}),
-            "report": quote(side.report),
+            "name": log.policy,
+            "verdict": verdict(log),
+            "other_choices": other_choices(log, other),
+            "tiles": key_figures(log.card.get("metrics") or {}),
+            "report": quote(path),
         }
-        for side, other in (sides, sides[::-1])
+        for (path, log), other in zip(reports.items(), [*reports.values()][::-1], strict=True)
     ]
     return Page(title=title, template="pair.html", content={"description": description, "sides": columns}).html()
 
 
-def other_choices(side: Side, other: Side) -> list[str]:
-    """Of the job of each fault, what became of it in the other run."""
+def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
+    """Of the job of each fault, what became of it in the other shift."""
     lines: list[str] = []
-    for job in dict.fromkeys(fault.job for fault in side.faults if fault.job):
+    for job in dict.fromkeys(fault.job for fault in log.faults if fault.job):
         own = [event for event in other.events if event.job == job]
         faults = [event for event in own if event.kind == "fault"]
         finish = next((event for event in own if event.kind == "finish"), None)
         if finish is not None:
             after = f", after {len(faults)} fault{'s' * (len(faults) > 1)}" if faults else " without a fault"
-            lines.append(f"Under {other.name}, {finish.arm} finished {job} at {clock(finish.time_s)}{after}.")
+            lines.append(f"Under {other.policy}, {finish.arm} finished {job} at {clock(finish.time_s)}{after}.")
         else:
             began = any(event.kind == "award" for event in own)
-            lines.append(f"Under {other.name}, {job} was not {'finished' if began else 'begun'}.")
+            lines.append(f"Under {other.policy}, {job} was not {'finished' if began else 'begun'}.")
     return lines

@@ -11,12 +11,12 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from fleet.errors import visible
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from rich.console import Group
 
 
@@ -117,20 +117,23 @@ class Table:
         from rich.table import Table as RichTable
         from rich.text import Text
 
+        def text(cell: str, style: str = "") -> Text:
+            return Text(visible(cell, "\n"), style=style)  # before rich measures its width
+
         table = RichTable(box=None, pad_edge=False, show_header=any(self.headings))
         for number, (heading, words) in enumerate(zip(self.headings, self.words, strict=True)):
             widest = MOST_LABEL if self.numbers and not number else None
             style = "bold" if not number and not table.show_header else None
             justify = "left" if words else "right"
-            table.add_column(Text(heading), justify=justify, overflow="fold", max_width=widest, style=style)
+            table.add_column(text(heading), justify=justify, overflow="fold", max_width=widest, style=style)
         for index, row in enumerate(self.rows):
             if index in self.groups:
-                table.add_row(Text(self.groups[index], style="bold"))
+                table.add_row(text(self.groups[index], "bold"))
             label = f"  {row[0]}" if self.groups else row[0]
-            table.add_row(Text(label), *map(Text, row[1:]))
-        above = [Text(self.caption)] if self.caption else []
+            table.add_row(text(label), *map(text, row[1:]))
+        above = [text(self.caption)] if self.caption else []
         body = [table] if self.rows or table.show_header else []
-        return Group(*above, *body, *map(Text, self.notes))
+        return Group(*above, *body, *map(text, self.notes))
 
     def __rich__(self) -> "Group":
         return self.rich()
@@ -191,7 +194,9 @@ def static(name: str) -> str:
 
 
 @cache
-def _environment() -> Environment:
+def _environment() -> "Environment":
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     return Environment(
         loader=PackageLoader("scenarios.show"),
         autoescape=True,

@@ -13,7 +13,8 @@ from fleet.env.render.picture import HEAT, heat_marks
 from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry
-from scenarios.run.schedule import Assignment, Outage, Schedule
+from scenarios.run.records import ShiftLog
+from scenarios.run.schedule import Assignment, Outage
 from scenarios.show import page
 from scenarios.show.page import AXIS, INK, plain
 from scenarios.show.words import by_joint, clock
@@ -79,23 +80,13 @@ LEGEND = {
 TEXT = {"xref": "paper", "xanchor": "left", "showarrow": False}
 
 
-def figure(
-    plan: Schedule,
-    telemetry: Telemetry,
-    events: Sequence[Event],
-    arms: Sequence[str],
-    *,
-    warning_c: float,
-    error_c: float,
-) -> dict[str, Any]:
-    """The figure: `data` and `layout` in Plotly's schema.
-
-    Args:
-        telemetry: Temperatures [sample, arm, joint], arms in the order of `arms`; may be empty.
-    """
+def figure(log: ShiftLog) -> dict[str, Any]:
+    """The figure: `data` and `layout` in Plotly's schema."""
+    plan, telemetry, arms = log.plan, log.readings, log.arms
+    warning_c, error_c = log.limits.warning_c, log.limits.error_c
     unit, unit_s = time_unit(plan.horizon_s)
-    bars = gantt(plan, events, arms, unit_s)
-    lanes = lanes_of(telemetry, len(arms))
+    bars = _gantt(log, unit_s)
+    lanes = _lanes(telemetry, len(arms))
     overview = len(lanes) < len(arms)
     time = AXIS | {
         "range": [0, max(plan.horizon_s / unit_s, 1e-3)],
@@ -122,7 +113,7 @@ def figure(
             for a in range(len(lanes))
             for _, limit, colour, _, dash in reversed(limits)
         ),
-        *_outages(plan, [arms[a] for a in lanes], unit_s),
+        *_outages(plan.outages, [arms[a] for a in lanes], unit_s),
     ]
     data = [*bars, *_temperatures(telemetry, arms, lanes, unit, unit_s)]
     if overview:
@@ -131,24 +122,25 @@ def figure(
         # The page may show any other arm in the last lane.
         title = len(lanes)  # annotations: the title of the heat map, then those of the lanes
         layout["meta"] = {"lane_traces": list(range(len(data) - JOINTS, len(data))), "lane_title": title}
-        heat = heat_map(telemetry, arms, number, unit, unit_s, warning_c=warning_c, error_c=error_c)
+        heat = _heat_map(log, number, unit, unit_s)
         data.append(heat | {"colorbar": heat["colorbar"] | {"y": layout[f"yaxis{number}"]["domain"][1]}})
     return {"data": data, "layout": layout}
 
 
-def gantt(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
-    """All traces; the row of an arm is its index, times are in units of `unit_s`."""
-    traces = _work_bars(plan, events, arms, unit_s)
-    if plan.outages:
+def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
+    """Work, outages and marks; the row of an arm is its index, times are in units of `unit_s`."""
+    outages, arms = log.plan.outages, log.arms
+    traces = _work_bars(log, unit_s)
+    if outages:
         look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": "x"}}
-        traces.append(_bars("out after a fault", plan.outages, _outage_text, arms, unit_s, look))
+        traces.append(_bars("out after a fault", outages, _outage_text, arms, unit_s, look))
     if not traces:  # without a trace Plotly draws no rows
         traces.append(
             BAR
             | {"name": "no job was begun", "showlegend": True, "x": [None], "y": [None], "marker": {"color": "#888888"}}
         )
     for kind, symbol, colour in MARKS:  # above the bars of their arm
-        own = [e for e in events if e.kind == kind and e.arm in arms]
+        own = [e for e in log.events if e.kind == kind and e.arm in arms]
         if own:
             traces.append(
                 {
@@ -170,15 +162,16 @@ def stream_of(job: str) -> str:
     return job.rpartition("-")[0] or job
 
 
-def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
+def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
     """Bars of every stream, then samples of the looks for the legend."""
+    assignments = log.plan.assignments
     # Streams of all jobs, done or not, so that a stream has the same colour in every policy's report.
-    streams = sorted({stream_of(event.job) for event in events if event.job})
+    streams = sorted({stream_of(event.job) for event in log.events if event.job})
     traces = []
     for i, stream in enumerate(streams):
         # The legend shows the look of the first one: not that of a late or unfinished job.
         own = sorted(
-            (a for a in plan.assignments if stream_of(a.job) == stream),
+            (a for a in assignments if stream_of(a.job) == stream),
             key=lambda a: (bool(a.late_s), a.outcome != "finished"),
         )
         if not own:
@@ -192,12 +185,12 @@ def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], uni
             },
             "pattern": HATCH | {"shape": [_shape(a) for a in own]},
         }
-        traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, arms, unit_s, look))
-    outcomes = {a.outcome for a in plan.assignments}
+        traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, log.arms, unit_s, look))
+    outcomes = {a.outcome for a in assignments}
     samples = (
         (
             "late",
-            any(a.late_s for a in plan.assignments),
+            any(a.late_s for a in assignments),
             {"color": "#888888", "line": LATE, "pattern": HATCH | {"shape": "."}},
         ),
         ("returned", "returned" in outcomes, {"color": "#888888", "pattern": HATCH | {"shape": "/"}}),
@@ -260,7 +253,7 @@ def _event_text(e: Event) -> str:
     return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s)}<br>{plain(by_joint(e.reason))}{job}"
 
 
-def lanes_of(telemetry: Telemetry, arms: int) -> list[int]:
+def _lanes(telemetry: Telemetry, arms: int) -> list[int]:
     """Indices of the arms with a lane of temperatures: all of a small fleet, the hottest of a large one."""
     if arms <= MOST_LANES:
         return list(range(arms))
@@ -268,10 +261,9 @@ def lanes_of(telemetry: Telemetry, arms: int) -> list[int]:
     return np.argsort(-peak_c, kind="stable")[:HOTTEST].tolist()
 
 
-def heat_map(
-    telemetry: Telemetry, arms: Sequence[str], axis: int, unit: str, unit_s: float, *, warning_c: float, error_c: float
-) -> Trace:
+def _heat_map(log: ShiftLog, axis: int, unit: str, unit_s: float) -> Trace:
     """The hottest motor of each arm over time, one row per arm; y axis `axis`, x axis 3."""
+    telemetry, arms, warning_c, error_c = log.readings, log.arms, log.limits.warning_c, log.limits.error_c
     samples = len(telemetry.time_s)
     edges = np.unique(np.linspace(0, samples, min(samples, HEAT_BINS) + 1).astype(int))[:-1]
     peak_c = np.zeros((len(arms), len(edges)))
@@ -410,10 +402,10 @@ def _limit_label(arm: int, name: str, limit: float, anchor: str) -> dict[str, An
     }
 
 
-def _outages(plan: Schedule, arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
+def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
     """Faults as vertical lines and outages as shade in the lane of their arm; arms without a lane are left out."""
     shapes = []
-    for o in plan.outages:
+    for o in outages:
         if o.arm not in arms:
             continue
         lane = {"xref": "x2", "yref": f"y{arms.index(o.arm) + 2} domain", "y0": 0, "y1": 1}

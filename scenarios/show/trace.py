@@ -11,11 +11,11 @@ from typing import Any  # values of run.json
 from fleet.errors import FleetError, nearest
 from fleet.events import EVENT_KINDS, MEANINGS, Event
 from scenarios.live.recording import CARD, read_card, read_parts
-from scenarios.live.recording_report import offers_of
+from scenarios.live.recording_report import arm_events, offers_of
 from scenarios.run.log import RunLog, open_run
 from scenarios.run.records import JobRecord, Offer
 from scenarios.show.table import Table
-from scenarios.show.words import CANNOT, by_joint, clock
+from scenarios.show.words import CANNOT, by_joint, clock, value_text
 
 CONFIGURATION = ("scenario_hash", "policy", "seed", "plant", "bus", "difficulty", "risk", "environment", "channel")
 NOT_RECORDED = "not recorded"
@@ -50,15 +50,9 @@ class Thread:
 
     def as_json(self) -> dict[str, Any]:
         """The thread as JSON values."""
-        named = {"event": self.event, "award": self.award}
-        plain = {name: None if event is None else _plain(event) for name, event in named.items()}
-        return (
-            asdict(replace(self, event=None, award=None, history=()))
-            | plain
-            | {  # pyright: ignore[reportArgumentType]
-                "history": [_plain(event) for event in self.history]
-            }
-        )
+        award = None if self.award is None else _plain(self.award)
+        events = {"event": _plain(self.event), "award": award, "history": [_plain(each) for each in self.history]}
+        return asdict(self) | events
 
 
 @dataclass(frozen=True)
@@ -187,7 +181,7 @@ def _of_run(run: RunLog) -> _Log:
 def _of_recording(folder: Path) -> _Log:
     card = read_card(folder)
     results = read_parts(folder, "results").to_pylist()
-    events = [_event(row) for row in read_parts(folder, "events").to_pylist() if row["kind"] in EVENT_KINDS]
+    events = arm_events(read_parts(folder, "events"))
     last = {row["job"]: row for row in results}
     busy = read_parts(folder, "telemetry").select(["time_s", "arm", "job"]).to_pylist()
 
@@ -217,11 +211,6 @@ def _of_recording(folder: Path) -> _Log:
         configuration={"fleet": card.fleet, "status": card.status, "recording format": card.format},
         code={"hash": NOT_RECORDED},
     )
-
-
-def _event(row: Mapping[str, Any]) -> Event:
-    names = ("time_s", "kind", "arm", "job", "joint", "reason")
-    return Event(**{name: row[name] for name in names}, value=float("nan") if row["value"] is None else row["value"])
 
 
 def _plain(event: Event) -> dict[str, Any]:
@@ -322,8 +311,4 @@ def _offer(offer: Offer) -> list[str]:
 
 
 def _pairs(values: Mapping[str, Any]) -> list[str]:
-    return [f"{key.replace('_', ' ')} {_text(value)}" for key, value in values.items() if value is not None]
-
-
-def _text(value: object) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return [f"{key.replace('_', ' ')} {value_text(value)}" for key, value in values.items() if value is not None]

@@ -35,7 +35,7 @@ from scenarios.prepare.twins import (
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
-from scenarios.show.page import AXIS, LAYOUT, Chart, Section, sections_page
+from scenarios.show.page import AXIS, LAYOUT, Chart, Page, Section
 from scenarios.show.table import Table
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario
@@ -792,7 +792,10 @@ def origin_of(subjects: Sequence[Subject]) -> dict[str, str]:
 def report_page(title: str, chapters: Sequence[Section], origin: Mapping[str, str]) -> str:
     """The page as HTML text, which opens offline; the same input gives the same text."""
     facts = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
-    return sections_page(title, LIMITS, [*chapters, Section(key="origin", title="Origin", tables=(facts,))])
+    sections = [*chapters, Section(key="origin", title="Origin", tables=(facts,))]
+    content = {"lead": LIMITS, "sections": sections, "failed": [each.title for each in sections if each.failed]}
+    charts = [chart for each in sections for chart in each.charts]
+    return Page(title=title, template="sections.html", content=content, charts=charts, narrow=True).html()
 
 
 LIMITS = (

@@ -1,7 +1,5 @@
 """A twin's scores of a scenario's jobs or of a log, as a table, CSV or JSON."""
 
-import csv
-import io
 import json
 from collections.abc import Sequence
 
@@ -54,17 +52,9 @@ def log_rows(twin: Twin, recordings: Sequence[Recording]) -> list[Row]:
 
 def _log_row(twin: Twin, recording: Recording) -> Row:
     measures = twin.measures_of(log_features(twin, recording))
-    temp_c = recording.temp_c
-    return {
-        "recording": recording.name,
-        "minutes": recording.duration_s / 60,
-        **_scores(measures),
-        "p_value": None if measures.p_value is None else float(measures.p_value),
-        "hottest_c": None if temp_c is None else float(temp_c.max()),
-        "why": measures.why(),
-        "twin": twin.version,
-        "data": twin.data_hash,
-    }
+    hottest_c = None if recording.temp_c is None else recording.temp_c.max()
+    begins: Row = {"recording": recording.name, "minutes": recording.duration_s / 60}
+    return begins | _scores(twin, measures, p_value=measures.p_value, hottest_c=hottest_c)
 
 
 def with_verdicts(rows: Sequence[Row], rule: Rule, features: Features) -> list[Row]:
@@ -86,19 +76,15 @@ def _repetitions(scenario: Scenario, plan: Plan) -> int:
 def _job_row(twin: Twin, plan: Plan, repetitions: int) -> Row:
     measures = twin.measure(plan, repetitions)
     calibrated = measures.calibrated
-    return {
+    begins: Row = {
         "job": f"{plan.work.kind} {' → '.join(place.name for place in plan.work.places)}",
         "payload_kg": plan.work.payload_kg,
         "elbow": plan.elbow,
         "speed": plan.speed,
         "repetitions": repetitions,
-        **_scores(measures),
-        "d_cal": None if calibrated is None else float(calibrated.max()),
-        "p_value": None if measures.p_value is None else float(measures.p_value),
-        "why": measures.why(),
-        "twin": twin.version,
-        "data": twin.data_hash,
     }
+    d_cal = None if calibrated is None else calibrated.max()
+    return begins | _scores(twin, measures, d_cal=d_cal, p_value=measures.p_value)
 
 
 def window_rows(twin: Twin, recording: Recording) -> list[Row]:
@@ -113,31 +99,19 @@ def window_rows(twin: Twin, recording: Recording) -> list[Row]:
 def _stretch_rows(twin: Twin, stretch: Stretch, first: Array, features: Features) -> list[Row]:
     window, measures, rows = twin.config.window, twin.measures_of(features), list[Row]()
     for number, i in enumerate(first.tolist()):
-        one = measures.of_job(number)
-        rows.append(
-            {
-                "log": stretch.recording,
-                "start_s": float(stretch.time_s[i]),
-                "end_s": float(stretch.time_s[i + window - 1]),
-                **_scores(one),
-                "hottest_c": None if stretch.temp_c is None else float(stretch.temp_c[i : i + window].max()),
-                "why": one.why(),
-                "twin": twin.version,
-                "data": twin.data_hash,
-            }
-        )
+        start_s, end_s = stretch.time_s[[i, i + window - 1]].tolist()
+        hottest_c = None if stretch.temp_c is None else stretch.temp_c[i : i + window].max()
+        begins: Row = {"log": stretch.recording, "start_s": start_s, "end_s": end_s}
+        rows.append(begins | _scores(twin, measures.of_job(number), hottest_c=hottest_c))
     return rows
 
 
-def _scores(measures: Measures) -> Row:
-    """The scores of one job or window."""
-    latent = measures.total_latent
-    return {
-        "d": float(measures.total),
-        **{f"d_{j + 1}": float(d) for j, d in enumerate(measures.difficulty)},
-        "load": float(measures.total_load),
-        "latent": None if latent is None else float(latent),
-    }
+def _scores(twin: Twin, measures: Measures, **more: float | Array | None) -> Row:
+    """The scores of one job or window, further figures, and their origin."""
+    figures = {"d": measures.total, **{f"d_{j + 1}": d for j, d in enumerate(measures.difficulty)}}
+    figures |= {"load": measures.total_load, "latent": measures.total_latent, **more}
+    plain: Row = {name: None if value is None else float(value) for name, value in figures.items()}
+    return plain | {"why": measures.why(), "twin": twin.version, "data": twin.data_hash}
 
 
 def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
@@ -146,11 +120,7 @@ def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
         return json.dumps({"twin": caption, "rows": list(rows)}, indent=1, allow_nan=False) + "\n"
     heads = list(rows[0]) if rows else []
     if how == "csv":
-        held = io.StringIO()
-        writer = csv.DictWriter(held, heads, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({key: _flat(value) for key, value in row.items()} for row in rows)
-        return held.getvalue()
+        return Table(head=tuple(heads), rows=tuple(tuple(map(_flat, row.values())) for row in rows)).csv()
     shown = [head for head in heads if head not in OMITTED]
     return Table(
         head=tuple(Column(SHORT.get(head, head), words=isinstance(rows[0][head], str)) for head in shown),
@@ -163,8 +133,8 @@ SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c"
 """Short column heads of tables."""
 
 
-def _flat(value: Cell) -> Cell:
-    return f"{value:.6g}" if isinstance(value, float) else "" if value is None else value
+def _flat(value: Cell) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
 def _cell(value: Cell) -> str:

@@ -229,9 +229,9 @@ def arm_line(arm: ArmSnapshot, *, joints: bool = False) -> str:
     parts = [
         f"{arm.arm:<10}",
         f"{arm.mode or 'unknown':<8}",
-        "" if arm.hottest_c is None else f"{arm.hottest_c:.1f} °C J{arm.joint}",
+        "" if arm.hottest_c is None else f"{arm.hottest_c:.1f} °C joint {arm.joint}",
         "" if arm.headroom_k is None else f"headroom {arm.headroom_k:.1f} K",
-        "motors " + " ".join(f"{temp_c:.1f}" for temp_c in arm.temp_c) if joints else "",
+        "joints " + " ".join(f"{temp_c:.1f}" for temp_c in arm.temp_c) if joints else "",
         f"job {arm.job}, {brief(arm.busy_s)} left" if arm.job and arm.busy_s else f"job {arm.job}" if arm.job else "",
         f"open jobs: {scores}" if scores else "",
         f"state {format_age(arm.state_age_s)}",

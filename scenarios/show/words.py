@@ -1,7 +1,7 @@
 """Times, events and offers in words."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from fleet.events import Event
 from scenarios.run.records import Offer
@@ -27,6 +27,18 @@ def duration(time_s: float) -> str:
     if time_s < 60:
         return f"{time_s:.0f} s"
     return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min")) if n)
+
+
+def value_text(value: object) -> str:
+    """A value of a card: numbers with six digits, keys before their values, only the length of nested lists."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {value_text(inner)}" for key, inner in value.items())
+    if isinstance(value, list | tuple):
+        nested = any(isinstance(inner, Mapping | list | tuple) for inner in value)
+        return f"list of {len(value)}" if nested else ", ".join(map(value_text, value))
+    return str(value)
 
 
 def by_joint(reason: str) -> str:

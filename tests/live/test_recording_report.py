@@ -19,11 +19,13 @@ from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Settle
 from fleet.errors import FleetError
 from fleet.events import Event
+from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder
 from scenarios.live.recording import read_parts
-from scenarios.live.recording_report import heat_use, order_events, recording_html, telemetry_of
+from scenarios.live.recording_report import heat_use, open_recording, order_events
 from scenarios.live.replayer import Replay
+from scenarios.run.records import ShiftLog
 from scenarios.run.schedule import schedule
 from scenarios.show.run_page import report_html
 from tests.profiles import examples
@@ -67,11 +69,12 @@ def record(folder, events, samples=100):
 def test_the_work_and_events_of_a_recording_are_those_of_a_run(tmp_path):
     """Second method: the page of the same events, written as that of a run."""
     record(tmp_path / "r", LOG).write(status="finished")
-    live = recording_html(tmp_path / "r")
-    telemetry = telemetry_of(read_parts(tmp_path / "r", "telemetry"), list(ARMS))
+    recording = open_recording(tmp_path / "r")
+    live, telemetry = recording.page(), recording.readings
     assert telemetry.temp_c[:, 0, 0].tolist() == pytest.approx([30.0 + tick / 8 for tick in range(100)])
     run = {"status": "finished", "scenario": {"name": "shop"}, "policy": "p", "seed": 1}
-    page = report_html(run, telemetry, LOG, ARMS, warning_c=60.0, error_c=75.0)
+    limits = ThermalLimits(warning_c=60.0, error_c=75.0)
+    page = report_html(ShiftLog(card=run, arms=ARMS, limits=limits, readings=telemetry, events=LOG))
     bars = figure_of(live)
     assert bars == figure_of(page)
     assert len(bars) >= 2
@@ -113,7 +116,7 @@ def test_a_report_names_missing_messages_and_returned_jobs(tmp_path):
         told = JobStatus(job=job, state=state, arm=arm, cycles=2)
         recorder.add("boss", Result(auctioneer="boss", number=2 * number, time_s=20.0 + number, status=told))
     recorder.write(status="finished")
-    html = recording_html(tmp_path / "r")
+    html = open_recording(tmp_path / "r").page()
     assert "returned to the queue, 2 cycles kept" in html
     assert "results of boss, numbers 1 to 1" in html
     assert "3 recorded, 2 missing" in html
@@ -126,7 +129,7 @@ def test_a_report_names_who_asked_for_what(tmp_path):
     for number, action in enumerate(actions):
         recorder.add("boss", Operation("boss", 60.0 * number, ControlRequest(str(number), action, "<ann>"), number))
     recorder.write(status="finished")
-    html = recording_html(tmp_path / "r")
+    html = open_recording(tmp_path / "r").page()
     rows = re.findall(r"<tr>(.*?)</tr>", html.split("Requests of people</h2>")[1].split("</table>")[0])
     assert [re.findall(r"<td>(.*?)</td>", row) for row in rows[1:]] == [
         ["0:00:00", "change due 900.0", "a-1", "&lt;ann&gt;"],
@@ -144,7 +147,7 @@ def test_the_report_of_two_epochs_shows_the_last_one(tmp_path):
             status = JobStatus(job, "finished", arm="arm_0")
             recorder.add("boss", Result("boss", number, time_s, status, epoch=epoch))
     recorder.write(status="finished")
-    html = recording_html(tmp_path / "r")
+    html = open_recording(tmp_path / "r").page()
     assert "this page shows the last one, two" in html
     assert "<dt>jobs finished</dt><dd>1<small> of 1</small>" in html
 
@@ -183,7 +186,7 @@ def test_the_command_writes_the_page_beside_the_recording(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     Recorder.open(tmp_path / "empty", "f")
     with pytest.raises(FleetError, match="no state of an arm"):
-        recording_html(tmp_path / "empty")
+        open_recording(tmp_path / "empty").page()
 
 
 def test_the_offers_behind_an_award_are_kept_listed_and_replayed(tmp_path):
@@ -194,7 +197,7 @@ def test_the_offers_behind_an_award_are_kept_listed_and_replayed(tmp_path):
         offers = offers if place == 0 else (offers[1], structs.replace(offers[0], plan=None))
         recorder.add("boss", structs.replace(result, auctioneer="boss", number=place, status=status, offers=offers))
     recorder.write()
-    html = recording_html(tmp_path / "r")
+    html = open_recording(tmp_path / "r").page()
     assert "the offers behind 2 awards" in html
     assert "<td>a-1</td><td>arm_0</td><td>P 0.04, 52 °C, d 0.53, 4 min</td>" in html
     assert "<td>b-1</td><td>arm_1</td><td>cannot do it</td>" in html
@@ -215,7 +218,7 @@ def test_the_cell_of_a_recording_is_shown_in_three_dimensions(tmp_path):
     ):
         recorder.cell = described
         recorder.write()
-        html = recording_html(tmp_path / "r")
+        html = open_recording(tmp_path / "r").page()
         assert ('id="cell-model"' in html) is shown
         if shown:
             model = json.loads(re.search(r'id="cell-model">(.*?)</script>', html)[1])
@@ -231,7 +234,7 @@ def test_a_part_that_was_cut_is_named(tmp_path):
     part = next((tmp_path / "r").glob("events-*.parquet"))
     part.write_bytes(part.read_bytes()[:50])
     with pytest.raises(FleetError, match=re.escape(str(part))):
-        recording_html(tmp_path / "r")
+        open_recording(tmp_path / "r").page()
 
 
 def test_a_changed_byte_in_a_part_is_an_error_that_names_it(tmp_path):
@@ -242,7 +245,7 @@ def test_a_changed_byte_in_a_part_is_an_error_that_names_it(tmp_path):
     assert b"cool again" in content
     part.write_bytes(content.replace(b"cool again", b"cold again", 1))
     with pytest.raises(FleetError, match=re.escape(str(part))):
-        recording_html(tmp_path / "r")
+        open_recording(tmp_path / "r").page()
 
 
 def test_the_rows_of_a_removed_part_are_counted_as_missing(tmp_path):
@@ -253,8 +256,10 @@ def test_the_rows_of_a_removed_part_are_counted_as_missing(tmp_path):
     again = Recorder.open(tmp_path / "r", "shop")
     again.add("boss", Result("boss", 0, 0.0, JobStatus("x", "waiting")))
     again.write(status="finished")
-    assert "parts of the recording were removed" not in recording_html(tmp_path / "r")
+    assert "parts of the recording were removed" not in open_recording(tmp_path / "r").page()
     part = next((tmp_path / "r").glob("events-*.parquet"))
     number = pq.read_metadata(part).num_rows
     part.unlink()
-    assert re.search(f"{number} rows of events.*parts of the recording were removed", recording_html(tmp_path / "r"))
+    assert re.search(
+        f"{number} rows of events.*parts of the recording were removed", open_recording(tmp_path / "r").page()
+    )

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scenarios.cli.terminal import Interrupted, SafeConsole, echo, plain_table, progress_bar
+from scenarios.cli.terminal import Interrupted, SafeConsole, echo, progress_bar
 from scenarios.progress import HINTS, Count, StageClock
+from scenarios.show.table import Table
 from tests.waiting import wait_until
 
 
@@ -78,9 +79,7 @@ def test_an_interruption_that_keeps_nothing_does_not_promise_it():
 
 def test_text_from_others_cannot_move_the_cursor_or_reorder_a_line(capsys):
     odd = "a\x1b[2Jb\u202ec\x9bd"
-    table = plain_table("name")
-    table.add_row(odd)
-    SafeConsole(width=200).print(table)
+    SafeConsole(width=200).print(Table(head=("name",), rows=((odd,),)))
     echo(odd)
     for line in capsys.readouterr().out.splitlines()[1:]:
         assert line.strip() == r"a\u001b[2Jb\u202ec\u009bd"

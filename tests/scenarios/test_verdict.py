@@ -3,8 +3,9 @@
 import pytest
 
 from fleet.events import Event
-from scenarios.run.records import Offer
-from scenarios.run.schedule import schedule
+from fleet.robot import ThermalLimits
+from fleet.telemetry import Telemetry
+from scenarios.run.records import Offer, ShiftLog
 from scenarios.show.run_page import verdict
 
 ARMS = ("hot", "cool")
@@ -35,7 +36,13 @@ def offer(arm, peak_c, *, at=20.5, **more):
 
 
 def sentences(*offers, events=EVENTS, end=60):
-    return verdict({"status": "finished"}, events, schedule(events, ARMS, end * MIN), offers).sentences
+    return told({"status": "finished", "time_s": end * MIN}, events, offers)
+
+
+def told(card, events=(), offers=()):
+    readings = Telemetry.empty(len(ARMS))
+    log = ShiftLog(card=card, arms=ARMS, limits=ThermalLimits(), readings=readings, events=events, offers=offers)
+    return verdict(log).sentences
 
 
 def test_a_fault_is_told_with_its_arm_joint_time_and_cause():
@@ -72,5 +79,6 @@ def test_without_offers_only_the_work_before_a_fault_is_told():
 
 
 def test_the_hottest_motor_of_a_shift_without_a_fault():
-    told = verdict({"metrics": {"peak_c": {"hot": 68.2, "cool": float("nan")}}}, (), schedule((), ARMS, 60.0))
-    assert told.sentences == ("No motor reached its fault limit; the hottest, in hot, reached 68 °C.",)
+    assert told({"metrics": {"peak_c": {"hot": 68.2, "cool": float("nan")}}}) == (
+        "No motor reached its fault limit; the hottest, in hot, reached 68 °C.",
+    )

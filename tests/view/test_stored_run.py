@@ -15,7 +15,7 @@ from fleet.errors import FleetError
 from fleet.telemetry import Telemetry
 from scenarios.cli.main import main
 from scenarios.run.log import open_run, telemetry_table
-from scenarios.show.replay import packed
+from scenarios.show.page import packed
 
 
 def unpacked(text: str) -> dict[str, tuple[dict, np.ndarray]]:

@@ -1,7 +1,7 @@
 // Plays a recorded shift: the cell, a clock, and a cursor in the figure below, all at one time of the shift.
 "use strict";
 
-// Difference-coded 16-bit values after a line of JSON, see scenarios/show/replay.py.
+// Difference-coded 16-bit values after a line of JSON, see `packed` of scenarios/show/page.py.
 async function readPlayback(id) {
   const bytes = new Uint8Array(await unpack(id)), end = bytes.indexOf(10);
   const listed = JSON.parse(new TextDecoder().decode(bytes.subarray(0, end))), arrays = {};

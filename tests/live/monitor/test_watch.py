@@ -94,7 +94,7 @@ def test_all_joints_are_shown_on_demand_with_marks_of_little_headroom():
     arm = arm_now(temp_c=(30.0, 52.5, 57.0, 61.0, 40.0, 41.0, 42.0), hottest_c=61.0, headroom_k=-1.0)
     told = shown(fleet_of([arm]), joints=True)
     assert re.search(r"^a +working +30\.0 +52\.5 +57\.0! +61\.0!! +40\.0 +41\.0 +42\.0$", told, re.M)
-    assert "motors 30.0 52.5 57.0 61.0 40.0 41.0 42.0" in arm_line(arm, joints=True)
+    assert "joints 30.0 52.5 57.0 61.0 40.0 41.0 42.0" in arm_line(arm, joints=True)
 
 
 def test_every_event_of_an_arm_is_told_in_words():
@@ -182,7 +182,7 @@ def test_without_a_terminal_lines_are_printed_until_stopped(fleet):
         try:
             assert process.stdout.readline() == "a joined\n"
             fleet.say()
-            while "52.5 °C J2" not in (told := process.stdout.readline()):
+            while "52.5 °C joint 2" not in (told := process.stdout.readline()):
                 assert told
             assert "j — °C, P — (d 0.50)" in told
             process.send_signal(number)
