@@ -19,9 +19,9 @@ from agents.heat import guarded
 from agents.pairs import PAIRS, load_pairs
 from agents.policy import SCOPES, ArmPolicy, Local, Planner, Policy, for_all_arms, no_simulator
 from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
-from fleet.bus.protocol.keys import ENDPOINT
 from fleet.errors import NAME_RULE, FleetError, is_name, nearest, printable
 from fleet.seeding import child
+from scenarios.spec.options import ENDPOINT
 
 MOST_WRAPPERS = 8
 """Wrappers in one another; more than a policy can need."""

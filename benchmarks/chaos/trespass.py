@@ -191,7 +191,7 @@ def queries(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Attempt]:
         entry = LeaseEntry(status.award, status.job, 0, "finishing")
         lease = LeaseRequest(status.arm, (entry,))
         report = Report(status.arm, status.award, status.job, "finished", 1, 0.0)
-        messages: tuple[tuple[msgspec.Struct, keys.AskedTopic], ...] = ((lease, "lease"), (report, "report"))
+        messages: tuple[tuple[msgspec.Struct, str], ...] = ((lease, "lease"), (report, "report"))
         for message, topic in messages:
             for querier in (status.arm, ROGUE):
                 key = keys.asked_by(fleet_name, "auctioneer", topic, querier)

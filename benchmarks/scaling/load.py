@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from fleet.bus.protocol.auction import LEASE_S, Ack, Award, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
+from fleet.bus.protocol.keys import STATE_HZ
 from fleet.bus.protocol.messages import State, encode
-from fleet.bus.protocol.registry import STATE_HZ
 from fleet.live.arm.awards import RENEWALS
 from fleet.live.auction.rounds import Timing
 

@@ -16,8 +16,8 @@ from world import Process, Sleep, World
 
 from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.keys import channel_for
 from fleet.bus.protocol.messages import decode_as, encode, encoding
-from fleet.bus.protocol.registry import channel_for
 from fleet.errors import BusError, Refused
 
 ENCODED = 0.02

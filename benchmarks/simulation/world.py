@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from disk import Crash, Disk
 from numpy.random import SeedSequence
 
-from fleet.bus.protocol.registry import SESSION_LEASE_S
+from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.errors import FleetError
 
 BACKLOG = 4096

@@ -1,1 +1,1 @@
-"""The bus: keys, messages and the exchange. Zenoh lives in `session` and nowhere else."""
+"""The bus: keys and messages, client and router, exchange between simulated arms, security."""

@@ -1,8 +1,6 @@
-"""Replies to one query: messages, refusals and timeouts, by the key of the replier.
+"""The client of the bus: publishes, subscribes, queries and replies, and calls all handlers on one thread.
 
-The client of the bus: publishes, subscribes, queries and replies, and calls all handlers on one thread.
-
-What each key carries, and with which history, priority and congestion control, is in `fleet.bus.protocol.registry`.
+The message, history, priority and congestion control of each key are in `fleet.bus.protocol.keys`.
 Zenoh's threads only queue what arrives; `serve` calls the handlers. So a participant needs no locks, and a handler may
 publish and query. `query` does not wait: its replies go to a handler, too; outside handlers, `ask` waits for a reply. A
 malformed message is counted and logged, and never raises; a malformed request is refused with the reason.
@@ -27,8 +25,8 @@ from zenoh import ext as advanced
 
 from fleet.bus.mailbox import Mailbox
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.keys import Channel, channel_for, channel_of
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode_as, encode, encoding
-from fleet.bus.protocol.registry import Channel, channel_for, channel_of
 from fleet.bus.router import connect, plain_reason
 from fleet.bus.security.access_control import Participant, rights_by_role
 from fleet.bus.security.tls import participant_at
@@ -47,7 +45,7 @@ class AnotherReplies(Exception):
 
 @dataclass(eq=False)
 class NoReply(BusError):
-    """Nobody replied to a query, and nobody refused it."""
+    """A query without a reply or a refusal."""
 
     key: str
     late: bool
@@ -106,7 +104,7 @@ class Replies(Generic[Message]):
         return message
 
     def miss(self, reason: str) -> None:
-        """Add an error of Zenoh's own, which does not say whose it is."""
+        """Add an error of Zenoh, which names no replier."""
         _add(self.refused, "?", "" if reason == "Timeout" else reason)
 
 
@@ -172,7 +170,7 @@ class BusClient:
 
         Args:
             timeout_s: How long the router may take to accept the connection.
-            backlog: Most messages in the queue; when it is full, the oldest is dropped.
+            backlog: Maximum number of queued messages; a full queue drops the oldest.
             stopped: Wait for a router until this is true, instead of `timeout_s`.
         """
         self.fleet = fleet
@@ -324,11 +322,11 @@ class BusClient:
 
         Args:
             timeout_s: Real seconds of one attempt.
-            attempts: The request is sent again, at most this often in all, while nobody replies.
+            attempts: Maximum number of requests, repeated without a reply.
 
         Raises:
             Refused: the participant refuses, with its reason.
-            NoReply: nobody replied.
+            NoReply: no reply and no refusal.
             BusError: as `query`.
         """
         replies: Replies[Reply] = Replies()

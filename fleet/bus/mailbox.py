@@ -20,8 +20,7 @@ class Mailbox(Generic[Item]):
     """A queue whose waits end in time, whichever signals arrive; the reader may wait for several items at once.
 
     `queue.SimpleQueue.get` does not: in CPython 3.11 a signal just before its timeout makes it wait with a negative
-    timeout, which is for ever. Of 60 replays that were asked to stop, 9 never did. Here the reader waits for a byte
-    in a pipe: its timeouts hold, and it wakes the reader some 10 µs sooner than a socket does.
+    timeout, without end. Here the reader waits for a byte in a pipe, which keeps its timeouts.
 
     Any thread may `put`, one reads.
     """
@@ -29,7 +28,7 @@ class Mailbox(Generic[Item]):
     def __init__(self) -> None:
         self._items: deque[Item] = deque()
         self._wanted = math.inf
-        """Items that the waiting reader needs; inf while none waits, so that nobody pays for waking it."""
+        """Number of items the blocked reader waits for; inf if none is blocked."""
         self._urgent = self._rung = False
         self._bell, self._ringer = os.pipe()
         self._poll = select.poll()

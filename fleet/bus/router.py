@@ -1,11 +1,7 @@
-"""Limits of what a router forwards from each session, so that one faulty session does not disturb the rest.
-
-The router of a fleet, and the transport settings of all sessions.
+"""The router of a fleet, its limits, the transport settings of all sessions, and the fleets at a router.
 
 Plain TCP does not authenticate, so it is limited to loopback. With TLS both ends of every connection are authenticated,
 and the router enforces the access control of its roster.
-
-Fleets at a router, found by the tokens of their arms and auctioneers.
 """
 
 import ipaddress
@@ -19,9 +15,9 @@ from typing import Any, Self
 import zenoh
 
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.bus.protocol.messages import MOST_BYTES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
-from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.bus.security.access_control import ROSTER, Roster, access_control, read_roster
 from fleet.bus.security.tls import Tls, identified, why_not
 from fleet.errors import BusError, NoRouter
@@ -345,7 +341,7 @@ class Router:
     def _settings(self) -> zenoh.Config:
         roster = None
         if self._tls is not None:
-            self._tls.check(serves=True, links=bool(self._connect))
+            self._tls.check(serves=True)
             roster = read_roster(self._tls.folder)
         own = {
             "mode": "router",
@@ -394,7 +390,7 @@ def plain_reason(error: zenoh.ZError) -> str:
 
 OURS = keys.PREFIX.rpartition("/")[2]
 """Version of the bus that this program uses."""
-EVERYBODY = f"{keys.PREFIX}/*/*/*/alive"
+ALL_TOKENS = f"{keys.PREFIX}/*/*/*/alive"
 
 
 def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
@@ -410,20 +406,20 @@ def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
         return (read_roster(tls.folder).fleet,) if (tls.folder / ROSTER).exists() else ()
     found: set[str] = set()
     with open_client(endpoint, timeout_s=timeout_s) as session:
-        for reply in session.liveliness().get(EVERYBODY, timeout=timeout_s):
+        for reply in session.liveliness().get(ALL_TOKENS, timeout=timeout_s):
             if reply.ok is None:
                 continue
             try:
                 found.add(keys.parse(str(reply.ok.key_expr)).fleet)
             except ValueError:
-                continue  # a token of somebody else
+                continue  # a foreign token
     return tuple(sorted(found))
 
 
 def other_versions(endpoint: str, fleet: str, *, timeout_s: float = 2.0) -> tuple[str, ...]:
     """Return a sentence on each participant of a fleet that uses another version of the bus, by name.
 
-    With TLS there is none: the router lets nobody see them.
+    With TLS there is none: the router hides them.
 
     Raises:
         BusError: no router accepted the connection.

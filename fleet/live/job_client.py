@@ -1,4 +1,4 @@
-"""Submit jobs to a fleet, follow them and cancel them: what every job interface of the fleet uses."""
+"""Submit jobs to a fleet, follow and cancel them: the basis of every job interface."""
 
 import logging
 import math
@@ -46,7 +46,7 @@ class JobClient:
         on_change: Called with the new state of a job; a job that is not accepted is `given_up`, with the reason.
 
     Attributes:
-        statuses: Last known state of each followed job; None until it is known.
+        statuses: Last state of each followed job; None before the first.
         heard_s: Real second of the last message about jobs.
     """
 
@@ -71,11 +71,11 @@ class JobClient:
         self._retry_s = -math.inf
 
     def submit_and_wait(self, jobs: Sequence[JobSpec]) -> list[Admission]:
-        """Submit jobs and return the decision on each; those that are accepted are on disk and followed.
+        """Submit jobs and return the decision on each; accepted jobs are durable and followed.
 
         Raises:
             Refused: the fleet refuses the submission, with its reason.
-            NoReply: nobody replied.
+            NoReply: no reply.
         """
         key, admissions = keys.of_jobs(self._link.fleet, "submit"), list[Admission]()
         for batch in batches(jobs):
@@ -92,7 +92,7 @@ class JobClient:
         self.heard_s, self._status_s = time.monotonic(), -math.inf
 
     def forget(self, job: str) -> None:
-        """Follow a job no longer."""
+        """Stop following a job."""
         self.statuses.pop(job, None)
         self._unsubmitted.pop(job, None)
 
@@ -167,7 +167,7 @@ class JobClient:
 
 
 def _progress(status: JobStatus) -> tuple[object, ...]:
-    """What results and statuses state alike."""
+    """Fields that are the same in a result and a status."""
     return status.state, status.arm, status.award, status.cycles, status.finished_s, status.reason
 
 
@@ -183,6 +183,6 @@ def in_order(jobs: Sequence[JobSpec]) -> Sequence[JobSpec]:
     try:
         order = list(TopologicalSorter({job.name: job.after for job in jobs}).static_order())
     except CycleError:
-        return jobs  # the auctioneer names the cycle
+        return jobs  # the auctioneer refuses them and names the cycle
     place = {name: i for i, name in enumerate(order)}
     return sorted(jobs, key=lambda job: place[job.name])

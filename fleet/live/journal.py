@@ -1,14 +1,11 @@
-"""Append-only journal: records are on disk before anyone acts on them.
+"""Append-only journal: records are durable before they take effect.
 
 Each line is one `append`: `{"crc":"0a1b2c3d","records":[…]}`, with the CRC-32 of the encoded records. A line is
 complete or absent: an unfinished last line was torn by a crash before `append` returned, and is removed on opening. Any
 other line whose checksum differs is damage, and the journal refuses to open.
 
-Records that the journals of arms and auctioneers have in common; each journal adds a few of its own.
-
-One name means one thing in every journal. Times are fleet seconds, 0 where the writer does not know the time.
-
-Journals that stay short while they are written, and fleet time in them.
+Journals of arms and auctioneers share the record types in this file; each adds its own. Times are fleet seconds, 0 for
+unknown. A journal is compacted when it has grown.
 """
 
 import errno
@@ -35,12 +32,12 @@ COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 PutAside = Callable[[bytes, str], object]
-"""Keeps a record that is not applied, with the reason."""
+"""Quarantines a record that cannot be applied, with the reason."""
 Salvage = Callable[[bytes, str], Sequence[Record]]
-"""Keeps a record that cannot be read, with the reason, and returns what replaces it."""
+"""Quarantines an unreadable record, with the reason, and returns its replacement."""
 
 _REMEDY = (
-    "Bring back a copy. Without its journal a participant has forgotten jobs, and may do them twice: see Epochs in "
+    "Restore a copy. Without its journal a participant has lost its jobs, and may do them twice: see Epochs in "
     "docs/bus/auctioneer.md before you move the file away."
 )
 _HEAD, _MIDDLE, _TAIL = b'{"crc":"', b'","records":', b"}\n"
@@ -54,7 +51,7 @@ class JournalState(ABC, Generic[Record]):
 
     @abstractmethod
     def apply(self, record: Record) -> object:
-        """Change the state as the record says."""
+        """Update the state by a record."""
 
     @abstractmethod
     def compact(self) -> tuple[Record, ...]:
@@ -64,7 +61,7 @@ class JournalState(ABC, Generic[Record]):
         """Apply records, oldest first, and return the state.
 
         Args:
-            put_aside: Gets each record that cannot be applied, with the reason; None: it is an error.
+            put_aside: Quarantines each record that cannot be applied; None: such a record is an error.
         """
         for record in records:
             try:
@@ -93,7 +90,7 @@ class Journal(Generic[Record]):
     Attributes:
         path: The file.
         torn: Bytes of an unfinished last line that were removed on opening.
-        put_aside: Gets records that are not applied.
+        put_aside: Quarantines records that cannot be applied.
     """
 
     def __init__(
@@ -108,8 +105,8 @@ class Journal(Generic[Record]):
 
         Args:
             sync: Writes an open file through to the disk.
-            put_aside: Gets each undamaged record that is none of this version, with the reason; `records` has what it
-                returns instead. None: the journal refuses to open.
+            put_aside: Quarantines each undamaged record of another version, with the reason; `records` yields its
+                replacement. None: the journal refuses to open.
         """
         self.path = path
         self.torn = 0
@@ -173,7 +170,7 @@ class Journal(Generic[Record]):
             yield from records
 
     def append(self, *records: Record) -> None:
-        """Write records and return when they are on disk: all of them or, if it raises, none.
+        """Write records and return when they are durable: all of them or, if it raises, none.
 
         Raises:
             JournalFull: no space on the disk; the file is unchanged.
@@ -219,11 +216,11 @@ class Journal(Generic[Record]):
 
     @property
     def needs_compaction(self) -> bool:
-        """Whether the file has grown so much since the last compaction that it is time for the next."""
+        """Whether the file has grown enough since the last compaction."""
         return self._end > max(COMPACT_BYTES, COMPACT_FACTOR * self._compacted)
 
     def compact(self, *records: Record) -> None:
-        """Replace all records by fewer that give the same state; without space on the disk, leave the file as it is.
+        """Replace all records by fewer that give the same state; a full disk leaves the file unchanged.
 
         Raises:
             JournalError: as `rewrite`.
@@ -242,7 +239,7 @@ class Journal(Generic[Record]):
         return self._file
 
     def _lock_file(self) -> int:
-        """Lock that ends with this process, however the process ends."""
+        """Lock that the system releases when this process exits."""
         path = self.path.with_name(f"{self.path.name}.lock")
         lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -355,7 +352,7 @@ class EpochBegun(msgspec.Struct, frozen=True, tag="epoch_begun"):
     epoch: str
     time_s: float = 0.0
     succeeds: bool = False
-    """A person has requested that it takes the place of another one: arms may know older epochs."""
+    """An operator has requested that it replaces another one: arms may have older epochs."""
 
 
 class ClockTick(msgspec.Struct, frozen=True, tag="clock_tick"):
@@ -417,18 +414,18 @@ class Closed(msgspec.Struct, frozen=True, tag="closed"):
 
 
 class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
-    """An arm says which spaces it takes; empty at home."""
+    """Spaces that an arm takes, by its own report; empty at home."""
 
     arm: Name
     space: tuple[Name, ...] = ()
     """Names, without those of its open awards."""
     time_s: float = 0.0
     number: Count = 0
-    """Of the claim that says it, where arms allocate by consensus."""
+    """Of the claim that reports it, where arms allocate by consensus."""
 
 
 class SpaceCleared(msgspec.Struct, frozen=True, tag="space_cleared"):
-    """A person has freed all space of an absent arm."""
+    """An operator has freed all space of an absent arm."""
 
     arm: Name
     by: str = ""
@@ -440,7 +437,7 @@ TICK_S = 2.0
 
 
 def put_aside(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
-    """Return what to do with a record of a journal that is not applied: append it to a file, and report it.
+    """Return a function that quarantines a journal record: it appends the record to a file, and logs the reason.
 
     Args:
         path: The file.
@@ -449,7 +446,7 @@ def put_aside(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
 
     def put(record: bytes, reason: str) -> tuple[()]:
         begin = printable(record[:200].decode(errors="replace"))
-        _LOG.error("'%s': put a journal record aside in '%s': %s. It begins %s.", name, path, reason, begin)
+        _LOG.error("'%s': quarantined a journal record in '%s': %s. It begins %s.", name, path, reason, begin)
         try:
             with path.open("ab") as file:
                 file.write(record + b"\n")
@@ -457,7 +454,7 @@ def put_aside(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
                 os.fsync(file.fileno())
         except OSError as error:
             raise JournalError(
-                f"A record cannot be put aside in '{path}': {error.strerror}. Make room there."
+                f"A record cannot be quarantined in '{path}': {error.strerror}. Free space there."
             ) from error
         return ()
 
@@ -474,7 +471,7 @@ def own_records(journal: Journal[Record], name: str) -> Iterator[Record]:
         if isinstance(record, Started) and record.name not in ("", name):
             raise JournalError(
                 f"Journal '{journal.path}' is of '{printable(record.name)}'; '{name}' needs its own. If journals were "
-                f"swapped or copied, bring that of '{name}' back. See Epochs in docs/bus/auctioneer.md before you "
+                f"swapped or copied, restore that of '{name}'. See Epochs in docs/bus/auctioneer.md before you "
                 "move one away."
             )
         yield record
@@ -504,7 +501,7 @@ class CompactingJournal(Generic[Record]):
 
 
 class TimeRecorder:
-    """Records fleet time, so that it continues after a restart and never runs backwards."""
+    """Records fleet time, so that it continues after a restart and never decreases."""
 
     def __init__(self, journal: Journal[Any], state: TimedState[Any], real_s: float) -> None:
         """Compact the journal, which gave this state."""
@@ -512,14 +509,14 @@ class TimeRecorder:
         journal.compact(*state.compact())
 
     def start_s(self, speed: float) -> float:
-        """Return the fleet time to start with: after a restart, one that was certainly not read before."""
+        """Return the fleet time to start with: after a restart, later than any reading before."""
         return self._state.time_s + TICK_S * speed if self._state.time_s else 0.0
 
     def step(self, real_s: float, time_s: float) -> None:
         """Record the fleet time every `TICK_S`, and compact the journal when it has grown.
 
         Raises:
-            JournalError: the journal cannot be relied on any more.
+            JournalError: the journal is no longer reliable.
         """
         if real_s < self._recorded_s + TICK_S:
             return

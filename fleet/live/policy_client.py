@@ -31,7 +31,7 @@ class PolicyClient:
     scope: ClassVar = "central"
 
     def __init__(self, policy: str, *, fleet: str, endpoint: str, limit_s: float) -> None:
-        """Prepare a client of the policy of this name; every decision may take `limit_s`, real seconds.
+        """Prepare a client of the policy; a decision may take `limit_s`, real seconds.
 
         Raises:
             BusError: no such endpoint is allowed.

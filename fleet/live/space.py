@@ -1,8 +1,8 @@
 """Space of the arms of a live fleet: which plans exclude each other, and which arm is in the way of a plan.
 
-An arm takes the space of a plan from the moment that it is granted until the arm says that it is at home again, however
-long that takes: no lease and no timeout frees it. On the bus the space of a plan has a name that every participant
-computes from the plan (`fleet.arm.space.space_name`). A name that a fleet does not know may be anywhere.
+An arm takes the space of a plan from its grant until the arm reports that it is at home again: no lease and no timeout
+frees it. On the bus the space of a plan has a name that every participant
+computes from the plan (`fleet.arm.space.space_name`). An unknown name stands for the whole workspace of the arm.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 ANYWHERE = "*"
-"""Space of an arm that may be anywhere within its reach."""
+"""Space of an arm at an unknown position: its whole workspace."""
 Excludes = Callable[[str, str, str, str], bool]
 """Whether the spaces of two arms exclude each other; arguments: arm, name of its space, other arm, name of its space.
 Symmetric."""
 
 
 def no_conflicts(arm: str, space: str, other: str, other_space: str) -> bool:
-    """Let all arms take all spaces at a time: they stand too far apart to meet."""
+    """Return False: arms beyond each other's reach have no conflicts."""
     return False
 
 
@@ -31,9 +31,9 @@ class CellSpace:
     conflicts: np.ndarray
     """bool [volume, volume], symmetric."""
     reach: frozenset[frozenset[str]]
-    """Every two arms that can touch each other at all."""
+    """All pairs of arms within reach of each other."""
     arms: frozenset[str]
-    """Arms of the cell; another arm may be anywhere."""
+    """Arms of the cell; the position of any other arm is unknown."""
 
     def __call__(self, arm: str, space: str, other: str, other_space: str) -> bool:
         """Return whether two spaces exclude each other; unknown ones do if their arms can touch."""
@@ -49,7 +49,7 @@ def arms_in_the_way(
     """Return the other arms that take a space which excludes this one, by name.
 
     Args:
-        space: None for unknown: anywhere.
+        space: None for unknown: the whole workspace.
         taken: Names of the spaces that each arm takes.
     """
     wanted = space or ANYWHERE

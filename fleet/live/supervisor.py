@@ -22,7 +22,7 @@ READY = "ready "
 SUPERVISED = "THERMOFLEET_SUPERVISOR"
 """Environment variable of supervised processes: the process id of the supervisor."""
 WAITS = 75
-"""Exit code of a process that lacks something which comes back, as a router: no failure (EX_TEMPFAIL of sysexits.h)."""
+"""Exit code of a process that waits for another, as a router: no failure (EX_TEMPFAIL of sysexits.h)."""
 LOG_S = 1.0
 """Real seconds to wait for the last output of an exited process."""
 
@@ -78,13 +78,13 @@ class _Running:
 
 
 class LogFile:
-    """Appends lines to a file; while the disk refuses them they are dropped and counted."""
+    """Appends lines to a file; on a full disk they are dropped and counted."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._lost = path, 0
 
     def write(self, line: str) -> None:
-        """Append a line, after one that says how many are missing."""
+        """Append a line, after one with the number of lost lines."""
         missing = f"[{self._lost} line(s) lost: the disk was full]\n" if self._lost else ""
         try:
             with self._path.open("ab", buffering=0) as file:
@@ -288,7 +288,7 @@ class Supervisor:
 
 
 def exit_with_supervisor() -> None:
-    """Have the kernel stop this process when its supervisor exits, however that exits; called by participants.
+    """Have the kernel stop this process when its supervisor exits; called by participants.
 
     Only Linux can do so (prctl(2), PR_SET_PDEATHSIG); elsewhere, and without a supervisor, it does nothing.
     """

@@ -47,7 +47,7 @@ MOVING_RAD_S = 0.01
 class _Arm:
     publisher: Publisher
     state: State
-    heard_s: float
+    received_s: float
 
 
 class Bridge:
@@ -103,7 +103,7 @@ class Bridge:
             if publisher is None:
                 return
             arm = self._arms[name] = _Arm(publisher, state, 0.0)
-        arm.state, arm.heard_s = state, time.monotonic()
+        arm.state, arm.received_s = state, time.monotonic()
         arm.publisher.put(payload)
 
     def _receive_difficulty(self, name: str, scores: DifficultyScores) -> None:
@@ -111,7 +111,7 @@ class Bridge:
 
     def _diagnose(self, now_s: float) -> None:
         for name, arm in list(self._arms.items()):
-            age_s = now_s - arm.heard_s
+            age_s = now_s - arm.received_s
             if age_s > GONE_S:
                 self._forget(name)
                 continue
@@ -231,7 +231,6 @@ class Follower:
         self._sync = ClockSync(link, lambda: self._clock, self._set_clock, self._warn)
         self._twin = f"ros2 {topics[0]}"
         self._refusal = f"this arm is a real one that publishes under {topics[0]}, and takes no work"
-        self.malformed = 0
         self._publish_state = link.publisher(keys.of_arm(link.fleet, arm, "state"), State)
         self._publish_info = link.publisher(keys.of_arm(link.fleet, arm, "info"), Info)  # holds the last one
         self._publish_info(Info(arm, len(readings.names), self._twin))
@@ -267,9 +266,7 @@ class Follower:
                 temp_c = temperatures(read_diagnostics(payload), self._readings.names, self._readings.hardware)
                 self._readings.update_temperatures(temp_c, now_s)
         except MalformedMessage as error:
-            self.malformed += 1
-            if self.malformed & (self.malformed - 1) == 0:  # 1, 2, 4, 8, …
-                _LOG.warning("Dropped invalid message of %s (%d so far): %s", topic.name, self.malformed, error)
+            self._link.reject(f"of {topic.name}: {error}")
 
     def _send_state(self, now_s: float) -> None:
         self._tick += 1

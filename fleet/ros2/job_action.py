@@ -1,7 +1,7 @@
-"""An action server of ROS 2 that has the fleet do jobs: `thermofleet_msgs/action/DoJob`.
+"""An action server of ROS 2 that submits jobs to the fleet: `thermofleet_msgs/action/DoJob`.
 
 Needs `rclpy` and the package in `fleet/ros2/thermofleet_msgs`, built in a ROS 2 workspace. It works with every
-middleware of ROS 2, DDS too, because rclpy speaks to it.
+middleware of ROS 2, DDS too, because it uses rclpy.
 """
 
 # ROS 2 is not on the package index as a whole, so its types are unknown here.
@@ -33,8 +33,8 @@ TURN_S = 0.02
 class JobAction:
     """`with JobAction(link) as jobs: jobs.serve(until_s)` in a loop; the link is open.
 
-    A goal is accepted, submitted and followed; its result says how the job ended. A goal that is no possible job is
-    aborted with the reason. The feedback is the state of the job, whenever it changes.
+    A goal is accepted, submitted and followed; its result is the outcome of the job. An invalid job is aborted with
+    the reason. The feedback is the state of the job, whenever it changes.
     """
 
     def __init__(self, link: BusClient, *, domain: int | None = None) -> None:

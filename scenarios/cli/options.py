@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from fleet.bus.exchange.channel import Channel, Partition
-from fleet.bus.protocol.keys import ENDPOINT as ENDPOINT
 from fleet.errors import NAME_RULE, FleetError, LogError, is_name, nearest, printable
 from fleet.fields import MAX_SEED, Option
 from scenarios.cli.from_fields import declared
+from scenarios.spec.options import ENDPOINT as ENDPOINT
 from scenarios.spec.options import RunSpec
 
 Number = TypeVar("Number", int, float, None)

@@ -4,8 +4,8 @@ import logging
 import os
 import secrets
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from fleet.bus.client import BusClient, NoReply
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
-from fleet.bus.protocol.registry import STATE_HZ
+from fleet.bus.protocol.keys import STATE_HZ
 from fleet.difficulty import Blind, DifficultyModel
 from fleet.errors import BusError, FleetError, InfeasibleJob, LogError, Refused
 from fleet.files import cache_folder
@@ -73,7 +73,13 @@ def run_arm(
     Raises:
         FleetError: options contradict each other or the journals.
     """
-    _check_allocation(spec.policy if alone else "", file)
+    if alone and scope_of(spec.policy) == "central":
+        raise FleetError(
+            f"'{spec.policy}' needs an auctioneer: start it with thermofleet bus auctioneer --policy {spec.policy}, "
+            "and leave --policy out for the arms."
+        )
+    if alone and file is not None:
+        raise FleetError("An arm that replays a log takes no jobs: leave --policy out.")
     if spec.new_epoch and not alone:
         raise FleetError("--new-epoch is for an arm with --policy, or for thermofleet bus auctioneer: leave it out.")
     fleet, folder = folder_of(spec.journal, spec.fleet, scenario)
@@ -81,8 +87,8 @@ def run_arm(
     with progress_bar() as progress:
         simulated = partial(simulated_arm, scenario, name, spec.difficulty, spec.seed, progress, risk=spec.risk)
         arm = replayed_arm(name, file) if file else simulated()
-    # An award that is put aside is not executed again: its lease expires at the auctioneer, which awards the job anew
-    # or, if it had permitted the last cycle, calls it unfinished.
+    # A quarantined award is not executed again: its lease expires at the auctioneer, which awards the job again or, if
+    # it had permitted the last cycle, marks it unfinished.
     aside = put_aside(folder / f"{name}.aside", name)
     with (
         until_stopped() as stop,
@@ -95,9 +101,9 @@ def run_arm(
         if alone:
             refuse_auctioneer(link)
             membership = membership_of(scenario, name, spec.policy, jobs=spec.jobs, seed=spec.seed)
-            source = resources.enter_context(
-                work_source(folder / f"{name}.grants", membership, new_epoch=spec.new_epoch)
-            )
+            grants = resources.enter_context(Journal[GrantRecord](folder / f"{name}.grants", GrantRecord))
+            source = partial(ConsensusNode, membership=membership, journal=grants, new_epoch=spec.new_epoch)
+
         node = make_node(link, book, arm, scenario, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=source)
         echo(f"ready {name} {endpoint} {os.getpid()}")
         if alone and serve_until_done(node, stop):
@@ -106,16 +112,6 @@ def run_arm(
             node.serve(time.monotonic() + TURN_S)
         node.retire(time.monotonic() + RETIRE_S)
         stop.leave(f"Interrupted; the journal is {book.path}, and the same command continues.")
-
-
-def _check_allocation(policy: str, file: Path | None) -> None:
-    if policy and scope_of(policy) == "central":
-        raise FleetError(
-            f"'{policy}' needs an auctioneer: start it with thermofleet bus auctioneer --policy {policy}, and leave "
-            "--policy out for the arms."
-        )
-    if policy and file is not None:
-        raise FleetError("An arm that replays a log takes no jobs: leave --policy out.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,12 +236,12 @@ def make_node(
     speed: float | None = None,
     rate_hz: float = STATE_HZ,
     capacity: int = 1,
-    work_source: Callable[[ArmNode, int], WorkSource] | None = None,
+    work_source: Callable[..., WorkSource] | None = None,
 ) -> ArmNode:
     """Join the bus with an arm and the history of its journal; link and journal are open.
 
     Args:
-        work_source: Makes its work source, from the arm and the boot number; by default auctioneers.
+        work_source: Makes its work source, from the arm and `boot`, the boot number; by default auctioneers.
     """
     clock = fleet_clock(link, speed)
     history = restart_history(book, arm.name, clock.now_s(time.monotonic()))
@@ -264,7 +260,7 @@ def make_node(
     )
     body = arm.body(clock.now_s(time.monotonic()), clock.speed / rate_hz)
     auctioneers = partial(AuctioneerClient, history=kept)
-    source = auctioneers if work_source is None else lambda live_arm: work_source(live_arm, history.boot)
+    source = auctioneers if work_source is None else partial(work_source, boot=history.boot)
     return ArmNode(link, body, executor, estimator, clock, arm_config, source)
 
 
@@ -322,19 +318,6 @@ def refuse_auctioneer(link: BusClient) -> None:
     if present := link.tokens(keys.of_every_auction(link.fleet, "alive"), timeout_s=2.0):
         names = ", ".join(sorted(present))
         raise BusError(f"Fleet '{link.fleet}' has an auctioneer: '{names}'. Stop it first, or leave --policy out.")
-
-
-@contextmanager
-def work_source(
-    path: Path, membership: Membership, *, new_epoch: bool = False
-) -> Iterator[Callable[[ArmNode, int], ConsensusNode]]:
-    """Factory of an arm's work source, from the arm and its boot number; the journal of its grants is open meanwhile.
-
-    Raises:
-        FleetError: the journal cannot be used.
-    """
-    with Journal[GrantRecord](path, GrantRecord) as book:
-        yield lambda arm, boot: ConsensusNode(arm, membership, book, boot=boot, new_epoch=new_epoch)
 
 
 def serve_until_done(node: ArmNode, stop: Stop) -> bool:

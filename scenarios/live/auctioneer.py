@@ -1,7 +1,4 @@
-"""Central policies in a live fleet: they allocate the jobs of each round of the auctioneer.
-
-The auctioneer of a live fleet as a process, and the jobs of its scenario.
-"""
+"""The auctioneer of a live fleet as a process: a central policy allocates the jobs of each round."""
 
 import logging
 import os
@@ -36,6 +33,11 @@ _LOG = logging.getLogger(__name__)
 
 ON_BUS_S = 1.0
 """Most real seconds for a decision of a policy in another process: meanwhile the auctioneer renews no lease."""
+TURN_S = 0.1
+"""Real seconds between two submissions of released jobs."""
+NONE_LEFT: Mapping[JobState, int] = {}
+FAREWELL_S = (1.0, 10.0)
+"""Real seconds to serve after the end; and at most, while a job is in its last cycle."""
 
 
 class CentralAllocation:
@@ -105,15 +107,6 @@ def central_allocation(
     return CentralAllocation(made, live_fleet(scenario, ends=ends))
 
 
-log = logging.getLogger(__name__)
-
-TURN_S = 0.1
-"""Real seconds between two submissions of released jobs."""
-NONE_LEFT: Mapping[JobState, int] = {}
-FAREWELL_S = (1.0, 10.0)
-"""Real seconds to serve after the end; and at most, while a job is in its last cycle."""
-
-
 def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str) -> None:
     """Run the auctioneer of a fleet until its jobs are settled, Ctrl-C or SIGTERM; its journal is `NAME.journal`.
 
@@ -149,14 +142,14 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
             cell=cell,
         )
         for sentence in other_versions(endpoint, fleet):
-            log.error("Refused: %s", sentence)
+            _LOG.error("Refused: %s", sentence)
         echo(f"ready {name} {endpoint} {os.getpid()}")
         ledger = node.auctioneer.ledger
         if ledger.jobs:
             so_far = summary(node.auctioneer.status(), node.time_s, ledger.left).partition("\n")[0]
-            log.warning("Continuing from %s: %s", book.path, so_far)
+            _LOG.warning("Continuing from %s: %s", book.path, so_far)
         if node.auctioneer.ledger.ended:
-            log.warning("That shift is over; another --journal (of thermofleet up: --out) begins a new one.")
+            _LOG.warning("That shift is over; another --journal (of thermofleet up: --out) begins a new one.")
         if own:
             submit_stream(node, own, scenario.horizon_s, stop)
         else:
@@ -176,10 +169,10 @@ def submit_stream(node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], ho
             try:
                 for admission in node.submit(Submission(due, "scenario")).jobs:
                     if not admission.accepted:
-                        log.warning("'%s' was refused: %s", admission.job, admission.reason)
+                        _LOG.warning("'%s' was refused: %s", admission.job, admission.reason)
                 del left[: len(due)]
             except Refused as error:
-                log.error("Could not submit the scenario's jobs; retrying: %s", error)
+                _LOG.error("Could not submit the scenario's jobs; retrying: %s", error)
         over = node.time_s >= horizon_s and not node.auctioneer.ledger.ended
         if over:
             node.end()

@@ -127,7 +127,7 @@ def show(endpoint: str, fleet: FleetSnapshot, report: HealthReport) -> None:
 
 
 def why_unreachable(endpoint: str) -> str:
-    """What a plain connection to the endpoint shows; "" for TLS or an invalid endpoint, where the error says it."""
+    """Result of a plain connection to the endpoint; "" for TLS or an invalid endpoint, whose error names the reason."""
     match = re.fullmatch(r"tcp/\[?([^\]/]+?)\]?:(\d{1,5})", endpoint)
     if match is None or int(match[2]) > 65535:
         return ""
@@ -135,7 +135,7 @@ def why_unreachable(endpoint: str) -> str:
     host, port = match[1], int(match[2])
     try:
         with socket.create_connection((host, port), timeout=REPLY_S):
-            known, _ = why_not(host, port, None)  # the error says it already
+            known, _ = why_not(host, port, None)  # the error names this reason already
             return "" if known else f"Port {port} is open, but no thermofleet router listens on it."
     except ConnectionRefusedError:
         return f"Nothing listens at port {port} of {host}; start it with: thermofleet bus router --port {port}"

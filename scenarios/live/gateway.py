@@ -1,14 +1,8 @@
-"""The live page: its files, as browsers load them, and the cell in three dimensions as it draws it.
-
-Nobody needs a token for the files, which say nothing about a fleet; the page asks for one and sends it with each
-request.
-
-The bus over HTTP: the fleet as JSON, messages as server-sent events, job submissions and quotes; who may do what.
+"""The bus over HTTP: the fleet as JSON, messages as server-sent events, job requests, and a page for browsers.
 
 The bus is served on a thread of its own (`fleet.live.monitor.async_bridge`); feed and reader buffers are used on the
-event loop only. Errors are problem details (RFC 9457).
-
-The bus over HTTP and server-sent events, and a page for browsers, as a process.
+event loop only. Errors are problem details (RFC 9457). The files of the page need no token, as they contain nothing of
+a fleet; the page asks for one and sends it with each request.
 """
 
 import asyncio
@@ -68,6 +62,31 @@ from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import Interrupted, echo
 from scenarios.spec.schema import Scenario
 
+_LOG = logging.getLogger(__name__)
+
+Role = Literal["monitor", "submitter", "operator"]
+ROLES: tuple[Role, ...] = get_args(Role)
+"""Each role may do what the ones before it may."""
+TOKEN = "THERMOFLEET_TOKEN"
+"""Environment variable of the operator's token."""
+MIN_TOKEN = 16
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+RATE_HZ, BURST = 50.0, 100.0
+"""Requests per real second of one token, or without tokens of one address; and requests at once after a pause."""
+MAX_SENDERS = 4096
+"""Tokens and addresses whose rate is kept."""
+MAX_BYTES = 60_000
+"""Of a body: what the router forwards, less the overhead of a message."""
+MAX_BODIES = 32
+"""Unfinished bodies; the next one ends the oldest."""
+MAX_READERS, MAX_REQUESTS = 64, 16
+BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
+"""Real seconds: for a body to arrive; for a reader to take what was sent; between two heartbeats."""
+MAX_CONNECTIONS = 1000
+MAX_WAITING = 128
+"""Connections without a complete request; the next one closes the oldest."""
+HEADER_S = 5.0
+"""Real seconds until a connection without a complete request is closed."""
 PAGE = "dashboard.html"
 FILES = ("page.css", "dashboard.css", "cell.js", "stream.js", "tables.js", "actions.js", "dashboard.js")
 TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
@@ -92,7 +111,7 @@ class LivePage:
         self._cell: Cell | None = None
 
     async def scene(self, ask_cell: Callable[[], Awaitable[Cell]]) -> Mapping[str, Any]:
-        """The cell in three dimensions; raises BusError if nobody describes it, or with wrong numbers."""
+        """The cell in three dimensions; raises BusError if no participant describes it, or with wrong numbers."""
         if self._given and self._model is not None:
             return self._model
         cell = await ask_cell()
@@ -100,7 +119,7 @@ class LivePage:
             try:
                 self._model = await asyncio.to_thread(_model_of, cell)
             except ValueError as error:
-                raise BusError(f"The auctioneer describes a cell that cannot be: {error}") from error
+                raise BusError(f"The auctioneer describes an invalid cell: {error}") from error
             self._cell = cell
         return self._model
 
@@ -140,22 +159,6 @@ def _model_of(cell: Cell) -> Mapping[str, Any]:
     return {**described_model(cell, [arm.name for arm in cell.arms]), "heat": heat_scale(cell.warning_c, cell.error_c)}
 
 
-Role = Literal["monitor", "submitter", "operator"]
-ROLES: tuple[Role, ...] = get_args(Role)
-"""Each role may do what the ones before it may."""
-MIN_TOKEN = 16
-MAX_BODIES = 32
-"""Unfinished bodies at a time; one more ends the oldest."""
-RATE_HZ, BURST = 50.0, 100.0
-"""Requests per real second of one token, or without tokens of one address; and how many at once after a pause."""
-MAX_SENDERS = 4096
-"""Tokens and addresses whose rate is kept."""
-LOCAL = ("127.0.0.1", "localhost", "[::1]")
-MAX_BYTES = 60_000
-"""Of a body: what the router passes, less the overhead of a message."""
-MAX_READERS, MAX_REQUESTS = 64, 16
-BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
-"""Real seconds: for a body to arrive; for a reader to take what was sent; between two heartbeats."""
 Body = TypeVar("Body", bound=msgspec.Struct)
 Asked = TypeVar("Asked", bound=msgspec.Struct)
 Reply = TypeVar("Reply")
@@ -211,8 +214,8 @@ def read_tokens(path: Path) -> dict[str, Role]:
 class AccessCheck:
     """Passes requests that show a token, at a limited rate; without tokens, requests to this machine's local names.
 
-    The name is checked since a page of another site must not reach the gateway under a name of its own. A request that
-    is `public` needs no token.
+    The host name is checked because a page of another site could otherwise send requests under its own host name (DNS
+    rebinding). A `public` request needs no token.
     """
 
     def __init__(
@@ -262,19 +265,8 @@ class AccessCheck:
         return problem_response(HTTPStatus.TOO_MANY_REQUESTS, detail, {"Retry-After": str(math.ceil(1 / RATE_HZ))})
 
 
-def check_role(request: Request, needed: Role) -> None:
-    """Check the role of a request's token.
-
-    Raises:
-        Problem: it may not do this.
-    """
-    role: Role = request.scope["role"]
-    if ROLES.index(role) < ROLES.index(needed):
-        raise Problem(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")
-
-
 class Bodies:
-    """Limits the time and the number of unfinished bodies: who sends quickly is not held up by those who do not."""
+    """Limits the time and the number of unfinished bodies, so that slow senders do not block fast ones."""
 
     def __init__(self, body_s: float) -> None:
         self.body_s = body_s
@@ -378,7 +370,7 @@ def application(
     async def ask(key: str, message: msgspec.Struct, kind: type[Asked]) -> Asked:
         return await limited(lambda: bridge.ask(key, message, kind))
 
-    def of_jobs(topic: keys.JobsTopic, kind: type[Body], reply: type[msgspec.Struct]) -> Endpoint:
+    def of_jobs(topic: str, kind: type[Body], reply: type[msgspec.Struct]) -> Endpoint:
         """Passes the body of a request on to the auctioneer."""
 
         async def post(request: Request) -> Response:
@@ -434,13 +426,7 @@ def application(
 
     table: list[tuple[str, str, Role, Endpoint, str]] = [
         ("GET", "/", "monitor", contents, "This list."),
-        (
-            "GET",
-            "/v4/fleet",
-            "monitor",
-            fleet,
-            "State of every arm, jobs and messages, as `thermofleet bus watch --json`.",
-        ),
+        ("GET", "/v4/fleet", "monitor", fleet, "Arms, jobs and messages, as `thermofleet bus watch --json`."),
         ("GET", "/v4/events", "monitor", events, "Every message as server-sent events."),
         ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
         ("POST", "/v4/jobs", "submitter", submit, "Submit jobs: a Submission."),
@@ -508,11 +494,13 @@ class EventStream(StreamingResponse):
         return f"id: {self._boot}-{entry.number}\nevent: {entry.topic}\ndata: {data}\n\n"
 
 
-def _checked(role: Role, handle: Endpoint) -> Endpoint:
+def _checked(needed: Role, handle: Endpoint) -> Endpoint:
     """The handler of a request that needs a role."""
 
     async def check(request: Request) -> Response:
-        check_role(request, role)
+        role: Role = request.scope["role"]
+        if ROLES.index(role) < ROLES.index(needed):
+            raise Problem(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")
         return await handle(request)
 
     return check
@@ -561,13 +549,6 @@ def error_response(_: Request, error: Exception) -> Response:
             return problem_response(HTTPStatus(error.status_code), str(error.detail), error.headers)
         case _:
             return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The gateway failed; the reason is in its log.")
-
-
-TOKEN = "THERMOFLEET_TOKEN"
-MAX_CONNECTIONS, MAX_WAITING, HEADER_S = 1000, 128, 5.0
-"""Connections at a time; those that have sent no complete request yet, of which one more ends the oldest; and real
-seconds after which such a connection ends."""
-_LOG = logging.getLogger(__name__)
 
 
 def scene_of(scenario: Scenario) -> dict[str, Any]:  # values of JSON

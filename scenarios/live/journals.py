@@ -24,7 +24,7 @@ def folder_of(folder: Path | None, fleet: str, scenario: Scenario) -> tuple[str,
 
 
 def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool, new_epoch: bool = False) -> None:
-    """Check that journals in a folder are not of a shift with the other kind of allocation: jobs would be done twice.
+    """Refuse journals of a shift with the other kind of allocation, since jobs would be done twice.
 
     Args:
         alone: Whether the arms allocate jobs without an auctioneer.

@@ -1,9 +1,8 @@
-"""Record the messages of arms and auctioneers: on disk within seconds, each once, and gaps known.
+"""Record the messages of arms and auctioneers: durable within seconds, without duplicates, and with known gaps.
 
 A message goes to the append-only journal first (`save`), later to Parquet parts (`write`). The card names the last
-complete part, so a crash at any moment loses no row and doubles none. Every sender numbers its messages: repeated ones
-are dropped, missing ones are sought in the caches of the publishers (`GapFetcher`), and those that cannot be had become
-a row of `gaps`.
+complete part, so a crash loses and duplicates no row. Every sender numbers its messages: repeated ones are dropped,
+missing ones are fetched from the caches of the publishers (`GapFetcher`), and lost ones become a row of `gaps`.
 """
 
 import fcntl
@@ -25,9 +24,9 @@ from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Operation
-from fleet.bus.protocol.registry import HISTORY
 from fleet.errors import BusError, FleetError, JournalError
 from fleet.events import EVENTS_PER_BOOT
 from fleet.files import atomic_path
@@ -41,10 +40,10 @@ from scenarios.live.recording import (
     Card,
     Count,
     Gap,
-    Heard,
     Kind,
     Message,
     PartOpened,
+    Received,
     Record,
     part_file,
     read_card,
@@ -59,7 +58,7 @@ _LOG = logging.getLogger(__name__)
 MAX_ROWS = 50_000
 """Rows in memory at which a part is written before it is due."""
 MAX_WAITING = 4 * MAX_ROWS
-"""Rows in memory while the disk takes none; further messages are not taken, and sought when it does."""
+"""Rows in memory on a full disk; further messages are dropped, and fetched once there is space."""
 FETCH_S, PAUSE_S = 2.0, 3.0
 """Real seconds: how long the caches have to reply; between two attempts."""
 ATTEMPTS = 4
@@ -71,13 +70,13 @@ SWEEP_S, SWEEP_KEYS = 60.0, 8
 TURN_S, BATCH = 0.5, 1000
 """Real seconds, and messages, after which received messages are written to the disk."""
 CELL_S, CELL_REPLY_S = 30.0, 5.0
-"""Real seconds between two questions about the cell, until one is answered; in which a reply counts."""
+"""Real seconds: between two requests for the cell, until one has a reply; until a request times out."""
 BACKLOG = 200_000
-"""Maximum number of messages that wait: joining a fleet of a hundred arms brings a hundred thousand at once."""
+"""Maximum number of queued messages: joining a fleet of 100 arms brings 100 000 at once."""
 CONNECT_S = 0.5
 """Real seconds that the router has to accept the session that fetches missed messages."""
 RETRY_S = 5.0
-"""Real seconds until the next attempt to write a part to a disk that refused."""
+"""Real seconds until the next attempt to write a part after a disk error."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ class Recorder:
 
     Attributes:
         counts: Messages by series: `state of arm_0`.
-        sought: Gaps that may still be filled.
+        sought: Gaps that are still being fetched.
         parts: Number of the last complete part.
         cell: Description of the cell, for the card.
     """
@@ -132,8 +131,8 @@ class Recorder:
         self.parts = 0 if card is None else card.parts
         self._rows: dict[Kind, int] = {} if card is None else card.rows
         self.cell: Cell | None = None if card is None else card.cell
-        self._saved: list[Heard | Gap] = []
-        self._unsaved: list[Heard | Gap] = []
+        self._saved: list[Received | Gap] = []
+        self._unsaved: list[Received | Gap] = []
         self._journal: Journal[Record] = Journal(folder / JOURNAL, Record)
 
     @classmethod
@@ -170,16 +169,16 @@ class Recorder:
                 self._unsaved.append(record)
 
     def give_up(self, gap: Gap, reason: str) -> None:
-        """Stop seeking the messages of a gap: it becomes a row."""
+        """Abandon a gap: it becomes a row."""
         if gap in self.sought:
             self.sought.remove(gap)
             self._unsaved.append(structs.replace(gap, reason=reason))
 
     def save(self) -> None:
-        """Write rows through to the journal on the disk.
+        """Write rows to the journal, durably.
 
         Raises:
-            FleetError: the disk refuses; no row is lost, and the next call tries again.
+            FleetError: a disk error; no row is lost, and the next call tries again.
         """
         if not self._unsaved:
             return
@@ -194,11 +193,11 @@ class Recorder:
         """Write all rows as a new part, and the card; a status other than `recording` ends the recording.
 
         Raises:
-            FleetError: the disk refuses; no row is lost, and the next call tries again.
+            FleetError: a disk error; no row is lost, and the next call tries again.
         """
         if ends := status != "recording":
             for gap in list(self.sought):
-                self.give_up(gap, "the recording ended while they were sought")
+                self.give_up(gap, "the recording ended before they were fetched")
         rows: dict[Kind, list[dict[str, object]]] = {kind: [] for kind in KINDS}
         for record in (*self._saved, *self._unsaved):
             kind, row = to_row(record)
@@ -227,15 +226,15 @@ class Recorder:
     # Inside
 
     def _continue_journal(self) -> None:
-        """Take back the rows of the journal, which a crash has left there; a damaged one is put aside."""
+        """Recover the rows of the journal after a crash; a damaged journal is quarantined."""
         try:
             self._journal.open()
         except JournalError as error:
-            if isinstance(error.__cause__, OSError):  # not damaged: the disk refuses, or another process has it
+            if isinstance(error.__cause__, OSError):  # not damaged: a disk error, or another process has it
                 raise FleetError(str(error)) from error
             aside = self._journal.path.with_name(f"damaged-after-{self.parts:06d}.journal")
             self._journal.path.replace(aside)
-            _LOG.error("%s Put aside as '%s'.", error, aside.name)
+            _LOG.error("%s Quarantined as '%s'.", error, aside.name)
             self._journal.open()
             time_s = max((count.time_s for count in self.counts.values()), default=0.0)
             self._unsaved.append(Gap("all", 0, 0, time_s, time_s, f"the journal was damaged: {aside.name}"))
@@ -249,7 +248,7 @@ class Recorder:
         if not records:
             self._journal.rewrite(PartOpened(self.parts + 1))
 
-    def _take(self, record: Heard) -> bool:
+    def _take(self, record: Received) -> bool:
         """Count a message; return whether it is new."""
         series = series_of(record.message)
         number, time_s = series.number, record.message.time_s
@@ -297,9 +296,9 @@ class Recorder:
 
     @contextmanager
     def _draft(self, path: Path) -> Iterator[Path]:
-        """A draft of a file, on disk before it takes its name; and the name is on disk when the block ends.
+        """A draft of a file, durable before it takes its name; the name is durable when the block ends.
 
-        So no later file, which relies on this one, is there without it after a loss of power.
+        So after a power failure no later file, which relies on this one, exists without it.
         """
         try:
             with atomic_path(path) as draft:
@@ -378,7 +377,7 @@ class GapFetcher:
             link.subscribe(str(keys.Key(link.fleet, role, name, topic)), kind, self._recorder.add, history=True)
 
     def _count(self) -> None:
-        """Give up the gaps of senders that were asked often enough."""
+        """Abandon the gaps of senders after `ATTEMPTS` requests."""
         missing = {gap.sender for gap in self._recorder.sought}
         self._tries = Counter({sender: self._tries[sender] + (sender in self._asked) for sender in missing})
         for gap in list(self._recorder.sought):
@@ -408,7 +407,7 @@ class RecorderNode:
             link.subscribe(keys.of_every(link.fleet, role, topic), kind, recorder.add, history=True)
 
     def serve(self, until_s: float = math.inf) -> None:
-        """Handle messages for a turn, and do what is due; a disk that refuses is tried again later."""
+        """Handle messages for a turn, and do what is due; after a disk error they are tried again later."""
         self._link.serve(min(until_s, time.monotonic() + TURN_S), at_least=BATCH)
         self._fetcher.step(real_s := time.monotonic())
         if self.recorder.cell is None and real_s >= self._ask_cell_s:
@@ -428,7 +427,7 @@ class RecorderNode:
             self._failure, self._due_s = str(error), min(self._due_s, real_s + RETRY_S)
 
     def _keep_cell(self, replies: Replies[Cell]) -> None:
-        """Keep the description of the cell without the work of its arms; the next part puts it on the disk."""
+        """Keep the description of the cell without the work of its arms; it is written with the next part."""
         for cell in replies.messages.values():
             self.recorder.cell = structs.replace(cell, arms=tuple(structs.replace(arm, works=()) for arm in cell.arms))
             self._due_s = -math.inf
@@ -438,7 +437,7 @@ class RecorderNode:
         """Write everything that has arrived, and end the recording.
 
         Raises:
-            FleetError: the disk refuses.
+            FleetError: a disk error.
         """
         self.close()
         self._link.serve()
@@ -459,7 +458,7 @@ def record(
         connect: Makes another client of the fleet, which fetches missed messages.
 
     Raises:
-        FleetError: the disk refuses at the beginning or at the end; in between it is tried again.
+        FleetError: a disk error at the beginning or at the end; in between it is tried again.
     """
     with (
         lock_folder(folder),

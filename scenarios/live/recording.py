@@ -2,7 +2,7 @@
 
 `recording.json` describes the recording. `telemetry-000001.parquet`, `events-…`, `results-…`, `operations-…` and
 `gaps-…` are its parts; columns are fields of the messages `State`, `ArmEvent`, `Result` and `Operation`. What is not in
-a part yet is in `open.journal`. A row of `gaps` says which messages of a sender are missing, and why.
+a part yet is in `open.journal`. A row of `gaps` names missing messages of a sender, and the reason.
 """
 
 import math
@@ -64,32 +64,26 @@ class Gap(msgspec.Struct, frozen=True, tag="gap"):
     """Fleet time of the message before the gap, and of the one after it."""
     time_s: float
     reason: str = ""
-    """Why they cannot be had; "" while they are sought."""
+    """Why they are lost; "" while they are being fetched."""
     epoch: str = ""
     """In which the numbers were given; "" for unknown."""
 
 
-class HeardState(msgspec.Struct, frozen=True, tag="telemetry"):
-    """A message in the journal."""
+class ReceivedState(msgspec.Struct, frozen=True, tag="telemetry"):
+    """A message in the journal, as are the next three."""
 
     message: State
 
 
-class HeardEvent(msgspec.Struct, frozen=True, tag="events"):
-    """A message in the journal."""
-
+class ReceivedEvent(msgspec.Struct, frozen=True, tag="events"):
     message: ArmEvent
 
 
-class HeardResult(msgspec.Struct, frozen=True, tag="results"):
-    """A message in the journal."""
-
+class ReceivedResult(msgspec.Struct, frozen=True, tag="results"):
     message: Result
 
 
-class HeardOperation(msgspec.Struct, frozen=True, tag="operations"):
-    """A message in the journal."""
-
+class ReceivedOperation(msgspec.Struct, frozen=True, tag="operations"):
     message: Operation
 
 
@@ -99,8 +93,8 @@ class PartOpened(msgspec.Struct, frozen=True, tag="part"):
     number: int
 
 
-Heard = HeardState | HeardEvent | HeardResult | HeardOperation
-Record = Heard | Gap | PartOpened
+Received = ReceivedState | ReceivedEvent | ReceivedResult | ReceivedOperation
+Record = Received | Gap | PartOpened
 
 
 @dataclass(eq=False)
@@ -128,7 +122,7 @@ class Card(msgspec.Struct, frozen=True):
     """Number of the last complete part."""
     speakers: dict[str, Count]
     sought: tuple[Gap, ...] = ()
-    """Missing messages that may still be had."""
+    """Missing messages that are still being fetched."""
     rows: dict[Kind, int] = {}
     """Number of rows in all parts, by kind; none in recordings of earlier versions."""
     cell: Cell | None = None
@@ -167,37 +161,37 @@ SCHEMAS: dict[Kind, pa.Schema] = {
 }
 
 
-def to_record(message: Message) -> Heard:
+def to_record(message: Message) -> Received:
     """Wrap a message for the journal."""
     match message:
         case State():
-            return HeardState(message)
+            return ReceivedState(message)
         case ArmEvent():
-            return HeardEvent(message)
+            return ReceivedEvent(message)
         case Result():
-            return HeardResult(message)
+            return ReceivedResult(message)
         case Operation():
-            return HeardOperation(message)
+            return ReceivedOperation(message)
 
 
-def to_row(record: Heard | Gap) -> tuple[Kind, dict[str, object]]:
+def to_row(record: Received | Gap) -> tuple[Kind, dict[str, object]]:
     """Kind and columns of a record."""
     match record:
         case Gap():
             return "gaps", structs.asdict(record)
-        case HeardEvent(message):
+        case ReceivedEvent(message):
             return "events", structs.asdict(message)
-        case HeardResult(message):
+        case ReceivedResult(message):
             fields = structs.asdict(message)
             fields["offers"] = msgspec.json.encode(message.offers).decode() if message.offers else ""
             return "results", fields | structs.asdict(fields.pop("status"))
-        case HeardOperation(message):
+        case ReceivedOperation(message):
             request = message.request
             action = cast(dict[str, object], msgspec.to_builtins(request.action))
             fields = structs.asdict(message) | {name: action.get(name, "") for name in ("action", "job", "arm")}
             fields |= {"request": request.request, "by": request.by, "content": msgspec.json.encode(request).decode()}
             return "operations", fields
-        case HeardState(message):
+        case ReceivedState(message):
             row: dict[str, object] = {name: getattr(message, name) for name in _STATE if name not in SENSORS}
             for name in SENSORS:
                 row |= {f"{name}_{joint + 1}": value for joint, value in enumerate(getattr(message, name)[:JOINTS])}
@@ -240,7 +234,7 @@ def to_table(kind: Kind, rows: list[dict[str, object]]) -> pa.Table:
 
 
 def read_parts(folder: Path, kind: Kind) -> pa.Table:
-    """Read everything of a kind that is on disk now, in order of time.
+    """Read all rows of a kind so far, in order of time.
 
     Raises:
         FleetError: it is no recording, or its journal or a part is damaged.
@@ -276,7 +270,7 @@ def _read_part(path: Path, kind: Kind) -> pa.Table:
         ) from error
 
 
-def _open_records(folder: Path, number: int) -> list[Heard | Gap]:
+def _open_records(folder: Path, number: int) -> list[Received | Gap]:
     """Records of the part that is not complete yet, from a copy of its journal: the recorder has locked the file."""
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / JOURNAL
@@ -288,7 +282,7 @@ def _open_records(folder: Path, number: int) -> list[Heard | Gap]:
             return records_of(journal, number)
 
 
-def records_of(journal: Journal[Record], number: int) -> list[Heard | Gap]:
+def records_of(journal: Journal[Record], number: int) -> list[Received | Gap]:
     """Records of the part of this number in a journal; none if it is of an earlier part."""
     records = list(journal.records())
     if not records or records[0] != PartOpened(number):

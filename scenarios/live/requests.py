@@ -55,6 +55,7 @@ PATIENCE_S = 30.0
 """Real seconds without a reply after which following ends."""
 MOST_CHARACTERS = 128
 """Longest name of a person."""
+_NEEDS_ROLE = "With TLS, use a certificate of the role operator."
 _UNKNOWN_KIND = re.compile(r"Invalid enum value '(.*)'", re.DOTALL)
 """Message of msgspec; of all fields of a job, only its kind is an enumeration."""
 Decoded = TypeVar("Decoded")
@@ -93,11 +94,12 @@ def quote_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, timeout_s:
     if len(jobs) > MOST_QUOTED:
         raise FleetError(f"A request can name at most {MOST_QUOTED} jobs (got {len(jobs)}).")
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        request = QuoteRequest("dry run", tuple(jobs), dry_run=True)
-        answers, until_s = query(link, request, timeout_s), time.monotonic() + timeout_s
+        key, request = keys.of_every_arm(link.fleet, "quote"), QuoteRequest("dry run", tuple(jobs), dry_run=True)
+        answers = link.query_and_wait(key, request, Quote, timeout_s=timeout_s)
+        until_s = time.monotonic() + timeout_s
         while _is_unplanned(answers) and time.monotonic() < until_s:
             link.serve(time.monotonic() + PAUSE_S)
-            answers = query(link, request, timeout_s)
+            answers = link.query_and_wait(key, request, Quote, timeout_s=timeout_s)
         name = link.fleet
     quotes = {quote.arm: quote for quote in sorted(answers.messages.values(), key=lambda quote: quote.arm)}
     if not quotes and not answers.refused:
@@ -181,8 +183,8 @@ def follow(link: BusClient, client: JobClient, stop: Stop) -> list[str]:
         link.serve(time.monotonic() + TURN_S)
         if time.monotonic() > client.heard_s + PATIENCE_S:
             raise BusError(
-                f"No reply from an auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; "
-                "accepted jobs are on its disk."
+                f"No reply from an auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; its journal has the "
+                "accepted jobs."
             )
     return [name for name, status in client.statuses.items() if status is None or status.state != "finished"]
 
@@ -197,11 +199,6 @@ def print_changes() -> Callable[[JobStatus], None]:
             echo(describe_status(status))
 
     return show
-
-
-def query(link: BusClient, request: QuoteRequest, timeout_s: float) -> Replies[Quote]:
-    """Request the quotes of every arm."""
-    return link.query_and_wait(keys.of_every_arm(link.fleet, "quote"), request, Quote, timeout_s=timeout_s)
 
 
 def _is_unplanned(answers: Replies[Quote]) -> bool:
@@ -274,38 +271,30 @@ def clear_space(arm: str, by: str, endpoint: str, fleet: str) -> None:
     """Free the space of an absent arm.
 
     Raises:
-        BusError: the request is refused, or nobody replies.
+        BusError: the request is refused, or there is no reply.
     """
-    check_person(by)
+    request = ClearRequest(arm, person(by))
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        request = ClearRequest(arm, by or user_name())
         replies = link.query_and_wait(keys.of_jobs(link.fleet, "clear"), request, Cleared, timeout_s=REPLY_S)
         name = link.fleet
     for reason in replies.refusals:
         where = " by all arms" if replies.messages else ""
         raise BusError(f"The space of '{arm}' was not freed{where}: {reason}")
     if not replies.messages:
-        raise BusError(
-            f"Neither an auctioneer nor an arm of fleet '{name}' replied within {REPLY_S:g} s. With TLS, use a "
-            "certificate of the role operator."
-        )
+        raise BusError(f"No auctioneer or arm of fleet '{name}' replied within {REPLY_S:g} s. {_NEEDS_ROLE}")
     echo(f"{arm}: its space is free until the arm reports its space again.")
 
 
-def check_person(by: str) -> None:
-    """Check the name of the person who requests something.
+def person(by: str) -> str:
+    """Name of the person who sends a request: the given one, or the user of this process, "" if it has no name.
 
     Raises:
         FleetError: it is too long.
     """
     if len(by) > MOST_CHARACTERS:
         raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
-
-
-def user_name() -> str:
-    """Name of the user of this process; "" if it has none."""
     try:
-        return getpass.getuser()
+        return by or getpass.getuser()
     except (KeyError, OSError):
         return ""
 
@@ -317,40 +306,35 @@ def reset_arm(arm: str, by: str, endpoint: str, fleet: str) -> None:
         Refused: the arm refuses.
         BusError: it does not reply.
     """
-    check_person(by)
+    request = ResetRequest(person(by))
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        key, message = keys.of_arm(link.fleet, arm, "reset"), ResetRequest(by or user_name())
         try:
-            reply = link.ask(key, message, ResetReply, timeout_s=REPLY_S)
+            reply = link.ask(keys.of_arm(link.fleet, arm, "reset"), request, ResetReply, timeout_s=REPLY_S)
         except NoReply as error:
-            raise BusError(
-                f"The arm '{arm}' did not reply. With TLS, use a certificate of the role operator."
-            ) from error
+            raise BusError(f"The arm '{arm}' did not reply. {_NEEDS_ROLE}") from error
     echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
 
 
 def control(actions: Sequence[Action], by: str, endpoint: str, fleet: str) -> None:
-    """Request actions, one after another, and print what became of them.
+    """Request actions, one after another, and print the outcome of each.
 
     Raises:
         Refused: one is refused.
-        BusError: nobody replies.
+        BusError: no reply.
     """
-    check_person(by)
+    by = person(by)
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        key = keys.of_jobs(link.fleet, "control")
         for action in actions:
-            echo(describe(action, _request(link, ControlRequest(secrets.token_hex(8), action, by or user_name()))))
-
-
-def _request(link: BusClient, control: ControlRequest) -> Controlled:
-    key = keys.of_jobs(link.fleet, "control")
-    try:
-        return link.ask(key, control, Controlled, timeout_s=REPLY_S, attempts=ATTEMPTS)
-    except NoReply as error:
-        raise BusError(
-            f"Neither an auctioneer nor an arm of fleet '{link.fleet}' replied within {ATTEMPTS * REPLY_S:g} s. With "
-            "TLS, use a certificate of the role operator."
-        ) from error
+            request = ControlRequest(secrets.token_hex(8), action, by)
+            try:
+                reply = link.ask(key, request, Controlled, timeout_s=REPLY_S, attempts=ATTEMPTS)
+            except NoReply as error:
+                wait_s = f"{ATTEMPTS * REPLY_S:g} s"
+                raise BusError(
+                    f"No auctioneer or arm of fleet '{link.fleet}' replied within {wait_s}. {_NEEDS_ROLE}"
+                ) from error
+            echo(describe(action, reply))
 
 
 def describe(action: Action, reply: Controlled) -> str:
@@ -359,8 +343,6 @@ def describe(action: Action, reply: Controlled) -> str:
     if isinstance(action, Pause | Resume):
         arms = ", ".join("all arms" if arm == ALL_ARMS else arm for arm in sorted(reply.paused))
         return f"Paused: {arms or 'none'}.{note}"
-    return f"{action.job}: {_state(reply.job)}{note}"
-
-
-def _state(job: JobStatus | None) -> str:
-    return "settled." if job is None else f"{job.state}, {job.cycles} of {job.repetitions} cycles."
+    job = reply.job
+    state = "settled" if job is None else f"{job.state}, {job.cycles} of {job.repetitions} cycles"
+    return f"{action.job}: {state}.{note}"

@@ -9,7 +9,7 @@ from fleet.bus.client import BusClient
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.cli.options import split_names, the_fleet
-from scenarios.cli.signals import until_stopped
+from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo
 from scenarios.extras import require_extra
 
@@ -36,9 +36,7 @@ def run_bridge(
     ):
         bridge = Bridge(link, node, limits=limits, humble=humble)
         echo(f"ready ros2 bridge {where} {os.getpid()}")
-        while not stop.is_set():
-            bridge.serve(time.monotonic() + TURN_S)
-        stop.leave("The bridge was interrupted.")
+        _serve(bridge.serve, stop, "The bridge was interrupted.")
 
 
 def run_listener(
@@ -79,9 +77,7 @@ def run_listener(
         readings, topics = ArmReadings(names, hardware), (topic, temperatures)
         follower = Follower(link, node, arm, readings, topics, clock, limits=limits, rate_hz=rate_hz)
         echo(f"ready {arm} {topic} {os.getpid()}")
-        while not stop.is_set():
-            follower.serve(time.monotonic() + TURN_S)
-        stop.leave(f"Stopped listening to {topic}.")
+        _serve(follower.serve, stop, f"Stopped listening to {topic}.")
 
 
 def run_jobs(endpoint: str, fleet: str, *, domain: int) -> None:
@@ -103,9 +99,13 @@ def run_jobs(endpoint: str, fleet: str, *, domain: int) -> None:
         JobAction(link, domain=domain) as jobs,
     ):
         echo(f"ready {jobs.name} {os.getpid()}")
-        while not stop.is_set():
-            jobs.serve(time.monotonic() + TURN_S)
-        stop.leave("The action server was stopped; submitted jobs go on.")
+        _serve(jobs.serve, stop, "The action server was stopped; submitted jobs go on.")
+
+
+def _serve(serve: Callable[[float], None], stop: Stop, farewell: str) -> None:
+    while not stop.is_set():
+        serve(time.monotonic() + TURN_S)
+    stop.leave(farewell)
 
 
 def ros2_router(router: str, endpoint: str) -> str:

@@ -55,6 +55,8 @@ class RunSpec:
 
 PORT, PAGE_PORT = 7447, 8080
 """TCP ports of the router and of the gateway, unless they are taken."""
+ENDPOINT = f"tcp/127.0.0.1:{PORT}"
+"""Of the router, by default."""
 LiveModel = Literal["twin", "blind"]
 JobSource = Literal["scenario", "none"]
 

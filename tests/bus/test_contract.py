@@ -17,8 +17,8 @@ from fleet.bus.protocol import auction as trade
 from fleet.bus.protocol import keys, messages
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.contract import EXAMPLES, asyncapi, descriptions, schema_document
+from fleet.bus.protocol.keys import CHANNELS, MESSAGES, channel_of
 from fleet.bus.protocol.messages import MalformedMessage
-from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
 from fleet.events import EVENT_KINDS, MEANINGS
 from fleet.live.arm.body import _REPORTED
 
@@ -134,11 +134,11 @@ def test_every_required_field_is_required_by_both(word):
 
 
 def test_a_whole_number_written_with_a_point_is_the_one_known_difference():
-    """JSON schema takes 3.0 for an integer, the structs do not; docs/bus.md says so."""
+    """JSON schema takes 3.0 for an integer, the structs do not; docs/bus/messages.md says so."""
     value = {**example(messages.State), "tick": 3.0}
     assert VALIDATORS[messages.State].is_valid(value)
     assert refused(messages.State, value) == "schema"
-    assert "`3`, not `3.0`" in (ROOT / "docs" / "bus.md").read_text(encoding="utf-8")
+    assert "`3`, not `3.0`" in (ROOT / "docs" / "bus" / "messages.md").read_text(encoding="utf-8")
 
 
 def test_fields_are_described_by_the_text_under_them():
@@ -223,7 +223,16 @@ def test_no_binding_is_claimed_that_asyncapi_does_not_know():
 
 def test_the_committed_documents_are_current(capsys):
     assert main(["--check"]) == 0
-    names = ("schemas.json", "asyncapi.json", "bus.md", "cli.md", "env.md", "leaderboard.md", "paper.md", "policies.md")
+    names = (
+        "schemas.json",
+        "asyncapi.json",
+        "messages.md",
+        "cli.md",
+        "env.md",
+        "leaderboard.md",
+        "paper.md",
+        "policies.md",
+    )
     printed = capsys.readouterr().out
     assert all(name in printed for name in names)
 
@@ -247,12 +256,12 @@ def test_every_kind_of_event_has_a_meaning_and_live_ones_are_those_that_arms_rep
     live = {kind for kind, meaning in MEANINGS.items() if meaning.live}
     assert tuple(MEANINGS) == EVENT_KINDS
     assert live == {*_REPORTED, "award", "finish", "return"}
-    page = Path("docs/bus.md").read_text(encoding="utf-8")
+    page = Path("docs/bus/messages.md").read_text(encoding="utf-8")
     assert all(f"| `{kind}` | {meaning.text} | {meaning.value} |" in page for kind, meaning in MEANINGS.items())
 
 
 def test_the_table_of_a_job_has_the_unit_of_every_bounded_field():
-    page = Path("docs/bus.md").read_text(encoding="utf-8")
+    page = Path("docs/bus/messages.md").read_text(encoding="utf-8")
     rows = [line.split(" | ") for line in page.partition("### JobSpec")[2].partition("### ")[0].splitlines()]
     units = {row[0].strip("| `"): row[2] for row in rows if len(row) == 5}
     assert {name: units[name].strip() for name in ("payload_kg", "force_n", "dwell_s", "due_s", "value")} == {

@@ -176,6 +176,6 @@ def test_a_key_that_was_read_before_is_not_taken_apart_again_unless_it_is_very_l
 
 
 def test_many_keys_fill_no_memory():
-    for i in range(2 * keys.MOST_KNOWN):
+    for i in range(2 * keys.MAX_CACHED):
         keys.parse(keys.of_arm("f", f"arm_{i}", "state"))
-    assert keys._known.cache_info().currsize == keys.MOST_KNOWN
+    assert keys._parse_cached.cache_info().currsize == keys.MAX_CACHED

@@ -3,7 +3,6 @@
 import queue
 import time
 from contextlib import ExitStack
-from datetime import UTC, datetime, timedelta
 from itertools import count
 
 import msgspec
@@ -16,7 +15,6 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
 from fleet.bus.router import Limits, Router, open_client
-from fleet.bus.security import certificates
 from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
@@ -163,23 +161,11 @@ def test_the_rate_limit_counts_each_arm_and_not_the_link(place):
         listener.undeclare()
 
 
-def test_a_link_needs_tls_and_a_certificate_that_may_connect(place, tmp_path, monkeypatch):
+def test_a_link_needs_tls(place):
     with pytest.raises(BusError, match="needs TLS: routers recognise each other"):
         Router(connect=["tcp/127.0.0.1:7447"])
     with pytest.raises(BusError, match=r"no endpoint for the certificate of 'router'. Expected tls/"):
         Router(tls=Tls(place, "router"), connect=["tcp/127.0.0.1:7447"])
-    monkeypatch.setattr(certificates, "_CONNECT", ExtendedKeyUsageOID.SERVER_AUTH)  # as earlier versions did
-    older = tmp_path / "older"
-    older.mkdir()
-    for name in ("ca.pem", "ca.key", "roster.json"):
-        (older / name).write_bytes((place / name).read_bytes())
-    issue(older, Participant("router", "router"), days=20, now=datetime.now(UTC) - timedelta(days=1))
-    monkeypatch.undo()
-    Router(tls=Tls(older, "router")).open().close()  # it may still listen
-    with pytest.raises(
-        BusError, match=r"permits listening only.*thermofleet bus keys .* --add router:router --overwrite"
-    ):
-        Router(tls=Tls(older, "router"), connect=["tls/127.0.0.1:7447"]).open()
 
 
 def test_a_router_in_no_roster_has_no_rights(place, tmp_path):

@@ -133,7 +133,7 @@ def test_a_warning_is_no_fault():
     told, found = faults(fleet(hot, counts=counts), ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
     assert told == []
     warned = " ".join(finding.what for finding in found.findings)
-    for word in ("joint 2 is at 76.0", "400 ms", "5 message(s)", "1 job(s) are unfinished", "2 job(s) are given up"):
+    for word in ("joint 2 is at 76.0", "400 ms", "5 message(s)", "1 job(s) are unfinished", "2 job(s) are abandoned"):
         assert word in warned
 
 

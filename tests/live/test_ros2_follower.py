@@ -191,7 +191,7 @@ def test_a_real_arm_is_an_arm_of_the_fleet(place, hashes):
     assert (said.q, said.qd, said.tau) == (Q, qd, tau)
     assert place.infos == [Info("real", 7, "ros2 /gen3/joint_states")]
     assert place.present[-1]
-    assert place.follower.malformed == 0
+    assert place.link.malformed == 0
     ticks = [state.tick for state in place.states]
     assert ticks == sorted(set(ticks))
 
@@ -213,7 +213,7 @@ def test_malformed_messages_are_counted_and_change_nothing(place, rubbish):
         place.warm(diagnostics())
         rubbish(place)
 
-    place.until(lambda: place.states and place.follower.malformed >= 2, live)
+    place.until(lambda: place.states and place.link.malformed >= 2, live)
     assert {state.q for state in place.states} == {Q}
     assert {state.temp_c for state in place.states} == {TEMP_C}
 

@@ -8,15 +8,14 @@ import typer
 from typer.testing import CliRunner
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.protocol.keys import ENDPOINT
-from fleet.bus.protocol.registry import CHANNEL, STATE_HZ
+from fleet.bus.protocol.keys import CHANNEL, STATE_HZ
 from fleet.errors import FleetError
 from fleet.fields import check, option, options_of
 from fleet.robot import ThermalLimits
 from scenarios.cli.from_fields import From, Given, flags_of, with_fields
 from scenarios.cli.main import COMMANDS, GROUPS, MOVED, load_command
 from scenarios.live.gateway import ROLES
-from scenarios.spec.options import PORT, LiveSpec, RunSpec, Shot
+from scenarios.spec.options import ENDPOINT, PORT, LiveSpec, RunSpec, Shot
 
 
 @dataclass(frozen=True, kw_only=True)

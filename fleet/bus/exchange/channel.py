@@ -1,6 +1,6 @@
 """Communication channels between arms: topology, delay, loss and partitions.
 
-A channel is a plain value; `fleet.bus.exchange.delivery` applies it, in memory and over Zenoh alike.
+A channel is a plain value; `fleet.bus.exchange.memory.Delivery` applies it.
 """
 
 import math

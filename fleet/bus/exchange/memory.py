@@ -1,11 +1,8 @@
-"""The exchange: broadcasts of every arm at a step, and what every arm then knows of every other.
+"""What arms of a simulated shift broadcast at each step, through a channel that may delay and lose messages.
 
-`MemoryExchange` is the one implementation; `ZenohExchange` also publishes the messages of each step on the bus.
-
-What arms of a simulated shift share with each other, through a channel that may delay and lose messages.
-
-Delay and loss depend on the channel, the time and the random generator of the episode, never on the content. So a seed
-delays and loses the same broadcasts under every policy.
+`MemoryExchange` delivers; `fleet.bus.exchange.zenoh.ZenohExchange` also publishes the messages on the bus. Delay
+and loss depend on the channel, the time and the random generator of the episode, never on the content: a seed delays
+and loses the same broadcasts under every policy.
 """
 
 import math
@@ -50,7 +47,7 @@ class Broadcast:
 
 @dataclass(frozen=True, eq=False)
 class PeerView:
-    """What every arm knows of every arm after a step, [receiver, sender, ...]; of itself, its own broadcast.
+    """Last broadcast that every arm has of every arm after a step, [receiver, sender, ...]; its own at once.
 
     Do not write to the arrays: receivers with the same knowledge share memory.
     """
@@ -83,7 +80,7 @@ class Exchange(Protocol):
         ...
 
     def share(self, broadcast: Broadcast) -> PeerView:
-        """Broadcast one step, and return what every arm knows after it.
+        """Broadcast one step, and return the view of every arm after it.
 
         Raises:
             ValueError: the broadcast does not fit the arms, holds infinite numbers, or is older than the last one
@@ -99,18 +96,6 @@ class Exchange(Protocol):
     def __enter__(self) -> Self: ...
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object, /) -> None: ...
-
-
-def checked_arms(arms: Sequence[str]) -> tuple[str, ...]:
-    """The names of the arms as a tuple.
-
-    Raises:
-        ValueError: no arm, a name twice, or an empty name.
-    """
-    names = tuple(arms)
-    if not names or not all(names) or len(set(names)) != len(names):
-        raise ValueError(f"An exchange needs arms with different, non-empty names (got {names}).")
-    return names
 
 
 def check(broadcast: Broadcast, arms: tuple[str, ...]) -> None:
@@ -155,12 +140,6 @@ def check(broadcast: Broadcast, arms: tuple[str, ...]) -> None:
         raise ValueError(f"Broadcast.mode must be one of 0..{len(MODES) - 1} (got {broadcast.mode}).")
 
 
-def check_order(time_s: float, last_s: float) -> None:
-    """Refuse a broadcast that is older than the last one."""
-    if time_s < last_s:
-        raise ValueError(f"Broadcast of {time_s:g} s after that of {last_s:g} s; begin() starts a new episode.")
-
-
 class MemoryExchange:
     """Shares broadcasts in memory through a channel, on the time of the broadcasts."""
 
@@ -173,14 +152,16 @@ class MemoryExchange:
             rng: For a channel with loss or jitter, until `begin` brings another.
 
         Raises:
-            ValueError: the channel names an arm that is not there.
+            ValueError: no arm, an empty name, a name twice, or the channel names an unknown arm.
         """
-        self.arms = checked_arms(arms)
+        self.arms = tuple(arms)
+        if not self.arms or not all(self.arms) or len(set(self.arms)) != len(self.arms):
+            raise ValueError(f"An exchange needs arms with different, non-empty names (got {self.arms}).")
         self.delivered = 0
         self.late = 0
         self._delivery = None if channel.perfect else Delivery(self.arms, channel, rng)
         self._sent: dict[int, Broadcast] = {}
-        """Broadcasts that an arm still has, or that are in transit, by tick."""
+        """Last broadcasts received by an arm, and those in transit, by tick."""
         self._tick, self._now_s = -1, -float("inf")
         self._closed = False
 
@@ -197,7 +178,7 @@ class MemoryExchange:
             self._delivery.begin(rng)
 
     def share(self, broadcast: Broadcast) -> PeerView:
-        """Broadcast one step, and return what every arm knows after it.
+        """Broadcast one step, and return the view of every arm after it.
 
         Raises:
             ValueError: the broadcast does not fit the arms or holds infinite numbers; or the channel has loss or
@@ -207,7 +188,9 @@ class MemoryExchange:
         if self._closed:
             raise BusError("This exchange is closed.")
         check(broadcast, self.arms)
-        check_order(broadcast.time_s, self._now_s)
+        if broadcast.time_s < self._now_s:
+            sent_s, last_s = f"{broadcast.time_s:g} s", f"{self._now_s:g} s"
+            raise ValueError(f"Broadcast of {sent_s} after that of {last_s}; begin() starts a new episode.")
         self._tick, self._now_s = self._tick + 1, float(broadcast.time_s)
         broadcast = _copy(broadcast)  # the caller may reuse its arrays at the next step
         if self._delivery is None:
@@ -315,7 +298,7 @@ class Delivery:
 
 
 def _copy(broadcast: Broadcast) -> Broadcast:
-    """A copy, in which empty slots have no scores."""
+    """A copy, with NaN in empty slots."""
     empty = [slot for slot, job in enumerate(broadcast.jobs) if not job]
     difficulty, p_saturation = (np.array(a, float) for a in (broadcast.difficulty, broadcast.p_saturation))
     difficulty[:, empty] = p_saturation[:, empty] = np.nan

@@ -1,8 +1,8 @@
 """The exchange of a simulated shift that is also on the bus: others can watch the shift, record it, or take part in it.
 
 At each step an arm publishes its `state` and then its `difficulty`. It publishes `info` when it changes, and a
-liveliness token shows that the arm is present. What an arm knows of its peers is what a `MemoryExchange` delivers, so
-the result of a shift does not depend on the load of the machine or on others on the bus.
+liveliness token shows that the arm is present. Arms know of their peers what a `MemoryExchange` delivers, so the result
+of a shift depends neither on the load of the machine nor on others on the bus.
 """
 
 import logging
@@ -17,7 +17,7 @@ import zenoh
 
 from fleet.bus.client import BusClient
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.bus.exchange.memory import Broadcast, MemoryExchange, PeerView, checked_arms
+from fleet.bus.exchange.memory import Broadcast, MemoryExchange, PeerView
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.router import Router, reachable
@@ -29,7 +29,7 @@ _LOG = logging.getLogger(__name__)
 Array = np.ndarray
 
 
-class ZenohExchange:
+class ZenohExchange(MemoryExchange):
     """A `MemoryExchange` that publishes the messages of each step, through a router and a client in this process.
 
     Nothing is opened before the first `share` or the `with` block. One thread at a time may use an exchange. The bus
@@ -56,20 +56,23 @@ class ZenohExchange:
             BusError: the endpoint is not on loopback.
             ValueError: the channel names an arm that is not there.
         """
-        self.arms = checked_arms(arms)
+        super().__init__(arms, channel)
         if not 0 < timeout_s < math.inf:
             raise ValueError(f"timeout_s must be finite and > 0 (got {timeout_s}).")
         keys.chunk(fleet)
-        self._memory = MemoryExchange(arms, channel)
-        self.delivered = self.late = 0
         self._fleet, self._timeout_s = fleet, timeout_s
         self._endpoint = None if endpoint is None else reachable(endpoint)
         self._publishers: list[_Publishers] = []
-        self._tick = -1
-        self._closed = False
+        self._published = 0
+        """Steps, over all episodes."""
         self._resources = ExitStack()
         # A process that exits without closing its router would hang.
         self._at_exit = weakref.finalize(self, self._resources.close)
+
+    @property
+    def perfect(self) -> bool:
+        """Never: each step is published, too."""
+        return False
 
     @property
     def endpoint(self) -> str | None:
@@ -103,23 +106,17 @@ class ZenohExchange:
             raise
         return self
 
-    def begin(self, rng: np.random.Generator | None = None) -> None:
-        """Begin an episode without any received messages; `rng` is for channels with loss or jitter."""
-        self._memory.begin(rng)
-
     def share(self, broadcast: Broadcast) -> PeerView:
-        """Publish the broadcast of one step, and return what every arm knows after it.
+        """Publish the broadcast of one step, and return the view of every arm after it.
 
         Raises:
-            ValueError: the broadcast does not fit the arms or holds infinite numbers; or the channel has loss or
-                jitter, and there is no rng.
+            ValueError: as a `MemoryExchange`.
             BusError: the bus could not be opened, was lost, or is closed.
         """
-        view = self._memory.share(broadcast)
-        self.delivered, self.late = self._memory.delivered, self._memory.late
+        view = super().share(broadcast)
         self.open()
-        self._tick += 1
-        messages = messages_of(broadcast, self.arms, self._tick)
+        messages = messages_of(broadcast, self.arms, self._published)
+        self._published += 1
         try:
             for publishers, (state, difficulty) in zip(self._publishers, messages, strict=True):
                 publishers.publish(state, difficulty)
@@ -133,8 +130,7 @@ class ZenohExchange:
         Raises:
             BusError: the client or the router did not close cleanly; the other is closed.
         """
-        self._closed = True
-        self._memory.close()
+        super().close()
         self._publishers = []
         try:
             self._resources.close()

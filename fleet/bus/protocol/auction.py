@@ -63,7 +63,7 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     after: tuple[Name, ...] = ()
     """Jobs that must be finished before."""
     expires: bool = False
-    """The due date is hard: the job is given up if it still waits then."""
+    """The due date is hard: a job that still waits then becomes `given_up`."""
 
     def __post_init__(self) -> None:
         check_names(self, "name", "places", "after")
@@ -91,18 +91,18 @@ class Admission(msgspec.Struct, frozen=True):
 
     job: str
     accepted: bool
-    """Also true for an identical job that is already known."""
+    """Also true for an identical job that was accepted before."""
     reason: str = ""
-    """Why it is not accepted, or is given up at once."""
+    """Why it is not accepted, or is `given_up` at once."""
 
 
 class SubmissionReply(msgspec.Struct, frozen=True):
-    """Reply to a `Submission`; every accepted job is on the auctioneer's disk."""
+    """Reply to a `Submission`; accepted jobs are durable."""
 
     auctioneer: Name
     jobs: tuple[Admission, ...]
     epoch: str = ""
-    """As in `Clock`. Another one than before means that the fleet has lost its journal: submit open jobs again."""
+    """As in `Clock`. A changed epoch means that the fleet has lost its journal: submit open jobs again."""
 
 
 class QuoteRequest(msgspec.Struct, frozen=True):
@@ -137,7 +137,7 @@ class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
     finish_in_s: Number | None = None
     """Time until its last cycle would be done, after the arm's current jobs; without the way home."""
     space: Name | None = None
-    """Name of the space of its plan, from home to home; null for unknown: anywhere within reach."""
+    """Name of the space of its plan, from home to home; null for unknown: its whole workspace counts as taken."""
 
     def __post_init__(self) -> None:
         finite("PlanQuote", "joint_difficulty", self.joint_difficulty or ())
@@ -169,7 +169,7 @@ class JobEstimate(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def least(self) -> PlanQuote:
-        """The plan with the least difficulty; without plans, one of which nothing is known."""
+        """Lowest-difficulty plan, or an empty PlanQuote."""
         return min(
             self.plans, key=lambda plan: inf if plan.difficulty is None else plan.difficulty, default=PlanQuote()
         )
@@ -194,8 +194,8 @@ class Quote(msgspec.Struct, frozen=True):
     estimates: tuple[JobEstimate, ...]
     """One per requested job, in that order."""
     space: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] | None = None
-    """Names of the spaces that the arm takes now and those of its jobs; empty at home without jobs. null if the arm
-    does not say: then it is at home if its mode is idle, and may be anywhere within reach if not."""
+    """Names of the spaces that the arm takes now and those of its jobs; empty at home without jobs. null if not
+    reported: the arm then counts as at home if its mode is idle, otherwise its whole workspace counts as taken."""
 
     def __post_init__(self) -> None:
         for name in ("valid_s", "time_s", "headroom_k"):
@@ -216,17 +216,17 @@ class Award(msgspec.Struct, frozen=True):
     """The quote that it refers to."""
     job: JobSpec
     cycles: Count = 0
-    """Cycles of the job that others have done already."""
+    """Cycles of the job that other arms have done."""
     lease_s: LeaseTime = LEASE_S
     """Real seconds that the arm may work on it without renewing the lease, counted from its quote."""
     plan: Count = 0
     """Number of the quoted plan by which to do it."""
     epoch: str = ""
-    """As in `Clock`; the arm has the last one on disk."""
+    """As in `Clock`; the arm stores the last one in its journal."""
 
 
 class Ack(msgspec.Struct, frozen=True):
-    """Reply to an `Award`, on the arm's disk before it is sent."""
+    """Reply to an `Award`, durable at the arm before it is sent."""
 
     arm: Name
     award: Name
@@ -241,7 +241,7 @@ class LeaseEntry(msgspec.Struct, frozen=True):
     award: Name
     job: Name
     cycles: Count
-    """Done so far, including those of others."""
+    """Done so far, by any arm."""
     phase: Literal["queued", "working", "finishing"]
     """finishing: requests permission to commit (to begin the last cycle), or has it."""
 
@@ -262,10 +262,9 @@ class Lease(msgspec.Struct, frozen=True):
     granted: tuple[str, ...]
     """Awards whose lease is renewed."""
     revoked: tuple[str, ...]
-    """Awards that the arm has lost: it begins no cycle of them any more, goes home and reports them."""
+    """Lost awards: the arm begins no further cycle of them, goes home and reports them."""
     may_commit: tuple[str, ...] = ()
-    """Awards with permission to commit: the last cycle may begin under a lease, and no other arm gets these jobs any
-    more."""
+    """Awards with permission to commit: the last cycle may begin under a lease, and these jobs go to no other arm."""
 
 
 class Report(msgspec.Struct, frozen=True):
@@ -276,7 +275,7 @@ class Report(msgspec.Struct, frozen=True):
     job: Name
     outcome: Literal["finished", "returned"]
     cycles: Count
-    """Done so far, including those of others."""
+    """Done so far, by any arm."""
     time_s: Number
     """When it was finished or returned."""
     reason: str = ""
@@ -284,15 +283,15 @@ class Report(msgspec.Struct, frozen=True):
     """With `returned`: the arm crashed after it got permission to commit, so it is unknown whether the last cycle was
     done. The job becomes unfinished; another arm might do that cycle a second time."""
     faulted: bool = False
-    """With `returned`: the arm faulted in this job. After two faults of one arm, or three of all arms, it is given
-    up."""
+    """With `returned`: the arm faulted in this job. After two faults of one arm, or three of all arms, the job becomes
+    `given_up`."""
 
     def __post_init__(self) -> None:
         finite("Report", "time_s", (self.time_s,))
 
 
 class Receipt(msgspec.Struct, frozen=True):
-    """Reply to a `Report`, which is on the auctioneer's disk."""
+    """Reply to a `Report`, which is durable at the auctioneer."""
 
     auctioneer: Name
     award: Name
@@ -300,12 +299,12 @@ class Receipt(msgspec.Struct, frozen=True):
 
 JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished", "given_up", "cancelled"]
 """waiting: for its release, its predecessors or an arm; finishing: in its last cycle; unfinished: the arm had
-permission to commit and is silent since, or the shift ended before the job was done; given_up: arms faulted in it too
-often, or in a job that it waits for; cancelled: by a `ControlRequest`."""
+permission to commit and sent no message since, or the shift ended before the job was done; given_up: abandoned after
+repeated faults in it, or in a job that it waits for; cancelled: by a `ControlRequest`."""
 ABANDONED: tuple[JobState, ...] = ("given_up", "cancelled")
 SETTLED: tuple[JobState, ...] = ("finished", "unfinished", *ABANDONED)
-"""States that need nothing more; only a late report that the job is finished, or a `ControlRequest`, may change those
-other than finished."""
+"""Final states; only a late report that the job is finished, or a `ControlRequest`, may change those other than
+finished."""
 
 
 class JobStatus(msgspec.Struct, frozen=True):
@@ -314,11 +313,11 @@ class JobStatus(msgspec.Struct, frozen=True):
     job: Name
     state: JobState
     arm: str = ""
-    """The arm that has it, or had it last; "" if none had."""
+    """The arm that has it, or had it last; "" for none."""
     award: str = ""
-    """The award by which that arm has it, or finished it; "" if it has it no more."""
+    """The award by which that arm has it, or finished it; "" if it no longer has it."""
     cycles: Count = 0
-    """Done, of `repetitions`, as far as arms have reported; a status and a `Result` count the same."""
+    """Reported as done, of `repetitions`; the same in a status and a `Result`."""
     finished_s: Number | None = None
     reason: str = ""
     repetitions: Count = 0
@@ -331,7 +330,7 @@ class JobStatus(msgspec.Struct, frozen=True):
     value: Number | None = None
     """As in `JobSpec`; null for unknown. A `Change` changes it."""
     not_planned: bool = False
-    """It waits, and is not planned yet: no arm has a plan for it, and it is unknown whether one can do it. Only
+    """It waits, and no arm has a plan for it yet: it is unknown whether one can do it. Only
     `jobs/status` has it: it is false in a `Result`."""
 
 
@@ -349,8 +348,8 @@ class Status(msgspec.Struct, frozen=True):
     time_s: Number
     jobs: tuple[JobStatus, ...]
     space: dict[Name, tuple[Name, ...]] = {}
-    """Names of the spaces that are closed to others, by the arm that takes them or may take them; "*" is all space
-    within its reach."""
+    """Names of the spaces that are closed to other arms, by the arm that takes them or may take them; "*" is its whole
+    workspace."""
     epoch: str = ""
     """As in `Clock`."""
     paused: dict[Name, str] = {}
@@ -367,14 +366,14 @@ class Announcement(msgspec.Struct, frozen=True):
 
 
 class ArmOffer(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What an arm offered for a job in the round in which the job was awarded."""
+    """Offer of an arm for a job in the round in which the job was awarded."""
 
     arm: Name
     mode: Mode
     free: bool
-    """Whether the arm could have taken it: it had capacity, and the places and the space of a plan were free."""
+    """Whether the arm was available: it had capacity, and the places and the space of a plan were free."""
     plan: PlanQuote | None = None
-    """The awarded plan, of other arms that with the least difficulty; null without one. Not with all its fields."""
+    """The awarded plan, or the lowest-difficulty plan of another arm, with some of its fields; null for none."""
 
 
 Offers = Annotated[tuple[ArmOffer, ...], msgspec.Meta(max_length=MOST_OFFERS)]
@@ -394,11 +393,11 @@ class Result(msgspec.Struct, frozen=True):
     p_saturation: Number | None = None
     peak_c: Number | None = None
     by: str = ""
-    """Who asked for the change, by a `Submission` or a `ControlRequest`, also who paused the arm that stopped."""
+    """Who requested the change, by a `Submission` or a `ControlRequest`, or paused the arm that stopped."""
     epoch: str = ""
-    """As in `Clock`: `number` begins again with another epoch."""
+    """As in `Clock`: `number` restarts with a new epoch."""
     offers: Offers = ()
-    """Behind an award, that of the arm which got the job first, then the best others; empty for other states."""
+    """With an award: the offer of its arm, then the best others; empty for other states."""
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -435,7 +434,7 @@ class Clock(msgspec.Struct, frozen=True):
     speed: Annotated[float, msgspec.Meta(ge=MIN_SPEED, le=MAX_SPEED)]
     """Fleet seconds per real second."""
     epoch: str = ""
-    """Name of the journal that the fleet continues; another one if that was lost, or a new shift began."""
+    """Name of the journal that the fleet continues; a new one after its loss, or in a new shift."""
 
     def __post_init__(self) -> None:
         finite("Clock", "time_s", (self.time_s,))

@@ -1,4 +1,4 @@
-"""Messages that describe a cell: all that an outsider needs to write a job."""
+"""Messages that describe a cell, so that a client can write jobs for it."""
 
 from typing import Annotated
 
@@ -15,7 +15,7 @@ class CellRequest(msgspec.Struct, frozen=True):
 
 
 class CellPlace(msgspec.Struct, frozen=True):
-    """A place that a job may name; one arm at a time works there."""
+    """A station that a job may name; one arm at a time works there."""
 
     name: Name
     position_m: Point
@@ -39,13 +39,13 @@ class CellFixture(msgspec.Struct, frozen=True):
 
 
 class CellKind(msgspec.Struct, frozen=True):
-    """A kind of job."""
+    """A task type."""
 
     kind: Kind
     places: Count
-    """How many places a job of this kind names: 2 are from and to."""
+    """Number of stations in a job of this type: 2 are from and to."""
     meaning: str
-    """What an arm does in a cycle."""
+    """One cycle in words."""
 
 
 class Limit(msgspec.Struct, frozen=True):
@@ -57,14 +57,14 @@ class Limit(msgspec.Struct, frozen=True):
 
 
 class PlannedWork(msgspec.Struct, frozen=True):
-    """Work for which an arm has plans. With another payload, dwell or force it is other work, which is planned when it
-    is asked for."""
+    """A task for which an arm has plans. Another payload, dwell or force makes another task, which is planned on
+    request."""
 
     kind: Kind
     places: tuple[Name, ...]
     payload_kg: Number
     plans: Count
-    """How many. Work that the arm cannot do is left out."""
+    """Number of plans. Infeasible tasks are left out."""
     cycle_s: Number | None = None
     """Duration of a cycle by the fastest plan, with this `dwell_s`."""
     dwell_s: Number = 0.0
@@ -81,14 +81,14 @@ class CellArm(msgspec.Struct, frozen=True):
     tilt_deg: Point
     """Roll, pitch, yaw of the base, deg."""
     payload_kg: Number
-    """Largest payload within half its reach, for as long as it likes: the rating less the gripper, or a lower limit of
-    its own."""
+    """Largest payload within half its reach, without time limit: the rating less the gripper, or a lower limit of this
+    arm."""
     payload_outstretched_kg: Number
     """The same at its full reach."""
     reach_m: Number
     """From joint 2 to the tool point."""
     works: tuple[PlannedWork, ...] = ()
-    """Work of the scenario; empty if the message would be too large. A dry run (`arm/*/quote`) answers for any job."""
+    """Tasks of the scenario; empty if the message would be too large. A dry run (`arm/*/quote`) covers any job."""
 
 
 class Cell(msgspec.Struct, frozen=True):
@@ -106,5 +106,5 @@ class Cell(msgspec.Struct, frozen=True):
     error_c: Number
     """Motor temperature at which an arm faults, °C."""
     jobs_in_message: Annotated[int, msgspec.Meta(ge=1)]
-    """Most jobs in one `Submission`."""
+    """Maximum number of jobs in one `Submission`."""
     fixtures: tuple[CellFixture, ...] = ()

@@ -6,13 +6,13 @@ scenario names it, has granted the job in a `ClaimReply`.
 
 Why no job is done twice: two majorities have an arm in common, and an arm grants a job to one peer at a time. A grant
 is a lease: the claimer counts it from the moment it sent the claim, the granter from the moment it replied. Permission
-to commit is granted once and for good. The granter has all of it on disk before it replies.
+to commit never expires. The granter makes each grant durable before it replies.
 
 Why no two arms are away from home on plans that exclude each other: an arm grants the space of a plan to one peer at a
-time, and takes it for free only when a later claim of that peer says so, never because a lease has ended.
+time, and frees it only by a later claim of that peer, never because a lease has ended.
 (Leases: Gray & Cheriton 1989, SOSP. Majorities: Thomas 1979, ACM TODS 4.)
 
-Messages about what an arm has done: an auctioneer, or an arm, whose journal is lost learns it from them.
+An auctioneer or an arm that has lost its journal recovers from the `History` of the arms.
 """
 
 from typing import Annotated, Literal
@@ -35,11 +35,11 @@ class Bid(msgspec.Struct, frozen=True):
     capacity: Count
     """How many more jobs it would accept now."""
     estimates: Annotated[tuple[JobEstimate, ...], msgspec.Meta(max_length=MOST_JOBS)]
-    """Estimates of jobs that wait for an arm, to this arm's knowledge."""
+    """Estimates of jobs that wait for an arm, as far as this arm has been informed."""
     open_count: Count
-    """Number of jobs without an outcome, as far as this arm knows."""
+    """Number of jobs without an outcome at this arm."""
     open_jobs: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
-    """The first jobs without an outcome, by release and name. A peer that knows an outcome, or a missing job, sends
+    """The first jobs without an outcome, by release and name. A peer that has an outcome, or a missing job, sends
     it."""
     choice: str = ""
     """The job among the estimates that this arm's policy chose; "" for none yet."""
@@ -48,7 +48,7 @@ class Bid(msgspec.Struct, frozen=True):
     epoch: str = ""
     """Name of the shift, as in `Clock`; an arm that has none takes that of the first bid."""
     digest: Count = 0
-    """Of the outcomes of jobs and requests of people that this arm knows. A peer with another digest sends its own."""
+    """Checksum of the job outcomes and operator requests at this arm. A peer with another checksum sends its own."""
 
     def __post_init__(self) -> None:
         finite("Bid", "time_s", (self.time_s,))
@@ -63,15 +63,15 @@ class ClaimEntry(msgspec.Struct, frozen=True):
     places: Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, max_length=2)]
     """Stations that it occupies."""
     cycles: Count
-    """Done so far, including those of others."""
+    """Done so far, by any arm."""
     phase: Literal["requested", "queued", "working", "finishing"]
     """requested: not granted yet; finishing: requests permission to commit (to begin the last cycle), or has it."""
     space: Name | None = None
-    """Name of the space of its plan, from home to home; null for unknown: anywhere within reach."""
+    """Name of the space of its plan, from home to home; null for unknown: its whole workspace counts as taken."""
 
 
 Faults = Annotated[dict[Name, Name], msgspec.Meta(max_length=16)]
-"""Faults of arms in a job, as far as the sender knows: the arm, by award."""
+"""Faults in a job at the sender: the arm, by award."""
 
 
 class JobOutcome(msgspec.Struct, frozen=True):
@@ -82,8 +82,8 @@ class JobOutcome(msgspec.Struct, frozen=True):
     arm: Name
     """The arm that had the job."""
     outcome: Literal["finished", "unfinished", "given_up", "cancelled", "returned"]
-    """unfinished: the arm crashed after it got permission to commit, and no arm does the job again; given_up: arms
-    faulted in it too often; cancelled: by a person; returned: the job is open again."""
+    """unfinished: the arm crashed after it got permission to commit, and no arm does the job again; given_up: abandoned
+    after repeated faults; cancelled: by an operator; returned: the job is open again."""
     cycles: Count
     time_s: Number
     reason: str = ""
@@ -103,13 +103,13 @@ class Claim(msgspec.Struct, frozen=True):
     entries: Annotated[tuple[ClaimEntry, ...], msgspec.Meta(max_length=MOST_JOBS)]
     outcomes: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     jobs: Annotated[tuple[JobSpec, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
-    """Jobs that outsiders submitted and that a peer does not seem to know."""
+    """Submitted jobs that a peer lacks, as its last messages show."""
     operations: Annotated[tuple[Operation, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
-    """Requests of people that a peer does not seem to know. For each thing that a request sets, the latest counts: by
-    `time_s`, then by name."""
+    """Operator requests that a peer lacks, as its last messages show. Of several requests that set the same value, the
+    latest applies: by `time_s`, then by name."""
     space: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] | None = None
     """Names of the spaces that the arm takes now; empty at home. All other space that was granted to it before and is
-    not of its entries is free. null if the arm does not say: it may be anywhere within reach."""
+    not of its entries is free. null if not reported: its whole workspace counts as taken."""
 
 
 class GrantedEntry(msgspec.Struct, frozen=True):
@@ -117,7 +117,7 @@ class GrantedEntry(msgspec.Struct, frozen=True):
 
     award: Name
     cycles: Count
-    """Cycles of the job known to be done."""
+    """Cycles of the job that are done, at the granter."""
     may_commit: bool = False
     """Permission to commit, by this granter: the last cycle may begin, and it grants the job to no other arm."""
     faults: Faults = {}
@@ -133,7 +133,7 @@ class DeniedEntry(msgspec.Struct, frozen=True):
 
 
 class ClaimReply(msgspec.Struct, frozen=True):
-    """Reply to a `Claim`, on the granter's disk before it is sent."""
+    """Reply to a `Claim`, durable at the granter before it is sent."""
 
     arm: Name
     number: Count
@@ -145,15 +145,15 @@ class ClaimReply(msgspec.Struct, frozen=True):
 
 
 MOST_FINISHED = 256
-"""Jobs that an arm remembers to have finished, the last ones."""
+"""Maximum number of finished jobs in a `History`, the last ones."""
 
 
 class HistoryRequest(msgspec.Struct, frozen=True):
-    """Request to `arm/*/history`: what the arm has done and has. An auctioneer asks before it awards the arm a job."""
+    """Request to `arm/*/history`: finished jobs and current awards. An auctioneer sends it before its first award."""
 
 
 class History(msgspec.Struct, frozen=True):
-    """Reply to a `HistoryRequest`, from the disk of the arm."""
+    """Reply to a `HistoryRequest`, from the journal of the arm."""
 
     arm: Name
     epoch: str = ""
@@ -161,10 +161,10 @@ class History(msgspec.Struct, frozen=True):
     finished: Annotated[tuple[JobSpec, ...], msgspec.Meta(max_length=MOST_FINISHED)] = ()
     """Jobs that it finished, in any epoch, oldest first; as many of the last ones as fit into one message."""
     awards: Annotated[tuple[Award, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
-    """Awards that it has accepted and that have not ended, with the cycles that are done now."""
+    """Accepted awards that have not ended, with the cycles done so far."""
     may_commit: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """Awards among these with permission to commit."""
     claims: Annotated[dict[Name, Count], msgspec.Meta(max_length=MOST_JOBS)] = {}
     """Number of the last claim of each arm, where arms allocate jobs without an auctioneer."""
     committed: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
-    """Likewise: jobs of arms with permission to commit, which are unfinished if their arms have lost their journals."""
+    """Likewise: jobs of arms with permission to commit; unfinished if an arm has lost its journal."""

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from fleet.bus.protocol import auction, cell, consensus, keys, messages, operator, policy
-from fleet.bus.protocol.registry import CHANNELS, MESSAGES, PATTERNS, Channel, MessageType
+from fleet.bus.protocol.keys import CHANNELS, MESSAGES, PATTERNS, Channel, MessageType
 from fleet.job import Job, Work
 
 

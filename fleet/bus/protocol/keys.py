@@ -1,50 +1,151 @@
-"""Keys of the bus: built and parsed here, and nowhere else.
+"""Keys of the bus and what travels under each: one table, and the functions that build and parse keys.
 
 `thermofleet/v4/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}`, `clock/now` and
-`policy/{policy}/act`.
-An arm queries an auctioneer under `auction/{auctioneer}/{topic}/{arm}`, and another arm under
+`policy/{policy}/act`. An arm queries an auctioneer under `auction/{auctioneer}/{topic}/{arm}`, and another arm under
 `arm/{other}/{topic}/{arm}`: access control sees only keys, so the querier must be part of the key.
 
-Names of fleets, arms and auctioneers are percent-encoded to one chunk, so no name can smuggle a wildcard, a `/` or an
-`@` into a key (a chunk that begins with `@` is matched by no wildcard, and its history is silently lost).
+`fleet.bus.client` publishes, subscribes, queries and replies by the table alone; docs/bus/messages.md and docs/contract
+are generated from it. Names of fleets, arms and auctioneers are percent-encoded to one chunk, so no name can contain a
+wildcard, a `/` or a leading `@` (no wildcard matches a chunk that begins with `@`, so its history would be lost).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, get_args
+from typing import Literal, cast
 from urllib.parse import quote, unquote
 
+import msgspec
+
+from fleet.bus.protocol import auction, cell, consensus, messages, operator, policy
 from fleet.errors import NAME_RULE, is_name, printable
 
 Role = Literal["arm", "auction", "jobs", "clock", "policy"]
-ArmTopic = Literal[
-    "alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history", "reset", "operation"
-]
-AuctionTopic = Literal["alive", "announce", "result", "operation"]
-AskedTopic = Literal["lease", "report", "claim"]
-JobsTopic = Literal["submit", "status", "clear", "control", "cell"]
-
-PREFIX = "thermofleet/v4"
-ENDPOINT = "tcp/127.0.0.1:7447"
-"""Of the router, by default."""
-STATES = f"{PREFIX}/*/arm/*/state"
-"""Key expression of the telemetry of every arm of every fleet; for router rules, not for publications."""
-TOPICS: dict[Role, tuple[str, ...]] = {
-    "arm": (*get_args(ArmTopic), "claim"),
-    "auction": (*get_args(AuctionTopic), "lease", "report"),
-    "jobs": get_args(JobsTopic),
-    "clock": ("now",),
-    "policy": ("act",),
+MessageType = type[msgspec.Struct]
+Pattern = Literal["token", "publish", "query"]
+Priority = Literal["REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"]
+"""As Zenoh names them."""
+PATTERNS: Mapping[Pattern, str] = {
+    "token": "a liveliness token without payload: present while the session is open",
+    "publish": "an advanced publisher that caches the last messages for subscribers that join late or missed some",
+    "query": "a complete queryable: the request is the payload of the query, the reply is a message or a Refusal",
 }
+PREFIX = "thermofleet/v4"
 NAMELESS: tuple[Role, ...] = ("jobs", "clock")
 """Roles whose keys name no participant."""
-MOST_KNOWN, LONGEST_KNOWN = 4096, 256
+HISTORY = 1024
+"""Messages that a publisher of telemetry or events caches: at ten a second, 100 s of a router's absence."""
+STATE_HZ = 10.0
+"""States that an arm publishes a second, real time."""
+SESSION_LEASE_S = 2.0
+"""Real seconds without a message after which Zenoh closes a session and withdraws its tokens."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One key of the bus."""
+
+    role: Role
+    topic: str
+    pattern: Pattern
+    message: MessageType | None = None
+    """Published there, or the request of a query; None for a token."""
+    reply: MessageType | None = None
+    """Of a query; a `Refusal` may come instead."""
+    receiver: str = "any"
+    """Role that subscribes, or queries; "any" for all participants."""
+    history: int = 0
+    """Messages that the publisher caches; a subscriber that asks for history gets as many, and lost ones are resent."""
+    heartbeat_s: float = 0.5
+    """Of a publisher with history: within this its last sequence number is repeated, so that a loss is noticed."""
+    rate_hz: float | None = None
+    """Messages a second from one sender, real time; None: when something changes."""
+    limit_hz: float | None = None
+    """Messages a second that the router of `thermofleet bus router` forwards from one session; None: any number."""
+    lease_s: float | None = None
+    """Real seconds that the token, or the job that is granted, stays valid without renewal."""
+    priority: Priority = "DATA"
+
+    @property
+    def sender(self) -> Literal["arm", "auctioneer", "policy"]:
+        """Role that publishes, replies or declares the token."""
+        return self.role if self.role in ("arm", "policy") else "auctioneer"
+
+    @property
+    def names_querier(self) -> bool:
+        """Whether the key ends in the name of the querying arm: access control sees only keys."""
+        return self.pattern == "query" and self.receiver == "arm"
+
+    @property
+    def congestion(self) -> Literal["DROP", "BLOCK"]:
+        """What Zenoh does when a receiver does not keep up: publications are dropped (and resent where there is a
+        history), a query waits for at most a second."""
+        return "BLOCK" if self.pattern == "query" else "DROP"
+
+    @property
+    def name(self) -> str:
+        """For example `arm_state`."""
+        return f"{self.role}_{self.topic}"
+
+    @property
+    def address(self) -> str:
+        """The key with its parameters in braces."""
+        owner = {"arm": "/{arm}", "auction": "/{auctioneer}", "policy": "/{policy}"}.get(self.role, "")
+        querier = "" if not self.names_querier else "/{peer}" if self.role == "arm" else "/{arm}"
+        return f"{PREFIX}/{{fleet}}/{self.role}{owner}/{self.topic}{querier}"
+
+    @property
+    def messages(self) -> tuple[MessageType, ...]:
+        """Message types: none, a publication, or a request, its reply and the `Refusal`."""
+        refusal = None if self.reply is None else messages.Refusal
+        return tuple(message for message in (self.message, self.reply, refusal) if message is not None)
+
+
+CHANNELS: tuple[Channel, ...] = (
+    Channel("arm", "alive", "token", lease_s=SESSION_LEASE_S),
+    Channel("arm", "state", "publish", messages.State, history=HISTORY, rate_hz=STATE_HZ, limit_hz=100.0),
+    Channel("arm", "info", "publish", messages.Info, history=1),
+    Channel("arm", "difficulty", "publish", messages.DifficultyScores, history=1),
+    Channel("arm", "event", "publish", auction.ArmEvent, history=HISTORY),
+    Channel("arm", "quote", "query", auction.QuoteRequest, auction.Quote, receiver="auctioneer; any for a dry run"),
+    Channel("arm", "award", "query", auction.Award, auction.Ack, receiver="auctioneer"),
+    Channel("arm", "history", "query", consensus.HistoryRequest, consensus.History, receiver="auctioneer, or arm"),
+    Channel("arm", "reset", "query", operator.ResetRequest, operator.ResetReply, receiver="operator"),
+    Channel("arm", "bid", "publish", consensus.Bid, receiver="arm", history=1, rate_hz=1.0),
+    Channel("arm", "claim", "query", consensus.Claim, consensus.ClaimReply, receiver="arm", lease_s=auction.LEASE_S),
+    Channel("arm", "operation", "publish", operator.Operation, history=HISTORY),
+    Channel("auction", "alive", "token", lease_s=SESSION_LEASE_S),
+    Channel("auction", "announce", "publish", auction.Announcement, history=HISTORY),
+    Channel("auction", "result", "publish", auction.Result, history=HISTORY),
+    Channel("auction", "operation", "publish", operator.Operation, history=HISTORY),
+    Channel("auction", "lease", "query", auction.LeaseRequest, auction.Lease, receiver="arm", lease_s=auction.LEASE_S),
+    Channel("auction", "report", "query", auction.Report, auction.Receipt, receiver="arm"),
+    Channel("jobs", "submit", "query", auction.Submission, auction.SubmissionReply),
+    Channel("jobs", "status", "query", auction.StatusRequest, auction.Status),
+    Channel("jobs", "clear", "query", operator.ClearRequest, operator.Cleared, receiver="operator"),
+    Channel("jobs", "control", "query", operator.ControlRequest, operator.Controlled, receiver="operator"),
+    Channel("jobs", "cell", "query", cell.CellRequest, cell.Cell),
+    Channel("clock", "now", "query", auction.ClockRequest, auction.Clock),
+    Channel("policy", "act", "query", policy.ActRequest, policy.ActReply, receiver="auctioneer, or simulated shift"),
+)
+CHANNEL: Mapping[tuple[str, str], Channel] = {(channel.role, channel.topic): channel for channel in CHANNELS}
+"""By role and topic."""
+PUBLISHED: Mapping[Channel, MessageType] = {
+    channel: channel.message for channel in CHANNELS if channel.pattern == "publish" and channel.message is not None
+}
+"""Those that can be subscribed to, with their messages."""
+MESSAGES: tuple[MessageType, ...] = tuple(dict.fromkeys(kind for channel in CHANNELS for kind in channel.messages))
+"""Every message that travels by itself, in the order of the keys."""
+TOPICS: Mapping[Role, tuple[str, ...]] = {
+    role: tuple(channel.topic for channel in CHANNELS if channel.role == role)
+    for role in dict.fromkeys(channel.role for channel in CHANNELS)
+}
+ASKED: Mapping[str, Role] = {channel.topic: channel.role for channel in CHANNELS if channel.names_querier}
+"""Role of the replier, by topic, for keys that end in the name of the querying arm."""
+STATES = f"{PREFIX}/*/arm/*/state"
+"""Key expression of the telemetry of every arm of every fleet; for router rules, not for publications."""
+MAX_CACHED, MAX_CACHED_CHARACTERS = 4096, 256
 """Parsed keys that are cached, and characters of the longest of them."""
-ASKED: tuple[str, ...] = get_args(AskedTopic)
-"""Topics of an auctioneer, or of an arm, whose keys end in the name of the querying arm."""
-_ROLES: dict[str, Role] = {str(role): role for role in TOPICS}
-_ASKED: dict[AskedTopic, Role] = {"lease": "auction", "report": "auction", "claim": "arm"}
-"""Role of the replier, by topic."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +182,7 @@ class Key:
         return f"{start}/{self.topic}"
 
 
-def of_arm(fleet: str, arm: str, topic: ArmTopic) -> str:
+def of_arm(fleet: str, arm: str, topic: str) -> str:
     """Key of one arm: `thermofleet/v4/{fleet}/arm/{arm}/{topic}`."""
     return str(Key(fleet, "arm", arm, topic))
 
@@ -91,36 +192,36 @@ def of_every(fleet: str, role: Role, topic: str) -> str:
     return str(Key(fleet, role, "x", topic)).replace(f"/{role}/x/", f"/{role}/*/")
 
 
-def of_every_arm(fleet: str, topic: ArmTopic) -> str:
+def of_every_arm(fleet: str, topic: str) -> str:
     """Key expression that matches the topic of every arm of one fleet; for subscribers and queries alone."""
     return of_every(fleet, "arm", topic)
 
 
-def of_auction(fleet: str, auctioneer: str, topic: AuctionTopic) -> str:
+def of_auction(fleet: str, auctioneer: str, topic: str) -> str:
     """Key of one auctioneer: `thermofleet/v4/{fleet}/auction/{auctioneer}/{topic}`."""
     return str(Key(fleet, "auction", auctioneer, topic))
 
 
-def of_every_auction(fleet: str, topic: AuctionTopic) -> str:
+def of_every_auction(fleet: str, topic: str) -> str:
     """Key expression that matches the topic of every auctioneer of one fleet; not for publications."""
     return of_every(fleet, "auction", topic)
 
 
-def asked_by(fleet: str, asked: str, topic: AskedTopic, arm: str) -> str:
+def asked_by(fleet: str, asked: str, topic: str, arm: str) -> str:
     """Key under which an arm queries another participant: `thermofleet/v4/{fleet}/auction/{asked}/{topic}/{arm}`
     for an auctioneer, `…/arm/{asked}/…` for an arm.
     """
-    return str(Key(fleet, _ASKED[topic], asked, topic, arm))
+    return str(Key(fleet, ASKED[topic], asked, topic, arm))
 
 
-def asked_by_every_arm(fleet: str, asked: str, topic: AskedTopic) -> str:
+def asked_by_every_arm(fleet: str, asked: str, topic: str) -> str:
     """Key expression of the queryable of an auctioneer, or arm, for all arms; not for replies (see `answered`)."""
     return asked_by(fleet, asked, topic, "x").removesuffix("x") + "*"
 
 
-def asked_of_all(fleet: str, topic: AskedTopic, arm: str) -> str:
+def asked_of_all(fleet: str, topic: str, arm: str) -> str:
     """Key expression of the queries of one arm to any auctioneer, or any arm."""
-    return asked_by(fleet, "x", topic, arm).replace(f"/{_ASKED[topic]}/x/", f"/{_ASKED[topic]}/*/")
+    return asked_by(fleet, "x", topic, arm).replace(f"/{ASKED[topic]}/x/", f"/{ASKED[topic]}/*/")
 
 
 def answered(expression: str, asked: str) -> str:
@@ -138,7 +239,7 @@ def answered(expression: str, asked: str) -> str:
     return key
 
 
-def of_jobs(fleet: str, topic: JobsTopic) -> str:
+def of_jobs(fleet: str, topic: str) -> str:
     """Key at which outsiders submit jobs, query their status or free space: `thermofleet/v4/{fleet}/jobs/{topic}`."""
     return str(Key(fleet, "jobs", "", topic))
 
@@ -151,11 +252,6 @@ def of_clock(fleet: str) -> str:
 def of_policy(fleet: str, policy: str) -> str:
     """Key at which a policy in another process is queried: `thermofleet/v4/{fleet}/policy/{policy}/act`."""
     return str(Key(fleet, "policy", policy, "act"))
-
-
-def of_every_policy(fleet: str) -> str:
-    """Key expression that matches every policy of one fleet; for router rules."""
-    return of_every(fleet, "policy", "act")
 
 
 def all_of_fleet(fleet: str) -> str:
@@ -197,7 +293,7 @@ def parse(key: str) -> Key:
         ValueError: not a key of this version, or not written as `str(Key(...))` would write it (wildcards, for one).
     """
     # The same few keys come with every message; longer ones than ours are not cached.
-    return _known(key) if len(key) <= LONGEST_KNOWN else _parse(key)
+    return _parse_cached(key) if len(key) <= MAX_CACHED_CHARACTERS else _parse(key)
 
 
 def _parse(key: str) -> Key:
@@ -206,8 +302,8 @@ def _parse(key: str) -> Key:
     named = len(parts) == 6 or asked
     if "/".join(parts[:2]) != PREFIX or not (named or len(parts) == 5):
         raise ValueError(f"'{key}' is no key of this bus: expected {PREFIX}/{{fleet}}/{{{'|'.join(TOPICS)}}}/….")
-    role = _ROLES.get(parts[3])
-    if role is None or named == (role in NAMELESS):
+    role = cast(Role, parts[3])
+    if role not in TOPICS or named == (role in NAMELESS):
         raise ValueError(
             f"'{key}' is not a key of this bus: expected arm/{{arm}}/…, auction/{{auctioneer}}/…, policy/{{policy}}/…, "
             "jobs/… or clock/now."
@@ -227,7 +323,7 @@ def _parse(key: str) -> Key:
     return parsed
 
 
-_known = lru_cache(MOST_KNOWN)(_parse)
+_parse_cached = lru_cache(MAX_CACHED)(_parse)
 
 
 def chunk(name: str) -> str:
@@ -239,3 +335,31 @@ def chunk(name: str) -> str:
     if not is_name(name):
         raise ValueError(f"A name in a key must have {NAME_RULE} (got '{printable(name)}').")
     return quote(name, safe="")
+
+
+def channel_of(expression: str) -> Channel:
+    """The channel that a key, or a key expression with wildcards for names, belongs to.
+
+    Raises:
+        ValueError: it belongs to none.
+    """
+    parts = expression.split("/")
+    role = parts[3] if len(parts) > 4 else ""
+    place = 4 if role in NAMELESS else 5
+    channel = CHANNEL.get((role, parts[place] if len(parts) > place else ""))
+    if channel is None:
+        raise ValueError(f"'{expression}' is no key of this bus. Keys: {', '.join(c.address for c in CHANNELS)}.")
+    return channel
+
+
+def channel_for(expression: str, pattern: Pattern, message: MessageType | None = None) -> Channel:
+    """The channel of a key or key expression, if it is used as the table says.
+
+    Raises:
+        ValueError: it has another pattern or message.
+    """
+    channel = channel_of(expression)
+    if channel.pattern != pattern or channel.message is not message:
+        expected = "nothing" if channel.message is None else channel.message.__name__
+        raise ValueError(f"'{expression}' is for {expected} ({channel.pattern}), not for {message} ({pattern}).")
+    return channel

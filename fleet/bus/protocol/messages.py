@@ -29,7 +29,7 @@ Celsius = Annotated[float, msgspec.Meta(ge=-273.15, le=1000)]
 
 
 class MalformedMessage(BusError, ValueError):
-    """A message that does not fit its key or its schema; says what is wrong with it."""
+    """A message that does not fit its key or its schema."""
 
 
 class State(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -47,11 +47,11 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     job: str = ""
     """The current job; "" for none."""
     space: str = ""
-    """Name of the space that the arm takes while it is away from home; "" at home, or if the arm does not say."""
+    """Name of the space that the arm takes while it is away from home; "" at home, or if not reported."""
     busy_s: Number = 0.0
     """Time until it is home with its current job done."""
     housing_c: tuple[Celsius, ...] = ()
-    """Its estimate of the housing temperatures, which have no sensor, [joint]."""
+    """Estimated housing temperatures, which have no sensor, [joint]."""
     ambient_c: Celsius | None = None
     """Measured ambient temperature at the arm."""
     job_value: Annotated[float, msgspec.Meta(ge=0, le=1e6)] = 0.0
@@ -86,14 +86,14 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class DifficultyScores(msgspec.Struct, frozen=True):
-    """How difficult the open jobs are for an arm, by its twin."""
+    """Difficulty of the open jobs for an arm, by its twin."""
 
     arm: Name
     tick: Count
     """Counts the scores of this arm; in a simulated shift, state and difficulty of one step have the same tick."""
     time_s: Number
     twin: str
-    """Version of the twin that scored."""
+    """Version of the twin that predicted."""
     jobs: tuple[Name, ...]
     """Names of the open jobs, each once; the columns of the lists below."""
     difficulty: tuple[Number | None, ...]
@@ -101,7 +101,7 @@ class DifficultyScores(msgspec.Struct, frozen=True):
     p_saturation: tuple[Number | None, ...]
     """Probability that a motor passes the warning limit, [job]; null where unknown."""
     peak_c: tuple[Number | None, ...] = ()
-    """Predicted temperature of the hottest motor during the job, [job]; null where unknown; empty if none is known."""
+    """Predicted temperature of the hottest motor during the job, [job]; null where unknown, empty if all are."""
 
     def __post_init__(self) -> None:
         finite("DifficultyScores", "time_s", (self.time_s,))
@@ -126,7 +126,7 @@ class Info(msgspec.Struct, frozen=True):
 
 
 class Refusal(msgspec.Struct, frozen=True):
-    """Instead of any other reply, under the key of the replier: the reason why there is none.
+    """Refused request: a reply under the key of the replier instead of the regular one.
 
     An ordinary reply. Zenoh's error replies have the key of the query; if it has a wildcard, a router with access
     control drops them.

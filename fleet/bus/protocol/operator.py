@@ -1,4 +1,4 @@
-"""Requests of people who operate a fleet."""
+"""Requests of operators."""
 
 from typing import Annotated, Literal
 
@@ -14,7 +14,7 @@ class ClearRequest(msgspec.Struct, frozen=True):
     """Request to `jobs/clear`: free the space of an absent arm, and end its awards. The same request again changes
     nothing.
 
-    Only a person who has seen that the arm is at home or removed, and switched off, may request it.
+    An operator must first have seen that the arm is at home or removed, and switched off.
     """
 
     arm: Name
@@ -23,7 +23,7 @@ class ClearRequest(msgspec.Struct, frozen=True):
 
 
 class Cleared(msgspec.Struct, frozen=True):
-    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it sends messages again."""
+    """Reply to a `ClearRequest`: it is durable, and the arm takes no space until it sends messages again."""
 
     auctioneer: Name
     arm: Name
@@ -35,15 +35,15 @@ ALL_ARMS = "*"
 
 class Cancel(msgspec.Struct, frozen=True, tag_field="action", tag="cancel"):
     """Cancel a job. An arm that has it finishes the cycle in progress, goes home and returns it. A job in its last
-    cycle is finished, and cancelled only if the arm returns it. Jobs that wait for it are given up."""
+    cycle is finished, and cancelled only if the arm returns it. Jobs that wait for it become `given_up`."""
 
     job: JobName
 
 
 class Settle(msgspec.Struct, frozen=True, tag_field="action", tag="settle"):
-    """Say what became of an `unfinished` job: a person has looked.
+    """Resolve an `unfinished` job, after inspecting the cell.
 
-    done: it is finished. redo: its last cycle was not done, and an arm does it again; refused while an arm that may
+    done: it is finished. redo: its last cycle was not done, and an arm does it again; refused while an arm that could
     still do it has the award: stop that arm and free its space with `jobs/clear` first.
     """
 
@@ -52,7 +52,7 @@ class Settle(msgspec.Struct, frozen=True, tag_field="action", tag="settle"):
 
 
 class Change(msgspec.Struct, frozen=True, tag_field="action", tag="change"):
-    """Change due date and value of a job that is not settled; what is left out stays as it is."""
+    """Change due date and value of a job that is not settled; omitted fields stay unchanged."""
 
     job: JobName
     due_s: Number | msgspec.UnsetType | None = msgspec.UNSET
@@ -61,8 +61,8 @@ class Change(msgspec.Struct, frozen=True, tag_field="action", tag="change"):
 
 
 class Pause(msgspec.Struct, frozen=True, tag_field="action", tag="pause"):
-    """Give an arm no more jobs. Its job goes back after the cycle in progress, and to another arm; a last cycle that
-    was permitted is finished."""
+    """Award an arm no further jobs. It returns its job after the cycle in progress; a permitted last cycle is
+    finished."""
 
     arm: Name = ALL_ARMS
     """"*" for all arms, also those that join later."""
@@ -79,34 +79,34 @@ Action = Cancel | Settle | Change | Pause | Resume
 
 
 class ControlRequest(msgspec.Struct, frozen=True):
-    """Request to `jobs/control`: change what the fleet does. One that was carried out is not carried out again."""
+    """Request to `jobs/control`: steer jobs and arms. It is idempotent."""
 
     request: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-    """Unique name of this request, for example a UUID; the last 1024 are known, also after a restart. The same request
-    again is answered and not carried out; another one of its name is refused."""
+    """Unique name of this request, for example a UUID; the last 1024 are kept, across restarts. A repeated request gets
+    a reply and changes nothing; a different one of the same name is refused."""
     action: Action
     by: Person = ""
     """Who requests it, for journal, events and status."""
 
 
 class Controlled(msgspec.Struct, frozen=True):
-    """Reply to a `ControlRequest`: it is on disk."""
+    """Reply to a `ControlRequest`, which is durable."""
 
     auctioneer: Name
     request: str
     changed: bool
-    """False if there was nothing to change, or the request was carried out before."""
+    """False if nothing had to change, or for a repeated request."""
     note: str = ""
     """What happens next, or why nothing changed."""
     job: JobStatus | None = None
-    """The job now; null for a pause, and for a job that was settled long ago."""
+    """The job now; null for a pause, and for a settled job that was evicted."""
     paused: dict[Name, str] = {}
     """As in `Status`."""
 
 
 class ResetRequest(msgspec.Struct, frozen=True):
     """Request to `arm/{arm}/reset`: clear the fault of an arm now, instead of waiting for it to clear. The arm then
-    ends its cycle and goes home by itself, so nobody may be in its way. Without a fault nothing changes."""
+    ends its cycle and moves home: keep people and objects out of its way. Without a fault nothing changes."""
 
     by: Person = ""
     """Who requests it, for journal and event."""
@@ -117,22 +117,22 @@ class ResetReply(msgspec.Struct, frozen=True):
 
     arm: Name
     changed: bool
-    """False if the arm has no fault. An arm that is too hot refuses, as does one whose fault only a person at the arm
-    can clear."""
+    """False if the arm has no fault. An arm that is too hot refuses, as does one whose fault must be cleared at the
+    arm."""
 
 
 class Operation(msgspec.Struct, frozen=True):
-    """Published under `auction/{auctioneer}/operation`, without an auctioneer under `arm/{arm}/operation`: a request of
-    a person was carried out, also one that changed nothing; not the same request again."""
+    """Published under `auction/{auctioneer}/operation`, without an auctioneer under `arm/{arm}/operation`: an operator
+    request was carried out, even if it changed nothing. A repeated request is not published."""
 
     auctioneer: Name
-    """Or the arm that replied, without an auctioneer."""
+    """Without an auctioneer, the arm that replied."""
     time_s: Number
     request: ControlRequest
     number: Count = 0
-    """Counts the requests that this auctioneer has carried out, across restarts."""
+    """Counts the operations of this auctioneer, across restarts."""
     epoch: str = ""
-    """As in `Clock`: `number` begins again with another epoch."""
+    """As in `Clock`: `number` restarts with a new epoch."""
     awards: Annotated[tuple[Name, ...], msgspec.Meta(max_length=16)] = ()
     """With `redo`, without an auctioneer: the awards of the job whose last cycle was not done."""
 

@@ -58,9 +58,9 @@ class ActRequest(msgspec.Struct, frozen=True):
     """Request to `policy/{policy}/act`: choose the actions of all arms for one decision."""
 
     shift: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-    """Unique name of this shift: several may run at once."""
+    """Unique name of this shift; several may run at the same time."""
     seed: Annotated[int, msgspec.Meta(ge=0, lt=2**32)]
-    """Of the policy in this shift. Draw all random numbers from it, and the shift can be repeated."""
+    """Of the policy in this shift. If all its random numbers follow from it, the shift can be repeated."""
     decision: Count
     """Counts the decisions of the shift; 0 begins it. A decision without a valid reply may be requested again."""
     observations: Annotated[list[ArmObservation], msgspec.Meta(min_length=1, max_length=MOST_ARMS)]
@@ -71,5 +71,5 @@ class ActReply(msgspec.Struct, frozen=True):
     """Reply to an `ActRequest`."""
 
     actions: Annotated[dict[Name, Action], msgspec.Meta(max_length=MOST_ARMS)]
-    """By arm: 0 waits, 1 + option claims the option, and the last action gives the current job back. An arm that is
-    left out waits; an action that its `action_mask` does not allow counts as illegal, and the arm waits."""
+    """By arm: 0 waits, 1 + option claims the option, and the last action returns the current job. An omitted arm waits;
+    so does one with an illegal action by its `action_mask`, which is counted."""

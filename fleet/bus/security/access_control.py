@@ -146,32 +146,32 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
         by_consensus: The fleet has no auctioneer, so its arms reply to outsiders.
     """
     time, status, cell = keys.of_clock(fleet), keys.of_jobs(fleet, "status"), keys.of_jobs(fleet, "cell")
-    quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
-    history = keys.of_every_arm(fleet, "history")
-    if participant.role == "arm":
-        # The key names the querier, so only that arm may use it.
-        asked = tuple(keys.asked_of_all(fleet, topic, participant.name) for topic in ("lease", "report", "claim"))
-        answers = (keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")) if by_consensus else ()
-        return Rights(
-            publishes=(keys.all_of(fleet, "arm", participant.name), *answers),
-            queries=(*asked, time, *((history,) if by_consensus else ())),
-        )
-    if participant.role == "auctioneer":
-        own = keys.all_of(fleet, "auction", participant.name)
-        return Rights(
-            publishes=(own, keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")),
-            queries=(quotes, awards, history, time, status, keys.of_every_policy(fleet)),
-        )
-    if participant.role in ("submitter", "operator"):
-        reset = keys.of_every_arm(fleet, "reset")
-        steer = (keys.of_jobs(fleet, "clear"), keys.of_jobs(fleet, "control"), reset)
-        operator = steer if participant.role == "operator" else ()
-        return Rights(queries=(keys.of_jobs(fleet, "submit"), *operator, status, cell, quotes, time))
-    if participant.role in ("monitor", "recorder"):
-        return Rights(queries=(status, cell, time))
-    if participant.role == "policy":
-        return Rights(publishes=(keys.all_of(fleet, "policy", participant.name),))
-    return Rights()
+    quotes, history = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "history")
+    outsiders = keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")
+    submit, looks = keys.of_jobs(fleet, "submit"), (status, cell, quotes, time)
+    match participant.role:
+        case "arm":
+            own = keys.all_of(fleet, "arm", participant.name)
+            # The key names the querier, so only that arm may use it.
+            asked = tuple(keys.asked_of_all(fleet, topic, participant.name) for topic in ("lease", "report", "claim"))
+            if by_consensus:
+                return Rights((own, *outsiders), (*asked, time, history))
+            return Rights((own,), (*asked, time))
+        case "auctioneer":
+            own, policies = keys.all_of(fleet, "auction", participant.name), keys.of_every(fleet, "policy", "act")
+            awards = keys.of_every_arm(fleet, "award")
+            return Rights((own, *outsiders), (quotes, awards, history, time, status, policies))
+        case "operator":
+            steer = keys.of_jobs(fleet, "clear"), keys.of_jobs(fleet, "control"), keys.of_every_arm(fleet, "reset")
+            return Rights(queries=(submit, *steer, *looks))
+        case "submitter":
+            return Rights(queries=(submit, *looks))
+        case "monitor" | "recorder":
+            return Rights(queries=(status, cell, time))
+        case "policy":
+            return Rights(publishes=(keys.all_of(fleet, "policy", participant.name),))
+        case "router":
+            return Rights()
 
 
 def rights_by_role(fleet: str, name: str) -> dict[Role, Rights]:

@@ -1,10 +1,8 @@
-"""Certificates of a fleet: its authority, and one certificate for each participant.
+"""The folder of keys of one fleet: its authority, and one certificate for each participant.
 
 ECDSA over P-256, X.509 v3 (RFC 5280). The common name identifies the participant. The certificate of a router is
 valid for listening and for links to other routers, every other one only for connecting, so no participant can act as
 the router.
-
-The folder of keys of one fleet: create it, add to it, read it.
 
 ca.pem ca.key        the certificate authority; its private key is needed only to issue certificates
 roster.json          the participants and their roles, from which the router derives its access control
@@ -38,7 +36,6 @@ LONGEST_DAYS = 3650
 """Lifetime of a certificate authority; every certificate that it signs expires by then."""
 SKEW = timedelta(minutes=5)
 """Certificates are valid from this long before their issue, as the clocks of machines differ."""
-_CONNECT = ExtendedKeyUsageOID.CLIENT_AUTH
 HERE = ("localhost", "127.0.0.1", "::1")
 _HOST_NAME = re.compile(r"(?=.{1,253}$)[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_])?", re.ASCII)
 _OWNER_ONLY, _ALL_READ = 0o600, 0o644
@@ -83,7 +80,8 @@ def issue(
     key = ec.generate_private_key(ec.SECP256R1())
     expires = min(now + timedelta(days=days), authority.not_valid_after_utc)
     is_router = participant.role == "router"
-    purposes = [_CONNECT] if not is_router else [ExtendedKeyUsageOID.SERVER_AUTH, _CONNECT]
+    connect, listen = ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH
+    purposes = [listen, connect] if is_router else [connect]
     authority_key = authority.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
     certificate = (
         _builder(_name(participant.common_name), authority.subject, key.public_key(), now - SKEW, expires)
@@ -155,11 +153,6 @@ def common_name(certificate: x509.Certificate) -> str:
     """Common name of a certificate, as `arm:arm_0`; "" for none."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
-
-
-def may_connect(certificate: x509.Certificate) -> bool:
-    """Whether a certificate is valid for the end of a connection that opens it."""
-    return _CONNECT in certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
 
 
 def format_time(moment: datetime) -> str:

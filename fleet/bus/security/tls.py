@@ -34,30 +34,23 @@ class Tls:
     folder: Path
     name: str
 
-    def check(self, *, serves: bool, links: bool = False) -> None:
+    def check(self, *, serves: bool) -> None:
         """Refuse a connection that would fail.
 
         Args:
             serves: Whether this end listens, as the router does.
-            links: Whether this end also connects to other routers.
 
         Raises:
             BusError: a file is missing, damaged, expired or of another authority, or the key is readable by others.
         """
         # Imported late: plain TCP does not need the library.
-        from fleet.bus.security.certificates import check, common_name, format_time, may_connect
+        from fleet.bus.security.certificates import check, common_name, format_time
 
         certificate = check(self.folder, self.file)
         owner = common_name(certificate)
         if owner.startswith("router:") != serves:
             needs = "a router needs that of a router" if serves else "only the router may use it"
             raise BusError(f"'{self.folder / self.file}.pem' is the certificate of '{owner}'; {needs}.")
-        if links and not may_connect(certificate):
-            raise BusError(
-                f"'{self.folder / self.file}.pem' is of an older version and permits listening only, so this router "
-                f"cannot connect to another one. Make a new one: thermofleet bus keys {self.folder} --add "
-                f"{self.name}:router --overwrite, with every --host."
-            )
         key = self._path(f"{self.file}.key")
         if os.name == "posix" and key.stat().st_mode & 0o077:
             raise BusError(f"Others on this machine may read the private key '{key}': chmod 600 it.")

@@ -46,9 +46,9 @@ from fleet.bus.protocol.auction import (
     Report,
 )
 from fleet.bus.protocol.consensus import HistoryRequest
+from fleet.bus.protocol.keys import STATE_HZ
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ResetReply, ResetRequest
-from fleet.bus.protocol.registry import STATE_HZ
 from fleet.difficulty import known_temperatures
 from fleet.errors import BusError, Refused, printable
 from fleet.events import EVENTS_PER_BOOT, Event
@@ -353,7 +353,7 @@ class AuctioneerClient:
     def _send(
         self,
         auctioneer: str,
-        topic: keys.AskedTopic,
+        topic: str,
         request: LeaseRequest | Report,
         kind: type[Message],
         apply: Callable[[Message], None],

@@ -23,10 +23,10 @@ import msgspec
 from msgspec.structs import asdict, replace
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus, Offers
+from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import ALL_ARMS, Cancel, ControlRequest, Pause, Resume, Settle
 from fleet.bus.protocol.operator import Change as ChangeJob
-from fleet.bus.protocol.registry import HISTORY
 from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import (
     EXPIRED,

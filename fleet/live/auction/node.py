@@ -36,9 +36,9 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.consensus import History, HistoryRequest
+from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
-from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalError, JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.job_rules import status_reply

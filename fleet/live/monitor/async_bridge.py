@@ -90,7 +90,7 @@ class ReaderBuffer:
     """Entries that wait for one reader."""
 
     full: bool = False
-    """Events were lost: the reader is to be dropped."""
+    """Events were lost, and the reader must be disconnected."""
     _newest: "Recent[tuple[str, str], Entry]" = field(default_factory=_newest)
     _events: list[Entry] = field(default_factory=list[Entry])
 
@@ -158,7 +158,7 @@ class AsyncBridge:
 
         Raises:
             Refused: it refuses.
-            NoReply: nobody replied.
+            NoReply: no reply.
             BusError: the certificate does not permit the query.
         """
         replies = await self._query(key, request, kind, REPLY_S)

@@ -18,7 +18,7 @@ class Finding(msgspec.Struct, frozen=True):
     """One statement about the fleet."""
 
     level: Literal["fault", "warning"]
-    """fault: the fleet cannot do its work; warning: it can, but needs attention."""
+    """fault: the fleet cannot work; warning: it works, but needs attention."""
     what: str
 
 
@@ -99,11 +99,10 @@ def check_health(
             Finding("warning", f"{overrun} message(s) dropped: they arrived faster than they were processed.")
         )
     if unfinished := fleet.counts.get("unfinished", 0):
-        findings.append(
-            Finding("warning", f"{unfinished} job(s) are unfinished, maybe done or not: their status names the reason.")
-        )
+        outcome = f"{unfinished} job(s) are unfinished, so their outcome is unknown; their status names the reason."
+        findings.append(Finding("warning", outcome))
     if given_up := fleet.counts.get("given_up", 0):
-        findings.append(Finding("warning", f"{given_up} job(s) are given up; their status names the reason."))
+        findings.append(Finding("warning", f"{given_up} job(s) are abandoned; their status names the reason."))
     findings += [Finding("fault", sentence) for sentence in other_versions]
     present = {arm.arm for arm in fleet.arms if arm.present}
     findings += [

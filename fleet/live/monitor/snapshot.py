@@ -29,9 +29,9 @@ from fleet.bus.protocol.auction import (
     Status,
     StatusRequest,
 )
+from fleet.bus.protocol.keys import PUBLISHED
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
 from fleet.bus.protocol.operator import ALL_ARMS, ControlRequest, Operation, Pause, Resume
-from fleet.bus.protocol.registry import PUBLISHED
 from fleet.errors import BusError
 from fleet.telemetry import Mode
 
@@ -57,7 +57,7 @@ OnPresence = Callable[[Role, str, bool], None]
 
 
 class Recent(OrderedDict[Key, Value]):
-    """Keeps the keys that were set last, at most `most` of them, in the order of their last setting."""
+    """A dict that keeps the `most` keys set last, in the order of their last setting."""
 
     def __init__(self, most: int) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class Recent(OrderedDict[Key, Value]):
 
 
 class JobScore(msgspec.Struct, frozen=True):
-    """What an arm says about a job; None where it knows nothing."""
+    """Predictions of an arm for a job; None for unknown."""
 
     peak_c: float | None = None
     """Predicted temperature of the hottest motor during the job."""
@@ -80,7 +80,7 @@ class JobScore(msgspec.Struct, frozen=True):
 
 
 class ArmSnapshot(msgspec.Struct, frozen=True):
-    """An arm as its messages show it; ages are real seconds, None without a message."""
+    """State of an arm, from its messages; ages are real seconds, None without a message."""
 
     arm: str
     token: bool
@@ -99,7 +99,7 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     busy_s: float = 0.0
     """Fleet seconds until it is home with its current job done."""
     away: bool = False
-    """It says that it is away from home."""
+    """It reports that it is away from home."""
     scores: dict[str, JobScore] = {}
     """Of the jobs that have not ended."""
     joints: int | None = None
@@ -113,7 +113,7 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
 
 
 class AuctioneerSnapshot(msgspec.Struct, frozen=True):
-    """An auctioneer as its messages show it."""
+    """State of an auctioneer, from its messages."""
 
     auctioneer: str
     token: bool
@@ -132,9 +132,9 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     jobs: tuple[JobStatus, ...]
     """The most recently changed last."""
     space: dict[str, tuple[str, ...]] = {}
-    """Names of the spaces that are closed to others, by arm, as the last status reply has them."""
+    """Names of the spaces that are closed to other arms, by arm, from the last status reply."""
     paused: dict[str, str] = {}
-    """Who paused an arm, by arm, as the last status reply has it; "*" for all arms."""
+    """Who paused an arm, by arm, from the last status reply; "*" for all arms."""
     speed: float | None = None
     """Fleet seconds per real second."""
 
@@ -162,7 +162,7 @@ class _Auctioneer:
 class _Job:
     status: JobStatus
     heard_s: float
-    """Real second at which it was last named."""
+    """Real second of the last message about it."""
     number: int = 0
     """Number of its last result: an older one changes nothing."""
 
@@ -212,9 +212,9 @@ class FleetView:
             self._set_status(status, now_s)
 
     def forget_other_jobs(self, replies: Sequence[Status], asked_s: float) -> None:
-        """Forget jobs that no reply to a request for all jobs names, unless they were named since `asked_s`.
+        """Evict jobs of an earlier fleet: in no reply to a request for all jobs, and in no message since `asked_s`.
 
-        They are of an earlier fleet. A reply that may not have had room for all jobs changes nothing.
+        A reply that may have been too small for all jobs changes nothing.
         """
         if not replies or not all(map(_complete, replies)):
             return

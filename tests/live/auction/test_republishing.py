@@ -1,8 +1,8 @@
 """What an auctioneer publishes again after a restart."""
 
 from fleet.bus.protocol.auction import JobSpec, Result
+from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.operator import ControlRequest, Operation, Pause
-from fleet.bus.protocol.registry import HISTORY
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import Operated
 from fleet.live.auction.rounds import LedgerWriter
