@@ -1,6 +1,6 @@
 """Time of an auction: 50 offered jobs, 8 arms, until all 8 awards of a batch are acknowledged.
 
-    python benchmarks/bench_auction.py [--arms 8] [--jobs 50] [--batches 100] [--policy matching]
+    python -m benchmarks.bench_auction [--arms 8] [--jobs 50] [--batches 100] [--policy matching]
 
 Router, auctioneer and every arm are separate processes on loopback. Ours: JSON messages validated at both ends, costs,
 matching, and a journal that is on disk before an award is sent. The arms quote constants and accept every award. Bare

@@ -1,6 +1,6 @@
 """Performance of a fleet when messages between its arms are late, lost or restricted.
 
-    python benchmarks/bench_channel.py [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
+    python -m benchmarks.bench_channel [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
         [--out docs/results/channels/SCENARIO.json]
 
 Writes the figures of every shift, and prints them as the table of docs/exchange.md that `docs/tables.py` makes of
@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
-from result_tables import channel_table
 
+from benchmarks.result_tables import channel_table
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.files import atomic_path, cache_folder
 from scenarios.prepare.fleet import prepare

@@ -1,6 +1,6 @@
 """Load of the live page: messages that reach it, and the processor time and memory of the process that serves it.
 
-    python benchmarks/bench_dashboard.py [--arms 16] [--rate 10] [--seconds 20] [--pages 1] [--chromium PROGRAM]
+    python -m benchmarks.bench_dashboard [--arms 16] [--rate 10] [--seconds 20] [--pages 1] [--chromium PROGRAM]
 
 A process publishes states of arms with all their quantities, --rate a second each (live arms: 10), and scores of 16
 jobs with every tenth, on a router of its own. `thermofleet bus gateway --page` serves the page. Readers take its

@@ -1,6 +1,6 @@
 """Time of a decision of every built-in policy, for 16 arms and 50 open jobs with two plans each.
 
-    python benchmarks/bench_decisions.py [--arms 16] [--jobs 50] [--decisions 30] [--policies a,b] [--wall] [--out FILE]
+    python -m benchmarks.bench_decisions [--arms 16] [--jobs 50] [--decisions 30] [--policies a,b] [--wall] [--out FILE]
 
 Prints Markdown for docs/policies.md and writes JSON to FILE. The observations are drawn: jobs of 2 to 30 min, values of
 1 to 4 and predicted peaks of 35 to 75 °C. Each arm can do 60 % of them, and half of the arms are free. The time is CPU

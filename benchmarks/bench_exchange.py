@@ -1,6 +1,6 @@
 """Time of a tick of a simulated shift that is also on the bus: `share` over Zenoh and in memory.
 
-    python benchmarks/bench_exchange.py [--arms 4 16 64] [--ticks 200]
+    python -m benchmarks.bench_exchange [--arms 4 16 64] [--ticks 200]
 
 An observer in another session counts the messages: `received` is the time until it has those of the tick. Bare put: as
 many puts of the same payloads with a Zenoh session, without waiting. All run in one process on loopback and alternate,

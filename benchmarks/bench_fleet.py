@@ -1,6 +1,6 @@
 """Cost of an arm's process: 64 working arms that publish ten states per second each, beside a bare Zenoh publisher.
 
-    python benchmarks/bench_fleet.py [--arms 64] [--seconds 20] [--rate 10] [--speed 1]
+    python -m benchmarks.bench_fleet [--arms 64] [--seconds 20] [--rate 10] [--speed 1]
 
 Every arm is `thermofleet arm run`, a separate process, blind, in its own cell; all connect to one router. This process
 deals: it awards each arm one long pick-and-place job and renews its lease, so that the arm moves and heats up. It also

@@ -1,6 +1,6 @@
 """Latency of a difficulty message from one process to another, beside bare Zenoh in the same run.
 
-    python benchmarks/bench_link.py [--words 1500] [--rate 100]
+    python -m benchmarks.bench_link [--words 1500] [--rate 100]
 
 A publisher and a listener, in separate processes, connect to a router in a third. The publisher alternates between a
 message by `BusClient` (validated, kept for late joiners, JSON) and the same bytes by a bare Zenoh publisher to a bare

@@ -1,6 +1,6 @@
 """Speed of closed-loop simulation: steps per second of the MuJoCo plant, beside bare `mj_step` of its scene.
 
-    python benchmarks/bench_plant.py
+    python -m benchmarks.bench_plant
 
 The plant is driven through ticks of the quickstart scenario in which its arms work: references, control, payload
 changes, simulation and heat. Bare is MuJoCo's own loop (`mj_step(model, data, nstep)`) with the same model and number

@@ -1,7 +1,7 @@
 """One shift of every policy, simulated and live: jobs finished and faults.
 
-    python benchmarks/bench_policies.py [quickstart] [--speed 240] [--seed 0] [--policies a,b] [--out FILE]
-    python benchmarks/bench_policies.py --steps [--difficulty oracle] [--policies a,b] [--out FILE]
+    python -m benchmarks.bench_policies [quickstart] [--speed 240] [--seed 0] [--policies a,b] [--out FILE]
+    python -m benchmarks.bench_policies --steps [--difficulty oracle] [--policies a,b] [--out FILE]
 
 Writes the figures, and prints them as the tables of docs/policies.md and docs/learning.md that `docs/tables.py`
 makes of docs/results/live_policies.json and docs/results/steps.json. A live shift is `thermofleet up` with a process
@@ -23,9 +23,9 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import pyarrow.parquet as pq
-from result_tables import live_table, steps_table
 
 from agents.registry import RULES
+from benchmarks.result_tables import live_table, steps_table
 from fleet.env.allocation_v1 import Decisions
 from fleet.files import atomic_path
 from scenarios.policy_loader import label, policy_at, scope_of

@@ -1,6 +1,6 @@
 """Size and speed of a run's report, and of its film, in a browser without a graphics card.
 
-    python benchmarks/bench_report.py RUN [--arms 100] [--film] [--loads 5] [--chromium PROGRAM]
+    python -m benchmarks.bench_report RUN [--arms 100] [--film] [--loads 5] [--chromium PROGRAM]
 
 RUN is a folder of `thermofleet run`. Its page is made anew and opened --loads times; times are those of the browser's
 own clock (User Timing): when the shift can be played in 3-D, and when every figure is drawn. --arms measures the page

@@ -1,6 +1,6 @@
 """CPU time of a shift of eight hours on one core, from the first decision to the metrics.
 
-    python benchmarks/bench_shift.py
+    python -m benchmarks.bench_shift
 
 The quickstart scenario over 8 h with its 4 arms, and with four such cells side by side; no twin, exchange in memory,
 round robin. Planning is not timed. Recording keeps one sensor reading per second and arm. The arms follow their plans

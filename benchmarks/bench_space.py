@@ -1,6 +1,6 @@
 """Whether arms ever touch, and what that costs: contacts in shifts, time to compare all plans, value of shifts.
 
-    python benchmarks/bench_space.py [--seeds 5] [--policies all] [--scenarios all] [--mujoco-s 1800]
+    python -m benchmarks.bench_space [--seeds 5] [--policies all] [--scenarios all] [--mujoco-s 1800]
 
 Every shift is played on the profile plant and its recorded postures, one each second, are given to MuJoCo, which finds
 contacts of arms, floor and fixtures; the plant `mujoco` is played for `--mujoco-s` seconds of each and looks at 100

@@ -1,6 +1,6 @@
 """Submissions of one job each, at a constant rate, to an auctioneer with its journal on the disk.
 
-    python benchmarks/bench_submit.py [--rate 1000] [--seconds 30] [--sessions 4] [--out DIR]
+    python -m benchmarks.bench_submit [--rate 1000] [--seconds 30] [--sessions 4] [--out DIR]
 
 Router and auctioneer are processes of their own. The submitter does not wait for replies, so a slow reply delays no
 later submission. No arm is present, and every job expires `EXPIRES_S` after its submission: it is accepted, written

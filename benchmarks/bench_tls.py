@@ -1,6 +1,6 @@
 """Cost of TLS, access rules and rate limits: a round trip through the router and opening a session, beside bare Zenoh.
 
-    python benchmarks/bench_tls.py [--rounds 2000] [--opens 40]
+    python -m benchmarks.bench_tls [--rounds 2000] [--opens 40]
 
 Three routers in one process on loopback: bare Zenoh, ours with plain TCP (size and rate limits), ours with mutual TLS
 (limits, and the access rules of a fleet of 16 arms). A round trip is a put of 256 bytes from one client through the

@@ -1,6 +1,6 @@
 """Calibration of the arms' P(saturation) in shifts: the probability at each award against the outcome.
 
-    python benchmarks/bench_trust.py [quickstart] [--seeds 10] [--first-seed 100]
+    python -m benchmarks.bench_trust [quickstart] [--seeds 10] [--first-seed 100]
 
 Every shift runs with `round_robin`, which ignores the probability. A job counts if its arm had a probability and was
 below the warning limit at the award; it passed if the arm gave a warning before the end of the job. The models learned

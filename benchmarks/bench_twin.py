@@ -1,7 +1,7 @@
 """Cost of a twin: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM` and a lower bound.
 
-    python benchmarks/bench_twin.py [--full]
-    python benchmarks/bench_twin.py --arms 100
+    python -m benchmarks.bench_twin [--full]
+    python -m benchmarks.bench_twin --arms 100
 
 CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
 layers, decoder, loss and backward pass, or the forward pass alone. The lower bound ("floor") is the matrix

@@ -1,6 +1,6 @@
 """Speed-up of `thermofleet compare` from one worker to two, or from one Ray node to two.
 
-    python benchmarks/bench_workers.py [--ray] [--suite test] [--instances 18] [--repeats 3] [--policies …] [--out FILE]
+    python -m benchmarks.bench_workers [--ray] [--suite test] [--instances 18] [--repeats 3] [--policies …] [--out FILE]
 
 Plans are made before. Each repeat runs the same study with one worker and with two, in turns, and checks that the rows
 are equal. The limit in the same run is a loop without shared memory or files, alone and twice at a time: what two

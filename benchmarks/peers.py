@@ -1,6 +1,6 @@
 """Steps per CPU-second of other environments, each measured in a separate process; prints one line.
 
-    python benchmarks/peers.py mpe|rware|vmas ENVS
+    python -m benchmarks.peers mpe|rware|vmas ENVS
 
 They are not part of thermofleet and it imports none of them; `make bench-env` installs them. VMAS is under GPL-3.
 """

@@ -1,6 +1,6 @@
 """Shifts computed with the instructions of an older processor: how many have another reward.
 
-    python benchmarks/processors.py [--instances 5] [--policies wsept,auction] [--out docs/results/processors.json]
+    python -m benchmarks.processors [--instances 5] [--policies wsept,auction] [--out docs/results/processors.json]
 
 Plans and shifts are made anew twice, in empty caches: with all that this processor can do, and with what a processor
 of 2008 can (x86-64-v2: no AVX, no fused multiply-add) in NumPy, OpenBLAS, the C library and compiled code.
@@ -17,8 +17,8 @@ import tempfile
 from pathlib import Path
 
 import pyarrow.parquet as parquet
-from result_tables import SAME
 
+from benchmarks.result_tables import SAME
 from scenarios.suite.splits import instance, manifest
 
 COMPARE = [sys.executable, "-m", "scenarios", "compare", "--difficulty", "oracle", "--workers", "1"]

@@ -1,6 +1,6 @@
 """A week of work through one auctioneer, with time compressed: memory, journal and time to accept jobs.
 
-    python benchmarks/soak.py [--jobs 100000] [--arms 16] [--out runs/soak]
+    python -m benchmarks.soak [--jobs 100000] [--arms 16] [--out runs/soak]
 
 The auctioneer's state machine runs with its real journal and 16 model arms, which bid for, accept and finish jobs at
 once. Real time is simulated: a week, whatever the number of jobs. Every submission of 10 jobs is written through to the

@@ -1,6 +1,6 @@
 """Jobs through one auctioneer over a real router, as fast as it can: memory, journal and time to accept jobs.
 
-    python benchmarks/soak_bus.py [--jobs 5000] [--arms 4] [--out runs/soak]
+    python -m benchmarks.soak_bus [--jobs 5000] [--arms 4] [--out runs/soak]
 
 The auctioneer and model arms, which finish a job at once, run in one process, each with a session of its own. A thread
 submits ten jobs whenever fewer than 200 wait. Writes soak_bus.json. For a week of work see soak.py.
@@ -15,8 +15,8 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
-from soak import BACKLOG, BATCH, PLAN, first_come, read_options, rss_mb
 
+from benchmarks.soak import BACKLOG, BATCH, PLAN, first_come, read_options, rss_mb
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (

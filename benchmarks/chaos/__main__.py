@@ -1,7 +1,7 @@
 """Inject faults into live fleets: count lost jobs and jobs done twice, and measure the recovery.
 
-    python benchmarks/chaos [--only NAME,NAME] [--jobs 24] [--speed 120] [--keep DIR] [--no-namespaces]
-    python benchmarks/chaos --minutes 10 --seed 1 [--speed 120] [--keep DIR]
+    python -m benchmarks.chaos [--only NAME,NAME] [--jobs 24] [--speed 120] [--keep DIR] [--no-namespaces]
+    python -m benchmarks.chaos --minutes 10 --seed 1 [--speed 120] [--keep DIR]
 
 Every fault gets a new fleet of four arms: router, auctioneer, recorder and arms, each its own process, on loopback.
 `alone-…` is without an auctioneer. `trespass` uses TLS, and so does `partition` as root, which makes network
@@ -32,14 +32,15 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from campaign import SCENARIO, campaign
-from consensus import cut_off_half, cut_off_one
-from fleet_under_test import CannotInject, Fault
-from malformed import malformed, replayed_awards
-from namespaces import unavailable_reason
-from partition import partition
-from poison import poison
-from processes import (
+
+from benchmarks.chaos.campaign import SCENARIO, campaign
+from benchmarks.chaos.consensus import cut_off_half, cut_off_one
+from benchmarks.chaos.fleet_under_test import CannotInject, Fault
+from benchmarks.chaos.malformed import malformed, replayed_awards
+from benchmarks.chaos.namespaces import unavailable_reason
+from benchmarks.chaos.partition import partition
+from benchmarks.chaos.poison import poison
+from benchmarks.chaos.processes import (
     full_disk,
     full_disks,
     full_log_disk,
@@ -50,10 +51,9 @@ from processes import (
     stop_arm,
     stuck_subscriber,
 )
-from random_faults import GAP_S, KILL, Figures, run
-from trespass import trespass
-from wall_clock import clock_jump
-
+from benchmarks.chaos.random_faults import GAP_S, KILL, Figures, run
+from benchmarks.chaos.trespass import trespass
+from benchmarks.chaos.wall_clock import clock_jump
 from scenarios.prepare.fleet import prepare
 from scenarios.spec.load import load
 

@@ -7,11 +7,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from fleet_under_test import Fault, Fleet, Outcome
-from namespaces import Namespaces
-from partition import Proxy
-from wall_clock import WallClocks
-
+from benchmarks.chaos.fleet_under_test import Fault, Fleet, Outcome
+from benchmarks.chaos.namespaces import Namespaces
+from benchmarks.chaos.partition import Proxy
+from benchmarks.chaos.wall_clock import WallClocks
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, Clock, ClockRequest, JobSpec, Submission, SubmissionReply

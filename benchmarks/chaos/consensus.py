@@ -1,7 +1,7 @@
 """Partitions of a fleet without an auctioneer."""
 
-from fleet_under_test import Fleet
-from partition import CUT_S, cut_at_work
+from benchmarks.chaos.fleet_under_test import Fleet
+from benchmarks.chaos.partition import CUT_S, cut_at_work
 
 LEASE_S = 8.0
 """Real seconds after which no job continues without a majority: a lease, its margins, and a last cycle."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import zenoh
-from journal_files import JournalFiles
 
+from benchmarks.chaos.journal_files import JournalFiles
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobStatus, Result, Status, StatusRequest

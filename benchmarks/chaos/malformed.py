@@ -5,8 +5,8 @@ import math
 import random
 
 import msgspec
-from fleet_under_test import Fleet
 
+from benchmarks.chaos.fleet_under_test import Fleet
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Award, LeaseRequest, QuoteRequest, Report, Submission
 from fleet.bus.protocol.consensus import Bid, Claim

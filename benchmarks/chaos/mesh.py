@@ -1,6 +1,6 @@
 """Many arms behind two linked routers: kill either router, cut the link, count lost jobs and jobs done twice.
 
-    python benchmarks/chaos/mesh.py [--arms 256] [--jobs 512] [--speed 120] [--keep DIR] [--no-namespaces]
+    python -m benchmarks.chaos.mesh [--arms 256] [--jobs 512] [--speed 120] [--keep DIR] [--no-namespaces]
 
 Host a has a router, the auctioneer and half of the arms, host b a router that is linked to the first, and the other
 arms. As root, host b is a network namespace and the link a virtual cable; otherwise the link passes a proxy. During the
@@ -20,11 +20,10 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from fleet_under_test import Fleet, Outcome
-from mesh_parts import FLEET, SCENARIO, job_of, names_of
-from namespaces import Namespaces, unavailable_reason
-from partition import CUT_S, Proxy
-
+from benchmarks.chaos.fleet_under_test import Fleet, Outcome
+from benchmarks.chaos.mesh_parts import FLEET, SCENARIO, job_of, names_of
+from benchmarks.chaos.namespaces import Namespaces, unavailable_reason
+from benchmarks.chaos.partition import CUT_S, Proxy
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, JobStatus, Status, StatusRequest, Submission, SubmissionReply
@@ -37,7 +36,6 @@ from scenarios.live.fleet_processes import PROGRAM, free_port
 from scenarios.prepare.fleet import prepare
 from scenarios.spec.load import load
 
-PARTS = Path(__file__).with_name("mesh_parts.py")
 START_S, BACK_S, LATE_REPORTS_S, AT_ONCE = 300.0, 120.0, 20.0, 64
 FAR = "router_b"
 
@@ -62,7 +60,7 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
 
         def part(name: str, what: str, address: str, rank: int) -> Part:
             words = (what, address, str(place), str(folder / "journals"), str(arms), f"{speed:g}")
-            return Part(name=name, argv=(sys.executable, str(PARTS), *words), rank=rank)
+            return Part(name=name, argv=(sys.executable, "-m", "benchmarks.chaos.mesh_parts", *words), rank=rank)
 
         halves = [",".join(str(number) for number in range(first, arms, 2)) for first in (0, 1)]
         others = [

@@ -12,9 +12,8 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Self
 
-from fleet_under_test import Fleet
-from namespaces import Namespaces
-
+from benchmarks.chaos.fleet_under_test import Fleet
+from benchmarks.chaos.namespaces import Namespaces
 from fleet.live.supervisor import Part
 
 CUT_S = 12.0

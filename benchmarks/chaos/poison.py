@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from copy import deepcopy
 
 import msgspec
-from fleet_under_test import Fleet
 
+from benchmarks.chaos.fleet_under_test import Fleet
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Award,

@@ -13,13 +13,14 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from campaign import LATE_REPORTS_S, is_healthy, short_job, start_fleet
-from fleet_under_test import TIMEOUT_S, Fault, Fleet, Inject
-from malformed import malformed, replayed_awards
 from msgspec import structs
-from partition import partition
-from poison import poison
-from processes import (
+
+from benchmarks.chaos.campaign import LATE_REPORTS_S, is_healthy, short_job, start_fleet
+from benchmarks.chaos.fleet_under_test import TIMEOUT_S, Fault, Fleet, Inject
+from benchmarks.chaos.malformed import malformed, replayed_awards
+from benchmarks.chaos.partition import partition
+from benchmarks.chaos.poison import poison
+from benchmarks.chaos.processes import (
     full_disk,
     full_disks,
     full_log_disk,
@@ -32,8 +33,7 @@ from processes import (
     stop_auctioneer,
     stuck_subscriber,
 )
-from wall_clock import clock_jump
-
+from benchmarks.chaos.wall_clock import clock_jump
 from fleet.bus.client import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, JobSpec, JobState, Status, StatusRequest, Submission, SubmissionReply

@@ -1,6 +1,6 @@
 """CPU time and memory of `thermofleet show` and `run` for 100 arms, 1 000 jobs and eight hours.
 
-    python benchmarks/scaling/commands.py [--arms 100] [--hours 8] [--jobs 1000] [--out FILE]
+    python -m benchmarks.scaling.commands [--arms 100] [--hours 8] [--jobs 1000] [--out FILE]
 
 `show` runs twice: with an empty cache, when it plans the work of all arms, and again. `run` exchanges messages over
 Zenoh, and then in memory. CPU time is that of all threads of the command; memory is the most that it held.
@@ -15,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from hall import hall, toml_of
+from benchmarks.scaling.hall import hall, toml_of
 
 COMMAND = [sys.executable, "-c", "from scenarios.cli.main import main; main()"]
 

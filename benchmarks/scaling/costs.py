@@ -1,6 +1,6 @@
 """CPU-seconds per message of a router and of the auctioneer's client, over mutual TLS on loopback.
 
-    python benchmarks/scaling/costs.py [--states 20000] [--arms 64]
+    python -m benchmarks.scaling.costs [--states 20000] [--arms 64]
 
 Router, arms (one process) and client are separate processes, so the CPU time of each is its own; the time of day is
 not used, so a busy machine changes little. `load.py` calculates with these costs.
@@ -15,8 +15,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from load import JOINTS, estimate_of, job_of, quote_of, state_of
-
+from benchmarks.scaling.load import JOINTS, estimate_of, job_of, quote_of, state_of
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Quote, QuoteRequest

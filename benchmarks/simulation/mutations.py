@@ -4,8 +4,8 @@ import math
 from typing import Any
 
 from msgspec.structs import replace as changed
-from mutation import add_mutation, unwritten
 
+from benchmarks.simulation.mutation import add_mutation, unwritten
 from fleet.errors import JournalError
 from fleet.live import journal as journal_module
 from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor

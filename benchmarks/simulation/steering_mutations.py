@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from mutation import add_mutation, unwritten
-
+from benchmarks.simulation.mutation import add_mutation, unwritten
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
 from fleet.errors import Refused
 from fleet.live.auction import auctioneer as auctioneer_module

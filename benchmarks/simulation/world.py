@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from random import Random
 from typing import Any, Protocol
 
-from disk import Crash, Disk
 from numpy.random import SeedSequence
 
+from benchmarks.simulation.disk import Crash, Disk
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import FleetError
 

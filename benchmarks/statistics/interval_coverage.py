@@ -1,6 +1,6 @@
 """Share of 95 % intervals that contain the true mean, by simulation: the tables of docs/results.md.
 
-python benchmarks/statistics/interval_coverage.py [--out docs/results/coverage.json]   # a minute of one core
+python -m benchmarks.statistics.interval_coverage [--out docs/results/coverage.json]   # a minute of one core
 """
 
 import argparse
