@@ -8,7 +8,6 @@ postures a second. The time to compare the plans is that of one core with nothin
 finished jobs is compared with the same shifts of arms that pass through each other (twins, paired, 95 % interval).
 """
 
-import argparse
 import shutil
 import tempfile
 import time
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.registry import RULES
+from benchmarks.harness import options
 from fleet.arm.cell import ContactFinder
 from fleet.arm.model import build_cell
 from fleet.arm.space import space_table
@@ -104,13 +104,8 @@ def _same_arm(table, arms: list[Robot]) -> np.ndarray:
 
 def main() -> None:
     """Print both tables."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--policies", default=",".join(RULES))
-    parser.add_argument("--scenarios", default=",".join(library()))
-    parser.add_argument("--mujoco-s", type=float, default=1800.0)
-    parser.add_argument("--value-seeds", type=int, default=20)
-    given = parser.parse_args()
+    policies, scenarios = ",".join(RULES), ",".join(library())
+    given = options(__doc__, seeds=5, policies=policies, scenarios=scenarios, mujoco_s=1800.0, value_seeds=20)
     names = given.scenarios.split(",")
     print("scenario            arms       plans  conflict  one core")
     tables(names)

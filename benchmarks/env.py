@@ -17,13 +17,12 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import statistics
 import subprocess
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.harness import median_rate, rss_mb
 from fleet.engine.tables import Tables
 from fleet.env.random_actions import random_legal
 from fleet.env.vector import BatchEnv, Library, keep_pages
@@ -32,16 +31,6 @@ from scenarios.spec.load import load
 from scenarios.spec.options import DifficultyName
 
 WINDOWS, SHIFT = 3, 720
-
-
-def median_rate(window: Callable[[], int]) -> float:
-    """Return steps per CPU-second: the median of the windows after one warm-up window."""
-    rates = []
-    for _ in range(WINDOWS + 1):
-        begin = time.process_time()
-        steps = window()
-        rates.append(steps / (time.process_time() - begin))
-    return statistics.median(rates[1:])
 
 
 def single(difficulty: DifficultyName) -> float:
@@ -143,11 +132,6 @@ def torchrl(envs: int, *, kept: bool = False) -> float:
     return median_rate(window)
 
 
-def resident_mb() -> float:
-    """Return the memory of this process, MB."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def memory(envs: int, arms: int) -> float:
     """Return the MB that a batch adds to a process with one env."""
     shared, rng = library("blind", arms), np.random.default_rng(0)
@@ -160,9 +144,9 @@ def memory(envs: int, arms: int) -> float:
         return env
 
     run(1)
-    before = resident_mb()
+    before = rss_mb()
     many = run(envs)
-    after = resident_mb()
+    after = rss_mb()
     assert many.num_envs == envs
     return after - before
 

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.soak import BACKLOG, BATCH, PLAN, first_come, read_options, rss_mb
+from benchmarks.harness import options, rss_mb
+from benchmarks.soak import BACKLOG, BATCH, PLAN, first_come
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -114,7 +115,8 @@ class Submitter(threading.Thread):
 
 def main() -> None:
     """Run all jobs and write the figures."""
-    arguments = read_options(__doc__, jobs=5000, arms=4)
+    arguments = options(__doc__, jobs=5000, arms=4, out=Path("runs/soak"))
+    arguments.out.mkdir(parents=True, exist_ok=True)
     with (
         tempfile.TemporaryDirectory(dir=arguments.out) as folder,
         Router() as router,

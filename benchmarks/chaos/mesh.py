@@ -9,7 +9,6 @@ supervisor starts routers again. TLS, access control and journals are on. A job 
 journals of the arms. Exit code 1: a job was lost or done twice, or a process exited that was not killed.
 """
 
-import argparse
 import logging
 import math
 import signal
@@ -24,6 +23,7 @@ from benchmarks.chaos.fleet_under_test import Fleet, Outcome
 from benchmarks.chaos.mesh_parts import FLEET, SCENARIO, job_of, names_of
 from benchmarks.chaos.namespaces import Namespaces, unavailable_reason
 from benchmarks.chaos.partition import CUT_S, Proxy
+from benchmarks.harness import options
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, JobStatus, Status, StatusRequest, Submission, SubmissionReply
@@ -165,13 +165,14 @@ def _outcome(fleet: Fleet, wanted: Sequence[str]) -> Outcome:
 
 def main() -> None:
     """Run the campaign and print its outcome."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, default=256)
-    parser.add_argument("--jobs", type=int, default=512)
-    parser.add_argument("--speed", type=float, default=120.0, help="fleet seconds per real second")
-    parser.add_argument("--keep", type=Path, help="folder for journals and logs; default: temporary")
-    parser.add_argument("--no-namespaces", action="store_true", help="cut the link by a proxy, also as root")
-    given = parser.parse_args()
+    given = options(
+        __doc__,
+        arms=256,
+        jobs=512,
+        speed=(120.0, "fleet seconds per real second"),
+        keep=(Path, "folder for journals and logs; default: temporary"),
+        no_namespaces=(False, "cut the link by a proxy, also as root"),
+    )
     logging.basicConfig(level=logging.ERROR)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # remove the namespaces: they outlive the process
     reason = "--no-namespaces" if given.no_namespaces else unavailable_reason()

@@ -30,6 +30,8 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from benchmarks.harness import machine
+
 COSTS = {"plans": "plans", "conflicts": "conflict table", "engine": "engine", "matching": "matching", "scores": "twins"}
 ONCE = ("plans", "conflicts")
 """Costs of a cell, not of each hour."""
@@ -107,11 +109,6 @@ def _shift(env: Any, policy: Any, seed: int) -> tuple[float, float]:  # modules 
         engine_s, matching_s = engine_s + process_time() - decided, matching_s + decided - began
         over = bool(finished[0] or cut[0])
     return engine_s, matching_s
-
-
-def machine() -> dict[str, object]:
-    """The machine and how busy it is."""
-    return {"cores": os.cpu_count(), "load_average": [round(load, 2) for load in os.getloadavg()]}
 
 
 def run(sizes: list[int], most_in_hall: int, out: Path) -> None:

@@ -1,6 +1,6 @@
 """Simulate whole fleets under faults, seed after seed, until a rule is broken or the run is stopped.
 
-    python -m benchmarks.simulation [--seeds N] [--hours H] [--first SEED]    seeds from SEED on, N of them or H real hours
+    python -m benchmarks.simulation [--seeds N] [--hours H] [--first SEED]    seeds from SEED on, N or H hours
     python -m benchmarks.simulation --seed 123                                one seed, with the trace of its events
     python -m benchmarks.simulation --mutations [NAME,NAME]                   break rules on purpose, and find each
 
