@@ -24,7 +24,7 @@ from fleet.arm.cell import cell_model
 from fleet.robot import Mount, Robot
 from fleet.telemetry import Telemetry
 from scenarios.live.fleet_processes import PROGRAM
-from scenarios.run.log import RunLog, open_run, run_html
+from scenarios.run.log import RunLog, open_run
 from scenarios.show.run_page import report_html
 
 COLUMNS = {
@@ -54,11 +54,6 @@ PICTURES = """(scrub) => new Promise((done) => {
   };
   requestAnimationFrame(step);
 })"""
-
-
-def page_of(run: RunLog) -> str:
-    """The report of a run."""
-    return run_html(run.card, run.scenario, run.readings, run.events, run.jobs, run.offers)
 
 
 def enlarged(run: RunLog, arms: int) -> str:
@@ -131,7 +126,7 @@ def main() -> None:
         chromium="/usr/bin/chromium",
     )
     run = open_run(given.run)
-    pages = {len(run.arms): page_of(run)} | ({given.arms: enlarged(run, given.arms)} if given.arms else {})
+    pages = {len(run.arms): run.page()} | ({given.arms: enlarged(run, given.arms)} if given.arms else {})
     print(f"{run.readings.time_s[-1] / 3600:.1f} h; median of {given.loads} loads")
     print(f"{'arms':>5}{'MB':>7}" + "".join(f"{title:>18}" for title in COLUMNS))
     with sync_playwright() as play:

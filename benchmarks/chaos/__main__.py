@@ -34,12 +34,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.chaos.campaign import SCENARIO, campaign
-from benchmarks.chaos.consensus import cut_off_half, cut_off_one
 from benchmarks.chaos.fleet_under_test import CannotInject, Fault
-from benchmarks.chaos.malformed import malformed, replayed_awards
+from benchmarks.chaos.messages import malformed, poison, replayed_awards
 from benchmarks.chaos.namespaces import unavailable_reason
-from benchmarks.chaos.partition import partition
-from benchmarks.chaos.poison import poison
+from benchmarks.chaos.partition import cut_off_half, cut_off_one, partition
 from benchmarks.chaos.processes import (
     full_disk,
     full_disks,

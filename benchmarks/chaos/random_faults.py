@@ -17,9 +17,8 @@ from msgspec import structs
 
 from benchmarks.chaos.campaign import LATE_REPORTS_S, is_healthy, short_job, start_fleet
 from benchmarks.chaos.fleet_under_test import TIMEOUT_S, Fault, Fleet, Inject
-from benchmarks.chaos.malformed import malformed, replayed_awards
+from benchmarks.chaos.messages import malformed, poison, replayed_awards
 from benchmarks.chaos.partition import partition
-from benchmarks.chaos.poison import poison
 from benchmarks.chaos.processes import (
     full_disk,
     full_disks,

@@ -18,7 +18,7 @@ import msgspec
 import zenoh
 
 from benchmarks.chaos.fleet_under_test import Fleet
-from benchmarks.chaos.malformed import awards_of
+from benchmarks.chaos.messages import awards_of
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Award,

@@ -185,10 +185,6 @@ def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
     }
 
 
-def _alarms(p: Array) -> float:
-    return float((p <= ALARM_RATE).mean())
-
-
 def _features(twin: Twin, study: Study, sample: Sample) -> Features:
     jobs = jobs_of(sample, study.horizon_s)
     return twin.features(jobs.plans, jobs.repetitions)

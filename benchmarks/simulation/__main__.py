@@ -15,11 +15,7 @@ import sys
 import time
 from dataclasses import dataclass
 
-from benchmarks.simulation import (
-    mutations,  # noqa: F401 -- adds its mutations, as the next one does
-    steering_mutations,  # noqa: F401
-)
-from benchmarks.simulation.mutation import MUTATIONS, applied
+from benchmarks.simulation.mutations import MUTATIONS, applied
 from benchmarks.simulation.shift import Shift
 from benchmarks.simulation.world import Violation
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.chaos.journal_files import JournalFiles
+from benchmarks.chaos.fleet_under_test import JournalFiles
 from benchmarks.chaos.random_faults import OTHERS, schedule
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted
