@@ -5,7 +5,7 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,13 +15,24 @@ import zenoh
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import JobStatus, Result, Status, StatusRequest
+from fleet.bus.protocol.auction import (
+    SETTLED,
+    JobSpec,
+    JobStatus,
+    Result,
+    Status,
+    StatusRequest,
+    Submission,
+    SubmissionReply,
+)
 from fleet.bus.protocol.messages import State
 from fleet.live.arm.awards import ArmRecord, Closed, JobsFinished
 from fleet.live.supervisor import Supervisor
 
 TIMEOUT_S = 150.0
 STALE_S = 3.0
+AT_ONCE = 64
+"""Jobs in a submission or a request for their status."""
 
 
 class CannotInject(Exception):
@@ -153,9 +164,41 @@ class Fleet:
         )
         return {job.job: job for word in answers.messages.values() for job in word.jobs}
 
-    def count_finished(self) -> Counter[str]:
-        """Count how often each job was finished, by the journals of the arms since their first start."""
-        return self.journals.count_finished()
+    def submit(self, jobs: Sequence[JobSpec]) -> None:
+        """Submit jobs, `AT_ONCE` in a message.
+
+        Raises:
+            RuntimeError: a job was not accepted.
+        """
+        for first in range(0, len(jobs), AT_ONCE):
+            some = Submission(tuple(jobs[first : first + AT_ONCE]))
+            key = keys.of_jobs(self.client.fleet, "submit")
+            replies = self.client.query_and_wait(key, some, SubmissionReply, timeout_s=20.0)
+            accepted = {job.job for reply in replies.messages.values() for job in reply.jobs if job.accepted}
+            if len(accepted) != len(some.jobs):
+                raise RuntimeError(f"Only {len(accepted)} of {len(some.jobs)} jobs were accepted: {replies.refused}")
+
+    def done_twice(self) -> tuple[str, ...]:
+        """Jobs that were finished more than once, by the journals of the arms since their first start."""
+        return tuple(sorted(name for name, times in self.journals.count_finished().items() if times > 1))
+
+    def exited(self) -> tuple[str, ...]:
+        """Processes that exited without being killed."""
+        return tuple(sorted(name for name, n in self.supervisor.restarts().items() if n > self.killed[name]))
+
+    def outcome(self, accepted: Iterable[str], status: Mapping[str, JobStatus]) -> Outcome:
+        """What became of the accepted jobs, by their last status and the journals of the arms."""
+        states = Counter(job.state for job in status.values())
+        settled = {name for name, job in status.items() if job.state in SETTLED}
+        return Outcome(
+            finished=states["finished"],
+            unfinished=states["unfinished"] + states["given_up"],
+            lost=tuple(sorted(set(accepted) - settled)),
+            twice=self.done_twice(),
+            exited=self.exited(),
+            violations=tuple(self.violations),
+            notes=tuple(self.notes),
+        )
 
     def _token(self, arm: str, there: bool) -> None:
         (self.tokens.add if there else self.tokens.discard)(arm)

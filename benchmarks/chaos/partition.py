@@ -169,4 +169,4 @@ def _cut(fleet: Fleet, *, may_work: bool) -> float:
 
 def _ended(fleet: Fleet) -> set[str]:
     """Return the finished jobs, by the journals of all arms."""
-    return set(fleet.count_finished())
+    return set(fleet.journals.count_finished())

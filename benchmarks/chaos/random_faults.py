@@ -232,16 +232,13 @@ def run(seed: int, folder: Path, *, minutes: float, speed: float, clocks: bool) 
             feeder.ask(list(islice(feeder.states, first, first + AT_ONCE)))
         fleet.wait_until(lambda: False, REPLY_S)
         figures.took_s = time.monotonic() - start_s
-        done, restarts = fleet.count_finished(), fleet.supervisor.restarts()
-        fleet.violations += [
-            f"{name} exited by itself" for name, count in restarts.items() if count > fleet.killed[name]
-        ]
+        figures.twice, done = fleet.done_twice(), fleet.journals.count_finished()
+        fleet.violations += [f"{name} exited by itself" for name in fleet.exited()]
         if math.isinf(ended_s):
             fleet.note(f"jobs were open {TIMEOUT_S:g} s after the last fault")
     (recorded, named), states = _recorded(folder / "recording"), feeder.states
     figures.states = Counter(str(state) for state in states.values())
     figures.lost = tuple(sorted(name for name, state in states.items() if state is None))
-    figures.twice = tuple(sorted(name for name, times in done.items() if times > 1))
     ended = {name: state for name, state in states.items() if state in SETTLED}
     missing = {name for name, state in ended.items() if recorded.get(name) != state}
     if named and missing:
