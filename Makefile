@@ -63,26 +63,26 @@ lint: $(STAMP)
 
 # MINUTES=10 SEED=1: random kills and many faults on one fleet instead, in an order that the seed determines.
 chaos: $(STAMP)
-	@$(BIN)/python benchmarks/chaos $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))
+	@$(BIN)/python -m benchmarks.chaos $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))
 
 # 256 arms behind two linked routers: kill either, cut the link.
 mesh: $(STAMP)
-	@$(BIN)/python benchmarks/chaos/mesh.py --speed 20
+	@$(BIN)/python -m benchmarks.chaos.mesh --speed 20
 
 # Whole fleets in one process under faults, seed after seed until one breaks a rule or Ctrl-C. SEEDS=n or HOURS=n
 # bounds it, FIRST=n is the first seed, SEED=n prints the trace of one, MUTATIONS=all breaks rules on purpose.
 simulate: $(STAMP)
-	@$(BIN)/python benchmarks/simulation $(if $(SEED),--seed $(SEED)) $(if $(SEEDS),--seeds $(SEEDS)) \
+	@$(BIN)/python -m benchmarks.simulation $(if $(SEED),--seed $(SEED)) $(if $(SEEDS),--seeds $(SEEDS)) \
 	  $(if $(HOURS),--hours $(HOURS)) $(if $(FIRST),--first $(FIRST)) $(if $(MUTATIONS),--mutations $(MUTATIONS))
 
 # A week of work, a million jobs, through one auctioneer: about 20 minutes.
 soak: $(STAMP)
-	@$(BIN)/python benchmarks/soak.py --jobs 1000000
+	@$(BIN)/python -m benchmarks.soak --jobs 1000000
 
 # Coverage-guided fuzzing of every parser. `make fuzz INPUTS=10000000` takes longer, `TARGETS=journal` one parser.
 INPUTS ?= 1000000
 fuzz: $(VENV)/.atheris
-	@$(BIN)/python benchmarks/fuzz --inputs $(INPUTS) $(TARGETS)
+	@$(BIN)/python -m benchmarks.fuzz --inputs $(INPUTS) $(TARGETS)
 
 $(VENV)/.atheris: $(STAMP)
 	@$(PIP) atheris==3.0.0
@@ -99,14 +99,14 @@ pictures: $(STAMP)
 	@$(BIN)/python docs/notebooks.py
 
 bench: $(STAMP)
-	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python -m benchmarks.$$(basename $$b .py) || exit 1; done
 
 EXTRA := [cli]
 .venv-adapters/bench/.installed: EXTRA := [cli,learn]
 .venv-adapters/ray/.installed: EXTRA := [cli,ray]
 .venv-adapters/ros2/.installed: EXTRA := [bus,ros2]
 bench-env: .venv-adapters/bench/.installed
-	@.venv-adapters/bench/bin/python benchmarks/env.py
+	@.venv-adapters/bench/bin/python -m benchmarks.env
 
 install: $(STAMP)
 

@@ -1,6 +1,6 @@
 """Time of an auction: 50 offered jobs, 8 arms, until all 8 awards of a batch are acknowledged.
 
-    python benchmarks/bench_auction.py [--arms 8] [--jobs 50] [--batches 100] [--policy matching]
+    python -m benchmarks.bench_auction [--arms 8] [--jobs 50] [--batches 100] [--policy matching]
 
 Router, auctioneer and every arm are separate processes on loopback. Ours: JSON messages validated at both ends, costs,
 matching, and a journal that is on disk before an award is sent. The arms quote constants and accept every award. Bare
@@ -8,26 +8,27 @@ Zenoh: in the same processes, a query to all arms and one to each, with payloads
 and half after ours. Then the journal alone.
 """
 
-import argparse
-import multiprocessing
 import os
-import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from argparse import Namespace
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from itertools import count
+from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 import zenoh
 
+from benchmarks.harness import cells, options, quantiles, received, route, seconds, spawned
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest, Submission
 from fleet.bus.protocol.messages import State, encode
-from fleet.bus.router import Router, open_client
+from fleet.bus.router import open_client
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, Awarded
@@ -38,16 +39,8 @@ from scenarios.policy_loader import policy_at
 
 FLEET = "bench"
 PATIENCE_S = 20.0
-START_S = 60.0
 STATE_S = 0.1
 JOINTS = 7
-
-
-def route(port: Any, stop: Any) -> None:
-    """The router's process."""
-    with Router() as router:
-        port.put(router.endpoint)
-        stop.wait()
 
 
 def offer(word: JobSpec, number: int) -> JobEstimate:
@@ -57,7 +50,7 @@ def offer(word: JobSpec, number: int) -> JobEstimate:
     return JobEstimate(word.name, tuple(PlanQuote(plan, *heat, 123.456789, 234.56789) for plan in range(2)))
 
 
-def arm(endpoint: str, number: int, quote_size: int, ready: Any, stop: Any) -> None:
+def arm(pipe: Connection, endpoint: str, number: int, quote_size: int) -> None:
     """An arm's process: quotes, accepts awards, publishes its state ten times per second and answers bare queries."""
     name, numbers, said_s = f"arm_{number}", count(), 0.0
     with BusClient(endpoint, FLEET, timeout_s=PATIENCE_S) as link, open_client(endpoint, timeout_s=PATIENCE_S) as bare:
@@ -71,8 +64,8 @@ def arm(endpoint: str, number: int, quote_size: int, ready: Any, stop: Any) -> N
         link.declare_token(keys.of_arm(FLEET, name, "alive"))
         sizes = {"quote": quote_size, "award": len(encode(Ack(name, "x" * 32, True)))}
         queryables = [constant(bare, f"bare/{number}/{topic}", b"x" * size) for topic, size in sizes.items()]
-        ready.release()
-        while not stop.is_set():
+        pipe.send("ready")
+        while not pipe.poll():
             link.serve(time.monotonic() + STATE_S / 2)
             if time.monotonic() >= said_s + STATE_S:
                 said_s = time.monotonic()
@@ -91,27 +84,6 @@ def constant(session: zenoh.Session, key: str, answer: bytes) -> zenoh.Queryable
 
     handler: Any = zenoh.handlers.Callback(reply, indirect=False)
     return session.declare_queryable(key, handler, complete=True)
-
-
-@contextmanager
-def processes(arms: int, quote_size: int) -> Iterator[str]:
-    """Run router and arms; yield the endpoint."""
-    spawn = multiprocessing.get_context("spawn")
-    stop, port, ready = spawn.Event(), spawn.Queue(), spawn.Semaphore(0)
-    router = spawn.Process(target=route, args=(port, stop))
-    router.start()
-    endpoint = port.get(timeout=START_S)
-    children = [spawn.Process(target=arm, args=(endpoint, i, quote_size, ready, stop)) for i in range(arms)]
-    try:
-        for child in children:
-            child.start()
-        for _ in children:
-            assert ready.acquire(timeout=START_S), "an arm did not start in time"
-        yield endpoint
-    finally:
-        stop.set()
-        for child in (*children, router):
-            child.join(PATIENCE_S)
 
 
 class Stopwatch:
@@ -149,23 +121,23 @@ def words(jobs: int) -> list[JobSpec]:
     ]
 
 
-def ours(endpoint: str, folder: Path, options: argparse.Namespace) -> tuple[list[tuple[int, float]], float]:
+def ours(endpoint: str, folder: Path, given: Namespace) -> tuple[list[tuple[int, float]], float]:
     """Batches of an auctioneer, and the awards per second over all of them."""
 
-    timing = Timing(lease_s=120.0, max_jobs=options.jobs)
+    timing = Timing(lease_s=120.0, max_jobs=given.jobs)
     # Enough jobs to keep the number of offers constant until the last batch.
-    work = words(options.arms * options.batches + options.jobs)
-    allocate = CentralAllocation(policy_at(options.policy, 0), LiveFleet(arms=()))
+    work = words(given.arms * given.batches + given.jobs)
+    allocate = CentralAllocation(policy_at(given.policy, 0), LiveFleet(arms=()))
     with BusClient(endpoint, FLEET) as link, Journal[AuctionRecord](folder / "bench.journal", AuctionRecord) as book:
         node = AuctionNode(link, "auctioneer", book, allocate=allocate, speed=1.0, timing=timing)
         deadline_s = time.monotonic() + PATIENCE_S
-        while len(node.present) < options.arms and time.monotonic() < deadline_s:
+        while len(node.present) < given.arms and time.monotonic() < deadline_s:
             node.serve(deadline_s)
         watch = Stopwatch(link, node)
         for i in range(0, len(work), 200):
             node.submit(Submission(tuple(work[i : i + 200])))
         begun_s, deadline_s = time.perf_counter(), time.monotonic() + 30.0
-        while len(watch.batches_s) < options.batches and time.monotonic() < deadline_s:
+        while len(watch.batches_s) < given.batches and time.monotonic() < deadline_s:
             node.serve(deadline_s)
         took_s = time.perf_counter() - begun_s
     return watch.batches_s, sum(sent for sent, _ in watch.batches_s) / took_s
@@ -173,10 +145,12 @@ def ours(endpoint: str, folder: Path, options: argparse.Namespace) -> tuple[list
 
 def bare_batch(session: zenoh.Session, arms: int, request: bytes, award: bytes) -> float:
     """Duration of a query to all, then one to each, s."""
-    begun_s = time.perf_counter()
-    gather(session, ["bare/*/quote"], request, arms)
-    gather(session, [f"bare/{i}/award" for i in range(arms)], award, arms)
-    return time.perf_counter() - begun_s
+
+    def both() -> None:
+        gather(session, ["bare/*/quote"], request, arms)
+        gather(session, [f"bare/{i}/award" for i in range(arms)], award, arms)
+
+    return seconds(both, time.perf_counter)
 
 
 def gather(session: zenoh.Session, asked: list[str], payload: bytes, answers: int) -> None:
@@ -215,9 +189,7 @@ def journal_s(folder: Path, arms: int, times: int, sync: Callable[[int], None]) 
                 Awarded(f"auctioneer-0a1b2c3d-{batch}:job-{i}", "a" * 24, f"job-{i}", f"arm_{i}", "q" * 16, 0, 1.0, 2.0)
                 for i in range(arms)
             ]
-            begun_s = time.perf_counter()
-            book.append(*made)
-            out.append(time.perf_counter() - begun_s)
+            out.append(seconds(partial(book.append, *made), time.perf_counter))
     return out
 
 
@@ -225,21 +197,15 @@ def unsynced(_file: int) -> None:
     """Replaces fsync: the system decides when to write."""
 
 
-def row(what: str, seconds: list[float]) -> str:
+def row(what: str, times_s: list[float]) -> str:
     """Median and 95th percentile in ms."""
-    ordered = sorted(1e3 * s for s in seconds)
-    return f"{what:<44}{statistics.median(ordered):>9.2f}{ordered[int(0.95 * len(ordered))]:>9.2f}{len(ordered):>7}"
+    return f"{what:<44}{cells(quantiles(times_s, 0.95), scale=1e3, width=9)}{len(times_s):>7}"
 
 
 def main() -> None:
     """Print the table and whether the targets are met."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, default=8)
-    parser.add_argument("--jobs", type=int, default=50, help="on offer at a time")
-    parser.add_argument("--batches", type=int, default=100)
-    parser.add_argument("--policy", default="matching")
-    options = parser.parse_args()
-    sample = words(options.jobs)
+    given = options(__doc__, arms=8, jobs=(50, "on offer at a time"), batches=100, policy="matching")
+    sample = words(given.jobs)
     request = encode(QuoteRequest("auctioneer-0a1b2c3d-1", tuple(sample)))
     quote = encode(
         Quote("arm_0", "a" * 22, "q" * 12, 5.0, "t", 0.0, "idle", 20.0, 1, tuple(offer(w, 1) for w in sample))
@@ -247,28 +213,27 @@ def main() -> None:
     award = encode(Award("a" * 36, "a" * 24, "auctioneer", "q" * 16, sample[0]))
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=os.getcwd())))
-        endpoint = stack.enter_context(processes(options.arms, len(quote)))
+        endpoint, _ = received(stack.enter_context(spawned(route)))
+        for pipe in [stack.enter_context(spawned(arm, endpoint, i, len(quote))) for i in range(given.arms)]:
+            received(pipe)
         with open_client(endpoint, timeout_s=PATIENCE_S) as session:
-            half = max(1, options.batches // 2)
-            bare = [bare_batch(session, options.arms, request, award) for _ in range(half)]
-            batches, per_s = ours(endpoint, folder, options)
-            bare += [bare_batch(session, options.arms, request, award) for _ in range(half)]
-        synced = journal_s(folder, options.arms, options.batches, os.fsync)
-        loose = journal_s(folder, options.arms, options.batches, unsynced)
+            half = max(1, given.batches // 2)
+            bare = [bare_batch(session, given.arms, request, award) for _ in range(half)]
+            batches, per_s = ours(endpoint, folder, given)
+            bare += [bare_batch(session, given.arms, request, award) for _ in range(half)]
+        synced = journal_s(folder, given.arms, given.batches, os.fsync)
+        loose = journal_s(folder, given.arms, given.batches, unsynced)
     times = [s for _, s in batches]
     print(
-        f"{options.arms} arms, {options.jobs} jobs on offer, {options.policy}; "
-        f"request {len(request)} B, quote {len(quote)} B"
+        f"{given.arms} arms, {given.jobs} jobs on offer, {given.policy}; request {len(request)} B, quote {len(quote)} B"
     )
     print(f"{'':<44}{'p50 ms':>9}{'p95 ms':>9}{'times':>7}")
-    print(row(f"a batch: quotes, {options.arms} awards, all answers", times))
+    print(row(f"a batch: quotes, {given.arms} awards, all answers", times))
     print(row("bare Zenoh: the same queries", bare))
     print(row("journal: the awards of a batch, fsync", synced))
     print(row("journal: the same without fsync", loose))
-    print(
-        f"awards per second: {per_s:.0f}; full batches: {sum(n == options.arms for n, _ in batches)} of {len(batches)}"
-    )
-    p95_ms = 1e3 * sorted(times)[int(0.95 * len(times))]
+    print(f"awards per second: {per_s:.0f}; full batches: {sum(n == given.arms for n, _ in batches)} of {len(batches)}")
+    p95_ms = 1e3 * quantiles(times, 0.95)[1]
     verdict = {True: "met", False: "missed"}
     print(f"targets: p95 of a batch <= 50 ms: {verdict[p95_ms <= 50.0]}; >= 100 awards/s: {verdict[per_s >= 100.0]}")
 

@@ -1,6 +1,6 @@
 """Performance of a fleet when messages between its arms are late, lost or restricted.
 
-    python benchmarks/bench_channel.py [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
+    python -m benchmarks.bench_channel [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
         [--out docs/results/channels/SCENARIO.json]
 
 Writes the figures of every shift, and prints them as the table of docs/exchange.md that `docs/tables.py` makes of
@@ -10,7 +10,6 @@ and the arms' twins, on all cores. The defaults are 130 shifts: some eight minut
 cores, and a few minutes more if the twins are not cached. `heat_wave` takes three times as long.
 """
 
-import argparse
 import json
 import os
 
@@ -22,10 +21,11 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
-from result_tables import channel_table
 
+from benchmarks.harness import options, write_text
+from benchmarks.result_tables import channel_table
 from fleet.bus.exchange.channel import Channel, Partition
-from fleet.files import atomic_path, cache_folder
+from fleet.files import cache_folder
 from scenarios.prepare.fleet import prepare
 from scenarios.run.shift import run
 from scenarios.spec.load import load
@@ -73,18 +73,13 @@ def shifts(scenario: Scenario, cache: Path, policy: str, channel: Channel, seeds
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenario", nargs="?", default="quickstart")
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--first-seed", type=int, default=100)
-    parser.add_argument("--policies", default="least_difficulty,consensus")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    scenario, cache = load(options.scenario), cache_folder()
+    policies = "least_difficulty,consensus"
+    given = options(__doc__, "scenario", scenario="quickstart", seeds=5, first_seed=100, policies=policies, out=Path)
+    scenario, cache = load(given.scenario), cache_folder()
     start_s = time.perf_counter()
     prepare(scenario, cache=cache)  # into the cache, for all workers
-    policies, between = options.policies.split(","), channels(scenario)
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    policies, between = given.policies.split(","), channels(scenario)
+    seeds = range(given.first_seed, given.first_seed + given.seeds)
     cells = [(policy, name) for policy in policies for name in between]
     found: Any = Parallel(n_jobs=-1)(
         delayed(shifts)(scenario, cache, policy, between[name], seeds) for policy, name in cells
@@ -98,10 +93,8 @@ def main() -> None:
             for (policy, name), values in zip(cells, found, strict=True)
         ],
     }
-    out = options.out or Path(f"docs/results/channels/{scenario.name}.json")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(out) as partial:
-        partial.write_text(json.dumps(result) + "\n", encoding="utf-8")
+    out = given.out or Path(f"docs/results/channels/{scenario.name}.json")
+    write_text(out, json.dumps(result) + "\n")
     print(channel_table(result))
     print(f"\n{len(cells) * len(seeds)} shifts in {time.perf_counter() - start_s:.0f} s on {os.cpu_count()} cores.")
 

@@ -1,6 +1,6 @@
 """Load of the live page: messages that reach it, and the processor time and memory of the process that serves it.
 
-    python benchmarks/bench_dashboard.py [--arms 16] [--rate 10] [--seconds 20] [--pages 1] [--chromium PROGRAM]
+    python -m benchmarks.bench_dashboard [--arms 16] [--rate 10] [--seconds 20] [--pages 1] [--chromium PROGRAM]
 
 A process publishes states of arms with all their quantities, --rate a second each (live arms: 10), and scores of 16
 jobs with every tenth, on a router of its own. `thermofleet bus gateway --page` serves the page. Readers take its
@@ -8,36 +8,35 @@ stream as the page does; with --chromium the page itself is opened too, drawn wi
 are measured apart. Linux only.
 """
 
-import argparse
 import json
 import math
-import multiprocessing
 import os
 import subprocess
-import sys
 import tempfile
 import threading
 import time
 import urllib.request
+from argparse import Namespace
 from collections.abc import Callable
+from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from benchmarks.harness import CHROMIUM, cpu_s, options, received, route, rss_mb, spawned
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import auction as bus
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.cell import Cell, CellArm, CellRequest
 from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import DifficultyScores, State
-from fleet.bus.router import Router
+from scenarios.live.fleet_processes import PROGRAM
 
 FLEET, JOBS = "bench", 16
 GOAL_CORE, GOAL_MB = 0.25, 150.0
-CHROMIUM = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
-def publish(endpoint: str, arms: int, rate_hz: float, pipe: Connection) -> None:
-    """Publish a fleet until the other end of the pipe is closed."""
+def publish(pipe: Connection, endpoint: str, arms: int, rate_hz: float) -> None:
+    """Publish a fleet until there is a message in the pipe."""
     names = tuple(f"arm_{i:02d}" for i in range(arms))
     example = EXAMPLES[Cell]
     assert isinstance(example, Cell)
@@ -82,18 +81,6 @@ def publish(endpoint: str, arms: int, rate_hz: float, pipe: Connection) -> None:
                 link.serve(start_s + (tick + 1) / rate_hz)
 
 
-def core_s(process: int) -> float:
-    """Processor seconds of a process so far."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def peak_mb(process: int) -> float:
-    """Largest resident memory of a process so far, MB."""
-    lines = Path(f"/proc/{process}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
-
-
 class Reader(threading.Thread):
     """Counts the states of a stream of events."""
 
@@ -117,98 +104,85 @@ def family(process: int) -> list[int]:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, default=16)
-    parser.add_argument("--rate", type=float, default=10.0)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--pages", type=int, default=1, help="readers of the stream")
-    parser.add_argument("--chromium", default="", help="program that opens the page, with playwright")
-    options = parser.parse_args()
-    context = multiprocessing.get_context("spawn")
-    pipe, other = context.Pipe()
-    command = [
-        sys.executable,
-        "-c",
-        "from scenarios.cli.main import main; main()",
-        "bus",
-        "gateway",
-        "--page",
-        "--fleet",
-        FLEET,
-    ]
-    with Router() as router, tempfile.TemporaryFile("w+") as log:
-        fleet = context.Process(target=publish, args=(router.endpoint, options.arms, options.rate, other))
-        fleet.start()
-        assert pipe.recv() == "ready"
-        argv = [*command, "--endpoint", router.endpoint, "--port", "0"]
+    given = options(
+        __doc__,
+        arms=16,
+        rate=10.0,
+        seconds=20.0,
+        pages=(1, "readers of the stream"),
+        chromium=("", "program that opens the page, with playwright"),
+    )
+    with ExitStack() as stack:
+        log = stack.enter_context(tempfile.TemporaryFile("w+"))
+        endpoint, _ = received(stack.enter_context(spawned(route)))
+        assert received(stack.enter_context(spawned(publish, endpoint, given.arms, given.rate))) == "ready"
+        argv = [*PROGRAM, "bus", "gateway", "--page", "--fleet", FLEET, "--endpoint", endpoint, "--port", "0"]
         server = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=log, text=True)
         try:
             assert server.stdout is not None
             address = server.stdout.readline().split()[2]
             urllib.request.urlopen(f"{address}v4/scene", timeout=60).read()
             urllib.request.urlopen(f"{address}page/three.js", timeout=60).read()
-            print_table(measure(address, server.pid, options), options)
+            print_table(measure(address, server.pid, given), given)
         finally:
             server.terminate()
             server.wait(20)
-            pipe.send("stop")
-            fleet.join(20)
 
 
-def measure(address: str, server: int, options: argparse.Namespace) -> dict[str, float]:
+def measure(address: str, server: int, given: Namespace) -> dict[str, float]:
     """Figures of a page that is read for a while, each per second of real time where it is a rate."""
-    readers = [Reader(address) for _ in range(options.pages)]
+    readers = [Reader(address) for _ in range(given.pages)]
     for reader in readers:
         reader.start()
     pause, found = threading.Event(), dict[str, float]()
-    if options.chromium:
+    if given.chromium:
         from playwright.sync_api import sync_playwright
 
         with sync_playwright() as play:
-            browser = play.chromium.launch(executable_path=options.chromium, args=list(CHROMIUM))
+            browser = play.chromium.launch(executable_path=given.chromium, args=list(CHROMIUM))
             page = browser.new_page(viewport={"width": 1280, "height": 800})
             page.goto(address)
             page.wait_for_selector("body[data-ready]", timeout=60_000)
             page.wait_for_timeout(3000)
             read = "({...dashboard, at: performance.now() / 1000})"
             mine = [one for one in family(os.getpid()) if b"chrom" in Path(f"/proc/{one}/cmdline").read_bytes()]
-            before, core = page.evaluate(read), sum(map(core_s, mine))
-            found |= rates(readers, server, options.seconds, lambda: page.wait_for_timeout(1000 * options.seconds))
+            before, core = page.evaluate(read), sum(map(cpu_s, mine))
+            found |= rates(readers, server, given.seconds, lambda: page.wait_for_timeout(1000 * given.seconds))
             after = page.evaluate(read)
             span_s = after["at"] - before["at"]
-            found["states of each arm in the page, 1/s"] = (after["states"] - before["states"]) / span_s / options.arms
+            found["states of each arm in the page, 1/s"] = (after["states"] - before["states"]) / span_s / given.arms
             found["pictures drawn by the page, 1/s"] = (after["updates"] - before["updates"]) / span_s
-            found["browser, cores"] = (sum(map(core_s, mine)) - core) / span_s
+            found["browser, cores"] = (sum(map(cpu_s, mine)) - core) / span_s
             browser.close()
         return found
     pause.wait(3.0)
-    return rates(readers, server, options.seconds, lambda: pause.wait(options.seconds))
+    return rates(readers, server, given.seconds, lambda: pause.wait(given.seconds))
 
 
 def rates(readers: list[Reader], server: int, seconds: float, wait: Callable[[], object]) -> dict[str, float]:
     """Figures of the server while `wait` runs."""
     counts, octets = [reader.count for reader in readers], sum(reader.octets for reader in readers)
-    start_s, start_core_s = time.monotonic(), core_s(server)
+    start_s, start_core_s = time.monotonic(), cpu_s(server)
     wait()
     span_s = time.monotonic() - start_s
     least = min(reader.count - count for reader, count in zip(readers, counts, strict=True))
     return {
         "updates": least / span_s,
         "kB/s to one reader": (sum(reader.octets for reader in readers) - octets) / span_s / len(readers) / 1000,
-        "server, cores": (core_s(server) - start_core_s) / span_s,
-        "server, MB at most": peak_mb(server),
+        "server, cores": (cpu_s(server) - start_core_s) / span_s,
+        "server, MB at most": rss_mb(server, peak=True),
     }
 
 
-def print_table(found: dict[str, float], options: argparse.Namespace) -> None:
+def print_table(found: dict[str, float], given: Namespace) -> None:
     """Print the figures beside their goals."""
-    found = {"states of each arm to a reader, 1/s": found.pop("updates") / options.arms, **found}
+    found = {"states of each arm to a reader, 1/s": found.pop("updates") / given.arms, **found}
     goals = {
-        "states of each arm to a reader, 1/s": f"of {options.rate:g} published",
+        "states of each arm to a reader, 1/s": f"of {given.rate:g} published",
         "server, cores": f"≤ {GOAL_CORE:g}",
         "server, MB at most": f"≤ {GOAL_MB:g}",
     }
-    print(f"{options.arms} arms, {options.pages} reader(s), {options.seconds:g} s, {json.dumps(os.cpu_count())} cores")
+    print(f"{given.arms} arms, {given.pages} reader(s), {given.seconds:g} s, {json.dumps(os.cpu_count())} cores")
     for name, value in found.items():
         print(f"{name:<42}{value:10.2f}   {goals.get(name, '')}")
 

@@ -1,6 +1,6 @@
 """Time of a decision of every built-in policy, for 16 arms and 50 open jobs with two plans each.
 
-    python benchmarks/bench_decisions.py [--arms 16] [--jobs 50] [--decisions 30] [--policies a,b] [--wall] [--out FILE]
+    python -m benchmarks.bench_decisions [--arms 16] [--jobs 50] [--decisions 30] [--policies a,b] [--wall] [--out FILE]
 
 Prints Markdown for docs/policies.md and writes JSON to FILE. The observations are drawn: jobs of 2 to 30 min, values of
 1 to 4 and predicted peaks of 35 to 75 °C. Each arm can do 60 % of them, and half of the arms are free. The time is CPU
@@ -10,7 +10,6 @@ slots. For `rolling_horizon` the largest gap that the solver left is added. Exit
 limit.
 """
 
-import argparse
 import json
 import statistics
 import time
@@ -27,6 +26,7 @@ from agents.planners import Mpc, RollingHorizon
 from agents.policy import Planner
 from agents.registry import RULES
 from agents.rules import Ssi
+from benchmarks.harness import options, seconds, write_text
 from fleet.env.lookahead import Lookahead
 from fleet.observation import Layout, Observation
 from scenarios.evaluate.hindsight import ShiftSimulator
@@ -91,9 +91,7 @@ def measure(name: str, moments: list[dict[str, Observation]], clock: Callable[[]
     policy, times_ms, gaps = policy_at(name, 0), [], []
     policy.act(moments[0])  # imports
     for seen in moments:
-        began_s = clock()
-        policy.act(seen)
-        times_ms.append((clock() - began_s) * 1e3)
+        times_ms.append(1e3 * seconds(partial(policy.act, seen), clock))
         if isinstance(policy, RollingHorizon) and policy.solution:
             gaps.append(policy.solution.gap)
     arms = len(moments[0]) / 2 if scope_of(name) == "arm" else 1  # those that are free
@@ -141,20 +139,13 @@ def measure_planner(name: str, clock: Callable[[], float]) -> dict[str, float | 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--arms", type=int, default=16)
-    parser.add_argument("--jobs", type=int, default=50)
-    parser.add_argument("--decisions", type=int, default=30)
-    parser.add_argument("--policies", default=",".join(RULES))
-    parser.add_argument("--wall", action="store_true")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    given = options(__doc__, arms=16, jobs=50, decisions=30, policies=",".join(RULES), wall=False, out=Path)
     rng = np.random.default_rng(0)
-    moments = [draw(rng, options.arms, options.jobs) for _ in range(options.decisions)]
-    clock = time.perf_counter if options.wall else time.process_time
+    moments = [draw(rng, given.arms, given.jobs) for _ in range(given.decisions)]
+    clock = time.perf_counter if given.wall else time.process_time
     rows = [
         measure_planner(name, clock) if name in RULES and RULES[name].plans else measure(name, moments, clock)
-        for name in options.policies.split(",")
+        for name in given.policies.split(",")
     ]
     print("| policy | scope | median ms | largest ms |\n|---|---|---|---|")
     for row in rows:
@@ -163,9 +154,9 @@ def main() -> None:
         if "largest_gap" in row:
             print(f"\n`{row['policy']}`: largest gap {row['largest_gap']:.1%}")
     slow = [str(row["policy"]) for row in rows if float(row["median_ms"]) > limit_ms(str(row["policy"]))]
-    if options.out:
-        sizes = {"arms": options.arms, "jobs": options.jobs, "decisions": options.decisions}
-        options.out.write_text(json.dumps(sizes | {"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    if given.out:
+        sizes = {"arms": given.arms, "jobs": given.jobs, "decisions": given.decisions}
+        write_text(given.out, json.dumps(sizes | {"rows": rows}, indent=1) + "\n")
     if slow:
         raise SystemExit(f"Slower than allowed: {', '.join(slow)}.")
 

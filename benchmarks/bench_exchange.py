@@ -1,21 +1,19 @@
 """Time of a tick of a simulated shift that is also on the bus: `share` over Zenoh and in memory.
 
-    python benchmarks/bench_exchange.py [--arms 4 16 64] [--ticks 200]
+    python -m benchmarks.bench_exchange [--arms 4 16 64] [--ticks 200]
 
 An observer in another session counts the messages: `received` is the time until it has those of the tick. Bare put: as
 many puts of the same payloads with a Zenoh session, without waiting. All run in one process on loopback and alternate,
 so that other load slows them equally.
 """
 
-import argparse
-import statistics
 import threading
 import time
-from collections.abc import Callable
 
 import numpy as np
 import zenoh
 
+from benchmarks.harness import cells, options, quantiles, seconds
 from fleet.bus.exchange.memory import Broadcast, MemoryExchange
 from fleet.bus.exchange.zenoh import ZenohExchange, messages_of
 from fleet.bus.protocol import keys
@@ -61,13 +59,6 @@ class Observer:
                 self.done.set()
 
 
-def timed(call: Callable[[], object]) -> float:
-    """Duration of a call, s."""
-    start_s = time.perf_counter()
-    call()
-    return time.perf_counter() - start_s
-
-
 def measure(arms: int, ticks: int) -> str:
     """One row of the table."""
     rng = np.random.default_rng(0)
@@ -85,29 +76,25 @@ def measure(arms: int, ticks: int) -> str:
             payloads = [encode(message) for pair in messages_of(words, names, tick) for message in pair]
             observer.done.clear()
             start_s = time.perf_counter()
-            columns["share"].append(timed(lambda words=words: bus.share(words)))
+            columns["share"].append(seconds(lambda words=words: bus.share(words), time.perf_counter))
             assert observer.done.wait(TIMEOUT_S), "The observer has not received all messages."
             columns["received"].append(time.perf_counter() - start_s)
             start_s = time.perf_counter()
             for publisher, payload in zip(bare, payloads, strict=True):
                 publisher.put(payload)
             columns["bare put"].append(time.perf_counter() - start_s)
-            columns["memory"].append(timed(lambda words=words: memory.share(words)))
-    times = [sorted(1e3 * s for s in column[WARM_UP:]) for column in columns.values()]
-    cells = "".join(f"{statistics.median(column):>9.3f}{column[int(0.95 * len(column))]:>9.3f}" for column in times)
-    return f"{arms:>5}{2 * arms:>10}{cells}"
+            columns["memory"].append(seconds(lambda words=words: memory.share(words), time.perf_counter))
+    times = [time for column in columns.values() for time in quantiles(column[WARM_UP:], 0.95)]
+    return f"{arms:>5}{2 * arms:>10}{cells(times, scale=1e3, width=9, digits=3)}"
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, nargs="+", default=[4, 16, 64])
-    parser.add_argument("--ticks", type=int, default=200, help="for 4 arms; fewer for more (default 200)")
-    options = parser.parse_args()
+    given = options(__doc__, arms=[4, 16, 64], ticks=(200, "for 4 arms; fewer for more"))
     print("ms per tick          share over Zenoh          received          bare put   share in memory")
     print(" arms  messages" + "   median      p95" * 4)
-    for arms in options.arms:
-        print(measure(arms, max(20, options.ticks * 4 // arms)), flush=True)
+    for arms in given.arms:
+        print(measure(arms, max(20, given.ticks * 4 // arms)), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Cost of an arm's process: 64 working arms that publish ten states per second each, beside a bare Zenoh publisher.
 
-    python benchmarks/bench_fleet.py [--arms 64] [--seconds 20] [--rate 10] [--speed 1]
+    python -m benchmarks.bench_fleet [--arms 64] [--seconds 20] [--rate 10] [--speed 1]
 
 Every arm is `thermofleet arm run`, a separate process, blind, in its own cell; all connect to one router. This process
 deals: it awards each arm one long pick-and-place job and renews its lease, so that the arm moves and heats up. It also
@@ -12,19 +12,19 @@ CPU time is user and system time of all threads over the window (/proc/PID/stat)
 processes that share them, so its sum over the arms is the memory that they really use.
 """
 
-import argparse
 import os
 import signal
-import statistics
 import sys
 import tempfile
 import time
+from argparse import Namespace
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
+from benchmarks.harness import cells, cpu_s, options, quantiles, rss_mb, status_of
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -134,27 +134,19 @@ class Dealer:
         return self._speed * (time.monotonic() - self._began_s)
 
 
-def cpu_s(pid: int) -> float:
-    """User and system time of a process so far, s."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def memory_mb(pid: int) -> tuple[float, float, int]:
-    """Resident and proportional set size of a process, MB, and its number of threads."""
-    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+def pss_mb(pid: int) -> float:
+    """Proportional set size of a process, MB."""
     shares = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    pss_kb = next(int(line.split()[1]) for line in shares if line.startswith("Pss:"))
-    return int(status["VmRSS"].split()[0]) / 1024, pss_kb / 1024, int(status["Threads"])
+    return next(int(line.split()[1]) for line in shares if line.startswith("Pss:")) * 1024 / 1e6
 
 
-def arms_of(folder: Path, names: list[str], endpoint: str, options: argparse.Namespace) -> list[Part]:
+def arms_of(folder: Path, names: list[str], endpoint: str, given: Namespace) -> list[Part]:
     """The arms' processes; their common plans are computed first, as by `thermofleet up`."""
     cells = [folder / f"{name}.toml" for name in names]
     for name, cell in zip(names, cells, strict=True):
         cell.write_text(CELL.format(arm=name), encoding="utf-8")
     prepare(load(cells[0]), difficulty="blind")
-    how = ("--difficulty", "blind", "--speed", f"{options.speed:g}", "--rate-hz", f"{options.rate:g}")
+    how = ("--difficulty", "blind", "--speed", f"{given.speed:g}", "--rate-hz", f"{given.rate:g}")
     where = ("--endpoint", endpoint, "--fleet", FLEET, "--journal", str(folder / "journals"))
     return [
         Part(name=name, argv=(*PROGRAM, "arm", "run", str(cell), name, *where, *how))
@@ -170,23 +162,22 @@ def end(supervisor: Supervisor, dealer: Dealer, names: list[str]) -> None:
     dealer.serve(FAREWELL_S, lambda: not any(supervisor.pid(name) for name in names))
 
 
-def row(what: str, values: list[float], form: str = "{:.2f}") -> str:
+def row(what: str, values: list[float], digits: int = 2) -> str:
     """Median, 95th percentile and maximum."""
-    ordered = sorted(values)
-    cells = (statistics.median(ordered), ordered[int(0.95 * (len(ordered) - 1))], ordered[-1])
-    return f"{what:<36}" + "".join(f"{form.format(cell):>10}" for cell in cells)
+    return f"{what:<36}{cells(quantiles(values, 0.95, 1.0), digits=digits)}"
 
 
 def main() -> None:
     """Print the table and whether the targets are met."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, default=64)
-    parser.add_argument("--seconds", type=float, default=20.0, help="measurement window, once all arms work")
-    parser.add_argument("--rate", type=float, default=10.0, help="states per arm and second")
-    parser.add_argument("--plain", action="store_true", help="listen without recovery of dropped messages")
-    parser.add_argument("--speed", type=float, default=1.0, help="fleet seconds per real second")
-    options = parser.parse_args()
-    names = [f"arm_{i:02d}" for i in range(options.arms)]
+    given = options(
+        __doc__,
+        arms=64,
+        seconds=(20.0, "measurement window, once all arms work"),
+        rate=(10.0, "states per arm and second"),
+        plain=(False, "listen without recovery of dropped messages"),
+        speed=(1.0, "fleet seconds per real second"),
+    )
+    names = [f"arm_{i:02d}" for i in range(given.arms)]
     size = len(encode(State("arm_00", 1000, 123.456789, "working", (12.345678901234567,) * JOINTS, 12.3456789)))
     size += 4 * JOINTS * 20  # joint positions, speeds, torques and currents, as published by a simulated arm
     with ExitStack() as stack:
@@ -196,10 +187,10 @@ def main() -> None:
         endpoint = f"tcp/127.0.0.1:{port}"
         supervisor.start(Part(name="router", argv=(*PROGRAM, "bus", "router", "--port", str(port)), ready=endpoint))
         supervisor.await_ready("router", START_S)
-        bare = (sys.executable, "-c", BARE, endpoint, str(size), str(options.rate))
+        bare = (sys.executable, "-c", BARE, endpoint, str(size), str(given.rate))
         supervisor.start(Part(name="bare", argv=bare, ready="ready"), ready_s=START_S)
-        dealer = Dealer(stack.enter_context(BusClient(endpoint, FLEET)), options.speed, not options.plain)
-        parts = arms_of(folder, names, endpoint, options)
+        dealer = Dealer(stack.enter_context(BusClient(endpoint, FLEET)), given.speed, not given.plain)
+        parts = arms_of(folder, names, endpoint, given)
         began_s = time.monotonic()
         for part in parts:
             supervisor.start(part)
@@ -217,11 +208,11 @@ def main() -> None:
         before = {name: cpu_s(pid) for name, pid in pids.items()}
         dealer.ticks.clear()
         begun_s = time.monotonic()
-        dealer.serve(options.seconds)
+        dealer.serve(given.seconds)
         took_s = time.monotonic() - begun_s
         share = {name: (cpu_s(pid) - before[name]) / took_s for name, pid in pids.items()}
         bounds = {name: (of[0], of[-1]) for name in names if (of := dealer.ticks[name])}
-        memory = {name: memory_mb(pid) for name, pid in pids.items()}
+        memory = {name: (rss_mb(pid), pss_mb(pid), float(status_of(pid)["Threads"])) for name, pid in pids.items()}
         still = len(dealer.working)
         dealer.serve(GRACE_S)
         ticks = {name: [t for t in dealer.ticks[name] if first <= t <= last] for name, (first, last) in bounds.items()}
@@ -231,13 +222,13 @@ def main() -> None:
     orderly = all(b > a for of in ticks.values() for a, b in pairwise(of))
     said_hz = [(last - first) / took_s for first, last in bounds.values()]
     arms = [100 * share[name] for name in names]
-    print(f"{len(names)} arms, {os.cpu_count()} cores, {options.rate:g} Hz, speed {options.speed:g}, {took_s:.1f} s;")
+    print(f"{len(names)} arms, {os.cpu_count()} cores, {given.rate:g} Hz, speed {given.speed:g}, {took_s:.1f} s;")
     print(f"all ready {started_s:.1f} s after the first start; {still} working at the end\n")
     print(f"{'each arm':<36}{'median':>10}{'p95':>10}{'max':>10}")
     print(row("processor, % of a core", arms))
-    print(row("RSS, MB", [memory[name][0] for name in names], "{:.1f}"))
-    print(row("PSS, MB", [memory[name][1] for name in names], "{:.1f}"))
-    print(row("threads", [float(memory[name][2]) for name in names], "{:.0f}"))
+    print(row("RSS, MB", [memory[name][0] for name in names], 1))
+    print(row("PSS, MB", [memory[name][1] for name in names], 1))
+    print(row("threads", [memory[name][2] for name in names], 0))
     print(row("states per second", said_hz))
     print(f"\n{'other processes':<36}{'% of core':>10}{'RSS MB':>10}{'PSS MB':>10}")
     for what, name in (("bare publisher", "bare"), ("router", "router"), ("dealer and listener", "this")):

@@ -1,6 +1,6 @@
 """Latency of a difficulty message from one process to another, beside bare Zenoh in the same run.
 
-    python benchmarks/bench_link.py [--words 1500] [--rate 100]
+    python -m benchmarks.bench_link [--words 1500] [--rate 100]
 
 A publisher and a listener, in separate processes, connect to a router in a third. The publisher alternates between a
 message by `BusClient` (validated, kept for late joiners, JSON) and the same bytes by a bare Zenoh publisher to a bare
@@ -8,17 +8,17 @@ callback. Both carry the monotonic clock, which the processes of one machine sha
 listener's handler has it validated. Microseconds; the target is the ratio.
 """
 
-import argparse
 import json
-import multiprocessing
 import statistics
 import time
+from contextlib import ExitStack
 from multiprocessing.connection import Connection
 
+from benchmarks.harness import options, received, route, spawned
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, encode
-from fleet.bus.router import Router, open_client
+from fleet.bus.router import open_client
 
 FLEET = "bench"
 SLOTS = 8
@@ -33,7 +33,7 @@ def word(tick: int) -> DifficultyScores:
     return DifficultyScores("arm_0", tick, time.monotonic(), "0123456789abcdef", jobs, scores, scores)
 
 
-def listen(endpoint: str, words: int, pipe: Connection) -> None:
+def listen(pipe: Connection, endpoint: str, words: int) -> None:
     """Receive both kinds of message and send back their ages, s."""
     ours: list[float] = []
     bare: list[float] = []
@@ -56,38 +56,30 @@ def listen(endpoint: str, words: int, pipe: Connection) -> None:
             link.serve(time.monotonic() + 0.5)
         pipe.send((ours, bare))
         subscriber.undeclare()
+    pipe.recv()
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--words", type=int, default=1500)
-    parser.add_argument("--rate", type=float, default=100.0, help="messages of each kind per second")
-    arguments = parser.parse_args()
-    spawn = multiprocessing.get_context("spawn")
-    router_end, router_other = spawn.Pipe()
-    router = spawn.Process(target=_route, args=(router_other,), daemon=True)
-    router.start()
-    endpoint = router_end.recv()
-    here, there = spawn.Pipe()
-    listener = spawn.Process(target=listen, args=(endpoint, arguments.words, there), daemon=True)
-    listener.start()
-    assert here.recv() == "ready"
-    with BusClient(endpoint, FLEET) as link, open_client(endpoint, timeout_s=10.0) as session:
+    given = options(__doc__, words=1500, rate=(100.0, "messages of each kind per second"))
+    with ExitStack() as stack:
+        endpoint, _ = received(stack.enter_context(spawned(route)))
+        listener = stack.enter_context(spawned(listen, endpoint, given.words))
+        assert received(listener) == "ready"
+        link = stack.enter_context(BusClient(endpoint, FLEET))
+        session = stack.enter_context(open_client(endpoint, timeout_s=10.0))
         say = link.publisher(keys.of_arm(FLEET, "arm_0", "difficulty"), DifficultyScores)
         put = session.declare_publisher("bare/difficulty")
-        seen: list[str] = []
-        link.watch_tokens(keys.of_every_arm(FLEET, "alive"), lambda arm, _: seen.append(arm))
+        link.watch_tokens(keys.of_every_arm(FLEET, "alive"), lambda arm, there: None)
         due_s = time.monotonic() + 0.5
         link.serve(due_s)
-        for tick in range(arguments.words):
+        for tick in range(given.words):
             for speak in (lambda tick=tick: say(word(tick)), lambda tick=tick: put.put(encode(word(tick)))):
-                due_s += 0.5 / arguments.rate
+                due_s += 0.5 / given.rate
                 while time.monotonic() < due_s:
                     link.serve(due_s)
                 speak()
-        ours, bare = here.recv()
-    router_end.send("end")
+        ours, bare = received(listener)
     print(f"{'one way, us':<26}{'count':>7}{'p50':>8}{'p99':>9}")
     rows = {"bare put → callback": bare, "ours, publish → used": ours}
     quantiles: dict[str, list[float]] = {}
@@ -97,14 +89,6 @@ def main() -> None:
         print(f"{name:<26}{len(ages):>7}{quantiles[name][0]:>8.0f}{quantiles[name][1]:>9.0f}")
     (bare_50, bare_99), (ours_50, ours_99) = quantiles.values()
     print(f"{'ratio (target ≤ ' + str(TARGET) + ')':<33}{ours_50 / bare_50:>8.2f}{ours_99 / bare_99:>9.2f}")
-    listener.join(PATIENCE_S)
-    router.join(PATIENCE_S)
-
-
-def _route(pipe: Connection) -> None:
-    with Router() as router:
-        pipe.send(router.endpoint)
-        pipe.recv()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Speed of closed-loop simulation: steps per second of the MuJoCo plant, beside bare `mj_step` of its scene.
 
-    python benchmarks/bench_plant.py
+    python -m benchmarks.bench_plant
 
 The plant is driven through ticks of the quickstart scenario in which its arms work: references, control, payload
 changes, simulation and heat. Bare is MuJoCo's own loop (`mj_step(model, data, nstep)`) with the same model and number
@@ -16,14 +16,14 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import statistics
-import time
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import mujoco
 import numpy as np
 
 from agents.registry import make_policy
+from benchmarks.harness import in_turns
 from fleet.arm.plant import MujocoPlant
 from fleet.engine.shift import StepRecord
 from fleet.engine.state import State
@@ -32,6 +32,7 @@ from scenarios.spec.load import load
 
 TICKS = 20
 RUNS = 9
+COLUMNS = ("bare mj_step", "no contacts", "plant", "reported")
 
 
 def at_work(factory: ShiftFactory) -> tuple[list[State], list[StepRecord]]:
@@ -46,13 +47,6 @@ def at_work(factory: ShiftFactory) -> tuple[list[State], list[StepRecord]]:
         env.step(policy.act(env.knowledge()))
     env.close()
     return states, records
-
-
-def seconds(call: Callable[[], object]) -> float:
-    """CPU time of a call, s."""
-    start_s = time.process_time()
-    call()
-    return time.process_time() - start_s
 
 
 def measure(arms: int) -> str:
@@ -85,20 +79,21 @@ def measure(arms: int) -> str:
         driven()
         plant.model.opt.disableflags ^= mujoco.mjtDisableBit.mjDSBL_CONTACT
 
-    calls = (lambda: mujoco.mj_step(plant.model, held, count), without, driven, reported)
-    speeds = [[count / seconds(call) for call in calls] for _ in range(RUNS)]
-    bare, no_contacts, ours, with_report = (statistics.median(column) for column in zip(*speeds, strict=True))
-    ratio = statistics.median(row[2] / row[0] for row in speeds)
+    bare = partial(mujoco.mj_step, plant.model, held, count)
+    took_s = in_turns(dict(zip(COLUMNS, (bare, without, driven, reported), strict=True)), RUNS, warm_up=0)
+    speeds = {name: count / statistics.median(column) for name, column in took_s.items()}
+    pairs = zip(took_s["bare mj_step"], took_s["plant"], strict=True)
+    ratio = statistics.median(bare_s / ours_s for bare_s, ours_s in pairs)
     busy = np.mean([state.mode[0] == 1 for state in states])
-    real_time = ours * plant.model.opt.timestep
-    speeds_text = "".join(f"{speed:>16,.0f}" for speed in (bare, no_contacts, ours, with_report))
+    real_time = speeds["plant"] * plant.model.opt.timestep
+    speeds_text = "".join(f"{speed:>16,.0f}" for speed in speeds.values())
     return f"{arms:>5}{busy:>8.0%}{speeds_text}{ratio:>9.2f}{real_time:>13,.0f} x"
 
 
 def main() -> None:
     """Print the table."""
     print(f"{RUNS} runs of {TICKS} ticks; median steps/s of CPU time; ratio: plant over bare")
-    heads = "".join(f"{head:>16}" for head in ("bare mj_step", "no contacts", "plant", "reported"))
+    heads = "".join(f"{head:>16}" for head in COLUMNS)
     print(f"{'arms':>5}{'busy':>8}{heads}{'ratio':>9}{'real time':>15}")
     for arms in (2, 4):
         print(measure(arms), flush=True)

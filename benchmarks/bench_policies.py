@@ -1,7 +1,7 @@
 """One shift of every policy, simulated and live: jobs finished and faults.
 
-    python benchmarks/bench_policies.py [quickstart] [--speed 240] [--seed 0] [--policies a,b] [--out FILE]
-    python benchmarks/bench_policies.py --steps [--difficulty oracle] [--policies a,b] [--out FILE]
+    python -m benchmarks.bench_policies [quickstart] [--speed 240] [--seed 0] [--policies a,b] [--out FILE]
+    python -m benchmarks.bench_policies --steps [--difficulty oracle] [--policies a,b] [--out FILE]
 
 Writes the figures, and prints them as the tables of docs/policies.md and docs/learning.md that `docs/tables.py`
 makes of docs/results/live_policies.json and docs/results/steps.json. A live shift is `thermofleet up` with a process
@@ -12,29 +12,28 @@ choice and a job in every slot, for every scenario of the library and every poli
 of steps give different results.
 """
 
-import argparse
 import json
 import subprocess
-import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow.parquet as pq
-from result_tables import live_table, steps_table
 
 from agents.registry import RULES
+from benchmarks.harness import options, write_text
+from benchmarks.result_tables import live_table, steps_table
 from fleet.env.allocation_v1 import Decisions
-from fleet.files import atomic_path
+from scenarios.live.fleet_processes import PROGRAM
 from scenarios.policy_loader import label, policy_at, scope_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.shift import run
 from scenarios.spec.load import library, load
 from scenarios.spec.options import DifficultyName, RunSpec
+from scenarios.spec.parse import choose
 
-PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 PATIENCE_S = 120.0
 
 
@@ -129,26 +128,29 @@ def measure_live(scenario: str, policies: list[str], seed: int, speed: float) ->
 
 def main() -> None:
     """Measure, write and print."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("scenario", nargs="?", help="default: quickstart, with --steps all of the library")
-    parser.add_argument("--speed", type=float, default=240.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--policies", default=",".join(RULES))
-    parser.add_argument("--steps", action="store_true")
-    parser.add_argument("--difficulty", choices=get_args(DifficultyName), default="blind", help="with --steps")
-    parser.add_argument("--out", type=Path, help="JSON file of the figures")
-    options = parser.parse_args()
-    policies = options.policies.split(",")
-    if options.steps:
-        scenarios = [options.scenario] if options.scenario else list(library())
-        measured = measure_steps(scenarios, policies, options.seed, options.difficulty)
+    given = options(
+        __doc__,
+        "scenario",
+        scenario=(str, "default: quickstart, with --steps all of the library"),
+        speed=240.0,
+        seed=0,
+        policies=",".join(RULES),
+        steps=False,
+        difficulty=("blind", "with --steps"),
+        out=(Path, "JSON file of the figures"),
+    )
+    policies = given.policies.split(",")
+    if given.steps:
+        scenarios = [given.scenario] if given.scenario else list(library())
+        measured = measure_steps(
+            scenarios, policies, given.seed, choose("difficulty", given.difficulty, DifficultyName)
+        )
         print(steps_table(measured))
     else:
-        measured = measure_live(options.scenario or "quickstart", policies, options.seed, options.speed)
+        measured = measure_live(given.scenario or "quickstart", policies, given.seed, given.speed)
         print(live_table(measured))
-    if options.out:
-        with atomic_path(options.out) as draft:
-            draft.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+    if given.out:
+        write_text(given.out, json.dumps(measured, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Size and speed of a run's report, and of its film, in a browser without a graphics card.
 
-    python benchmarks/bench_report.py RUN [--arms 100] [--film] [--loads 5] [--chromium PROGRAM]
+    python -m benchmarks.bench_report RUN [--arms 100] [--film] [--loads 5] [--chromium PROGRAM]
 
 RUN is a folder of `thermofleet run`. Its page is made anew and opened --loads times; times are those of the browser's
 own clock (User Timing): when the shift can be played in 3-D, and when every figure is drawn. --arms measures the page
@@ -9,11 +9,9 @@ pictures a second while the time of the replay changes with each stands what the
 films the whole shift at 120 times its speed.
 """
 
-import argparse
 import dataclasses
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -21,14 +19,19 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import Browser, sync_playwright
 
+from benchmarks.harness import CHROMIUM, options
 from fleet.arm.cell import cell_model
 from fleet.robot import Mount, Robot
 from fleet.telemetry import Telemetry
+<<<<<<< HEAD
 from scenarios.run.log import RunLog, open_run
 from scenarios.run.records import ShiftLog
+=======
+from scenarios.live.fleet_processes import PROGRAM
+from scenarios.run.log import RunLog, open_run
+>>>>>>> bench2
 from scenarios.show.run_page import report_html
 
-CHROMIUM = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 COLUMNS = {
     "playable s": "playable",
     "drawn s": "ready",
@@ -58,11 +61,14 @@ PICTURES = """(scrub) => new Promise((done) => {
 })"""
 
 
+<<<<<<< HEAD
 def page_of(run: RunLog) -> str:
     """The report of a run."""
     return run.page()
 
 
+=======
+>>>>>>> bench2
 def enlarged(run: RunLog, arms: int) -> str:
     """The report of a fleet whose arms repeat those of a run."""
     telemetry, count = run.readings, len(run.arms)
@@ -122,28 +128,30 @@ def measure(browser: Browser, html: str, loads: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--arms", type=int, default=0, help="measure the page of so many arms too")
-    parser.add_argument("--film", action="store_true")
-    parser.add_argument("--loads", type=int, default=5)
-    parser.add_argument("--chromium", default="/usr/bin/chromium")
-    options = parser.parse_args()
-    run = open_run(options.run)
-    pages = {len(run.arms): page_of(run)} | ({options.arms: enlarged(run, options.arms)} if options.arms else {})
-    print(f"{run.readings.time_s[-1] / 3600:.1f} h; median of {options.loads} loads")
+    given = options(
+        __doc__,
+        "run",
+        run=Path,
+        arms=(0, "measure the page of so many arms too"),
+        film=False,
+        loads=5,
+        chromium="/usr/bin/chromium",
+    )
+    run = open_run(given.run)
+    pages = {len(run.arms): run.page()} | ({given.arms: enlarged(run, given.arms)} if given.arms else {})
+    print(f"{run.readings.time_s[-1] / 3600:.1f} h; median of {given.loads} loads")
     print(f"{'arms':>5}{'MB':>7}" + "".join(f"{title:>18}" for title in COLUMNS))
     with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=options.chromium, args=[*CHROMIUM, "--ignore-gpu-blocklist"])
+        browser = play.chromium.launch(executable_path=given.chromium, args=[*CHROMIUM, "--ignore-gpu-blocklist"])
         for arms, html in pages.items():
-            found = measure(browser, html, options.loads)
+            found = measure(browser, html, given.loads)
             cells = "".join(f"{found[name]:>18.2f}" for name in COLUMNS.values())
             print(f"{arms:>5}{len(html.encode()) / 1e6:>7.2f}{cells}")
         browser.close()
-    if options.film:
+    if given.film:
         with tempfile.TemporaryDirectory() as folder:
             out, start_s = Path(folder, "shift.mp4"), time.monotonic()
-            command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "film", str(options.run)]
+            command = [*PROGRAM, "film", str(given.run)]
             subprocess.run([*command, "--out", str(out)], check=True, stderr=subprocess.DEVNULL)
             print(f"film {time.monotonic() - start_s:.0f} s, {out.stat().st_size / 1e6:.1f} MB")
 

@@ -1,6 +1,6 @@
 """Submissions of one job each, at a constant rate, to an auctioneer with its journal on the disk.
 
-    python benchmarks/bench_submit.py [--rate 1000] [--seconds 30] [--sessions 4] [--out DIR]
+    python -m benchmarks.bench_submit [--rate 1000] [--seconds 30] [--sessions 4] [--out DIR]
 
 Router and auctioneer are processes of their own. The submitter does not wait for replies, so a slow reply delays no
 later submission. No arm is present, and every job expires `EXPIRES_S` after its submission: it is accepted, written
@@ -9,7 +9,6 @@ answered and accepted, and the time to the reply. Exit code 1: one was not answe
 reached.
 """
 
-import argparse
 import os
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.harness import options
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest, JobSpec, Submission, SubmissionReply
@@ -66,15 +66,11 @@ class Submitters:
 
 def main() -> None:
     """Submit, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rate", type=float, default=1000.0, help="submissions a second")
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--sessions", type=int, default=4)
-    parser.add_argument("--out", type=Path, help="folder for journal and logs; default: temporary")
-    arguments = parser.parse_args()
+    out = Path, "folder for journal and logs; default: temporary"
+    given = options(__doc__, rate=(1000.0, "submissions a second"), seconds=30.0, sessions=4, out=out)
     prepare(load(SCENARIO), difficulty="blind")
     with ExitStack() as stack:
-        folder = arguments.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder = given.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         router, _, _, auction = parts_of(
             SCENARIO,
             tuple(arm.name for arm in load(SCENARIO).arms),
@@ -86,18 +82,18 @@ def main() -> None:
         supervisor = stack.enter_context(Supervisor(folder / "logs"))
         supervisor.start(router, ready_s=START_S)
         supervisor.start(auction, ready_s=START_S)
-        links = [stack.enter_context(BusClient(router.ready, SCENARIO)) for _ in range(arguments.sessions)]
+        links = [stack.enter_context(BusClient(router.ready, SCENARIO)) for _ in range(given.sessions)]
         clocks = links[0].query_and_wait(keys.of_clock(SCENARIO), ClockRequest(), Clock, timeout_s=REPLY_S)
         submitters = Submitters(links, *clocks.messages.values())
-        took_s = run(submitters, arguments.rate, arguments.seconds)
-    wanted, per_s = round(arguments.rate * arguments.seconds), submitters.sent / took_s
+        took_s = run(submitters, given.rate, given.seconds)
+    wanted, per_s = round(given.rate * given.seconds), submitters.sent / took_s
     answered, (p50_s, p99_s) = len(submitters.took_s), np.quantile(submitters.took_s or [np.nan], [0.5, 0.99])
     print(
         f"{submitters.sent} submissions in {took_s:.1f} s, {per_s:.0f} a second: {answered} answered, "
         f"{submitters.accepted} accepted; reply p50 {p50_s * 1e3:.1f} ms, p99 {p99_s * 1e3:.1f} ms, longest "
         f"{max(submitters.took_s, default=np.nan) * 1e3:.0f} ms; load of the machine {os.getloadavg()[0]:.1f}"
     )
-    sys.exit(not (submitters.accepted == answered == wanted and per_s > 0.99 * arguments.rate))
+    sys.exit(not (submitters.accepted == answered == wanted and per_s > 0.99 * given.rate))
 
 
 def run(submitters: Submitters, rate: float, seconds: float) -> float:

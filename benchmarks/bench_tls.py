@@ -1,6 +1,6 @@
 """Cost of TLS, access rules and rate limits: a round trip through the router and opening a session, beside bare Zenoh.
 
-    python benchmarks/bench_tls.py [--rounds 2000] [--opens 40]
+    python -m benchmarks.bench_tls [--rounds 2000] [--opens 40]
 
 Three routers in one process on loopback: bare Zenoh, ours with plain TCP (size and rate limits), ours with mutual TLS
 (limits, and the access rules of a fleet of 16 arms). A round trip is a put of 256 bytes from one client through the
@@ -8,17 +8,18 @@ router to another, whose callback puts it back; `open` is `zenoh.open` of a clie
 The three alternate, so that other load slows them equally.
 """
 
-import argparse
 import json
 import queue
 import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import zenoh
 
+from benchmarks.harness import cells, in_turns, options, quantiles
 from fleet.bus.protocol import keys
 from fleet.bus.router import Limits, Router, open_client
 from fleet.bus.security.access_control import of_arms
@@ -51,12 +52,10 @@ class PingPong:
         for session in (one, other):  # replies come in order, so the router knows the declarations
             list(session.get(keys.caches_of("thermofleet/v4/bench/arm/nobody"), timeout=PATIENT_S))
 
-    def round_s(self) -> float:
-        """Seconds of one round trip."""
-        began_s = time.perf_counter()
+    def round_trip(self) -> None:
+        """Send a message there and back."""
         self._ask.put(PAYLOAD)
         self._came.get(timeout=PATIENT_S)
-        return time.perf_counter() - began_s
 
 
 def bare_router(stack: ExitStack) -> str:
@@ -85,30 +84,21 @@ def bare_client(endpoint: str) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
 
 
-def opened_s(open_arm: Callable[[str], zenoh.Session]) -> float:
-    """Duration of opening a session, s."""
-    began_s = time.perf_counter()
+def open_one(open_arm: Callable[[str], zenoh.Session]) -> None:
+    """Open and close a session."""
     with open_arm(ARMS[2]):
-        return time.perf_counter() - began_s
+        pass
 
 
 def row(name: str, rounds: list[float], opens: list[float]) -> str:
     """Median and 99th percentile of both, in µs and ms."""
-
-    def at(values: list[float], share: float) -> float:
-        return sorted(values)[min(len(values) - 1, int(share * len(values)))]
-
-    cells = [f"{1e6 * at(rounds, share):>10.0f}" for share in (0.5, 0.99)]
-    cells += [f"{1e3 * at(opens, share):>10.2f}" for share in (0.5, 0.99)]
-    return f"{name:<34}{''.join(cells)}"
+    times = cells(quantiles(rounds, 0.99), scale=1e6, digits=0) + cells(quantiles(opens, 0.99), scale=1e3)
+    return f"{name:<34}{times}"
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=2000)
-    parser.add_argument("--opens", type=int, default=40)
-    options = parser.parse_args()
+    given = options(__doc__, rounds=2000, opens=40)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "keys"
         make(folder, of_arms("bench", ARMS), days=30)
@@ -124,18 +114,14 @@ def main() -> None:
             ),
         }
         pairs = {name: PingPong(open_arm, stack) for name, open_arm in sides.items()}
-        rounds: dict[str, list[float]] = {name: [] for name in sides}
-        opens: dict[str, list[float]] = {name: [] for name in sides}
-        for _ in range(options.rounds + WARM_UP):
-            for name, pair in pairs.items():
-                rounds[name].append(pair.round_s())
-        for _ in range(options.opens):
-            for name, open_arm in sides.items():
-                opens[name].append(opened_s(open_arm))
+        trips = {name: pair.round_trip for name, pair in pairs.items()}
+        rounds = in_turns(trips, given.rounds, warm_up=WARM_UP, clock=time.perf_counter)
+        opening = {name: partial(open_one, open_arm) for name, open_arm in sides.items()}
+        opens = in_turns(opening, given.opens, warm_up=0, clock=time.perf_counter)
         print(f"{'':<34}  round trip, µs       open, ms")
         print(f"{'':<34}{'p50':>10}{'p99':>10}{'p50':>10}{'p99':>10}")
         for name in sides:
-            print(row(name, rounds[name][WARM_UP:], opens[name]))
+            print(row(name, rounds[name], opens[name]))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Cost of a twin: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM` and a lower bound.
 
-    python benchmarks/bench_twin.py [--full]
-    python benchmarks/bench_twin.py --arms 100
+    python -m benchmarks.bench_twin [--full]
+    python -m benchmarks.bench_twin --arms 100
 
 CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
 layers, decoder, loss and backward pass, or the forward pass alone. The lower bound ("floor") is the matrix
@@ -15,7 +15,6 @@ import os
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
-import argparse
 import statistics
 import tempfile
 import time
@@ -28,6 +27,7 @@ import torch
 from joblib import Parallel, delayed
 from torch import Tensor
 
+from benchmarks.harness import in_turns, options, seconds
 from fleet.motion import RATE_HZ
 from twin.vae.config import TwinConfig
 from twin.vae.inference import reconstruct
@@ -48,22 +48,9 @@ JOB_S = 16.0
 """Duration of a job that is scored."""
 
 
-def seconds(call: Callable[[], object]) -> float:
-    """CPU time of a call, s."""
-    start_s = time.process_time()
-    call()
-    return time.process_time() - start_s
-
-
-def in_turns(calls: dict[str, Callable[[], object]], runs: int) -> dict[str, float]:
-    """Median CPU time of each call, s, after a warm-up call."""
-    for call in calls.values():
-        call()
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(runs):
-        for name, call in calls.items():
-            times[name].append(seconds(call))
-    return {name: statistics.median(column) for name, column in times.items()}
+def medians(calls: dict[str, Callable[[], object]], runs: int) -> dict[str, float]:
+    """Median CPU time of each call, s."""
+    return {name: statistics.median(took) for name, took in in_turns(calls, runs).items()}
 
 
 def plain_forward(net: LstmVae, x: Tensor) -> Tensor:
@@ -123,7 +110,7 @@ def training(config: TwinConfig, name: str) -> None:
     }
     for count in BESIDE:
         calls[str(count)] = _epochs_of(count, config, channels)
-    took = in_turns(calls, RUNS)
+    took = medians(calls, RUNS)
     ours = {count: took[str(count)] / count for count in BESIDE}
     steps = nets * -(-config.max_windows // config.batch)
     trial = round(config.trial * config.epochs) if config.restarts > 1 else 0
@@ -163,7 +150,7 @@ def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
         "plain": plain,
         "floor": floor(config, windows, 1, len(twin.nets)),
     }
-    took = in_turns({**calls, **_onnx(twin, z)}, runs)
+    took = medians({**calls, **_onnx(twin, z)}, runs)
     cells = "".join(f"{1e3 * took[key]:>11.2f}" if key in took else f"{'-':>11}" for key in (*calls, "onnx"))
     print(f"{name:<34}{cells}{took['ours'] / took['plain']:>8.2f}")
 
@@ -222,7 +209,7 @@ def fleet(arms: int) -> None:
     training_s, scoring_s, sizes = zip(*parts, strict=True)
     x, net = torch.randn(config.batch, config.window, 3), build(config, 0)
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, fused=True)
-    plain_s = in_turns({"plain": lambda: plain_step(net, x, optimizer)}, RUNS)["plain"]
+    plain_s = medians({"plain": lambda: plain_step(net, x, optimizer)}, RUNS)["plain"]
     steps = arms * JOINTS * config.epochs * -(-config.max_windows // config.batch)
     print(f"\n{arms} twins of the quick size, two processes; everything took {wall_s:.0f} s")
     print(f"{'training, CPU s':<34}{sum(training_s):>9.0f}   one after another: {plain_s * steps:.0f}")
@@ -232,10 +219,8 @@ def fleet(arms: int) -> None:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="train seven joints at the default configuration")
-    parser.add_argument("--arms", type=int, default=0, help="train and score with the twins of so many arms")
-    arguments = parser.parse_args()
+    full = False, "train seven joints at the default configuration"
+    arguments = options(__doc__, full=full, arms=(0, "train and score with the twins of so many arms"))
     torch.set_num_threads(1)
     if arguments.arms > 1:
         fleet(arguments.arms)

@@ -1,13 +1,12 @@
 """Speed-up of `thermofleet compare` from one worker to two, or from one Ray node to two.
 
-    python benchmarks/bench_workers.py [--ray] [--suite test] [--instances 18] [--repeats 3] [--policies …] [--out FILE]
+    python -m benchmarks.bench_workers [--ray] [--suite test] [--instances 18] [--repeats 3] [--policies …] [--out FILE]
 
 Plans are made before. Each repeat runs the same study with one worker and with two, in turns, and checks that the rows
 are equal. The limit in the same run is a loop without shared memory or files, alone and twice at a time: what two
 processes gain on this machine now. With `--ray` a worker is a node with one CPU of a local cluster (extra `ray`).
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -15,11 +14,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from statistics import median
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from benchmarks.harness import options, seconds
 from scenarios.evaluate import runner
 from scenarios.evaluate.runner import run_study
 from scenarios.evaluate.sources import Fleets
@@ -56,14 +57,8 @@ def ray_cluster(nodes: int) -> Iterator[str]:
 
 def main() -> None:
     """Measure, and print a JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--ray", action="store_true")
-    parser.add_argument("--suite", default="test")
-    parser.add_argument("--instances", type=int, default=18)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--policies", default="random,round_robin,least_loaded,wspt,wsept,matching")
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
+    policies = "random,round_robin,least_loaded,wspt,wsept,matching"
+    arguments = options(__doc__, ray=False, suite="test", instances=18, repeats=3, policies=policies, out=Path)
     cases = suite_of(arguments.suite, 1)[: arguments.instances]
     study = Study(policies=arguments.policies.split(","), cases=cases, difficulties=["blind"])
     expected = None
@@ -79,9 +74,7 @@ def main() -> None:
             expected = expected or rows
             if rows != expected:
                 raise SystemExit("The rows differ between one worker and two.")
-            began_s = time.perf_counter()
-            loops(workers)
-            took[f"loop_{name}"].append(time.perf_counter() - began_s)
+            took[f"loop_{name}"].append(seconds(partial(loops, workers), time.perf_counter))
             loads.append(os.getloadavg()[0])
     medians = {name: round(median(values), 2) for name, values in took.items()}
     result = {

@@ -1,7 +1,7 @@
 """Env steps per CPU-second on one core and one thread, beside other environments.
 
     make bench-env                          # installs the other environments and runs this
-    .venv/bin/python benchmarks/env.py      # skips environments that are not installed
+    .venv/bin/python -m benchmarks.env      # skips environments that are not installed
 
 Every row is a separate process, pinned to one core, and the median of three windows. A window is a whole shift (720
 steps), so resets are included. Actions are random legal ones, and choosing them is included:
@@ -17,13 +17,12 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import statistics
 import subprocess
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.harness import median_rate, rss_mb
 from fleet.engine.tables import Tables
 from fleet.env.random_actions import random_legal
 from fleet.env.vector import BatchEnv, Library, keep_pages
@@ -32,17 +31,6 @@ from scenarios.spec.load import load
 from scenarios.spec.options import DifficultyName
 
 WINDOWS, SHIFT = 3, 720
-PEERS = Path(__file__).parent / "peers.py"
-
-
-def median_rate(window: Callable[[], int]) -> float:
-    """Return steps per CPU-second: the median of the windows after one warm-up window."""
-    rates = []
-    for _ in range(WINDOWS + 1):
-        begin = time.process_time()
-        steps = window()
-        rates.append(steps / (time.process_time() - begin))
-    return statistics.median(rates[1:])
 
 
 def single(difficulty: DifficultyName) -> float:
@@ -144,11 +132,6 @@ def torchrl(envs: int, *, kept: bool = False) -> float:
     return median_rate(window)
 
 
-def resident_mb() -> float:
-    """Return the memory of this process, MB."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def memory(envs: int, arms: int) -> float:
     """Return the MB that a batch adds to a process with one env."""
     shared, rng = library("blind", arms), np.random.default_rng(0)
@@ -161,9 +144,9 @@ def memory(envs: int, arms: int) -> float:
         return env
 
     run(1)
-    before = resident_mb()
+    before = rss_mb()
     many = run(envs)
-    after = resident_mb()
+    after = rss_mb()
     assert many.num_envs == envs
     return after - before
 
@@ -179,7 +162,13 @@ ROWS = {
 
 def measured(*command: str) -> float | None:
     """Run a measurement in a separate process; if it fails, print the reason and return None."""
-    done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=600, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", f"benchmarks.{command[0]}", *command[1:]],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
     if done.returncode:
         print(f"  {' '.join(command[1:])} failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
         return None
@@ -194,30 +183,29 @@ def line(what: str, value: float | None, target: float | None = None, unit: str 
 
 def main() -> None:
     """Print the table."""
-    here = str(Path(__file__))
     print(f"{'env steps per CPU-second, one core':<52}{'measured':>12}{'target':>12}")
     for difficulty in ("blind", "twin"):
-        line(f"single ParallelEnv, {difficulty}", measured(here, "single", difficulty), 40_000)
-        line(f"batch of 32, {difficulty}", measured(here, "batch", difficulty, "32"), 600_000)
-        line(f"batch of 1024, {difficulty}", measured(here, "batch", difficulty, "1024"), 1_000_000)
-    print(f"two threads against one, 1024 envs, wall clock: {measured(here, 'threads', '1024')} times (target 1.8)")
+        line(f"single ParallelEnv, {difficulty}", measured("env", "single", difficulty), 40_000)
+        line(f"batch of 32, {difficulty}", measured("env", "batch", difficulty, "32"), 600_000)
+        line(f"batch of 1024, {difficulty}", measured("env", "batch", difficulty, "1024"), 1_000_000)
+    print(f"two threads against one, 1024 envs, wall clock: {measured('env', 'threads', '1024')} times (target 1.8)")
     if find_spec("torchrl") is None:
         print("TorchRL is not installed; install it with: pip install -e '.[learn]' -c constraints.txt")
     else:
-        line("TorchRL rollout of 1024, blind", measured(here, "torchrl", "1024"), 300_000)
-        line("the same after keep_pages()", measured(here, "torchrl", "1024", "kept"), 300_000)
+        line("TorchRL rollout of 1024, blind", measured("env", "torchrl", "1024"), 300_000)
+        line("the same after keep_pages()", measured("env", "torchrl", "1024", "kept"), 300_000)
     for name, module, envs in (("mpe", "mpe2", (1,)), ("rware", "rware", (1,)), ("vmas", "vmas", (1, 32, 1024))):
         if find_spec(module) is None:
             print(f"{name} is not installed; make bench-env installs it")
             continue
         for count in envs:
-            line(f"{name}, {count}", measured(str(PEERS), name, str(count)))
+            line(f"{name}, {count}", measured("peers", name, str(count)))
     for peers, what in (((), "all peers"), (("3",), "3 peers")):
         for arms in (4, 8, 16, 64):
-            rate = measured(here, "batch", "blind", "64", str(arms), *peers)
+            rate = measured("env", "batch", "blind", "64", str(arms), *peers)
             cost_ns = None if rate is None else 1e9 / (rate * arms)
             line(f"64 envs of {arms} arms that observe {what}: one arm step", cost_ns, unit="ns")
-    line("memory of 1024 envs with 8 arms", measured(here, "memory", "1024", "8"), 200, "MB")
+    line("memory of 1024 envs with 8 arms", measured("env", "memory", "1024", "8"), 200, "MB")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Record the results of the simulator, and compare two records: a check for changes that must not alter behaviour.
 
-    python benchmarks/golden.py record FOLDER        # every scenario, policy and seed; about 20 minutes of one core
-    python benchmarks/golden.py compare OLD NEW      # every difference, the largest of each kind
+    python -m benchmarks.golden record FOLDER        # every scenario, policy and seed; about 20 minutes of one core
+    python -m benchmarks.golden compare OLD NEW      # every difference, the largest of each kind
 
 A record contains numbers, not hashes, because two correct implementations may differ in the last bits. Times and
 readings are compared within `TOLERANCE`, names and counts exactly. Telemetry is recorded once a minute.

@@ -1,6 +1,6 @@
 """Steps per CPU-second of other environments, each measured in a separate process; prints one line.
 
-    python benchmarks/peers.py mpe|rware|vmas ENVS
+    python -m benchmarks.peers mpe|rware|vmas ENVS
 
 They are not part of thermofleet and it imports none of them; `make bench-env` installs them. VMAS is under GPL-3.
 """
@@ -11,27 +11,29 @@ import sys
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
-import statistics
 import time
 import warnings
 from collections.abc import Callable
 
 import numpy as np
 
+from benchmarks.harness import median_rate
+
 warnings.filterwarnings("ignore")
-WINDOWS, WINDOW_S = 3, 1.5
+WINDOW_S = 1.5
 
 
 def rate(step: Callable[[], None], envs: int) -> float:
-    """Env steps per CPU-second, median of the windows after a warm-up window."""
-    found = []
-    for _ in range(WINDOWS + 1):
+    """Env steps per CPU-second."""
+
+    def window() -> int:
         begin, steps = time.process_time(), 0
         while time.process_time() - begin < WINDOW_S:
             step()
             steps += 1
-        found.append(envs * steps / (time.process_time() - begin))
-    return statistics.median(found[1:])
+        return envs * steps
+
+    return median_rate(window)
 
 
 def mpe() -> Callable[[], None]:

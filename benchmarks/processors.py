@@ -1,14 +1,12 @@
 """Shifts computed with the instructions of an older processor: how many have another reward.
 
-    python benchmarks/processors.py [--instances 5] [--policies wsept,auction] [--out docs/results/processors.json]
+    python -m benchmarks.processors [--instances 5] [--policies wsept,auction] [--out docs/results/processors.json]
 
 Plans and shifts are made anew twice, in empty caches: with all that this processor can do, and with what a processor
 of 2008 can (x86-64-v2: no AVX, no fused multiply-add) in NumPy, OpenBLAS, the C library and compiled code.
 `--instances` is the number of each cell of the test split with at most `--arms` arms.
 """
 
-import argparse
-import json
 import os
 import platform
 import subprocess
@@ -17,8 +15,9 @@ import tempfile
 from pathlib import Path
 
 import pyarrow.parquet as parquet
-from result_tables import SAME
 
+from benchmarks.harness import options, print_json
+from benchmarks.result_tables import SAME
 from scenarios.suite.splits import instance, manifest
 
 COMPARE = [sys.executable, "-m", "scenarios", "compare", "--difficulty", "oracle", "--workers", "1"]
@@ -45,12 +44,7 @@ def rewards(instances: list[str], policies: str, folder: Path, setting: dict[str
 
 def main() -> None:
     """Measure, and print a JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--instances", type=int, default=5)
-    parser.add_argument("--arms", type=int, default=16)
-    parser.add_argument("--policies", default="wsept,auction")
-    parser.add_argument("--out", type=Path)
-    given = parser.parse_args()
+    given = options(__doc__, instances=5, arms=16, policies="wsept,auction", out=Path)
     if platform.machine() != "x86_64":
         raise SystemExit(f"Needs an x86-64 processor, whose instructions it switches off (this: {platform.machine()}).")
     cells: dict[str, list[str]] = {}
@@ -73,9 +67,7 @@ def main() -> None:
         "other_reward": sorted(" ".join(key) for key, share in apart.items() if share > SAME),
         "largest_share": max(apart.values()),
     }
-    print(json.dumps(result, indent=1))
-    if given.out:
-        given.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print_json(result, given.out)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Sample efficiency of PPO here and in BenchMARL on the same environment: the reward of a shift after env steps.
 
-    python benchmarks/sample_efficiency.py train random rule mappo ippo mappo_warm
-    .venv-adapters/benchmarl/bin/python benchmarks/sample_efficiency.py train benchmarl_mappo benchmarl_ippo
-    python benchmarks/sample_efficiency.py plot
+    python -m benchmarks.sample_efficiency train random rule mappo ippo mappo_warm
+    .venv-adapters/benchmarl/bin/python -m benchmarks.sample_efficiency train benchmarl_mappo benchmarl_ippo
+    python -m benchmarks.sample_efficiency plot
 
 `make .venv-adapters/benchmarl/.installed` builds the environment of the second command. Every training is appended as a
 line to docs/results/sample_efficiency/heat_wave.jsonl; those that are there are skipped. `plot` draws the curves.
@@ -32,8 +32,8 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 import torch
-from result_tables import course, trainings
 
+from benchmarks.result_tables import course, trainings
 from fleet.engine.batch import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs, random_legal
 from scenarios.evaluate.rollout import Act, rollout

@@ -1,6 +1,6 @@
 """A week of work through one auctioneer, with time compressed: memory, journal and time to accept jobs.
 
-    python benchmarks/soak.py [--jobs 100000] [--arms 16] [--out runs/soak]
+    python -m benchmarks.soak [--jobs 100000] [--arms 16] [--out runs/soak]
 
 The auctioneer's state machine runs with its real journal and 16 model arms, which bid for, accept and finish jobs at
 once. Real time is simulated: a week, whatever the number of jobs. Every submission of 10 jobs is written through to the
@@ -11,7 +11,6 @@ the last tenth as in the first, memory or journal have grown by more than half s
 restart with 10,000 open jobs takes more than 3 s. The first tenth counts from the moment that settled jobs leave.
 """
 
-import argparse
 import json
 import os
 import sys
@@ -22,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.harness import options, rss_mb
 from fleet.bus.protocol.auction import (
     Ack,
     JobEstimate,
@@ -161,11 +161,6 @@ class Week:
         return self._made >= self._left and not self.auctioneer.ledger.unsettled()
 
 
-def rss_mb() -> float:
-    """Resident memory of this process, MB."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def soak(path: Path, jobs: int, arms: int) -> tuple[list[Sample], int]:
     """Run the week; return samples over time, and the number of jobs that are missing at the end."""
     disk, samples, start_s = Disk(), list[Sample](), time.monotonic()
@@ -225,20 +220,10 @@ def plot(samples: list[Sample], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def read_options(description: str | None, *, jobs: int, arms: int) -> argparse.Namespace:
-    """Return the options of the command line, and make the folder of results."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=jobs)
-    parser.add_argument("--arms", type=int, default=arms)
-    parser.add_argument("--out", type=Path, default=Path("runs/soak"))
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    return options
-
-
 def main() -> None:
     """Run the week, write the figures and check the goals."""
-    arguments = read_options(__doc__, jobs=100_000, arms=16)
+    arguments = options(__doc__, jobs=100_000, arms=16, out=Path("runs/soak"))
+    arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=arguments.out) as folder:
         samples, missing = soak(Path(folder) / "auctioneer.journal", arguments.jobs, arguments.arms)
         took_s = restart_s(Path(folder))

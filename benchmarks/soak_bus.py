@@ -1,6 +1,6 @@
 """Jobs through one auctioneer over a real router, as fast as it can: memory, journal and time to accept jobs.
 
-    python benchmarks/soak_bus.py [--jobs 5000] [--arms 4] [--out runs/soak]
+    python -m benchmarks.soak_bus [--jobs 5000] [--arms 4] [--out runs/soak]
 
 The auctioneer and model arms, which finish a job at once, run in one process, each with a session of its own. A thread
 submits ten jobs whenever fewer than 200 wait. Writes soak_bus.json. For a week of work see soak.py.
@@ -15,8 +15,9 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
-from soak import BACKLOG, BATCH, PLAN, first_come, read_options, rss_mb
 
+from benchmarks.harness import options, rss_mb
+from benchmarks.soak import BACKLOG, BATCH, PLAN, first_come
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -114,7 +115,8 @@ class Submitter(threading.Thread):
 
 def main() -> None:
     """Run all jobs and write the figures."""
-    arguments = read_options(__doc__, jobs=5000, arms=4)
+    arguments = options(__doc__, jobs=5000, arms=4, out=Path("runs/soak"))
+    arguments.out.mkdir(parents=True, exist_ok=True)
     with (
         tempfile.TemporaryDirectory(dir=arguments.out) as folder,
         Router() as router,

@@ -25,6 +25,9 @@ from reference_tables import TABLES as REFERENCE
 from agents.learned.evolution import read_log
 from benchmarks.paper.__main__ import study
 from benchmarks.result_tables import (
+    FIGURES as ABLATION_FIGURES,
+)
+from benchmarks.result_tables import (
     bold_if,
     channel_table,
     difference,
@@ -35,10 +38,9 @@ from benchmarks.result_tables import (
     read_json,
     signed,
     steps_table,
+    stored,
     trainings,
 )
-from benchmarks.stored_ablations import FIGURES as ABLATION_FIGURES
-from benchmarks.stored_ablations import stored
 from fleet.bus.protocol.contract import asyncapi, schema_document
 from fleet.errors import FleetError
 from scenarios.evaluate.comparison import HEADINGS

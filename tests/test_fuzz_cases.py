@@ -10,8 +10,7 @@ ROOT = Path(__file__).parents[1]
 PARSE = """
 import sys
 from pathlib import Path
-sys.path.insert(0, "benchmarks/fuzz")
-from targets import TARGETS
+from benchmarks.fuzz.targets import TARGETS
 for name in sys.argv[1:]:
     cases = Path("tests/fuzz_cases") / name
     for data in [*TARGETS[name].seeds(), *(path.read_bytes() for path in cases.glob("*"))]:

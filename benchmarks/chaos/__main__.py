@@ -1,7 +1,7 @@
 """Inject faults into live fleets: count lost jobs and jobs done twice, and measure the recovery.
 
-    python benchmarks/chaos [--only NAME,NAME] [--jobs 24] [--speed 120] [--keep DIR] [--no-namespaces]
-    python benchmarks/chaos --minutes 10 --seed 1 [--speed 120] [--keep DIR]
+    python -m benchmarks.chaos [--only NAME,NAME] [--jobs 24] [--speed 120] [--keep DIR] [--no-namespaces]
+    python -m benchmarks.chaos --minutes 10 --seed 1 [--speed 120] [--keep DIR]
 
 Every fault gets a new fleet of four arms: router, auctioneer, recorder and arms, each its own process, on loopback.
 `alone-…` is without an auctioneer. `trespass` uses TLS, and so does `partition` as root, which makes network
@@ -32,14 +32,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from campaign import SCENARIO, campaign
-from consensus import cut_off_half, cut_off_one
-from fleet_under_test import CannotInject, Fault
-from malformed import malformed, replayed_awards
-from namespaces import unavailable_reason
-from partition import partition
-from poison import poison
-from processes import (
+
+from benchmarks.chaos.campaign import SCENARIO, campaign
+from benchmarks.chaos.fleet_under_test import CannotInject, Fault
+from benchmarks.chaos.messages import malformed, poison, replayed_awards
+from benchmarks.chaos.namespaces import unavailable_reason
+from benchmarks.chaos.partition import cut_off_half, cut_off_one, partition
+from benchmarks.chaos.processes import (
     full_disk,
     full_disks,
     full_log_disk,
@@ -50,10 +49,9 @@ from processes import (
     stop_arm,
     stuck_subscriber,
 )
-from random_faults import GAP_S, KILL, Figures, run
-from trespass import trespass
-from wall_clock import clock_jump
-
+from benchmarks.chaos.random_faults import GAP_S, KILL, Figures, run
+from benchmarks.chaos.trespass import trespass
+from benchmarks.chaos.wall_clock import clock_jump
 from scenarios.prepare.fleet import prepare
 from scenarios.spec.load import load
 
@@ -83,6 +81,13 @@ FAULTS = {
 }
 
 
+COLUMNS = {
+    **{"fault": 18, "jobs": 5, "finished": 9, "unfinished": 11, "lost": 5, "twice": 6, "exited": 7},
+    **{"detected s": 11, "recovered s": 12, "all s": 7},
+}
+"""Headings and widths of the table."""
+
+
 def main() -> None:
     """Inject every fault and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -105,20 +110,7 @@ def main() -> None:
     if any(FAULTS[name].cut for name in chosen):
         no_namespaces = "--no-namespaces" if arguments.no_namespaces else unavailable_reason()
     prepare(load(SCENARIO), difficulty="blind")  # fills the cache, so that arms do not plan during a fault
-    columns = (
-        "fault",
-        "jobs",
-        "finished",
-        "unfinished",
-        "lost",
-        "twice",
-        "exited",
-        "detected s",
-        "recovered s",
-        "all s",
-    )
-    widths = (18, 5, 9, 11, 5, 6, 5, 11, 12, 7)
-    print("".join(f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)), flush=True)
+    print("".join(f"{name:>{width}}" for name, width in COLUMNS.items()), flush=True)
     good, not_run = True, list[str]()
     for name in chosen:
         with ExitStack() as stack:
@@ -127,23 +119,19 @@ def main() -> None:
             try:
                 found = campaign(FAULTS[name], folder / name, **amount, namespaces=not no_namespaces)
             except CannotInject as lack:
-                print(f"{name:>{widths[0]}}  not run: {lack}.", flush=True)
+                print(f"{name:>{COLUMNS['fault']}}  not run: {lack}.", flush=True)
                 not_run.append(name)
                 continue
         good = good and found.good
-        numbers = (
-            len(found.lost),
-            len(found.twice),
-            len(found.exited),
-            found.detected_s,
-            found.recovered_s,
-            found.took_s,
-        )
+        numbers = (len(found.lost), len(found.twice), len(found.exited))
+        times = (found.detected_s, found.recovered_s, found.took_s)
         named = f"{name} ({found.by})" if found.by else name
         if found.by == "proxy":
             found.notes += (f"without namespaces: {no_namespaces}",)
-        cells = (named, arguments.jobs, found.finished, found.unfinished, *numbers)
-        print("".join(f"{_text(cell):>{width}}" for cell, width in zip(cells, widths, strict=True)), flush=True)
+        cells = (named, arguments.jobs, found.finished, found.unfinished, *numbers, *times)
+        print(
+            "".join(f"{_text(cell):>{width}}" for cell, width in zip(cells, COLUMNS.values(), strict=True)), flush=True
+        )
         for what in ("lost", "twice", "exited", "violations", "notes"):
             if names := getattr(found, what):
                 print(f"    {what}: {', '.join(names)}", flush=True)

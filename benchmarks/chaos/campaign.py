@@ -7,14 +7,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from fleet_under_test import Fault, Fleet, Outcome
-from namespaces import Namespaces
-from partition import Proxy
-from wall_clock import WallClocks
-
+from benchmarks.chaos.fleet_under_test import Fault, Fleet, Outcome
+from benchmarks.chaos.namespaces import Namespaces
+from benchmarks.chaos.partition import Proxy
+from benchmarks.chaos.wall_clock import WallClocks
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import SETTLED, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
+from fleet.bus.protocol.auction import SETTLED, Clock, ClockRequest, JobSpec
 from fleet.bus.router import open_client
 from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.certificates import HERE, make
@@ -107,13 +106,9 @@ def start_fleet(fault: Fault, folder: Path, *, speed: float, namespaces: bool = 
 def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces: bool) -> Outcome:
     """Run one fault on a new fleet; arguments and errors as for `start_fleet`."""
     with start_fleet(fault, folder, speed=speed, namespaces=namespaces) as fleet:
-        client, work = fleet.client, tuple(map(short_job, range(jobs)))
-        replies = client.query_and_wait(
-            keys.of_jobs(SCENARIO, "submit"), Submission(work), SubmissionReply, timeout_s=10.0
-        )
-        accepted = {job.job for word in replies.messages.values() for job in word.jobs if job.accepted}
-        if len(accepted) != jobs:
-            raise RuntimeError(f"Only {len(accepted)} of {jobs} jobs were accepted: {replies.refused}")
+        work = tuple(map(short_job, range(jobs)))
+        accepted = {job.name for job in work}
+        fleet.submit(work)
         fleet.wait_until(lambda: fleet.working_arm() is not None and _finished(fleet) >= 2)
         injected_s = time.monotonic()
         detected_s = fault.inject(fleet)
@@ -122,7 +117,7 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         settled_s = fleet.wait_until(lambda: _all_settled(fleet, accepted))
         ended_s = time.monotonic()
         fleet.wait_until(lambda: not _any_unfinished(fleet), LATE_REPORTS_S)
-        outcome = _outcome(fleet, accepted)
+        outcome = fleet.outcome(accepted, fleet.status())
         outcome.by = getattr(fleet.cut, "by", "")
         outcome.detected_s, outcome.recovered_s = detected_s, recovered_s
         outcome.took_s = ended_s - injected_s if math.isfinite(settled_s) else math.inf
@@ -161,19 +156,3 @@ def _any_unfinished(fleet: Fleet) -> bool:
     """Whether a job is unfinished; an arm that reconnects may still report it as finished."""
     fleet.client.serve(time.monotonic() + 0.2)
     return any(job.state == "unfinished" for job in fleet.status().values())
-
-
-def _outcome(fleet: Fleet, accepted: set[str]) -> Outcome:
-    status, done = fleet.status(), fleet.count_finished()
-    finished = {name for name, job in status.items() if job.state == "finished"}
-    unfinished = {name for name, job in status.items() if job.state in ("unfinished", "given_up")}
-    restarts = fleet.supervisor.restarts()
-    return Outcome(
-        finished=len(finished),
-        unfinished=len(unfinished),
-        lost=tuple(sorted(accepted - finished - unfinished)),
-        twice=tuple(sorted(name for name, times in done.items() if times > 1)),
-        exited=tuple(sorted(name for name, count in restarts.items() if count > fleet.killed[name])),
-        violations=tuple(fleet.violations),
-        notes=tuple(fleet.notes),
-    )

@@ -5,22 +5,34 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import zenoh
-from journal_files import JournalFiles
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import JobStatus, Result, Status, StatusRequest
+from fleet.bus.protocol.auction import (
+    SETTLED,
+    JobSpec,
+    JobStatus,
+    Result,
+    Status,
+    StatusRequest,
+    Submission,
+    SubmissionReply,
+)
 from fleet.bus.protocol.messages import State
+from fleet.live.arm.awards import ArmRecord, Closed, JobsFinished
 from fleet.live.supervisor import Supervisor
 
 TIMEOUT_S = 150.0
 STALE_S = 3.0
+AT_ONCE = 64
+"""Jobs in a submission or a request for their status."""
 
 
 class CannotInject(Exception):
@@ -152,9 +164,41 @@ class Fleet:
         )
         return {job.job: job for word in answers.messages.values() for job in word.jobs}
 
-    def count_finished(self) -> Counter[str]:
-        """Count how often each job was finished, by the journals of the arms since their first start."""
-        return self.journals.count_finished()
+    def submit(self, jobs: Sequence[JobSpec]) -> None:
+        """Submit jobs, `AT_ONCE` in a message.
+
+        Raises:
+            RuntimeError: a job was not accepted.
+        """
+        for first in range(0, len(jobs), AT_ONCE):
+            some = Submission(tuple(jobs[first : first + AT_ONCE]))
+            key = keys.of_jobs(self.client.fleet, "submit")
+            replies = self.client.query_and_wait(key, some, SubmissionReply, timeout_s=20.0)
+            accepted = {job.job for reply in replies.messages.values() for job in reply.jobs if job.accepted}
+            if len(accepted) != len(some.jobs):
+                raise RuntimeError(f"Only {len(accepted)} of {len(some.jobs)} jobs were accepted: {replies.refused}")
+
+    def done_twice(self) -> tuple[str, ...]:
+        """Jobs that were finished more than once, by the journals of the arms since their first start."""
+        return tuple(sorted(name for name, times in self.journals.count_finished().items() if times > 1))
+
+    def exited(self) -> tuple[str, ...]:
+        """Processes that exited without being killed."""
+        return tuple(sorted(name for name, n in self.supervisor.restarts().items() if n > self.killed[name]))
+
+    def outcome(self, accepted: Iterable[str], status: Mapping[str, JobStatus]) -> Outcome:
+        """What became of the accepted jobs, by their last status and the journals of the arms."""
+        states = Counter(job.state for job in status.values())
+        settled = {name for name, job in status.items() if job.state in SETTLED}
+        return Outcome(
+            finished=states["finished"],
+            unfinished=states["unfinished"] + states["given_up"],
+            lost=tuple(sorted(set(accepted) - settled)),
+            twice=self.done_twice(),
+            exited=self.exited(),
+            violations=tuple(self.violations),
+            notes=tuple(self.notes),
+        )
 
     def _token(self, arm: str, there: bool) -> None:
         (self.tokens.add if there else self.tokens.discard)(arm)
@@ -186,3 +230,59 @@ class Fault:
     """The arms allocate the jobs by consensus."""
     cut_arms: int = 0
     """Number of arms that can be cut off; 0 for half of them."""
+
+
+class _Line(msgspec.Struct):
+    records: list[ArmRecord]
+
+
+_DECODER = msgspec.json.Decoder(_Line)
+
+
+class JournalFiles:
+    """Journals of arms, with all files that they were.
+
+    A journal is compacted, and at each start rewritten, into a new file. The old one stays readable here, because it is
+    kept open.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Follow the journals of a folder, which need not exist yet."""
+        self._folder = folder
+        self._files: dict[Path, list[int]] = {}
+
+    def follow(self) -> None:
+        """Open what is new; to be called more often than journals are rewritten."""
+        for path in self._folder.glob("*.journal"):
+            files = self._files.setdefault(path, [])
+            if path.stem != "auctioneer" and not (files and os.path.samestat(os.fstat(files[-1]), path.stat())):
+                files.append(os.open(path, os.O_RDONLY | os.O_CLOEXEC))
+
+    def count_finished(self) -> Counter[str]:
+        """Count how often each job was finished: once for each award, and at least once if an arm names it."""
+        self.follow()
+        ended: set[tuple[str, str]] = set()
+        named: set[str] = set()
+        for files in self._files.values():
+            for file in files:
+                for record in _records(file):
+                    if isinstance(record, Closed) and record.outcome == "finished":
+                        ended.add((record.job, record.award))
+                    elif isinstance(record, JobsFinished):
+                        named.update(job.name for job in record.jobs)
+        done = Counter(job for job, _ in ended)
+        done.update(named - done.keys())
+        return done
+
+    def close(self) -> None:
+        """Close all files."""
+        for files in self._files.values():
+            for file in files:
+                os.close(file)
+            files.clear()
+
+
+def _records(file: int) -> list[ArmRecord]:
+    """Records of the complete lines."""
+    lines = os.pread(file, os.fstat(file).st_size, 0).splitlines(keepends=True)
+    return [record for line in lines if line.endswith(b"\n") for record in _DECODER.decode(line).records]

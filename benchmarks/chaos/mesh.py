@@ -1,6 +1,6 @@
 """Many arms behind two linked routers: kill either router, cut the link, count lost jobs and jobs done twice.
 
-    python benchmarks/chaos/mesh.py [--arms 256] [--jobs 512] [--speed 120] [--keep DIR] [--no-namespaces]
+    python -m benchmarks.chaos.mesh [--arms 256] [--jobs 512] [--speed 120] [--keep DIR] [--no-namespaces]
 
 Host a has a router, the auctioneer and half of the arms, host b a router that is linked to the first, and the other
 arms. As root, host b is a network namespace and the link a virtual cable; otherwise the link passes a proxy. During the
@@ -9,7 +9,6 @@ supervisor starts routers again. TLS, access control and journals are on. A job 
 journals of the arms. Exit code 1: a job was lost or done twice, or a process exited that was not killed.
 """
 
-import argparse
 import logging
 import math
 import signal
@@ -20,14 +19,14 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from fleet_under_test import Fleet, Outcome
-from mesh_parts import FLEET, SCENARIO, job_of, names_of
-from namespaces import Namespaces, unavailable_reason
-from partition import CUT_S, Proxy
-
+from benchmarks.chaos.fleet_under_test import AT_ONCE, Fleet, Outcome
+from benchmarks.chaos.mesh_parts import FLEET, SCENARIO, job_of, names_of
+from benchmarks.chaos.namespaces import Namespaces, unavailable_reason
+from benchmarks.chaos.partition import CUT_S, Proxy
+from benchmarks.harness import options
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import SETTLED, JobStatus, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.protocol.auction import SETTLED, JobStatus, Status, StatusRequest
 from fleet.bus.router import open_client
 from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.certificates import HERE, make
@@ -37,8 +36,7 @@ from scenarios.live.fleet_processes import PROGRAM, free_port
 from scenarios.prepare.fleet import prepare
 from scenarios.spec.load import load
 
-PARTS = Path(__file__).with_name("mesh_parts.py")
-START_S, BACK_S, LATE_REPORTS_S, AT_ONCE = 300.0, 120.0, 20.0, 64
+START_S, BACK_S, LATE_REPORTS_S = 300.0, 120.0, 20.0
 FAR = "router_b"
 
 
@@ -62,7 +60,7 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
 
         def part(name: str, what: str, address: str, rank: int) -> Part:
             words = (what, address, str(place), str(folder / "journals"), str(arms), f"{speed:g}")
-            return Part(name=name, argv=(sys.executable, str(PARTS), *words), rank=rank)
+            return Part(name=name, argv=(sys.executable, "-m", "benchmarks.chaos.mesh_parts", *words), rank=rank)
 
         halves = [",".join(str(number) for number in range(first, arms, 2)) for first in (0, 1)]
         others = [
@@ -85,7 +83,7 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
         if math.isinf(fleet.wait_until(lambda: _all_present(fleet), START_S)):
             raise RuntimeError(f"Only {len(fleet.states)} of {arms} arms are on the bus.")
         accepted = tuple(job_of(number, arms) for number in range(jobs))
-        _submit(client, accepted)
+        fleet.submit(accepted)
         wanted, began_s = [job.name for job in accepted], time.monotonic()
         fleet.wait_until(lambda: _count(fleet, wanted, ("finished",)) >= max(1, jobs // 8), settle_s)
         for what, inject in (("router b killed", _kill_far), ("link cut", _cut), ("router a killed", _kill_near)):
@@ -98,20 +96,9 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
             )
         settled_s = fleet.wait_until(lambda: _count(fleet, wanted, SETTLED) == jobs, settle_s)
         fleet.wait_until(lambda: _count(fleet, wanted, ("finished",)) == jobs, LATE_REPORTS_S)
-        outcome = _outcome(fleet, wanted)
+        outcome = fleet.outcome(wanted, _statuses(fleet, wanted))
         outcome.by, outcome.took_s = cable.by, time.monotonic() - began_s if math.isfinite(settled_s) else math.inf
     return outcome
-
-
-def _submit(client: BusClient, jobs: Sequence) -> None:
-    for first in range(0, len(jobs), AT_ONCE):
-        some = tuple(jobs[first : first + AT_ONCE])
-        replies = client.query_and_wait(
-            keys.of_jobs(FLEET, "submit"), Submission(some), SubmissionReply, timeout_s=20.0
-        )
-        admitted = [job for reply in replies.messages.values() for job in reply.jobs if job.accepted]
-        if len(admitted) != len(some):
-            raise RuntimeError(f"Only {len(admitted)} of {len(some)} jobs were accepted: {replies.refused}")
 
 
 def _kill_far(fleet: Fleet, _: Proxy | Namespaces) -> None:
@@ -151,29 +138,16 @@ def _count(fleet: Fleet, wanted: Sequence[str], states: Sequence[str]) -> int:
     return sum(job.state in states for job in _statuses(fleet, wanted).values())
 
 
-def _outcome(fleet: Fleet, wanted: Sequence[str]) -> Outcome:
-    status, done, restarts = _statuses(fleet, wanted), fleet.count_finished(), fleet.supervisor.restarts()
-    settled = {name for name, job in status.items() if job.state in SETTLED}
-    return Outcome(
-        finished=sum(job.state == "finished" for job in status.values()),
-        unfinished=sum(job.state in ("unfinished", "given_up") for job in status.values()),
-        lost=tuple(sorted(set(wanted) - settled)),
-        twice=tuple(sorted(name for name, times in done.items() if times > 1)),
-        exited=tuple(sorted(name for name, count in restarts.items() if count > fleet.killed[name])),
-        violations=tuple(fleet.violations),
-        notes=tuple(fleet.notes),
-    )
-
-
 def main() -> None:
     """Run the campaign and print its outcome."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, default=256)
-    parser.add_argument("--jobs", type=int, default=512)
-    parser.add_argument("--speed", type=float, default=120.0, help="fleet seconds per real second")
-    parser.add_argument("--keep", type=Path, help="folder for journals and logs; default: temporary")
-    parser.add_argument("--no-namespaces", action="store_true", help="cut the link by a proxy, also as root")
-    given = parser.parse_args()
+    given = options(
+        __doc__,
+        arms=256,
+        jobs=512,
+        speed=(120.0, "fleet seconds per real second"),
+        keep=(Path, "folder for journals and logs; default: temporary"),
+        no_namespaces=(False, "cut the link by a proxy, also as root"),
+    )
     logging.basicConfig(level=logging.ERROR)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # remove the namespaces: they outlive the process
     reason = "--no-namespaces" if given.no_namespaces else unavailable_reason()

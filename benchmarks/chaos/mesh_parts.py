@@ -1,6 +1,6 @@
 """Participants of the campaign with two routers: an auctioneer, and one process with many arms.
 
-    python benchmarks/chaos/mesh_parts.py auction|NUMBER,NUMBER,… ADDRESS KEYS JOURNALS ARMS SPEED
+    python -m benchmarks.chaos.mesh_parts auction|NUMBER,NUMBER,… ADDRESS KEYS JOURNALS ARMS SPEED
 
 Four arms are a cell with places of its own, so many arms can work at a time. Bodies, plans and journals are those of
 `thermofleet arm run` without twins; the arms of a process take turns on one thread, and publish one state a second.

@@ -11,8 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from fleet_under_test import Fleet
-
+from benchmarks.chaos.fleet_under_test import Fleet
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, Submission, SubmissionReply
 

@@ -13,13 +13,13 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from campaign import LATE_REPORTS_S, is_healthy, short_job, start_fleet
-from fleet_under_test import TIMEOUT_S, Fault, Fleet, Inject
-from malformed import malformed, replayed_awards
 from msgspec import structs
-from partition import partition
-from poison import poison
-from processes import (
+
+from benchmarks.chaos.campaign import LATE_REPORTS_S, is_healthy, short_job, start_fleet
+from benchmarks.chaos.fleet_under_test import TIMEOUT_S, Fault, Fleet, Inject
+from benchmarks.chaos.messages import malformed, poison, replayed_awards
+from benchmarks.chaos.partition import partition
+from benchmarks.chaos.processes import (
     full_disk,
     full_disks,
     full_log_disk,
@@ -32,8 +32,7 @@ from processes import (
     stop_auctioneer,
     stuck_subscriber,
 )
-from wall_clock import clock_jump
-
+from benchmarks.chaos.wall_clock import clock_jump
 from fleet.bus.client import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, JobSpec, JobState, Status, StatusRequest, Submission, SubmissionReply
@@ -233,16 +232,13 @@ def run(seed: int, folder: Path, *, minutes: float, speed: float, clocks: bool) 
             feeder.ask(list(islice(feeder.states, first, first + AT_ONCE)))
         fleet.wait_until(lambda: False, REPLY_S)
         figures.took_s = time.monotonic() - start_s
-        done, restarts = fleet.count_finished(), fleet.supervisor.restarts()
-        fleet.violations += [
-            f"{name} exited by itself" for name, count in restarts.items() if count > fleet.killed[name]
-        ]
+        figures.twice, done = fleet.done_twice(), fleet.journals.count_finished()
+        fleet.violations += [f"{name} exited by itself" for name in fleet.exited()]
         if math.isinf(ended_s):
             fleet.note(f"jobs were open {TIMEOUT_S:g} s after the last fault")
     (recorded, named), states = _recorded(folder / "recording"), feeder.states
     figures.states = Counter(str(state) for state in states.values())
     figures.lost = tuple(sorted(name for name, state in states.items() if state is None))
-    figures.twice = tuple(sorted(name for name, times in done.items() if times > 1))
     ended = {name: state for name, state in states.items() if state in SETTLED}
     missing = {name for name, state in ended.items() if recorded.get(name) != state}
     if named and missing:

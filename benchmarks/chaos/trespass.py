@@ -16,9 +16,9 @@ from pathlib import Path
 
 import msgspec
 import zenoh
-from fleet_under_test import Fleet
-from malformed import awards_of
 
+from benchmarks.chaos.fleet_under_test import Fleet
+from benchmarks.chaos.messages import awards_of
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Award,

@@ -14,8 +14,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from fleet_under_test import CannotInject, Fleet
-
+from benchmarks.chaos.fleet_under_test import CannotInject, Fleet
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
 

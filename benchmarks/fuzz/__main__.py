@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of every parser: `python benchmarks/fuzz [TARGET …] [--inputs N]`; needs atheris.
+"""Coverage-guided fuzzing of every parser: `python -m benchmarks.fuzz [TARGET …] [--inputs N]`; needs atheris.
 
 Each target runs in a process of its own (libFuzzer ends its process). The corpus grows in out/fuzz/TARGET, and an input
 that a parser does not handle is kept in tests/fuzz_cases/TARGET, where `make test` parses it again.
@@ -29,13 +29,13 @@ def main() -> int:
     if chosen.run:
         fuzz(chosen.run, chosen.inputs, chosen.seed)
         return 0
-    from targets import TARGETS
+    from benchmarks.fuzz.targets import TARGETS
 
     failed = 0
     for name in chosen.targets or TARGETS:
         inputs = round(chosen.inputs * TARGETS[name].share)
         start_s = time.monotonic()
-        command = [sys.executable, str(Path(__file__).parent), "--run", name, "--inputs", str(inputs)]
+        command = [sys.executable, "-m", "benchmarks.fuzz", "--run", name, "--inputs", str(inputs)]
         done = subprocess.run(
             [*command, "--seed", str(chosen.seed)], stderr=subprocess.PIPE, text=True, errors="replace", check=False
         )
@@ -53,7 +53,7 @@ def fuzz(name: str, inputs: int, seed: int) -> None:
     """Fuzz one target; does not return."""
     atheris: Any = import_module("atheris")  # without types
     with atheris.instrument_imports(include=["fleet", "scenarios", "twin", "tomllib"]):
-        from targets import TARGETS
+        from benchmarks.fuzz.targets import TARGETS
     target = TARGETS[name]
     corpus, cases = CORPUS / name, CASES / name
     for place in (corpus, cases):

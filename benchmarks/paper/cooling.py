@@ -18,7 +18,6 @@ from scipy.optimize import brentq, least_squares
 
 from benchmarks.paper.harness import (
     Experiment,
-    Table,
     Unit,
     content_key,
     names,
@@ -26,6 +25,7 @@ from benchmarks.paper.harness import (
     scenarios_of,
     seed_options,
     seeds_of,
+    table_of,
 )  # fmt: skip
 from benchmarks.result_tables import difference
 from fleet.heat.motor import thermal_data
@@ -36,6 +36,7 @@ from scenarios.evaluate.rollout import Outcome, outcomes
 from scenarios.json_rows import Row
 from scenarios.motion.hold import hold
 from scenarios.prepare.fleet import prepare
+from scenarios.show.table import Table
 from scenarios.spec.options import DifficultyName
 from scenarios.spec.parse import choose
 from scenarios.spec.schema import Scenario
@@ -335,13 +336,15 @@ def cooling_tables(rows: Sequence[Row]) -> dict[str, Table]:
     for row in rows:
         if "motor" in row:
             motor = [(MOTOR_FIGURES[e["figure"]], f"{e['published']:g}", f"{e['modelled']:.2f}") for e in row["motor"]]
-            tables["cooling_motor"] = Table(("time to 125 °C, or temperature", "published", "here"), motor)
+            tables["cooling_motor"] = table_of(("time to 125 °C, or temperature", "published", "here"), motor)
             tables["cooling_joint"] = joint_table(row["joint"])
             core = [(f"joint {joint}", f"{value:.1f}") for joint, value in enumerate(row["core_k_per_w"], start=1)]
-            tables["cooling_core"] = Table((f"core warns first at {HOTTEST_AIR_C:g} °C from", "K/W to housing"), core)
+            tables["cooling_core"] = table_of(
+                (f"core warns first at {HOTTEST_AIR_C:g} °C from", "K/W to housing"), core
+            )
         if "fit" in row:
             parameters = [(name, f"{value:.4g}", f"{sd:.2f}") for name, (value, sd) in row["fit"].items()]
-            tables["cooling_fit"] = Table(("parameter, per J/K of the winding", "value", "relative sd"), parameters)
+            tables["cooling_fit"] = table_of(("parameter, per J/K of the winding", "value", "relative sd"), parameters)
         if "fleet" in row:
             tables[f"cooling_{row['scenario']}"] = fleet_table(row)
     return tables
@@ -361,7 +364,7 @@ def joint_table(rows: Sequence[Row]) -> Table:
         for row in rows
     ]
     hold_heads = ("3 kg held outstretched: 60 °C after", "75 °C after", "settles at")
-    return Table(("`cooling`", "what changes", "winding to air, W/K", *hold_heads), lines)
+    return table_of(("`cooling`", "what changes", "winding to air, W/K", *hold_heads), lines)
 
 
 def fleet_table(row: Row) -> Table:
@@ -377,7 +380,7 @@ def fleet_table(row: Row) -> Table:
             text = difference(value["difference"], value["difference_low"], value["difference_high"])
             cells += [f"{value['mean']:.1f}" + f"; {text}" * (n > 0), f"{faults['mean']:.2f}", f"{warm['mean']:.0f}"]
         lines.append((f"`{cooling}`", *cells))
-    return Table((f"`{row['scenario']}`", *heads), lines)
+    return table_of((f"`{row['scenario']}`", *heads), lines)
 
 
 def cooling_options(parser: ArgumentParser) -> None:

@@ -15,10 +15,10 @@ from scipy.stats import norm
 
 from benchmarks.paper.features import with_wear
 from benchmarks.paper.harness import (
-    Table,
     matching,
     number,
     seeded,
+    table_of,
 )
 from benchmarks.paper.subjects import SHORT, Study, sensed, usual_study, with_steps
 from benchmarks.paper.transfer import continue_training
@@ -31,6 +31,7 @@ from scenarios.json_rows import Row
 from scenarios.prepare.arms import ArmHardware
 from scenarios.prepare.identify import own_logs
 from scenarios.prepare.twins import cold_peaks, records
+from scenarios.show.table import Table
 from twin.thermal.identify import HeatModel, identify
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Measures
@@ -340,12 +341,12 @@ def drift_tables(rows: Sequence[Row]) -> dict[str, Table]:
         if (own := matching(rows, kind=kind, policy=policy))
     ]
     return {
-        "drift_delays": Table(
+        "drift_delays": table_of(
             ("change", "calibrated d", "conformal p-value", "thermal residual"),
             [*noticed, ("false alarms per 100 days", *false)],
             "Days from the onset to the first alarm, without retraining: median, and seeds with an alarm",
         ),
-        "drift_costs": Table(
+        "drift_costs": table_of(
             ("change, retraining", *measures),
             costs,
             f"In the last {rows[0]['window']} days: error of the predicted peak and share of cool jobs that are "

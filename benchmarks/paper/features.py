@@ -26,9 +26,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from benchmarks.paper.harness import (
-    Table,
     matching,
     seeded,
+    table_of,
 )
 from benchmarks.paper.subjects import SHORT, USUAL, Jobs, Sample, Study, jobs_of, sensed, usual_study, with_steps
 from fleet.arm.model import ArmModel
@@ -41,6 +41,7 @@ from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.motion.generate import MOST_DRAWS, GenerationError, Rejected, Verification, planned
 from scenarios.prepare.twins import cold_peaks, records
+from scenarios.show.table import Table
 from twin.baselines import untrained_config
 from twin.vae.config import TwinConfig
 from twin.vae.generate import vary
@@ -212,7 +213,9 @@ def feature_tables(rows: Sequence[Row]) -> dict[str, Table]:
         return interval([e["r2"] for e in matching(found, target=target, labels=labels, inputs=inputs)]).text()
 
     lines = [(f"{t}, {n} jobs", *(r2(t, n, each) for each in INPUTS)) for t, n in keys]
-    return {"features_r2": Table(("target, jobs", *INPUTS), lines, "R² of ridge regressions, cross-validated by job")}
+    return {
+        "features_r2": table_of(("target, jobs", *INPUTS), lines, "R² of ridge regressions, cross-validated by job")
+    }
 
 
 FEATURES = seeded(
@@ -360,7 +363,7 @@ def augmentation_tables(rows: Sequence[Row]) -> dict[str, Table]:
     lines.append((NETWORK, cool, "", every, ""))
     heads = ("measured jobs, regressor: data", "cool jobs, K", "difference", "all jobs, K", "difference")
     caption = "RMSE of the peak temperature, and its paired difference to the measured jobs only"
-    return {"augmentation_errors": Table(heads, lines, caption)}
+    return {"augmentation_errors": table_of(heads, lines, caption)}
 
 
 AUGMENTATION = seeded(

@@ -18,14 +18,18 @@ from typing import Any, NamedTuple  # values of JSON
 import msgspec
 import numpy as np
 from joblib import delayed
+from rich.console import Console
 
 from fleet.errors import FleetError
 from scenarios.json_rows import Row, Rows
 from scenarios.processes import worker_processes
 from scenarios.progress import brief
+from scenarios.show.table import Table
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
 
+WIDEST = 240
+"""Characters of a printed line."""
 KeyedRows = Iterable[tuple[str, Mapping[str, Any]]]
 
 
@@ -37,30 +41,9 @@ class Unit(NamedTuple):
     """Rows of some of the keys, each with its key, as they become known; it must be picklable."""
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of text with headings."""
-
-    head: tuple[str, ...]
-    rows: Sequence[Sequence[str]]
-    caption: str = ""
-
-    def __post_init__(self) -> None:
-        odd = [row for row in self.rows if len(row) != len(self.head)]
-        if odd:
-            raise ValueError(f"Every row needs {len(self.head)} cells like the head (got {odd[0]}).")
-
-    def markdown(self) -> str:
-        """The table as Markdown, without the caption."""
-        return "\n".join(f"| {' | '.join(cells)} |" for cells in (self.head, ["---"] * len(self.head), *self.rows))
-
-    def text(self) -> str:
-        """The table for a terminal: the caption, and Markdown with columns of equal width."""
-        lines = [tuple(self.head), *map(tuple, self.rows)]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        lines.insert(1, tuple("-" * width for width in widths))
-        padded = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines]
-        return "\n".join([self.caption, *padded] if self.caption else padded)
+def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> Table:
+    """A table of texts."""
+    return Table(head=tuple(head), rows=tuple(map(tuple, rows)), caption=caption)
 
 
 def no_options(parser: ArgumentParser) -> None:
@@ -191,7 +174,9 @@ def run(name: str, study: Experiment, argv: Sequence[str]) -> None:
         )
     with rows.readable():
         tables = study.tables(wanted).values()
-    print("\n\n".join(table.text() for table in tables))
+    console = Console(width=WIDEST, highlight=False)
+    for number, table in enumerate(tables):
+        console.print(*[""] * (number > 0), table, sep="\n")
     print(f"The rows are in {given.out}.", file=sys.stderr)
 
 

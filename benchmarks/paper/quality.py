@@ -11,11 +11,12 @@ import numpy as np
 from sklearn.neighbors import NearestNeighbors
 from sklearn.preprocessing import StandardScaler
 
-from benchmarks.paper.harness import Table, seeded
+from benchmarks.paper.harness import seeded, table_of
 from benchmarks.paper.subjects import CARRIER, LABELS, Jobs, Study, cached_twin, detection, jobs_of, usual_study
 from fleet.motion import CHANNELS, Plan
 from scenarios.json_rows import Row
 from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
+from scenarios.show.table import Table
 from twin.baselines import torque_over_known, untrained_config
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.config import TwinConfig
@@ -192,7 +193,7 @@ def quality_tables(rows: Sequence[Row]) -> dict[str, Table]:
             for name in rows[0]["scores"]
         ]
         caption = f"Does {question} overheat? Mean ± standard deviation over {len(rows)} seeds"
-        tables[f"quality_{question}"] = Table(("score", *measures.values()), lines, caption)
+        tables[f"quality_{question}"] = table_of(("score", *measures.values()), lines, caption)
     return tables
 
 

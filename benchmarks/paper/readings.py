@@ -25,7 +25,6 @@ from sklearn.metrics import average_precision_score, roc_auc_score
 
 from benchmarks.paper.harness import (
     Experiment,
-    Table,
     Unit,
     content_key,
     names,
@@ -33,6 +32,7 @@ from benchmarks.paper.harness import (
     scenarios_of,
     size_given,
     size_options,
+    table_of,
     whole,
 )
 from benchmarks.paper.saturation import wilson
@@ -44,6 +44,7 @@ from scenarios.evaluate.statistics import Interval, mean_by_group
 from scenarios.json_rows import Row
 from scenarios.motion.generate import Rejected, planned
 from scenarios.prepare.twins import cold_peaks
+from scenarios.show.table import Table
 from scenarios.spec.schema import Scenario
 from twin.vae.config import TwinConfig
 from twin.vae.generate import Variation, vary
@@ -185,10 +186,6 @@ def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
     }
 
 
-def _alarms(p: Array) -> float:
-    return float((p <= ALARM_RATE).mean())
-
-
 def _features(twin: Twin, study: Study, sample: Sample) -> Features:
     jobs = jobs_of(sample, study.horizon_s)
     return twin.features(jobs.plans, jobs.repetitions)
@@ -233,7 +230,7 @@ def reading_tables(rows: Sequence[Row]) -> dict[str, Table]:
             texts = (each.text(3) if i in (0, 4) else f"{each.mean:.3f}" for i, each in enumerate(shown))
             lines.append((reading, *texts))
         caption = f"{len(rows)} arms and seeds; jobs found and false alarms of a verdict at {ALARM_RATE:.0%}"
-        tables[f"readings_{question}"] = Table((title, *HEADS), lines, caption)
+        tables[f"readings_{question}"] = table_of((title, *HEADS), lines, caption)
     return tables
 
 
@@ -419,7 +416,9 @@ def side_tables(rows: Sequence[Row]) -> dict[str, Table]:
     ]
     caption = f"Motion generated from each side of the latent space: {rows[0]['arm']} of {rows[0]['scenario']}"
     return {
-        "sides": Table(("payload, side", "above 40 °C", "60 °C or more", "median of the hottest motor"), lines, caption)
+        "sides": table_of(
+            ("payload, side", "above 40 °C", "60 °C or more", "median of the hottest motor"), lines, caption
+        )
     }
 
 

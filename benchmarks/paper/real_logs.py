@@ -22,7 +22,7 @@ from sklearn.model_selection import GroupKFold, cross_val_predict
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from benchmarks.paper.harness import Experiment, Table, Unit, content_key, one_row, whole
+from benchmarks.paper.harness import Experiment, Unit, content_key, one_row, table_of, whole
 from benchmarks.paper.subjects import CARRIER
 from fleet.difficulty import difficulty_of_error
 from fleet.errors import FleetError, LogError
@@ -33,6 +33,7 @@ from fleet.robot import JOINTS
 from scenarios.evaluate.statistics import Interval, percentile_interval
 from scenarios.json_rows import Row
 from scenarios.prepare.twins import LOG_INPUT, train_or_load
+from scenarios.show.table import Table
 from twin.logs.reader import read_folder
 from twin.logs.recording import READINGS, HeatLog, Recording, Stretch, cool_stretches, heat_logs, stretches
 from twin.thermal.identify import HeatModel, Identified, Noise, ParameterVector, Problem, identify
@@ -380,7 +381,7 @@ def question_tables(rows: Sequence[Row]) -> dict[str, Table]:
             lines.append((question, windows, *auroc, *leads))
         heads = ("question", "windows (files with)", "d", "load", "latent", "RMS torque")
         caption = f"AUROC and its difference to that of RMS torque; windows of {row['windows']}, seed {row['seed']}"
-        table = Table((*heads, "difference: d", "load", "latent"), lines, caption)
+        table = table_of((*heads, "difference: d", "load", "latent"), lines, caption)
         tables.setdefault(f"questions_{row['windows']}", table)
     return tables
 
@@ -620,7 +621,7 @@ def forecast_tables(rows: Sequence[Row]) -> dict[str, Table]:
     ]
     first = rows[0]["below"]
     caption = f"AUROC for: joint 2 passes 40 °C within 5 min; {first['passing']} of {first['windows']} windows below"
-    return {"forecast": Table(heads, lines, caption)}
+    return {"forecast": table_of(heads, lines, caption)}
 
 
 def forecast_options(parser: ArgumentParser) -> None:
@@ -704,7 +705,7 @@ def identification_tables(rows: Sequence[Row]) -> dict[str, Table]:
                 ("the same with two folds", f"{rms_k[row['step']][CARRIER]:.2f}"),
             ]
     caption = "Error of predicted temperatures of held-out files, only initial temperatures fitted"
-    return {"identification": Table(("", "RMS, K"), lines, caption)}
+    return {"identification": table_of(("", "RMS, K"), lines, caption)}
 
 
 def identification_units(given: Namespace) -> list[Unit]:

@@ -17,7 +17,6 @@ from sklearn.metrics import roc_auc_score
 from agents.policy import WAIT
 from benchmarks.paper.harness import (
     Experiment,
-    Table,
     Unit,
     content_key,
     names,
@@ -26,6 +25,7 @@ from benchmarks.paper.harness import (
     seed_options,
     seeded,
     seeds_of,
+    table_of,
     whole,
 )
 from benchmarks.paper.quality import QualitySize, spread
@@ -41,6 +41,7 @@ from scenarios.policy_loader import policy_at
 from scenarios.prepare.calibrate import PastJobs, past_jobs
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
+from scenarios.show.table import Table
 from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.parse import choose
 from scenarios.spec.schema import Scenario
@@ -240,7 +241,7 @@ def saturation_tables(rows: Sequence[Row]) -> dict[str, Table]:
             (name, *(spread([number(row[kind][name][measure]) for row in rows]) for measure in measures))
             for name in rows[0][kind]
         ]
-        return Table(("", *measures.values()), lines, f"{caption}; mean ± standard deviation over {len(rows)} seeds")
+        return table_of(("", *measures.values()), lines, f"{caption}; mean ± standard deviation over {len(rows)} seeds")
 
     return {
         "saturation": table("predictions", MEASURES, "P(saturation) of held-out past jobs"),
@@ -429,8 +430,8 @@ def reliability_tables(rows: Sequence[Row]) -> dict[str, Table]:
                 bins.append((who, f"{p:.3f}", f"{share:.3f} [{low:.3f}, {high:.3f}]", str(count)))
     heads = ("shift", "arms", "awards", "passed", "unknown", "ECE", "Brier", "AUROC", "peak RMS, K", "peak bias, K")
     caption = f"P(saturation) in the shift; warm: a motor within {WARM_K:g} K of the warning limit, or beyond it"
-    diagram = Table(("shift", "mean P", "share passed [95 %]", "awards"), bins, "Stated and observed")
-    return {"reliability": Table(heads, lines, caption), "reliability_diagram": diagram}
+    diagram = table_of(("shift", "mean P", "share passed [95 %]", "awards"), bins, "Stated and observed")
+    return {"reliability": table_of(heads, lines, caption), "reliability_diagram": diagram}
 
 
 def reliability_options(parser: ArgumentParser) -> None:

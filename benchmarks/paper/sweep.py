@@ -20,13 +20,13 @@ from torch import nn
 
 from benchmarks.paper.harness import (
     Experiment,
-    Table,
     Unit,
     content_key,
     matching,
     names,
     size_given,
     size_options,
+    table_of,
     whole,
     wholes,
 )
@@ -50,6 +50,7 @@ from fleet.motion import RATE_HZ, Plan
 from scenarios.evaluate.statistics import Interval, mean_by_group
 from scenarios.json_rows import Row
 from scenarios.prepare.twins import records
+from scenarios.show.table import Table
 from twin.vae.config import RECIPE, TwinConfig
 from twin.vae.model import one_thread
 from twin.vae.train import train
@@ -225,7 +226,7 @@ def sweep_tables(rows: Sequence[Row]) -> dict[str, Table]:
     ]
     caption = "in brackets: paired difference to ours, ± the 95 % margin over the arms; * if that excludes zero"
     heads = ("group", "configuration", *columns, "active units", "KL, nat", "epochs", "CPU s", "arms")
-    return {"sweep": Table(heads, lines, caption)}
+    return {"sweep": table_of(heads, lines, caption)}
 
 
 def sweep_cell(rows: Mapping[str, Row], ours: Mapping[str, Row], path: Sequence[str]) -> str:
@@ -393,7 +394,7 @@ def parsimony_tables(rows: Sequence[Row]) -> dict[str, Table]:
             reached = ", ".join(LABELS[measure] for measure in RANKING if knees[measure] == jobs)
             lines.append((model, str(jobs), f"{_mean(some, 'minutes'):.1f}", *cells, reached))
     heads = ("model", "jobs", "minutes of motion", "AUROC", "AUPRC", "Spearman", "knee of")
-    return {"parsimony": Table(heads, lines, "d of the carrying joint, or its predicted rise, by amount of data")}
+    return {"parsimony": table_of(heads, lines, "d of the carrying joint, or its predicted rise, by amount of data")}
 
 
 def parsimony_units(given: Namespace) -> list[Unit]:

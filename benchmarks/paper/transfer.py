@@ -18,7 +18,6 @@ from sklearn.metrics import roc_auc_score
 
 from benchmarks.paper.harness import (
     Experiment,
-    Table,
     Unit,
     content_key,
     matching,
@@ -29,6 +28,7 @@ from benchmarks.paper.harness import (
     seeds_of,
     size_given,
     size_options,
+    table_of,
 )
 from benchmarks.paper.real_logs import CONFIG, HOT_C, log_options, recordings_given
 from benchmarks.paper.subjects import (
@@ -51,6 +51,7 @@ from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.prepare.identify import own_logs
 from scenarios.prepare.twins import records
+from scenarios.show.table import Table
 from twin.logs.recording import Recording, cool_stretches, stretches
 from twin.vae.config import TwinConfig, hash_records, seed_text
 from twin.vae.model import one_thread
@@ -279,8 +280,8 @@ def transfer_tables(rows: Sequence[Row]) -> dict[str, Table]:
         f"by {jobs[-1]}; CPU seconds and AUROC with {jobs[-1]} jobs, {NOTHING} → {FURTHER}"
     )
     return {
-        "transfer_errors": Table(("second arm, start", *(f"{count} jobs" for count in jobs)), errors, errors_of),
-        "transfer_savings": Table(heads, saved, savings),
+        "transfer_errors": table_of(("second arm, start", *(f"{count} jobs" for count in jobs)), errors, errors_of),
+        "transfer_savings": table_of(heads, saved, savings),
     }
 
 

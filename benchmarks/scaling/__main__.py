@@ -1,6 +1,6 @@
 """Fleets of 1 000 and 10 000 arms: the table of loads, and the value that is lost if few arms are asked for a quote.
 
-    python benchmarks/scaling [load] [ask] [--seeds 8] [--arms 64] [--arrivals 1.0] [--difficulty twin]
+    python -m benchmarks.scaling [load] [ask] [--seeds 8] [--arms 64] [--arrivals 1.0] [--difficulty twin]
 
 `load` is a calculation: the sizes of the messages are those of encoded examples, the rates those of the contract, and
 the costs per message those that `costs.py` measures.
@@ -15,8 +15,8 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from ask import print_asked
-from load import print_loads
+from benchmarks.scaling.ask import print_asked
+from benchmarks.scaling.load import print_loads
 
 
 def main() -> None:

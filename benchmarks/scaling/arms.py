@@ -1,7 +1,7 @@
 """Cost per arm-hour as a hall grows: engine, matching, twin scores and conflict table, and the memory.
 
-    python benchmarks/scaling/arms.py run [--arms 4 16 64 256 1000] [--out docs/results/scaling/arms.jsonl]
-    python benchmarks/scaling/arms.py plot [--out docs/results/scaling/arms.jsonl]
+    python -m benchmarks.scaling.arms run [--arms 4 16 64 256 1000] [--out docs/results/scaling/arms.jsonl]
+    python -m benchmarks.scaling.arms plot [--out docs/results/scaling/arms.jsonl]
 
 Each size is a process of its own with an empty cache of plans. Costs are CPU seconds of one thread, so other work on
 the machine matters little; the load average is in the file. Arms observe their eight nearest peers, in 64 slots.
@@ -30,6 +30,8 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from benchmarks.harness import machine
+
 COSTS = {"plans": "plans", "conflicts": "conflict table", "engine": "engine", "matching": "matching", "scores": "twins"}
 ONCE = ("plans", "conflicts")
 """Costs of a cell, not of each hour."""
@@ -43,10 +45,10 @@ SHIFTS = 3
 def measure(arms: int, most_in_hall: int) -> dict[str, object]:
     """The costs of a hall of a number of arms, CPU s in all, and the most memory, MB."""
     import numpy as np
-    from ask import repeated
-    from hall import hall
 
     from agents.registry import make_policy
+    from benchmarks.scaling.ask import repeated
+    from benchmarks.scaling.hall import hall
     from fleet.arm.space import space_table
     from fleet.env.vector import BatchEnv
     from scenarios.prepare.fleet import Randomisation, library_of, prepare
@@ -109,17 +111,21 @@ def _shift(env: Any, policy: Any, seed: int) -> tuple[float, float]:  # modules 
     return engine_s, matching_s
 
 
-def machine() -> dict[str, object]:
-    """The machine and how busy it is."""
-    return {"cores": os.cpu_count(), "load_average": [round(load, 2) for load in os.getloadavg()]}
-
-
 def run(sizes: list[int], most_in_hall: int, out: Path) -> None:
     """Measure each size, and add a line for it to the file in place of an earlier one."""
     out.parent.mkdir(parents=True, exist_ok=True)
     for arms in sizes:
         done = subprocess.run(
-            [sys.executable, __file__, "measure", "--arms", str(arms), "--hall", str(most_in_hall)],
+            [
+                sys.executable,
+                "-m",
+                "benchmarks.scaling.arms",
+                "measure",
+                "--arms",
+                str(arms),
+                "--hall",
+                str(most_in_hall),
+            ],
             stdout=-1,
             check=True,
         )
@@ -134,8 +140,7 @@ def plot(out: Path) -> None:
     """Print the table, and draw the costs per arm-hour; plans and conflicts per arm."""
     from matplotlib.figure import Figure
 
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    from result_tables import halls_table
+    from benchmarks.result_tables import halls_table
 
     rows = [json.loads(line) for line in out.read_text("utf-8").splitlines()]
     figure = Figure(figsize=(7, 4.2), layout="constrained")

@@ -1,8 +1,8 @@
 """Simulate whole fleets under faults, seed after seed, until a rule is broken or the run is stopped.
 
-    python benchmarks/simulation [--seeds N] [--hours H] [--first SEED]    seeds from SEED on, N of them or H real hours
-    python benchmarks/simulation --seed 123                                one seed, with the trace of its events
-    python benchmarks/simulation --mutations [NAME,NAME]                   break rules on purpose, and find each
+    python -m benchmarks.simulation [--seeds N] [--hours H] [--first SEED]    seeds from SEED on, N or H hours
+    python -m benchmarks.simulation --seed 123                                one seed, with the trace of its events
+    python -m benchmarks.simulation --mutations [NAME,NAME]                   break rules on purpose, and find each
 
 A fleet-hour is an hour of fleet time, in which jobs take as long as on a real arm; the participants' own clocks advance
 less, by the speed of the fleet (1 to 240, drawn by the seed). Both are printed. One seed gives the same events in every
@@ -15,11 +15,9 @@ import sys
 import time
 from dataclasses import dataclass
 
-import mutations  # noqa: F401 -- adds its mutations, as the next one does
-import steering_mutations  # noqa: F401
-from mutation import MUTATIONS, applied
-from shift import Shift
-from world import Violation
+from benchmarks.simulation.mutations import MUTATIONS, applied
+from benchmarks.simulation.shift import Shift
+from benchmarks.simulation.world import Violation
 
 FIND_S = 600.0
 """CPU seconds in which a mutation must be found."""

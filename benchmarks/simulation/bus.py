@@ -12,8 +12,8 @@ from functools import lru_cache
 from typing import Any
 
 import msgspec
-from world import Process, Sleep, World
 
+from benchmarks.simulation.world import Process, Sleep, World
 from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import channel_for

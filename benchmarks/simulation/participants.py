@@ -12,12 +12,11 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
-from bus import SimulatedClient
-from disk import Disk, DiskCalls, DiskPath
-from machine import Deeds, SimulatedArm, SimulatedEstimator
-from recording import simulated_files
-from world import Process, World
-
+from benchmarks.simulation.bus import SimulatedClient
+from benchmarks.simulation.disk import Disk, DiskCalls, DiskPath
+from benchmarks.simulation.machine import Deeds, SimulatedArm, SimulatedEstimator
+from benchmarks.simulation.recording import simulated_files
+from benchmarks.simulation.world import Process, World
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, Submission, SubmissionReply
 from fleet.errors import BusError

@@ -16,10 +16,10 @@ from typing import Any
 
 import msgspec
 import pyarrow.parquet as pq
-from bus import Bus, Published, SimulatedClient
-from disk import DiskCalls
-from world import Process, Violation
 
+from benchmarks.simulation.bus import Bus, Published, SimulatedClient
+from benchmarks.simulation.disk import DiskCalls
+from benchmarks.simulation.world import Process, Violation
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.operator import Operation

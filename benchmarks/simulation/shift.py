@@ -10,12 +10,19 @@ from collections.abc import Mapping
 from random import Random
 from typing import Any
 
-from bus import Bus
-from participants import AUCTIONEER, CLIENT, ArmProcess, Submitter, Watch, auctioneer_process, simulated_system
-from recording import RECORDER, Sent, recorder_process
-from steering import check_steering
-from world import Process, Violation, World
-
+from benchmarks.simulation.bus import Bus
+from benchmarks.simulation.participants import (
+    AUCTIONEER,
+    CLIENT,
+    ArmProcess,
+    Submitter,
+    Watch,
+    auctioneer_process,
+    simulated_system,
+)
+from benchmarks.simulation.recording import RECORDER, Sent, recorder_process
+from benchmarks.simulation.steering import check_steering
+from benchmarks.simulation.world import Process, Violation, World
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec
 from fleet.bus.protocol.operator import (

@@ -9,9 +9,8 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from recording import Sent
-from world import Violation
-
+from benchmarks.simulation.recording import Sent
+from benchmarks.simulation.world import Violation
 from fleet.bus.protocol.auction import Result
 from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, Operation, Pause, Resume, Settle
 

@@ -15,10 +15,14 @@ from contextlib import contextmanager
 from random import Random
 from typing import Any, Protocol
 
-from disk import Crash, Disk
 from numpy.random import SeedSequence
 
+<<<<<<< HEAD
 from fleet.bus.protocol.keys import SESSION_LEASE_S
+=======
+from benchmarks.simulation.disk import Crash, Disk
+from fleet.bus.protocol.registry import SESSION_LEASE_S
+>>>>>>> bench2
 from fleet.errors import FleetError
 
 BACKLOG = 4096

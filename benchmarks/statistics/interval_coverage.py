@@ -1,9 +1,8 @@
 """Share of 95 % intervals that contain the true mean, by simulation: the tables of docs/results.md.
 
-python benchmarks/statistics/interval_coverage.py [--out docs/results/coverage.json]   # a minute of one core
+python -m benchmarks.statistics.interval_coverage [--out docs/results/coverage.json]   # a minute of one core
 """
 
-import argparse
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from benchmarks.harness import options, write_text
 from scenarios.evaluate.statistics import aggregates, by_group, mean_bounds
 
 Array = np.ndarray
@@ -99,10 +99,8 @@ def measure() -> dict[str, Any]:
 
 def main() -> None:
     """Write the shares as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/coverage.json"))
-    out = parser.parse_args().out
-    out.write_text(json.dumps(measure(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    out = options(__doc__, out=Path("docs/results/coverage.json")).out
+    write_text(out, json.dumps(measure(), indent=1, ensure_ascii=False) + "\n")
 
 
 if __name__ == "__main__":

@@ -5,56 +5,49 @@ import re
 import shutil
 import subprocess
 import sys
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
 
 import pytest
 
+from benchmarks.chaos.fleet_under_test import JournalFiles
+from benchmarks.chaos.random_faults import OTHERS, schedule
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted
 from fleet.live.journal import Closed, Journal
 
-CAMPAIGN = Path(__file__).parents[2] / "benchmarks" / "chaos"
+ROOT = Path(__file__).parents[2]
 
 
 def strike(*faults, jobs, env=None):
     return subprocess.run(
-        [sys.executable, str(CAMPAIGN), "--only", ",".join(faults), "--jobs", str(jobs), "--speed", "240"],
+        [sys.executable, "-m", "benchmarks.chaos", "--only", ",".join(faults), "--jobs", str(jobs), "--speed", "240"],
         capture_output=True,
         text=True,
         timeout=900,
         check=False,
+        cwd=ROOT,
         env=env,
     )
 
 
-@pytest.fixture
-def chaos(monkeypatch):
-    """The modules of the campaign."""
-    monkeypatch.syspath_prepend(str(CAMPAIGN))
-    return import_module
-
-
-def test_a_seed_repeats_its_faults_and_12_faults_occur(chaos):
-    schedule, others = chaos("random_faults").schedule, chaos("random_faults").OTHERS
-
+def test_a_seed_repeats_its_faults_and_12_faults_occur():
     def faults(seed):
         return list(islice(schedule(seed, ("a", "b")), 60))
 
     assert faults(1) == faults(1) != faults(2)
-    assert len(others) >= 12
-    assert others.keys() <= {step.fault for step in faults(1)}
+    assert len(OTHERS) >= 12
+    assert OTHERS.keys() <= {step.fault for step in faults(1)}
 
 
-def test_jobs_are_counted_that_a_journal_has_left_out(chaos, tmp_path):
+def test_jobs_are_counted_that_a_journal_has_left_out(tmp_path):
     def close(journal, award, job):
         journal.append(
             AwardAccepted(Award(award, "r", "auctioneer", "q", JobSpec(job, "hold", ("x",)))),
             Closed(award, "finished", 1, 0.0, job=job, arm="a"),
         )
 
-    files = chaos("journal_files").JournalFiles(tmp_path)
+    files = JournalFiles(tmp_path)
     with Journal[ArmRecord](tmp_path / "a.journal", ArmRecord) as journal:
         close(journal, "1", "j")
         files.follow()

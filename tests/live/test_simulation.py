@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
-SIMULATION = Path(__file__).parents[2] / "benchmarks" / "simulation"
+ROOT = Path(__file__).parents[2]
 
 
 def simulate(*arguments, hash_seed="0"):
     return subprocess.run(
-        [sys.executable, str(SIMULATION), *arguments],
+        [sys.executable, "-m", "benchmarks.simulation", *arguments],
+        cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=600,

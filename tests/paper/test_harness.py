@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.paper import harness
 from benchmarks.paper.__main__ import STUDIES, main
-from benchmarks.paper.harness import Experiment, Table, Unit, compute, one_row, seeded, wholes
+from benchmarks.paper.harness import Experiment, Unit, compute, one_row, seeded, table_of, wholes
 from fleet.errors import FleetError
 from scenarios.json_rows import Rows
 
@@ -55,18 +55,13 @@ def test_a_value_that_json_has_not_is_refused() -> None:
         harness.plain({"value": object()})
 
 
-def test_a_table_as_markdown_and_for_a_terminal() -> None:
-    table = Table(("name", "n"), [("a", "10"), ("longer", "2")], "Numbers")
-    assert table.markdown() == "| name | n |\n| --- | --- |\n| a | 10 |\n| longer | 2 |"
-    assert table.text().splitlines() == [
-        "Numbers",
-        "| name   | n  |",
-        "| ------ | -- |",
-        "| a      | 10 |",
-        "| longer | 2  |",
-    ]
-    with pytest.raises(ValueError, match="needs 2 cells"):
-        Table(("name", "n"), [("a",)])
+def test_tables_are_printed_with_their_captions(tmp_path, capsys) -> None:
+    tables = {name: table_of(("name", "n"), [(name, "10"), ("longer", "2")], "Numbers") for name in ("a", "b")}
+    study = Experiment(help="", units=lambda given: [one_row("a", dict)], tables=lambda rows: tables)
+    harness.run("numbers", study, ["--out", str(tmp_path / "rows.jsonl")])
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    first = [["Numbers"], ["name", "n"], ["a", "10"], ["longer", "2"]]
+    assert lines == [*first, [], *first[:2], ["b", "10"], first[3]]
 
 
 @dataclass(frozen=True)
@@ -86,27 +81,24 @@ def per_seed(seed, size, wanted):
 
 
 def totals(rows):
-    return {"totals": Table(("part", "total"), [(row["part"], str(row["total"])) for row in rows])}
+    return {"totals": table_of(("part", "total"), [(row["part"], str(row["total"])) for row in rows])}
 
 
 SEEDED = seeded("Totals.", Size, 2, per_seed, totals, parts=("x", "y"))
 
 
-def run(tmp_path, capsys, *words: str) -> list[str]:
+def run(tmp_path, capsys, *words: str) -> list[list[str]]:
     harness.run("totals", SEEDED, [*words, "--out", str(tmp_path / "rows.jsonl")])
-    return capsys.readouterr().out.splitlines()[2:]
+    return [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
 
 
 def test_the_options_of_a_size_are_its_numbers(tmp_path, capsys) -> None:
-    assert run(tmp_path, capsys) == ["| x    | 105   |", "| y    | 105   |"] * 2
-    assert run(tmp_path, capsys, "--seeds", "1", "--quick", "--steps", "3") == ["| x    | 6     |", "| y    | 6     |"]
-    assert run(tmp_path, capsys, "--seeds", "1", "--jobs", "1", "2")[0] == "| x    | 21    |"
+    assert run(tmp_path, capsys) == [["x", "105"], ["y", "105"]] * 2
+    assert run(tmp_path, capsys, "--seeds", "1", "--quick", "--steps", "3") == [["x", "6"], ["y", "6"]]
+    assert run(tmp_path, capsys, "--seeds", "1", "--jobs", "1", "2")[0] == ["x", "21"]
     rows = Rows(tmp_path / "rows.jsonl")
     assert len(rows.by_key) == 4 + 2 + 2
-    assert run(tmp_path, capsys, "--show", "--first-seed", "2", "--seeds", "1") == [
-        "| x    | 105   |",
-        "| y    | 105   |",
-    ]
+    assert run(tmp_path, capsys, "--show", "--first-seed", "2", "--seeds", "1") == [["x", "105"], ["y", "105"]]
     with pytest.raises(FleetError, match="has no such row"):
         run(tmp_path, capsys, "--show", "--first-seed", "9")
 
