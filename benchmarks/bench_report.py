@@ -23,13 +23,9 @@ from benchmarks.harness import CHROMIUM, options
 from fleet.arm.cell import cell_model
 from fleet.robot import Mount, Robot
 from fleet.telemetry import Telemetry
-<<<<<<< HEAD
-from scenarios.run.log import RunLog, open_run
-from scenarios.run.records import ShiftLog
-=======
 from scenarios.live.fleet_processes import PROGRAM
 from scenarios.run.log import RunLog, open_run
->>>>>>> bench2
+from scenarios.run.records import ShiftLog
 from scenarios.show.run_page import report_html
 
 COLUMNS = {
@@ -61,14 +57,6 @@ PICTURES = """(scrub) => new Promise((done) => {
 })"""
 
 
-<<<<<<< HEAD
-def page_of(run: RunLog) -> str:
-    """The report of a run."""
-    return run.page()
-
-
-=======
->>>>>>> bench2
 def enlarged(run: RunLog, arms: int) -> str:
     """The report of a fleet whose arms repeat those of a run."""
     telemetry, count = run.readings, len(run.arms)

@@ -1,9 +1,10 @@
-"""Fields of dataclasses with their sentence, bounds and choices, for the command line, files and docs."""
+"""Fields of dataclasses, and parameters of commands, with their sentence, bounds and choices."""
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from functools import cache
 from math import inf
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 from fleet.errors import NAME_RULE, is_name, nearest, printable
 
@@ -29,6 +30,8 @@ class Option:
     """What an error calls one of these names; "" for the name of the field."""
     is_name: bool = False
     """Whether a text must follow the rule for names, which become parts of keys and files; "" is none."""
+    is_argument: bool = False
+    """Whether a command takes it by position."""
     flag: str = ""
     """Name on the command line; "" for that of the field."""
     panel: str = ""
@@ -48,16 +51,17 @@ class Option:
             return f"> {self.low:.10g} and at most {self.high:.10g}"
         return f"{self.low:.10g} to {self.high:.10g}"
 
-    def problem(self, name: str, value: object) -> str:
+    def problem(self, name: str, value: object, default: object = "") -> str:
         """Sentence that says what is wrong with a value and what is allowed; "" if nothing is wrong.
 
         Args:
             name: What the sentence calls the value, as `--seed` or `RunSpec.seed`.
+            default: Allowed although it does not follow the rule for names.
         """
         if self.choices and isinstance(value, str) and value not in self.choices:
-            noun = self.noun or name.rpartition(".")[2].removeprefix("--")
+            noun = self.noun or name.rpartition(".")[2].removeprefix("--").lower()
             return f"No {noun} '{printable(value)}'{nearest(value, self.choices)}"
-        if self.is_name and isinstance(value, str) and value and not is_name(value):
+        if self.is_name and isinstance(value, str) and value != default and not is_name(value):
             return f"{name} must have {NAME_RULE} (got '{printable(value)}')."
         if isinstance(value, int | float) and not self._within(value):
             return f"{name} must be {self.limits} (got {value:g})."
@@ -68,16 +72,32 @@ class Option:
 
 
 def option(help: str, default: Any, **more: Any) -> Any:
-    """A field of a dataclass that is an option; `more` are fields of `Option`.
+    """A field of a dataclass, or a parameter of a command, that is an option; `more` are fields of `Option`.
 
-    Any: a dataclass declares the type beside the name, as with `dataclasses.field`.
+    Any: the type stands beside the name, as with `dataclasses.field`.
     """
     return field(default=default, metadata={_KEY: Option(help=help, **more)})
 
 
+def argument(help: str, default: Any = MISSING, **more: Any) -> Any:
+    """An option that a command takes by position; without a default it must be given."""
+    return option(help, default, is_argument=True, **more)
+
+
+def option_of(given: "Field[Any]", kind: Any) -> Option | None:
+    """The option that a field or parameter of a type is; None of any other field.
+
+    The names of a Literal type are the allowed ones, unless others are given.
+    """
+    known: Option | None = given.metadata.get(_KEY)
+    literal = next((each for each in (kind, *get_args(kind)) if get_origin(each) is Literal), None)
+    return replace(known, choices=get_args(literal)) if known and literal and not known.choices else known
+
+
+@cache
 def options_of(kind: type) -> Mapping[str, Option]:
     """The options of a dataclass by field; fields without an option are left out."""
-    return dict(_options(kind))
+    return {each.name: known for each in fields(kind) if (known := option_of(each, each.type))}
 
 
 def check(value: object) -> None:
@@ -86,12 +106,6 @@ def check(value: object) -> None:
     Raises:
         ValueError: names the field, the value and what is allowed.
     """
-    for name, known in _options(type(value)):
+    for name, known in options_of(type(value)).items():
         if problem := known.problem(f"{type(value).__name__}.{name}", getattr(value, name)):
             raise ValueError(problem)
-
-
-def _options(kind: type) -> Iterator[tuple[str, Option]]:
-    for each in fields(kind):
-        if _KEY in each.metadata:
-            yield each.name, each.metadata[_KEY]

@@ -11,6 +11,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from fleet.errors import FleetError
+from fleet.files import atomic_path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +73,19 @@ def disk_errors(out: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise FleetError(f"Cannot write to '{out}': {error.strerror or error}.") from error
+
+
+@contextmanager
+def new_file(out: Path) -> Iterator[Path]:
+    """A temporary file that is renamed to `out` when the block succeeds; its folder is made.
+
+    Raises:
+        FleetError: `out` cannot be written.
+    """
+    with disk_errors(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(out) as draft:
+            yield draft
 
 
 def check_free(out: Path, kind: ResultKind, *, overwrite: bool) -> None:

@@ -209,8 +209,8 @@ print(*sorted(f.name for f in files("scenarios").joinpath("library").iterdir() i
 
 @pytest.mark.ci_slow
 def test_the_command_works_there(elsewhere):
-    assert "quickstart" in there(elsewhere, "thermofleet", "list")
-    told = json.loads(there(elsewhere, "thermofleet", "hold", "--payload", "3", "--json"))
+    assert "quickstart" in there(elsewhere, "thermofleet", "show")
+    told = json.loads(there(elsewhere, "thermofleet", "show", "--hold", "3", "--json"))
     # facts of the arm: outstretched with 3 kg, joint 2 passes 60 °C after 12.6 min and 75 °C after 30
     assert told["cold"]["t60_min"][1] == pytest.approx(12.6, abs=0.5)
     assert told["cold"]["t75_min"][1] == pytest.approx(30.0, abs=1.5)

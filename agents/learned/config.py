@@ -1,8 +1,10 @@
-"""Hyperparameters of a training of networks."""
+"""Length of a training, and hyperparameters of that of networks."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from math import inf
 from typing import Literal, get_args
 
+from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, check, option
 
 Algorithm = Literal["mappo", "ippo"]
@@ -24,6 +26,49 @@ class NetworkSize:
         for name, value in vars(self).items():
             if value < 1:
                 raise ValueError(f"NetworkSize.{name} must be >= 1 (got {value}).")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingLength:
+    """Length of a training; subclasses add counts, which must be positive.
+
+    Raises:
+        FleetError: a number is not positive.
+    """
+
+    minutes: float = option(
+        "Training time excluding the twins, min. With --resume: additional time; with --resume and --seeds: total of "
+        "each training.",
+        30.0,
+        low=0,
+        high=100_000,
+        above=True,
+    )
+    iterations: int | None = option(
+        "Maximum number of iterations in total, those before a resume included.", None, low=1, high=1_000_000
+    )
+    in_total: bool = False
+    """Whether `minutes` include those before a resume, too, and a complete training is skipped."""
+
+    def __post_init__(self) -> None:
+        try:
+            check(self)
+        except ValueError as error:
+            raise FleetError(str(error)) from error
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if value is not None and each.name not in ("minutes", "iterations", "in_total") and value < 1:
+                raise FleetError(f"{each.name} must be >= 1 (got {value}).")
+
+    def share(self, iterations: int, seconds: float, before_s: float) -> float:
+        """Finished share of a training; from 1 on it is complete.
+
+        Args:
+            iterations, seconds: Of all sessions.
+            before_s: Time of the sessions before a resume.
+        """
+        spent_s = seconds - (0.0 if self.in_total else before_s)
+        return max(spent_s / (60.0 * self.minutes), iterations / (self.iterations or inf))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,12 +17,8 @@ from typing import Any, Protocol
 
 from numpy.random import SeedSequence
 
-<<<<<<< HEAD
-from fleet.bus.protocol.keys import SESSION_LEASE_S
-=======
 from benchmarks.simulation.disk import Crash, Disk
-from fleet.bus.protocol.registry import SESSION_LEASE_S
->>>>>>> bench2
+from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.errors import FleetError
 
 BACKLOG = 4096

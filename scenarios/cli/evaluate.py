@@ -1,131 +1,79 @@
-"""Commands that evaluate and train policies: suite, bounds, leaderboard and train; see `compare` too.
-
-`thermofleet compare`.
-
-`thermofleet bounds`: random, best rule, hindsight and upper bound of shifts.
-
-`thermofleet leaderboard`.
-"""
+"""Commands that evaluate and train policies: compare, bounds, leaderboard and train."""
 
 import json
 from dataclasses import asdict
 from itertools import chain
 from math import inf
+from os import cpu_count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from agents.learned.config import PpoConfig
-from agents.learned.evolution import TrainingLength
+from agents.learned.config import PpoConfig, TrainingLength
 from agents.registry import RULES, WRAPPERS_HELP
+from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
+from fleet.fields import MAX_SEED, argument, option
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.options import JsonOption, RandomiseOption, number, parse_randomisation
 from scenarios.cli.terminal import KEPT, echo, out_console, print_json, progress_bar, say
 from scenarios.result_folder import disk_errors
 from scenarios.show.table import Table
-from scenarios.spec.options import RunSpec
-from scenarios.spec.parse import choose
+from scenarios.spec.options import Budget, RunSpec, StudySpec
 
 if TYPE_CHECKING:
     from scenarios.evaluate.leaderboard import Submission
 
 
-def suite_command(
-    split: Annotated[
-        str | None,
-        typer.Option(help="List the instances of this split: train, validation, test or sizes.", show_default=False),
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """List the cells of the benchmark suite, or the instances of one of its splits.
-
-    A cell is a group of arms with stations and tasks. An instance is a scenario
-    in a cell with a seed: `thermofleet show test/0000` describes it.
-    """
-    from scenarios.suite.instances import CELLS
-    from scenarios.suite.splits import manifest
-
-    if split is not None:
-        rows = manifest(split)
-        if as_json:
-            print_json([asdict(row) for row in rows])
-            return
-        axes = (", ".join(f"{name} {value}" for name, value in asdict(row.axes).items()) for row in rows)
-        lines = tuple((row.name, row.cell, text, str(row.count)) for row, text in zip(rows, axes, strict=True))
-        out_console.print(Table(head=("instance", "cell", "axes", "jobs"), rows=lines, numbers=False))
-        return
-    if as_json:
-        print_json({cell.name: {**asdict(cell), "stations_per_arm": cell.stations_per_arm} for cell in CELLS})
-        return
-    head = ("split", "cell", "arms are", "stations per arm", "hours", "instances")
-    lines = tuple(
-        (cell.split, cell.name, cell.unlike, f"{cell.stations_per_arm:.2g}", f"{cell.hours:g}", str(cell.instances))
-        for cell in CELLS
-    )
-    out_console.print(Table(head=head, rows=lines, numbers=False))
+Algorithm = Literal["mappo", "ippo", "pairs"]
+TrainingSplit = Literal["train"]
+"""The other splits are for validation and for results."""
+PAGE = "index.html"
+_SUBMIT = "Check a result and write the file to send"
+FOLDER = Path("docs/results/leaderboard")
+"""Of the results in a checkout."""
 
 
 def train_command(
+    scenario: str | None = argument("A library name, a .toml file or an instance of the suite; or use --suite.", None),
+    *,
     given: Annotated[Given, From(PpoConfig, "warm_start", "envs", "decisions", "learning_rate", "entropy", "seed")],
     length: Annotated[Given, From(TrainingLength, "minutes", "iterations")],
     models: Annotated[Given, From(RunSpec, "difficulty", "risk")],
-    scenario: Annotated[
-        str | None, typer.Argument(help="A library name, a .toml file or an instance of the suite; or use --suite.")
-    ] = None,
-    suite: Annotated[
-        str | None,
-        typer.Option(
-            help="Split of the suite to train over, which must be train; validation is on the split validation.",
-            show_default=False,
-        ),
-    ] = None,
-    algo: Annotated[
-        str | None,
-        typer.Option(
-            help="mappo (one critic for the whole fleet), ippo (one critic per arm), or pairs (scores of arm-job pairs "
-            "by evolution, only with --suite); default: mappo, with --suite pairs.",
-            show_default=False,
-        ),
-    ] = None,
-    discount_hours: Annotated[
-        float, number("Horizon of the discount: a reward this much later counts 1/e.", 0.01, 1000)
-    ] = 2.0,
-    instances: Annotated[
-        int | None,
-        number(
-            "With --suite: number of training instances; default: 12, with --algo pairs 36.", 1, 200, show_default=False
-        ),
-    ] = None,
-    validation_instances: Annotated[
-        int | None,
-        number(
-            "With --suite: number of validation instances; default: 24, four shifts each, with --algo pairs 60, the "
-            "shift of the benchmark each.",
-            1,
-            200,
-            show_default=False,
-        ),
-    ] = None,
-    seeds: Annotated[int, number("Number of trainings, one after another, with seeds from --seed on.", 1, 100)] = 1,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED or runs/SPLIT-ALGO-SEED. Not with --seeds."
-        ),
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Continue the training in --out. With --seeds: continue trainings that have begun, skip complete "
-            "ones, begin the others.",
-        ),
-    ] = False,
-    threads: Annotated[int, number("Threads of the network's computations.", 1, 1024)] = 1,
-    randomise: RandomiseOption = None,
+    suite: str | None = option(
+        "Split of the suite to train over, which must be train; validation is on the split validation.", None
+    ),
+    algo: Algorithm | None = option(
+        "mappo (one critic for the whole fleet), ippo (one critic per arm), or pairs (scores of arm-job pairs "
+        "by evolution, only with --suite); default: mappo, with --suite pairs.",
+        None,
+        noun="algorithm",
+    ),
+    discount_hours: float = option(
+        "Horizon of the discount: a reward this much later counts 1/e.", 2.0, low=0.01, high=1000
+    ),
+    instances: int | None = option(
+        "With --suite: number of training instances; default: 12, with --algo pairs 36.", None, low=1, high=200
+    ),
+    validation_instances: int | None = option(
+        "With --suite: number of validation instances; default: 24, four shifts each, with --algo pairs 60, the "
+        "shift of the benchmark each.",
+        None,
+        low=1,
+        high=200,
+    ),
+    seeds: int = option("Number of trainings, one after another, with seeds from --seed on.", 1, low=1, high=100),
+    out: Path | None = option(
+        "Folder of the policy; default: runs/SCENARIO-ALGO-SEED or runs/SPLIT-ALGO-SEED. Not with --seeds.", None
+    ),
+    resume: bool = option(
+        "Continue the training in --out. With --seeds: continue trainings that have begun, skip complete "
+        "ones, begin the others.",
+        False,
+    ),
+    threads: int = option("Threads of the network's computations.", 1, low=1, high=1024),
+    randomise: list[str] | None = options.RANDOMISE,
 ) -> None:
     """Train a policy by reinforcement learning or evolution, with checkpoints and learning curves.
 
@@ -138,6 +86,7 @@ def train_command(
     from scenarios.extras import require_extra
     from scenarios.policy_loader import policy_of, without_simulator
     from scenarios.spec.load import INSTANCE, load
+    from scenarios.spec.parse import choose
 
     if (scenario is None) == (suite is None):
         raise FleetError("Give either a scenario or --suite SPLIT.")
@@ -145,7 +94,7 @@ def train_command(
         raise FleetError(
             "--randomise needs a scenario: the instances of --suite are fixed. Give a scenario instead of --suite."
         )
-    varied = parse_randomisation(randomise)
+    varied = options.parse_randomisation(randomise)
     if seeds > 1 and out is not None:
         raise FleetError("--seeds makes several trainings: they go to runs/, leave --out away.")
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
@@ -155,7 +104,7 @@ def train_command(
 
     spec, seed = RunSpec(**models), given.pop("seed", 0)
     sources: Any = {"difficulty": spec.difficulty, "risk": spec.risk}
-    algorithm = choose("algorithm", algo or ("mappo" if suite is None else "pairs"), Algorithm)
+    algorithm = algo or ("mappo" if suite is None else "pairs")
     if algorithm == "pairs" and suite is None:
         raise FleetError("--algo pairs trains over a split: give --suite, not a scenario.")
     chosen = load(scenario) if scenario is not None else None
@@ -219,105 +168,55 @@ def train_command(
             return
 
 
-Algorithm = Literal["mappo", "ippo", "pairs"]
-TrainingSplit = Literal["train"]
-"""The other splits are for validation and for results."""
-
-
-PAGE = "index.html"
-
-
 def compare_command(
     ctx: typer.Context,
-    scenario: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Library names (see `thermofleet show`) or .toml files; or use --suite.", show_default=False
-        ),
-    ] = None,
-    policies: Annotated[
-        str,
-        typer.Option(
-            help="Policies, separated by commas: names, FILE.py:CLASS, bus:NAME in another process, or folders of "
-            "`thermofleet train` ('FOLDER-*': one policy with several trainings); POLICY@SOURCE for a policy with one "
-            "source of predictions; "
-            f"{WRAPPERS_HELP}. Default: {', '.join(RULES)}.",
-            show_default=False,
-        ),
-    ] = ",".join(RULES),
-    suite: Annotated[
-        str | None,
-        typer.Option(
-            help="Instances that are judged together: train, validation, test or sizes; or instances of a split "
-            "(test/0017), library names and .toml files, separated by commas.",
-            show_default=False,
-        ),
-    ] = None,
-    seeds: Annotated[
-        int | None,
-        options.number("Number of seeds of each instance; default: 10, with --suite 1.", 1, 10_000, show_default=False),
-    ] = None,
-    first_seed: Annotated[
-        int,
-        options.number("First seed of a scenario. Compare on seeds that you did not tune on.", 0, options.MAX_SEED),
-    ] = 0,
-    fleets: Annotated[
-        int, options.number("Number of fleets: draws of the arms' deviations (spread.seed).", 1, 100)
-    ] = 1,
-    trainings: Annotated[int, options.number("Number of trainings of each fleet's twins.", 1, 20)] = 1,
-    baseline: Annotated[
-        str | None,
-        typer.Option(
-            help="Policy that the paired differences refer to; default: round_robin if it is compared, else the first.",
-            show_default=False,
-        ),
-    ] = None,
-    difficulty: Annotated[
-        str,
-        typer.Option(
-            help="Sources of predictions, separated by commas: twin, oracle (simulator), blind (none), or models to "
-            "compare: trained, untrained, unweighted, torque, weighted-torque, rc-nominal, rc, random, inverted, "
-            "constant. With several, POLICY@SOURCE names a policy."
-        ),
-    ] = "twin",
-    risk: options.RiskOption = "rc",
-    randomise: options.RandomiseOption = None,
-    decision_limit: Annotated[
-        float, options.number("Longest time for one decision of a policy, s. A slower policy fails.", 0.001, 86_400)
-    ] = 60.0,
-    references: Annotated[
-        Path | None,
-        typer.Option(
-            help="Rows of `thermofleet bounds`, for normalised scores; splits use those of the package, if any.",
-            show_default=False,
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the results, one row per shift, and of their page, index.html. The same command continues "
-            "after an interruption.",
-            show_default=False,
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None, options.number("Number of processes; default: one per core.", 1, 1024, show_default=False)
-    ] = None,
-    ray: Annotated[
-        str | None,
-        typer.Option(help="Run on a Ray cluster: its address, `auto` for the one of this machine.", show_default=False),
-    ] = None,
-    marl_eval: Annotated[
-        bool, typer.Option("--marl-eval", help="With --out: also write marl_eval.json, which marl-eval reads.")
-    ] = False,
-    as_json: options.JsonOption = False,
-    topology: options.TopologyOption = "complete",
-    radius: options.RadiusOption = 0.5,
-    topology_seed: options.TopologySeedOption = 0,
-    delay_s: options.DelayOption = 0.0,
-    jitter_s: options.JitterOption = 0.0,
-    loss: options.LossOption = 0.0,
-    partition: options.PartitionOption = None,
+    scenario: list[str] | None = argument(
+        "Library names (see `thermofleet show`) or .toml files; or use --suite.", None
+    ),
+    *,
+    policies: str = option(
+        "Policies, separated by commas: names, FILE.py:CLASS, bus:NAME in another process, or folders of "
+        "`thermofleet train` ('FOLDER-*': one policy with several trainings); POLICY@SOURCE for a policy with one "
+        "source of predictions; "
+        f"{WRAPPERS_HELP}. Default: {', '.join(RULES)}.",
+        ",".join(RULES),
+        shown="",
+    ),
+    suite: str | None = option(
+        "Instances that are judged together: train, validation, test or sizes; or instances of a split "
+        "(test/0017), library names and .toml files, separated by commas.",
+        None,
+    ),
+    seeds: int | None = option(
+        "Number of seeds of each instance; default: 10, with --suite 1.", None, low=1, high=10_000
+    ),
+    first_seed: int = option(
+        "First seed of a scenario. Compare on seeds that you did not tune on.", 0, low=0, high=MAX_SEED
+    ),
+    spec: Annotated[Given, From(StudySpec)],
+    baseline: str | None = option(
+        "Policy that the paired differences refer to; default: round_robin if it is compared, else the first.", None
+    ),
+    difficulty: str = option(
+        "Sources of predictions, separated by commas: twin, oracle (simulator), blind (none), or models to "
+        "compare: trained, untrained, unweighted, torque, weighted-torque, rc-nominal, rc, random, inverted, "
+        "constant. With several, POLICY@SOURCE names a policy.",
+        "twin",
+    ),
+    randomise: list[str] | None = options.RANDOMISE,
+    references: Path | None = option(
+        "Rows of `thermofleet bounds`, for normalised scores; splits use those of the package, if any.", None
+    ),
+    out: Path | None = option(
+        "Folder of the results, one row per shift, and of their page, index.html. The same command continues "
+        "after an interruption.",
+        None,
+    ),
+    workers: int | None = options.WORKERS,
+    ray: str | None = option("Run on a Ray cluster: its address, `auto` for the one of this machine.", None),
+    marl_eval: bool = option("With --out: also write marl_eval.json, which marl-eval reads.", False),
+    as_json: bool = options.JSON,
+    channel: Annotated[Given, From(Channel)],
 ) -> None:
     """Compare policies on the same seeds, with confidence intervals.
 
@@ -331,7 +230,6 @@ def compare_command(
     from scenarios.evaluate.scores import references_of, to_marl_eval
     from scenarios.evaluate.study import Study, cases_of, columns, suite_label, suite_of
     from scenarios.show.comparison_page import Judged, comparison_page, result_text, verdict
-    from scenarios.spec.options import RiskName
 
     if bool(scenario) == bool(suite):
         raise FleetError("Give either scenarios or --suite.")
@@ -346,23 +244,14 @@ def compare_command(
         raise FleetError("Give either --references or --randomise: references are of shifts without randomisation.")
     out = out and out.resolve()  # a policy may change the folder of the process
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
-    channels = [
-        options.channel_of(
-            case.scenario, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
-            jitter_s=jitter_s, loss=loss,
-        )
-        for case in cases
-    ]  # fmt: skip
+    channels = [options.channel_of(case.scenario, **channel) for case in cases]
     study = Study(
         policies=options.split_names(policies),
         cases=cases,
-        fleets=fleets,
-        trainings=trainings,
         difficulties=options.split_names(difficulty),
-        risk=choose("risk", risk, RiskName),
         randomise=varied,
         channel=channels[0],  # the same of all; each scenario has the arms that it names
-        decision_limit_s=decision_limit,
+        **spec,
     )
     names = study.competitors
     base = baseline or names.get(("round_robin", study.sources[0]), next(iter(names.values())))
@@ -392,48 +281,27 @@ def compare_command(
 
 
 def bounds_command(
-    scenarios: Annotated[
-        str | None,
-        typer.Argument(
-            help="Separated by commas: library names (see `thermofleet show`), .toml files, or instances of the suite, "
-            "as test/0017.",
-            show_default=False,
-        ),
-    ] = None,
-    suite: Annotated[
-        str | None, typer.Option(help="All instances of a split: train, validation, test or sizes.", show_default=False)
-    ] = None,
-    seeds: Annotated[int, options.number("Number of seeds of each scenario.", 1, 10_000)] = 5,
-    first_seed: Annotated[int, options.number("First seed.", 0, options.MAX_SEED)] = 0,
-    budget: Annotated[float, options.number("CPU seconds of the search for each shift.", 0, 86_400, above=True)] = 30.0,
-    evaluations: Annotated[
-        int | None,
-        options.number(
-            "End the search after this number of simulated shifts; the file then does not depend on other load.",
-            1,
-            10**9,
-            show_default=False,
-        ),
-    ] = None,
-    nodes: Annotated[
-        int,
-        options.number("Maximum nodes of the upper bound's branch and bound; 0: only the linear program.", 0, 10**6),
-    ] = 2000,
-    starts: Annotated[
-        str | None,
-        typer.Option(
-            help="Policies that the search starts from, separated by commas; default: all but random. Without "
-            "rolling_horizon it takes a tenth of the time.",
-            show_default=False,
-        ),
-    ] = None,
-    workers: Annotated[int, options.number("Number of processes.", 1, 1024)] = 1,
-    difficulty: options.DifficultyOption = "oracle",
-    out: Annotated[Path, typer.Option(help="File of the rows; finished ones are not computed again.")] = Path(
-        "runs/bounds.jsonl"
+    scenarios: str | None = argument(
+        "Separated by commas: library names (see `thermofleet show`), .toml files, or instances of the suite, "
+        "as test/0017.",
+        None,
     ),
-    show_only: Annotated[bool, typer.Option("--show", help="Compute nothing: print all rows of the file.")] = False,
-    format_: Annotated[str, typer.Option("--format", help="table, markdown or json.")] = "table",
+    *,
+    suite: str | None = option("All instances of a split: train, validation, test or sizes.", None),
+    seeds: int = option("Number of seeds of each scenario.", 5, low=1, high=10_000),
+    first_seed: int = option("First seed.", 0, low=0, high=MAX_SEED),
+    budget: Annotated[Given, From(Budget)],
+    starts: str | None = option(
+        "Policies that the search starts from, separated by commas; default: all but random. Without "
+        "rolling_horizon it takes a tenth of the time.",
+        None,
+    ),
+    workers: int | None = options.WORKERS,
+    models: Annotated[Given, From(RunSpec, "difficulty", difficulty="oracle")],
+    out: Path = option("File of the rows; finished ones are not computed again.", Path("runs/bounds.jsonl")),
+    show_only: bool = option("Compute nothing: print all rows of the file.", False, flag="--show"),
+    markdown: bool = option("Print the table in Markdown.", False),
+    as_json: bool = options.JSON,
 ) -> None:
     """Bound the best possible reward of shifts from both sides.
 
@@ -443,85 +311,50 @@ def bounds_command(
     same command continues after an interruption. A larger budget searches again.
     With --evaluations in place of --budget, a repetition gives the same file.
     """
-    choose("format", format_, Literal["table", "markdown", "json"])
-    from scenarios.evaluate.hindsight import Budget
-    from scenarios.evaluate.references import (
-        STARTS,
-        cells,
-        heads_of,
-        load_references,
-        reference_table,
-        references,
-        tasks_of,
-    )
+    from scenarios.evaluate import references as bounds
     from scenarios.policy_loader import scope_of
-    from scenarios.spec.options import DifficultyName
 
     if show_only:
         if not out.is_file():
             raise FleetError(f"--show prints a file of this command, and there is no file '{out}'.")
-        found = load_references(out)
+        found = bounds.load_references(out)
     else:
         if bool(scenarios) == bool(suite):
             raise FleetError("Give either scenarios or --suite.")
-        tasks = tasks_of(suite or scenarios or "", seeds, first_seed)
-        limit = Budget(seconds=budget, nodes=nodes)
-        if evaluations is not None:
-            limit = Budget(seconds=inf, evaluations=evaluations, nodes=nodes)
-        source = choose("difficulty", difficulty, DifficultyName)
-        policies = options.split_names(starts) if starts else STARTS
+        tasks = bounds.tasks_of(suite or scenarios or "", seeds, first_seed)
+        if "evaluations" in budget:
+            budget["seconds"] = inf
+        policies = options.split_names(starts) if starts else bounds.STARTS
         for name in policies:
             scope_of(name)
-        chosen: Any = {"difficulty": source, "workers": workers, "policies": policies}
+        chosen: Any = {**models, "workers": workers or cpu_count() or 1, "policies": policies}
         with progress_bar(kept="Finished rows are", file=out) as progress:
-            found = references(tasks, out, limit, **chosen, progress=progress)
-    if format_ == "json":
+            found = bounds.references(tasks, out, Budget(**budget), **chosen, progress=progress)
+    if as_json:
         print_json([asdict(each) | {"gap": each.gap, "rule_score": each.normalised(each.best_rule)} for each in found])
         return
-    if format_ == "markdown":
-        echo(reference_table(found))
+    if markdown:
+        echo(bounds.reference_table(found))
         return
-    head = heads_of(found)
-    out_console.print(Table(head=head, rows=tuple(cells(each)[: len(head)] for each in found)))
+    head = bounds.heads_of(found)
+    out_console.print(Table(head=head, rows=tuple(bounds.cells(each)[: len(head)] for each in found)))
     if not show_only:
         say(f"Written to {out}.")
 
 
-_SUBMIT = "Check a result and write the file to send"
-FOLDER = Path("docs/results/leaderboard")
-"""Of the results in a checkout."""
-
-
 def leaderboard_command(
-    folder: Annotated[Path, typer.Argument(help="Folder of results, one file for each policy.")] = FOLDER,
-    split: Annotated[str, typer.Option(help="Split of the suite: test, sizes or validation.")] = "test",
-    verify: Annotated[
-        int, options.number("Number of shifts to repeat of each result of a built-in policy.", 0, 200)
-    ] = 0,
-    markdown: Annotated[
-        bool, typer.Option("--markdown", help="Print the table as docs/leaderboard.md has it.")
-    ] = False,
-    as_json: options.JsonOption = False,
-    submit: Annotated[
-        Path | None,
-        typer.Option(help="Folder of `thermofleet compare --suite test --out`.", rich_help_panel=_SUBMIT),
-    ] = None,
-    author: Annotated[
-        str, typer.Option(help="--submit: name of the person who sends the result.", rich_help_panel=_SUBMIT)
-    ] = "",
-    about: Annotated[
-        str,
-        typer.Option(help="--submit: what the policy is, and where to get it; one sentence.", rich_help_panel=_SUBMIT),
-    ] = "",
-    policies: Annotated[
-        str | None,
-        typer.Option(
-            help="--submit: policies of the folder, separated by commas; default: all.",
-            show_default=False,
-            rich_help_panel=_SUBMIT,
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option(help="--submit: folder for the files.", rich_help_panel=_SUBMIT)] = Path(),
+    folder: Path = argument("Folder of results, one file for each policy.", FOLDER),
+    split: str = option("Split of the suite: test, sizes or validation.", "test"),
+    verify: int = option("Number of shifts to repeat of each result of a built-in policy.", 0, low=0, high=200),
+    markdown: bool = option("Print the table as docs/leaderboard.md has it.", False),
+    as_json: bool = options.JSON,
+    submit: Path | None = option("Folder of `thermofleet compare --suite test --out`.", None, panel=_SUBMIT),
+    author: str = option("--submit: name of the person who sends the result.", "", panel=_SUBMIT),
+    about: str = option("--submit: what the policy is, and where to get it; one sentence.", "", panel=_SUBMIT),
+    policies: str | None = option(
+        "--submit: policies of the folder, separated by commas; default: all.", None, panel=_SUBMIT
+    ),
+    out: Path = option("--submit: folder for the files.", Path(), panel=_SUBMIT),
 ) -> None:
     """Print the leaderboard: normalised scores of all results on a split.
 
@@ -539,6 +372,7 @@ def leaderboard_command(
     from scenarios.evaluate.leaderboard import best_text, board_of, board_text, read_all, remark_text
     from scenarios.evaluate.statistics import LEGEND
     from scenarios.show.comparison_page import narrow_score_tables
+    from scenarios.spec.parse import choose
     from scenarios.spec.schema import SplitName
 
     split = choose("split", split, SplitName)

@@ -1,60 +1,49 @@
-"""Commands that steer a live fleet: `thermofleet job` and `thermofleet arm pause | resume | reset | clear`."""
+"""Commands that steer a live fleet: `thermofleet job` and `thermofleet arm pause | reset | clear`."""
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from fleet.errors import FleetError
+from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, JsonOption, check_name, number
+from scenarios.cli import options
 from scenarios.cli.terminal import out_console, print_json
 from scenarios.show.table import Table
 
 if TYPE_CHECKING:  # slow to import
     from fleet.bus.protocol.operator import Action
 
-_RANGES = {name: (bounds.low, bounds.high) for name, bounds in BOUNDS.items()}
+_RANGES = {name: {"low": bounds.low, "high": bounds.high} for name, bounds in BOUNDS.items()}
 _ONE = "One job instead of a file"
 LISTEN_S = 1.0
 """Real seconds of listening for the list of jobs."""
-JobArg = Annotated[str, typer.Argument(help="Name of the job.")]
-ArmArg = Annotated[str, typer.Argument(help="Name of the arm.", callback=check_name)]
-ArmOrAll = Annotated[str, typer.Argument(help="Name of the arm. Default: all arms.")]
-ByOption = Annotated[str, typer.Option(help="Who requests it, for journal and status. Default: the name of the user.")]
+JOB = argument("Name of the job.")
+ARM = argument("Name of the arm.", is_name=True)
+BY = option("Who requests it, for journal and status. Default: the name of the user.", "")
 
 
 def submit_command(
-    file: Annotated[
-        str, typer.Argument(help="Jobs as JSON: a list, or one job per line; - reads standard input.")
-    ] = "",
-    wait: Annotated[
-        bool, typer.Option("--wait", help="Follow the jobs to their end; exit code 1 if one stays unfinished.")
-    ] = False,
-    quote: Annotated[
-        bool,
-        typer.Option("--quote", help="Submit nothing: print the cost of each plan of every arm, or why it cannot."),
-    ] = False,
-    timeout: Annotated[float, number("--quote: real seconds to wait for arms.", 0, 600, above=True)] = 5.0,
-    as_json: Annotated[bool, typer.Option("--json", help="--quote: print JSON.")] = False,
-    by: Annotated[str, typer.Option(help="Name of the submitter, for the records.")] = "",
-    kind: Annotated[str, typer.Option(help="pick_place, hold, press or sort.", rich_help_panel=_ONE)] = "",
-    name: Annotated[str, typer.Option(help="Name of the job. Default: its kind.", rich_help_panel=_ONE)] = "",
-    place: Annotated[
-        list[str] | None, typer.Option(help="Place of the cell; twice for pick_place and sort.", rich_help_panel=_ONE)
-    ] = None,
-    payload: Annotated[float, number("Payload, kg.", *_RANGES["payload_kg"], rich_help_panel=_ONE)] = 0.0,
-    repetitions: Annotated[int, number("Number of cycles.", *_RANGES["repetitions"], rich_help_panel=_ONE)] = 1,
-    dwell: Annotated[
-        float,
-        number(
-            "hold, press: duration of a cycle, s. Others: time to close or open the hand, s.",
-            *_RANGES["dwell_s"],
-            rich_help_panel=_ONE,
-        ),
-    ] = DWELL_S,
-    force: Annotated[float, number("Force of a press, N.", *_RANGES["force_n"], rich_help_panel=_ONE)] = 0.0,
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
+    file: str = argument("Jobs as JSON: a list, or one job per line; - reads standard input.", ""),
+    wait: bool = option("Follow the jobs to their end; exit code 1 if one stays unfinished.", False),
+    quote: bool = option("Submit nothing: print the cost of each plan of every arm, or why it cannot.", False),
+    timeout: float = option("--quote: real seconds to wait for arms.", 5.0, low=0, high=600, above=True),
+    as_json: bool = option("--quote: print JSON.", False, flag="--json"),
+    by: str = option("Name of the submitter, for the records.", ""),
+    kind: str = option("pick_place, hold, press or sort.", "", panel=_ONE),
+    name: str = option("Name of the job. Default: its kind.", "", panel=_ONE),
+    place: list[str] | None = option("Place of the cell; twice for pick_place and sort.", None, panel=_ONE),
+    payload: float = option("Payload, kg.", 0.0, **_RANGES["payload_kg"], panel=_ONE),
+    repetitions: int = option("Number of cycles.", 1, **_RANGES["repetitions"], panel=_ONE),
+    dwell: float = option(
+        "hold, press: duration of a cycle, s. Others: time to close or open the hand, s.",
+        DWELL_S,
+        **_RANGES["dwell_s"],
+        panel=_ONE,
+    ),
+    force: float = option("Force of a press, N.", 0.0, **_RANGES["force_n"], panel=_ONE),
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
 ) -> None:
     """Submit jobs to a fleet; accepted jobs are durable. With --quote, only ask what they would cost.
 
@@ -84,7 +73,7 @@ def submit_command(
         raise typer.Exit(1)
 
 
-def list_command(endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = "", as_json: JsonOption = False) -> None:
+def list_command(endpoint: str = options.ENDPOINT, fleet: str = options.FLEET, as_json: bool = options.JSON) -> None:
     """List the jobs of a fleet by name: state, arm, cycles and reason."""
     import time
 
@@ -107,10 +96,10 @@ def list_command(endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = "", a
 
 
 def cancel_command(
-    jobs: Annotated[list[str], typer.Argument(help="Names of the jobs.")],
-    by: ByOption = "",
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
+    jobs: list[str] = argument("Names of the jobs."),
+    by: str = BY,
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
 ) -> None:
     """Cancel jobs.
 
@@ -123,27 +112,26 @@ def cancel_command(
 
 
 def settle_command(
-    job: JobArg,
-    outcome: Annotated[str, typer.Argument(help="done, or redo: its last cycle is done again.")],
-    by: ByOption = "",
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
+    job: str = JOB,
+    outcome: Literal["done", "redo"] = argument("done, or redo: its last cycle is done again."),
+    by: str = BY,
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
 ) -> None:
     """Resolve a job with unknown outcome, after inspecting the cell."""
     from fleet.bus.protocol.operator import Settle
-    from scenarios.spec.parse import choose
 
-    _control([Settle(job, choose("outcome", outcome, Literal["done", "redo"]))], by, endpoint, fleet)
+    _control([Settle(job, outcome)], by, endpoint, fleet)
 
 
 def change_command(
-    job: JobArg,
-    due: Annotated[float | None, number("Due date, s of fleet time.", *_RANGES["due_s"])] = None,
-    no_due: Annotated[bool, typer.Option("--no-due", help="Remove the due date.")] = False,
-    value: Annotated[float | None, number("Value.", *_RANGES["value"])] = None,
-    by: ByOption = "",
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
+    job: str = JOB,
+    due: float | None = option("Due date, s of fleet time.", None, **_RANGES["due_s"]),
+    no_due: bool = option("Remove the due date.", False),
+    value: float | None = option("Value.", None, **_RANGES["value"]),
+    by: str = BY,
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
 ) -> None:
     """Change due date and value of a job that is not settled."""
     if (due is not None and no_due) or (due is None and not no_due and value is None):
@@ -157,28 +145,23 @@ def change_command(
 
 
 def pause_command(
-    arm: ArmOrAll = "*", by: ByOption = "", endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = ""
+    arm: str = argument("Name of the arm. Default: all arms.", "*"),
+    end: bool = option("End the pause.", False),
+    by: str = BY,
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
 ) -> None:
-    """Give an arm, or all, no more jobs.
+    """Give an arm, or all, no more jobs; with --end, give it jobs again.
 
     An arm at work ends the cycle in progress and goes home; its job goes to
     another arm. A job in its last cycle is finished.
     """
-    from fleet.bus.protocol.operator import Pause
+    from fleet.bus.protocol.operator import Pause, Resume
 
-    _control([Pause(arm)], by, endpoint, fleet)
-
-
-def resume_command(
-    arm: ArmOrAll = "*", by: ByOption = "", endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = ""
-) -> None:
-    """End a pause."""
-    from fleet.bus.protocol.operator import Resume
-
-    _control([Resume(arm)], by, endpoint, fleet)
+    _control([Resume(arm) if end else Pause(arm)], by, endpoint, fleet)
 
 
-def reset_command(arm: ArmArg, by: ByOption = "", endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = "") -> None:
+def reset_command(arm: str = ARM, by: str = BY, endpoint: str = options.ENDPOINT, fleet: str = options.FLEET) -> None:
     """Clear the fault of an arm now.
 
     The arm ends its cycle and goes home by itself: nobody may be in its way.
@@ -189,7 +172,7 @@ def reset_command(arm: ArmArg, by: ByOption = "", endpoint: EndpointOption = END
     reset_arm(arm, by, endpoint, fleet)
 
 
-def clear_command(arm: ArmArg, by: ByOption = "", endpoint: EndpointOption = ENDPOINT, fleet: FleetOption = "") -> None:
+def clear_command(arm: str = ARM, by: str = BY, endpoint: str = options.ENDPOINT, fleet: str = options.FLEET) -> None:
     """Free the space that an absent arm takes, so that other arms can use it.
 
     First stop the process of the arm, and make sure that the arm is at home

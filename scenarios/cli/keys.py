@@ -3,42 +3,32 @@
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import get_args
 
-import typer
+from rich.table import Table
 
 from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, of_arms, read_roster, rights
 from fleet.errors import FleetError, nearest
-from scenarios.cli.options import JsonOption, number
+from fleet.fields import argument, option
+from scenarios.cli import options
 from scenarios.cli.terminal import out_console, print_json, say
-from scenarios.show.table import Table
 
 DAYS, MAX_DAYS = 365, 3650
+_ROLES = ", ".join(ROLES)
 
 
 def keys_command(
-    folder: Annotated[Path, typer.Argument(help="Folder of one fleet's keys.", metavar="DIR")],
-    scenario: Annotated[
-        str | None, typer.Argument(help="Make new keys for the arms of this scenario; default: show the present keys.")
-    ] = None,
-    extra: Annotated[
-        list[str] | None, typer.Option(help=f"NAME:ROLE, another participant; roles: {', '.join(ROLES)}.")
-    ] = None,
-    add: Annotated[
-        list[str] | None, typer.Option(help="NAME:ROLE, a new certificate from the present authority.")
-    ] = None,
-    days: Annotated[int, number("Lifetime of the participants' certificates, days.", 1, MAX_DAYS)] = DAYS,
-    host: Annotated[
-        list[str] | None,
-        typer.Option(help="Another name or address of the router than localhost, 127.0.0.1 and ::1."),
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace all keys; with --add, replace one certificate.")
-    ] = False,
-    no_auctioneer: Annotated[
-        bool, typer.Option("--no-auctioneer", help="For arms that allocate jobs by consensus and reply to submitters.")
-    ] = False,
-    as_json: JsonOption = False,
+    folder: Path = argument("Folder of one fleet's keys.", metavar="DIR"),
+    scenario: str | None = argument(
+        "Make new keys for the arms of this scenario; default: show the present keys.", None
+    ),
+    extra: list[str] | None = option(f"NAME:ROLE, another participant; roles: {_ROLES}.", None),
+    add: list[str] | None = option("NAME:ROLE, a new certificate from the present authority.", None),
+    days: int = option("Lifetime of the participants' certificates, days.", DAYS, low=1, high=MAX_DAYS),
+    host: list[str] | None = option("Another name or address of the router than localhost, 127.0.0.1 and ::1.", None),
+    overwrite: bool = option("Replace all keys; with --add, replace one certificate.", False),
+    no_auctioneer: bool = option("For arms that allocate jobs by consensus and reply to submitters.", False),
+    as_json: bool = options.JSON,
 ) -> None:
     """Make, extend and show keys and certificates for mutual TLS."""
     from fleet.bus.security.certificates import HERE, lifetimes, make
@@ -81,13 +71,13 @@ def participant_of(text: str) -> Participant:
     name, colon, role = text.rpartition(":")
     if not colon or not name:
         raise FleetError(f"'{text}' is not NAME:ROLE, as in gateway:submitter.")
-    for known in get_args(Role):
-        if role == known:
-            try:
-                return Participant(name, known)
-            except ValueError as error:
-                raise FleetError(str(error)) from error
-    raise FleetError(f"'{text}': no role '{role}'{nearest(role, ROLES)}")
+    known: Role | None = next((each for each in get_args(Role) if each == role), None)
+    if known is None:
+        raise FleetError(f"'{text}': no role '{role}'{nearest(role, ROLES)}")
+    try:
+        return Participant(name, known)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
 
 
 def _table(roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table:

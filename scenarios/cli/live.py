@@ -1,6 +1,6 @@
 """Commands that run a live fleet: up, `thermofleet arm run` and `thermofleet bus`."""
 
-from dataclasses import replace
+from dataclasses import MISSING, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,17 +8,9 @@ import typer
 
 from agents.registry import WRAPPERS_HELP, names_of
 from fleet.errors import FleetError
-from fleet.fields import MAX_SPEED, MIN_SPEED
+from fleet.fields import MAX_SPEED, MIN_SPEED, argument, option
+from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.options import (
-    ENDPOINT,
-    EndpointOption,
-    FleetOption,
-    JsonOption,
-    ScenarioArg,
-    check_name,
-    number,
-)
 from scenarios.cli.terminal import echo, out_console, say
 from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
 
@@ -28,39 +20,27 @@ _TLS, _LISTEN = "Mutual TLS", "ros2 listen"
 
 
 def up_command(
-    scenario: ScenarioArg,
+    scenario: str = options.SCENARIO,
+    *,
     given: Annotated[
         Given,
         From(LiveSpec, "speed", "policy", "difficulty", "risk", "jobs", "seed", "fleet", "new_epoch", speed=60.0),
     ],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for journals, recording and logs. Default: runs/live-FLEET.")
-    ] = None,
-    port: Annotated[
-        int | None,
-        number("Loopback port of the router; 0 is any free one. Default: 7447, or any if taken.", 0, 65535),
-    ] = None,
-    tls: Annotated[
-        Path | None,
-        typer.Option(help="Folder that `thermofleet bus keys` made for this scenario: TLS and access control."),
-    ] = None,
-    arms: Annotated[
-        str, typer.Option(help="Start only these arms here, comma-separated; the others run on other machines.")
-    ] = "",
-    router: Annotated[
-        str,
-        typer.Option(
-            help="--arms: endpoint of a running router, as tls/HOST:PORT. Only the arms are started; router, recorder "
-            "and auctioneer run elsewhere."
-        ),
-    ] = "",
-    host: Annotated[
-        str, typer.Option(help="--tls: address on which the router listens, as 0.0.0.0. Default: loopback only.")
-    ] = "",
-    page: Annotated[
-        bool,
-        typer.Option("--page", help=f"Also serve a live page (bus gateway --page), on port {PAGE_PORT} if free."),
-    ] = False,
+    out: Path | None = option("Folder for journals, recording and logs. Default: runs/live-FLEET.", None),
+    port: int | None = option(
+        "Loopback port of the router; 0 is any free one. Default: 7447, or any if taken.", None, low=0, high=65535
+    ),
+    tls: Path | None = option(
+        "Folder that `thermofleet bus keys` made for this scenario: TLS and access control.", None
+    ),
+    arms: str = option("Start only these arms here, comma-separated; the others run on other machines.", ""),
+    router: str = option(
+        "--arms: endpoint of a running router, as tls/HOST:PORT. Only the arms are started; router, recorder "
+        "and auctioneer run elsewhere.",
+        "",
+    ),
+    host: str = option("--tls: address on which the router listens, as 0.0.0.0. Default: loopback only.", ""),
+    page: bool = option(f"Also serve a live page (bus gateway --page), on port {PAGE_PORT} if free.", False),
 ) -> None:
     """Start a whole fleet, each participant as its own process, and keep it running until its jobs are done.
 
@@ -74,25 +54,23 @@ def up_command(
 
 
 def arm_command(
-    scenario: ScenarioArg,
-    name: Annotated[str, typer.Argument(help="Arm of the scenario; with --source log any name.", callback=check_name)],
+    scenario: str = options.SCENARIO,
+    name: str = argument("Arm of the scenario; with --source log any name.", is_name=True),
+    file: Path | None = argument("--source log: a Gen3 log, a plain log, or a recording.", None),
+    *,
     given: Annotated[Given, From(LiveSpec, "difficulty", "risk", "seed", "journal", "jobs", "fleet", "new_epoch")],
-    file: Annotated[Path | None, typer.Argument(help="--source log: a Gen3 log, a plain log, or a recording.")] = None,
-    source: Annotated[Literal["sim", "log"], typer.Option(help="sim (the scenario's arm), or log FILE.")] = "sim",
-    policy: Annotated[
-        str,
-        typer.Option(
-            help=f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, your own as "
-            f"FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}. Default: an auctioneer awards them."
-        ),
-    ] = "",
-    speed: Annotated[
-        float | None,
-        number("Fleet seconds per real second. Default: the auctioneer's, else 1.", MIN_SPEED, MAX_SPEED),
-    ] = None,
-    rate_hz: Annotated[float, number("State messages per real second.", 0, 100, above=True)] = 10.0,
-    capacity: Annotated[int, number("Maximum concurrent jobs.", 1, 256)] = 1,
-    endpoint: EndpointOption = ENDPOINT,
+    source: Literal["sim", "log"] = option("sim (the scenario's arm), or log FILE.", "sim"),
+    policy: str = option(
+        f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, your own as "
+        f"FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}. Default: an auctioneer awards them.",
+        "",
+    ),
+    speed: float | None = option(
+        "Fleet seconds per real second. Default: the auctioneer's, else 1.", None, low=MIN_SPEED, high=MAX_SPEED
+    ),
+    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True),
+    capacity: int = option("Maximum concurrent jobs.", 1, low=1, high=256),
+    endpoint: str = options.ENDPOINT,
 ) -> None:
     """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
     from scenarios.spec.load import load
@@ -105,26 +83,16 @@ def arm_command(
 
     spec = LiveSpec(**given)
     spec = replace(spec, policy=policy) if policy else spec
-    run_arm(
-        chosen,
-        name,
-        spec,
-        endpoint,
-        alone=bool(policy),
-        file=file,
-        speed=speed,
-        rate_hz=rate_hz,
-        capacity=capacity,
-    )
+    alone = bool(policy)
+    run_arm(chosen, name, spec, endpoint, alone=alone, file=file, speed=speed, rate_hz=rate_hz, capacity=capacity)
 
 
 def auctioneer_command(
-    scenario: ScenarioArg,
+    scenario: str = options.SCENARIO,
+    *,
     given: Annotated[Given, From(LiveSpec, "policy", "speed", "journal", "jobs", "seed", "fleet", "new_epoch")],
-    name: Annotated[
-        str, typer.Option(help="Name of the auctioneer; part of its keys.", callback=check_name)
-    ] = "auctioneer",
-    endpoint: EndpointOption = ENDPOINT,
+    name: str = option("Name of the auctioneer; part of its keys.", "auctioneer", is_name=True),
+    endpoint: str = options.ENDPOINT,
 ) -> None:
     """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
     from scenarios.live.auctioneer import run_auctioneer
@@ -134,33 +102,21 @@ def auctioneer_command(
 
 
 def router_command(
-    port: Annotated[int, number("TCP port; 0 is any free one.", 0, 65535)] = PORT,
-    host: Annotated[str, typer.Option(help="Address to listen on; beyond loopback only with --tls.")] = "127.0.0.1",
-    state_hz: Annotated[
-        float, number("Telemetry messages forwarded per second and session; 0 is unlimited.", 0, 1_000_000)
-    ] = 100.0,
-    tls: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder that `thermofleet bus keys` made: mutual TLS, and access by role.", rich_help_panel=_TLS
-        ),
-    ] = None,
-    name: Annotated[
-        str,
-        typer.Option(
-            help="Participant whose certificate the router presents.", callback=check_name, rich_help_panel=_TLS
-        ),
-    ] = "router",
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Another router of the fleet, tls/HOST:PORT, to link with; may be repeated.", rich_help_panel=_TLS
-        ),
-    ] = None,
-    scenario: Annotated[
-        str | None,
-        typer.Option(help="Refuse to start unless every arm of this scenario has a certificate.", rich_help_panel=_TLS),
-    ] = None,
+    port: int = option("TCP port; 0 is any free one.", PORT, low=0, high=65535),
+    host: str = option("Address to listen on; beyond loopback only with --tls.", "127.0.0.1"),
+    state_hz: float = option(
+        "Telemetry messages forwarded per second and session; 0 is unlimited.", 100.0, low=0, high=1_000_000
+    ),
+    tls: Path | None = option(
+        "Folder that `thermofleet bus keys` made: mutual TLS, and access by role.", None, panel=_TLS
+    ),
+    name: str = option("Participant whose certificate the router presents.", "router", is_name=True, panel=_TLS),
+    connect: list[str] | None = option(
+        "Another router of the fleet, tls/HOST:PORT, to link with; may be repeated.", None, panel=_TLS
+    ),
+    scenario: str | None = option(
+        "Refuse to start unless every arm of this scenario has a certificate.", None, panel=_TLS
+    ),
 ) -> None:
     """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; it prints its endpoint once it listens."""
     from fleet.bus.router import Limits, Router
@@ -180,13 +136,11 @@ def router_command(
 
 
 def watch_command(
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print one snapshot as JSON.")] = False,
-    joints: Annotated[bool, typer.Option("--joints", help="Show every joint; the key j changes that.")] = False,
-    scenario: Annotated[
-        str, typer.Option(help="Scenario of the fleet, to show what is left of the shift; the bus does not tell.")
-    ] = "",
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
+    as_json: bool = option("Print one snapshot as JSON.", False, flag="--json"),
+    joints: bool = option("Show every joint; the key j changes that.", False),
+    scenario: str = option("Scenario of the fleet, to show what is left of the shift; the bus does not tell.", ""),
 ) -> None:
     """Watch a fleet until it has ended, or Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
     from scenarios.live.watch import watch
@@ -196,19 +150,16 @@ def watch_command(
 
 
 def doctor_command(
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    seconds: Annotated[float, number("Real seconds to listen.", 0, 600, above=True)] = 3.0,
-    auctioneer: Annotated[
-        bool, typer.Option(help="The fleet should have one; --no-auctioneer: it should have none.")
-    ] = True,
-    scenario: Annotated[
-        str,
-        typer.Option(
-            help="Every arm of this scenario should be present. Default: only the arms that are found are checked."
-        ),
-    ] = "",
-    as_json: JsonOption = False,
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
+    seconds: float = option("Real seconds to listen.", 3.0, low=0, high=600, above=True),
+    auctioneer: bool = option(
+        "The fleet should have one; --no-auctioneer: it should have none.", True, flag="--auctioneer/--no-auctioneer"
+    ),
+    scenario: str = option(
+        "Every arm of this scenario should be present. Default: only the arms that are found are checked.", ""
+    ),
+    as_json: bool = options.JSON,
 ) -> None:
     """Check the health of a fleet: whether its arms and its auctioneer are present, and their clocks agree.
 
@@ -223,14 +174,12 @@ def doctor_command(
 
 
 def record_command(
-    fleet: Annotated[
-        str, typer.Argument(help="Name of the fleet; `up` uses the name of the scenario.", callback=check_name)
-    ],
-    out: Annotated[Path, typer.Option(help="Folder of the recording; an interrupted one is continued.")],
-    endpoint: EndpointOption = ENDPOINT,
-    rotate: Annotated[
-        float, number("Real seconds between two parts; a message is durable within a second.", 0.1, 86_400)
-    ] = 60.0,
+    fleet: str = argument("Name of the fleet; `up` uses the name of the scenario.", is_name=True),
+    out: Path = option("Folder of the recording; an interrupted one is continued.", MISSING),
+    endpoint: str = options.ENDPOINT,
+    rotate: float = option(
+        "Real seconds between two parts; a message is durable within a second.", 60.0, low=0.1, high=86_400
+    ),
 ) -> None:
     """Record what arms and auctioneer publish: a journal, then Parquet parts; readable at once."""
     from fleet.bus.client import BusClient
@@ -252,10 +201,10 @@ def record_command(
 
 
 def replay_command(
-    path: Annotated[Path, typer.Argument(help="Folder of a run or of a recording.")],
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: Annotated[str | None, typer.Option(help="Name of the fleet. Default: that of the recording.")] = None,
-    speed: Annotated[float, number("Recorded seconds per real second.", 0, MAX_SPEED, above=True)] = 1.0,
+    path: Path = argument("Folder of a run or of a recording."),
+    endpoint: str = options.ENDPOINT,
+    fleet: str | None = option("Name of the fleet. Default: that of the recording.", None),
+    speed: float = option("Recorded seconds per real second.", 1.0, low=0, high=MAX_SPEED, above=True),
 ) -> None:
     """Publish a run or a recording on the bus, in real time or at --speed."""
     from fleet.bus.client import BusClient
@@ -273,43 +222,33 @@ def replay_command(
 
 
 def gateway_command(
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    page: Annotated[
-        bool,
-        typer.Option(
-            "--page",
-            help="Also serve a live page: arms in 3-D, temperatures, jobs, offers, alerts, and what the role of a "
-            "token may request.",
-        ),
-    ] = False,
-    scenario: Annotated[
-        str,
-        typer.Option(
-            help="--page: scenario of the cell, to draw its fixtures too. Default: as the auctioneer describes it."
-        ),
-    ] = "",
-    port: Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)] = PAGE_PORT,
-    host: Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")] = "127.0.0.1",
-    token: Annotated[
-        str,
-        typer.Option(
-            envvar="THERMOFLEET_TOKEN",
-            help="Bearer token for all requests. Prefer the variable: other users can read command lines.",
-        ),
-    ] = "",
-    tokens: Annotated[
-        Path | None,
-        typer.Option(
-            help="File with ROLE TOKEN in each line, readable by you alone. Roles: monitor, submitter, operator; each "
-            "may do what the ones before it may."
-        ),
-    ] = None,
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
+    page: bool = option(
+        "Also serve a live page: arms in 3-D, temperatures, jobs, offers, alerts, and what the role of a "
+        "token may request.",
+        False,
+    ),
+    scenario: str = option(
+        "--page: scenario of the cell, to draw its fixtures too. Default: as the auctioneer describes it.", ""
+    ),
+    port: int = option("TCP port of the gateway; 0 takes a free one.", PAGE_PORT, low=0, high=65535),
+    host: str = option("Listening address; beyond loopback only with a token.", "127.0.0.1"),
+    token: str = option(
+        "Bearer token for all requests. Prefer the variable: other users can read command lines.",
+        "",
+        env="THERMOFLEET_TOKEN",
+    ),
+    tokens: Path | None = option(
+        "File with ROLE TOKEN in each line, readable by you alone. Roles: monitor, submitter, operator; each "
+        "may do what the ones before it may.",
+        None,
+    ),
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM; with --page also a live page for browsers."""
     if scenario and not page:
         raise FleetError("--scenario is for --page: leave it out.")
-    from scenarios.live.gateway import run_gateway, scene_of
+    from scenarios.live.gateway import LivePage, run_gateway, scene_of
 
     shown = None
     if page:
@@ -323,53 +262,29 @@ def gateway_command(
 
 
 def ros2_command(
-    mode: Annotated[
-        str,
-        typer.Argument(
-            help="bridge: publish every arm as JointState and DiagnosticArray. listen: show a real arm with a ROS 2 "
-            "driver as an arm that takes no jobs. jobs: serve the action thermofleet_msgs/action/DoJob, with rclpy."
-        ),
-    ],
-    topic: Annotated[
-        str, typer.Argument(help="listen: topic of the arm's sensor_msgs/JointState, as /joint_states.")
-    ] = "",
-    endpoint: EndpointOption = ENDPOINT,
-    fleet: FleetOption = "",
-    domain: Annotated[int, number("The ROS 2 domain.", 0, 232, envvar="ROS_DOMAIN_ID")] = 0,
-    router: Annotated[
-        str, typer.Option(help="Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.")
-    ] = "",
-    warning_c: Annotated[float, number("Motor temperature at which a warning begins, °C.", 0, 200)] = 60.0,
-    error_c: Annotated[float, number("bridge: motor temperature at which an error begins, °C.", 0, 200)] = 75.0,
-    humble: Annotated[
-        bool, typer.Option("--humble", help="bridge: for ROS 2 Humble, whose keys have no type hash.")
-    ] = False,
-    arm: Annotated[
-        str, typer.Option(help="Name of the arm in the fleet.", callback=check_name, rich_help_panel=_LISTEN)
-    ] = "real",
-    temperatures: Annotated[
-        str,
-        typer.Option(
-            help="Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.", rich_help_panel=_LISTEN
-        ),
-    ] = "",
-    hardware: Annotated[
-        str,
-        typer.Option(
-            help="Text before /JOINT in the hardware_id of these diagnostics; default: none.", rich_help_panel=_LISTEN
-        ),
-    ] = "",
-    joints: Annotated[
-        str, typer.Option(help="Names of its joints in ROS 2, from joint 1 on.", rich_help_panel=_LISTEN)
-    ] = "",
-    rate_hz: Annotated[
-        float, number("State messages per real second.", 0, 100, above=True, rich_help_panel=_LISTEN)
-    ] = 10.0,
+    mode: Literal["bridge", "listen", "jobs"] = argument(
+        "bridge: publish every arm as JointState and DiagnosticArray. listen: show a real arm with a ROS 2 "
+        "driver as an arm that takes no jobs. jobs: serve the action thermofleet_msgs/action/DoJob, with rclpy."
+    ),
+    topic: str = argument("listen: topic of the arm's sensor_msgs/JointState, as /joint_states.", ""),
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
+    domain: int = option("The ROS 2 domain.", 0, low=0, high=232, env="ROS_DOMAIN_ID"),
+    router: str = option("Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.", ""),
+    warning_c: float = option("Motor temperature at which a warning begins, °C.", 60.0, low=0, high=200),
+    error_c: float = option("bridge: motor temperature at which an error begins, °C.", 75.0, low=0, high=200),
+    humble: bool = option("bridge: for ROS 2 Humble, whose keys have no type hash.", False),
+    arm: str = option("Name of the arm in the fleet.", "real", is_name=True, panel=_LISTEN),
+    temperatures: str = option(
+        "Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.", "", panel=_LISTEN
+    ),
+    hardware: str = option(
+        "Text before /JOINT in the hardware_id of these diagnostics; default: none.", "", panel=_LISTEN
+    ),
+    joints: str = option("Names of its joints in ROS 2, from joint 1 on.", "", panel=_LISTEN),
+    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True, panel=_LISTEN),
 ) -> None:
-    """Connect a fleet and ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra ros2."""
-    from scenarios.spec.parse import choose
-
-    mode = choose("mode", mode, Literal["bridge", "listen", "jobs"])
+    """Connect a fleet and ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
     if (mode == "listen") != bool(topic):
         raise FleetError(f"TOPIC is for listen, and listen needs one (got {mode} {topic}".rstrip() + ").")
     from scenarios.live.ros2 import run_bridge, run_jobs, run_listener

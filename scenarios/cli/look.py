@@ -6,11 +6,12 @@ import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Literal, get_args
 
 import typer
 
 from fleet.errors import FleetError
+from fleet.fields import argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING, Cooling
 from scenarios.cli import options
@@ -26,58 +27,60 @@ MOST_GIF_PIXELS = 600_000_000
 """Of all frames of a GIF together: they stay in memory until the file is written."""
 NO_DISPLAY = (
     "MuJoCo's viewer needs a display, and there is none (DISPLAY and WAYLAND_DISPLAY are not set). Use "
-    "`thermofleet film RUN`, `--rerun` or `--mcap`, or open the run's report.html."
+    "`thermofleet film RUN`, `--mcap` or `--gltf`, or open the run's report.html."
 )
 _HOLD = "How long an arm holds a payload"
 
 
 def show_command(
-    scenario: Annotated[
-        str | None,
-        typer.Argument(
-            help="A library name, a .toml file, or an instance of the suite, as test/0017. Default: list the library."
-        ),
-    ] = None,
-    hold: Annotated[
-        float | None,
-        options.number(
-            "Show no scenario, but how long an arm can hold this payload, kg.",
-            *BOUNDS["payload_kg"][:2],
-            rich_help_panel=_HOLD,
-        ),
-    ] = None,
-    posture: Annotated[
-        str,
-        typer.Option(
-            help=f"{', '.join(POSTURES)}, or seven comma-separated angles in degrees.",
-            rich_help_panel=_HOLD,
-        ),
-    ] = "outstretched",
-    ambient: Annotated[float, options.number("Ambient temperature, °C.", -40, 60, rich_help_panel=_HOLD)] = 25.0,
-    cooling: Annotated[
-        str,
-        typer.Option(help=f"Cooling of the arm: {', '.join(get_args(Cooling))}.", rich_help_panel=_HOLD),
-    ] = "still_air",
-    tool_kg: Annotated[
-        float, options.number("Mass of the gripper at the flange, kg.", 0, RATING.temporary_kg, rich_help_panel=_HOLD)
-    ] = 0.0,
-    beyond_rating: Annotated[
-        bool,
-        typer.Option("--beyond-rating", help="Accept a load beyond the rating of the arm.", rich_help_panel=_HOLD),
-    ] = False,
-    as_json: options.JsonOption = False,
+    scenario: str | None = argument(
+        "A library name, a .toml file, or an instance of the suite, as test/0017. Default: list the library.", None
+    ),
+    hold: float | None = option(
+        "Show no scenario, but how long an arm can hold this payload, kg.",
+        None,
+        low=BOUNDS["payload_kg"].low,
+        high=BOUNDS["payload_kg"].high,
+        panel=_HOLD,
+    ),
+    posture: str = option(
+        f"{', '.join(POSTURES)}, or seven comma-separated angles in degrees.", "outstretched", panel=_HOLD
+    ),
+    ambient: float = option("Ambient temperature, °C.", 25.0, low=-40, high=60, panel=_HOLD),
+    cooling: str = option(f"Cooling of the arm: {', '.join(get_args(Cooling))}.", "still_air", panel=_HOLD),
+    tool_kg: float = option(
+        "Mass of the gripper at the flange, kg.", 0.0, low=0, high=RATING.temporary_kg, panel=_HOLD
+    ),
+    beyond_rating: bool = option("Accept a load beyond the rating of the arm.", False, panel=_HOLD),
+    suite: Literal["cells", "train", "validation", "test", "sizes"] | None = option(
+        "List the benchmark's suite: its cells, or the instances of a split: train, validation, test or sizes.", None
+    ),
+    as_json: bool = options.JSON,
 ) -> None:
     """List the scenarios of the library, or show one: its arms, its jobs and its thermal load factor.
 
     The thermal load factor is the heat of all jobs relative to the capacity of
     the fleet. Above 1.2 no policy keeps all motors below the warning limit.
     With --hold it shows the time until the motors of an arm that holds a payload
-    reach the warning and error limits.
+    reach the warning and error limits. With --suite it lists instances: a scenario
+    in a cell (a group of arms with stations and tasks) with a seed.
     """
+    if scenario is not None and (hold is not None or suite is not None):
+        raise FleetError(f"--{'suite' if hold is None else 'hold'} needs no scenario; leave '{scenario}' out.")
+    if hold is not None and suite is not None:
+        raise FleetError("Give either --hold or --suite.")
     if hold is not None:
-        if scenario is not None:
-            raise FleetError(f"--hold needs no scenario; leave '{scenario}' out.")
-        _show_hold(hold, posture, ambient, cooling, tool_kg, beyond_rating, as_json)
+        from scenarios.motion import hold as holding
+
+        held = holding.hold(hold, posture, ambient, cooling=cooling, tool_kg=tool_kg, beyond_rating=beyond_rating)
+        if as_json:
+            print_json(holding.as_json(held))
+        else:
+            out_console.print(holding.as_table(held))
+    elif suite == "cells":
+        _list_cells(as_json)
+    elif suite is not None:
+        _list_split(suite, as_json)
     elif scenario is None:
         _list_library(as_json)
     else:
@@ -94,22 +97,30 @@ def show_command(
             out_console.print(part)
 
 
-def _show_hold(
-    payload_kg: float,
-    posture: str,
-    ambient_c: float,
-    cooling: str,
-    tool_kg: float,
-    beyond_rating: bool,
-    as_json: bool,
-) -> None:
-    from scenarios.motion import hold
+def _list_cells(as_json: bool) -> None:
+    from scenarios.suite.instances import CELLS
 
-    result = hold.hold(payload_kg, posture, ambient_c, cooling=cooling, tool_kg=tool_kg, beyond_rating=beyond_rating)
     if as_json:
-        print_json(hold.as_json(result))
-    else:
-        out_console.print(hold.as_table(result))
+        print_json({cell.name: {**asdict(cell), "stations_per_arm": cell.stations_per_arm} for cell in CELLS})
+        return
+    head = ("split", "cell", "arms are", "stations per arm", "hours", "instances")
+    lines = tuple(
+        (cell.split, cell.name, cell.unlike, f"{cell.stations_per_arm:.2g}", f"{cell.hours:g}", str(cell.instances))
+        for cell in CELLS
+    )
+    out_console.print(Table(head=head, rows=lines, numbers=False))
+
+
+def _list_split(split: str, as_json: bool) -> None:
+    from scenarios.suite.splits import manifest
+
+    rows = manifest(split)
+    if as_json:
+        print_json([asdict(row) for row in rows])
+        return
+    axes = (", ".join(f"{name} {value}" for name, value in asdict(row.axes).items()) for row in rows)
+    lines = tuple((row.name, row.cell, text, str(row.count)) for row, text in zip(rows, axes, strict=True))
+    out_console.print(Table(head=("instance", "cell", "axes", "jobs"), rows=lines, numbers=False))
 
 
 def _list_library(as_json: bool) -> None:
@@ -124,18 +135,17 @@ def _list_library(as_json: bool) -> None:
 
 
 def layout_command(
-    scenario: options.ScenarioArg,
-    out: Annotated[Path | None, typer.Option(help="Draw the cell from above as this PNG file.")] = None,
-    overwrite: options.OverwriteOption = False,
-    as_json: options.JsonOption = False,
+    scenario: str = options.SCENARIO,
+    out: Path | None = option("Draw the cell from above as this PNG file.", None),
+    overwrite: bool = options.OVERWRITE,
+    as_json: bool = options.JSON,
 ) -> None:
     """Show the reach of each arm, which jobs exclude each other in space, and how many arms can work at once.
 
     Lists all problems of the cell, for example two arms that are too close at
     home. Exit code 2: there are problems.
     """
-    from fleet.files import atomic_path
-    from scenarios.result_folder import check_file, disk_errors
+    from scenarios.result_folder import check_file, new_file
     from scenarios.show.layout import layout_report, layout_scene, layout_tables
     from scenarios.spec.load import load
 
@@ -154,10 +164,8 @@ def layout_command(
 
         from fleet.env.render.picture import Picture
 
-        with disk_errors(out):
-            out.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_path(out) as file:
-                imsave(file, Picture().frame(layout_scene(chosen, report)), format="png")
+        with new_file(out) as file:
+            imsave(file, Picture().frame(layout_scene(chosen, report)), format="png")
         say(f"Drew the cell: {out}.")
     for problem in report.problems:
         say(f"Error: {problem}")
@@ -166,29 +174,26 @@ def layout_command(
 
 
 def view_command(
-    what: Annotated[str, typer.Argument(help="Folder of `thermofleet run`, or a scenario.")],
+    what: str = argument("Folder of `thermofleet run`, or a scenario."),
+    *,
     given: Annotated[Given, From(Shot, "speed", "begin_s", "meshes", speed=30.0)],
-    mcap: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the run as this file (.mcap) instead, in messages of ROS 2, for Foxglove, Rerun, RViz or "
-            "PlotJuggler; needs the extra `mcap`."
-        ),
-    ] = None,
-    gltf: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the run as this file (.glb) instead, for viewers of augmented reality and of the web; --speed "
-            "is that of its animation."
-        ),
-    ] = None,
-    every: Annotated[
-        float | None,
-        options.number(
-            "Time between two postures in these files, s. Default: as recorded, up to 250,000 postures.", 0.01, 3600
-        ),
-    ] = None,
-    overwrite: options.OverwriteOption = False,
+    mcap: Path | None = option(
+        "Write the run as this file (.mcap) instead, in messages of ROS 2, for Foxglove, Rerun, RViz or "
+        "PlotJuggler; needs the extra `mcap`.",
+        None,
+    ),
+    gltf: Path | None = option(
+        "Write the run as this file (.glb) instead, for viewers of augmented reality and of the web; --speed "
+        "is that of its animation.",
+        None,
+    ),
+    every: float | None = option(
+        "Time between two postures in these files, s. Default: as recorded, up to 250,000 postures.",
+        None,
+        low=0.01,
+        high=3600,
+    ),
+    overwrite: bool = options.OVERWRITE,
 ) -> None:
     """Play a recorded shift in MuJoCo's viewer, or show the cell of a scenario; close its window to end.
 
@@ -232,61 +237,54 @@ def view_command(
 
 
 def _write_files(
-    what: str,
-    mcap: Path | None,
-    gltf: Path | None,
-    every_s: float | None,
-    speed: float,
-    overwrite: bool,
+    what: str, mcap: Path | None, gltf: Path | None, every_s: float | None, speed: float, overwrite: bool
 ) -> None:
-    from fleet.files import atomic_path
     from scenarios.extras import require_extra
-    from scenarios.result_folder import check_file, disk_errors
+    from scenarios.result_folder import check_file, new_file
 
-    wanted = [("mcap", mcap, ".mcap"), ("gltf", gltf, ".glb")]
-    files = {name: (path, ending) for name, path, ending in wanted if path is not None}
-    extras = {"mcap": ("mcap", "ros2"), "gltf": ("report",)}
-    for name, (path, ending) in files.items():
-        check_file(path, (ending,), overwrite, f"--{name}")
-        for extra in extras[name]:
-            require_extra(extra)
+    if mcap is not None:
+        check_file(mcap, (".mcap",), overwrite, "--mcap")
+        require_extra("mcap")
+        require_extra("ros2")
+    if gltf is not None:
+        check_file(gltf, (".glb",), overwrite, "--gltf")
+        require_extra("report")
     if not (Path(what) / "run.json").exists():
         raise FleetError(f"--mcap and --gltf need the folder of a `thermofleet run` (got '{what}').")
     from scenarios.run.log import open_run
     from scenarios.show.moments import Moments
 
     moments = Moments(open_run(Path(what)), every_s)
-    for name, (path, _) in files.items():
-        with progress_bar(kept="") as progress, disk_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_path(path) as file:
-                if name == "mcap":
-                    from scenarios.show.mcap import write_mcap
+    for path, hint in (
+        (mcap, f"open it in Foxglove, or: ros2 bag play {mcap}"),
+        (gltf, f"{speed:g} × real time; open it in Blender or a web viewer"),
+    ):
+        if path is None:
+            continue
+        with progress_bar(kept="") as progress, new_file(path) as file:
+            if path is mcap:
+                from scenarios.show.mcap import write_mcap
 
-                    write_mcap(file, moments, progress)
-                else:
-                    from scenarios.show.gltf import write_gltf
+                write_mcap(file, moments, progress)
+            else:
+                from scenarios.show.gltf import write_gltf
 
-                    write_gltf(file, moments, speed, progress)
-        hints = {
-            "mcap": f"open it in Foxglove, or: ros2 bag play {path}",
-            "gltf": f"{speed:g} × real time; open it in Blender or a web viewer",
-        }
+                write_gltf(file, moments, speed, progress)
         size = f"{path.stat().st_size / 1e6:.1f} MB"
-        say(f"Wrote {len(moments.poses)} moments, {size}: {path} ({hints[name]}).", out_console)
+        say(f"Wrote {len(moments.poses)} moments, {size}: {path} ({hint}).", out_console)
 
 
 def film_command(
-    run: Annotated[Path, typer.Argument(help="Folder of `thermofleet run`.")],
+    run: Path = argument("Folder of `thermofleet run`."),
+    *,
     given: Annotated[Given, From(Shot, "speed", "fps", "begin_s", "end_s", "meshes")],
-    out: Annotated[Path, typer.Option(help="Output file: .mp4, .webm or .gif.")] = Path("shift.mp4"),
-    size: Annotated[str, typer.Option(help="Width x height, px; even numbers.")] = "1280x720",
-    overwrite: options.OverwriteOption = False,
+    out: Path = option("Output file: .mp4, .webm or .gif.", Path("shift.mp4")),
+    size: str = option("Width x height, px; even numbers.", "1280x720"),
+    overwrite: bool = options.OVERWRITE,
 ) -> None:
     """Film a recorded shift: the arms move, their motors coloured by temperature."""
-    from fleet.files import atomic_path
     from scenarios.progress import Count
-    from scenarios.result_folder import check_file, disk_errors
+    from scenarios.result_folder import check_file, new_file
 
     suffix = out.suffix.lower()
     check_file(out, (".mp4", ".webm", ".gif"), overwrite)
@@ -305,16 +303,14 @@ def film_command(
             f"The film would have {len(at_s)} pictures; at most {most} are possible in this size. Raise --speed (now "
             f"{shot.speed:g}), lower --fps (now {shot.fps}), or choose a part with --begin and --end."
         )
-    with progress_bar() as progress, disk_errors(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
+    with progress_bar() as progress, new_file(out) as file:
 
         def counted():
             for number, picture in enumerate(frames(stored, shot, at_s), 1):
                 progress("filming", Count(number, len(at_s)))
                 yield picture
 
-        with atomic_path(out) as file:
-            count = write_film(file, suffix[1:], counted(), shot)
+        count = write_film(file, suffix[1:], counted(), shot)
     length_s, megabytes = count / shot.fps, out.stat().st_size / 1e6
     say(f"Filmed {count} pictures, {length_s:.1f} s, {megabytes:.1f} MB: {out}.", out_console)
 
@@ -330,21 +326,16 @@ def _size(asked: str) -> tuple[int, int]:
 
 
 def report_command(
-    folder: Annotated[Path, typer.Argument(help="Folder of `thermofleet run`, or of a recording, finished or not.")],
-    out: Annotated[
-        Path | None, typer.Option(help="The HTML file. Default: in the folder of a run, beside that of a recording.")
-    ] = None,
-    scenario: Annotated[
-        str | None, typer.Option(help="Of a recording: the scenario of the fleet, if no auctioneer described its cell.")
-    ] = None,
-    meshes: Annotated[
-        bool, typer.Option("--meshes", help="Of a run: Kinova's shells; needs the extra `meshes`.")
-    ] = False,
+    folder: Path = argument("Folder of `thermofleet run`, or of a recording, finished or not."),
+    out: Path | None = option("The HTML file. Default: in the folder of a run, beside that of a recording.", None),
+    scenario: str | None = option(
+        "Of a recording: the scenario of the fleet, if no auctioneer described its cell.", None
+    ),
+    meshes: bool = option("Of a run: Kinova's shells; needs the extra `meshes`.", False),
 ) -> None:
     """Write the report of a live recording, as `run` writes one of a simulated shift, or that of a run anew."""
-    from fleet.files import atomic_path
     from scenarios.live.recording_report import open_recording
-    from scenarios.result_folder import disk_errors
+    from scenarios.result_folder import new_file
     from scenarios.run.log import open_run
     from scenarios.spec.load import load
 
@@ -354,24 +345,18 @@ def report_command(
     else:
         path = out or folder.parent / "report.html"
         html = open_recording(folder, None if scenario is None else load(scenario)).page()
-    with disk_errors(path), atomic_path(path) as draft:
+    with new_file(path) as draft:
         draft.write_text(html, encoding="utf-8")
     say(f"Open {path} in a browser.", out_console)
 
 
 def trace_command(
-    event: Annotated[
-        str,
-        typer.Argument(
-            help="A row of the event log from 0; a kind such as fault, also with an arm or a job as fault@arm_1; or a "
-            "job, for its award. Of several events, the first one."
-        ),
-    ],
-    folder: Annotated[
-        Path | None,
-        typer.Option("--in", help="Folder of a run or a recording; default: the last of runs/.", show_default=False),
-    ] = None,
-    as_json: options.JsonOption = False,
+    event: str = argument(
+        "A row of the event log from 0; a kind such as fault, also with an arm or a job as fault@arm_1; or a "
+        "job, for its award. Of several events, the first one."
+    ),
+    folder: Path | None = option("Folder of a run or a recording; default: the last of runs/.", None, flag="--in"),
+    as_json: bool = options.JSON,
 ) -> None:
     """Follow an event to its job, plan, offers, twin, training data, configuration and code."""
     from scenarios.show.trace import thread_of, thread_table

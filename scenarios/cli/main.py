@@ -51,14 +51,13 @@ GROUPS = {
 COMMANDS = {
     "demo": LazyCommand(_LOOK, "run:demo_command", "Run the quickstart shift under two policies."),
     "run": LazyCommand(_LOOK, "run:run_command", "Run one shift of a scenario and record it."),
-    "show": LazyCommand(_LOOK, "look:show_command", "List the scenarios, or show one: arms, jobs, thermal load."),
+    "show": LazyCommand(_LOOK, "look:show_command", "List the scenarios or the suite, or show one scenario."),
     "layout": LazyCommand(_LOOK, "look:layout_command", "Show reach, space and problems of a cell."),
     "view": LazyCommand(_LOOK, "look:view_command", "Play a shift in MuJoCo's viewer."),
     "film": LazyCommand(_LOOK, "look:film_command", "Film a recorded shift."),
     "report": LazyCommand(_LOOK, "look:report_command", "Write the page of a run or of a recording."),
     "trace": LazyCommand(_LOOK, "look:trace_command", "Follow an event to its causes."),
     "compare": LazyCommand(_POLICIES, "evaluate:compare_command", "Compare policies on the same seeds."),
-    "suite": LazyCommand(_POLICIES, "evaluate:suite_command", "List the benchmark's suite of instances."),
     "bounds": LazyCommand(_POLICIES, "evaluate:bounds_command", "Bound the reward of shifts."),
     "leaderboard": LazyCommand(_POLICIES, "evaluate:leaderboard_command", "Print the leaderboard, or check a result."),
     "train": LazyCommand(_POLICIES, "evaluate:train_command", "Train a policy by reinforcement learning."),
@@ -69,8 +68,7 @@ COMMANDS = {
     "job change": LazyCommand(_LIVE, "jobs:change_command", "Change due date and value of a job."),
     "job settle": LazyCommand(_LIVE, "jobs:settle_command", "Resolve a job with unknown outcome."),
     "arm run": LazyCommand(_LIVE, "live:arm_command", "Run one arm of a fleet."),
-    "arm pause": LazyCommand(_LIVE, "jobs:pause_command", "Give an arm, or all arms, no more jobs."),
-    "arm resume": LazyCommand(_LIVE, "jobs:resume_command", "End a pause."),
+    "arm pause": LazyCommand(_LIVE, "jobs:pause_command", "Give an arm, or all arms, no more jobs; or end that."),
     "arm reset": LazyCommand(_LIVE, "jobs:reset_command", "Clear the fault of an arm."),
     "arm clear": LazyCommand(_LIVE, "jobs:clear_command", "Free the space of an absent arm."),
     "bus router": LazyCommand(_LIVE, "live:router_command", "Run the Zenoh router of a fleet."),
@@ -83,8 +81,7 @@ COMMANDS = {
     "bus keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
     "bus ros2": LazyCommand(_LIVE, "live:ros2_command", "Connect a fleet and ROS 2."),
     "twin train": LazyCommand(_TWIN, "twin:train_command", "Train the twins of a scenario, or that of logs."),
-    "twin score": LazyCommand(_TWIN, "twin:score_command", "Score every job of a scenario, or a log."),
-    "twin verdict": LazyCommand(_TWIN, "twin:verdict_command", "Judge recordings as hot or cool."),
+    "twin score": LazyCommand(_TWIN, "twin:score_command", "Score and judge every job of a scenario, or a log."),
     "twin identify": LazyCommand(_TWIN, "twin:identify_command", "Identify an arm's thermal network."),
     "twin generate": LazyCommand(_TWIN, "twin:generate_command", "Generate new cool motion."),
     "twin recover": LazyCommand(_TWIN, "twin:recover_command", "Find a posture with less load for a warm arm."),
@@ -92,29 +89,20 @@ COMMANDS = {
     "twin report": LazyCommand(_TWIN, "twin:report_command", "Write the paper's pictures as one page."),
 }
 MOVED = {
+    **{word: f"job {word}" for word in ("submit", "cancel", "change", "settle")},
+    **{word: f"arm {word}" for word in ("pause", "reset", "clear")},
+    **{word: f"bus {word}" for word in ("router", "watch", "doctor", "gateway", "record", "replay", "ros2", "keys")},
     "list": "show",
     "hold": "show --hold",
+    "suite": "show --suite",
     "ablate": "compare --difficulty",
     "submit-result": "leaderboard --submit",
-    "submit": "job submit",
     "ask": "job submit --quote",
-    "cancel": "job cancel",
-    "change": "job change",
-    "settle": "job settle",
-    "pause": "arm pause",
-    "resume": "arm resume",
-    "reset": "arm reset",
-    "clear": "arm clear",
+    "resume": "arm pause --end",
+    "arm resume": "arm pause --end",
     "auction": "bus auctioneer",
-    "router": "bus router",
-    "watch": "bus watch",
-    "doctor": "bus doctor",
     "dashboard": "bus gateway --page",
-    "gateway": "bus gateway",
-    "record": "bus record",
-    "replay": "bus replay",
-    "ros2": "bus ros2",
-    "keys": "bus keys",
+    "twin verdict": "twin score --verdict",
 }
 """Earlier names of commands."""
 
@@ -141,8 +129,9 @@ class LazyGroup(TyperGroup):
         Any: typer keeps the classes of contexts and commands private.
         """
         if args and args[0] not in self.commands:
-            if not self.words and args[0] in MOVED and not ctx.resilient_parsing:
-                raise FleetError(f"`thermofleet {args[0]}` is now `thermofleet {MOVED[args[0]]}`.")
+            old = " ".join((*self.words, args[0]))
+            if old in MOVED and not ctx.resilient_parsing:
+                raise FleetError(f"`thermofleet {old}` is now `thermofleet {MOVED[old]}`.")
             if self.words == ("arm",) and not args[0].startswith("-") and len(args) > 1 and not ctx.resilient_parsing:
                 raise FleetError("`thermofleet arm SCENARIO NAME` is now `thermofleet arm run SCENARIO NAME`.")
         name, listed, rest = super().resolve_command(ctx, args)

@@ -2,55 +2,21 @@
 
 import shlex
 import tomllib
-from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from fleet.bus.exchange.channel import Channel, Partition
-from fleet.errors import NAME_RULE, FleetError, LogError, is_name, nearest, printable
-from fleet.fields import MAX_SEED, Option
-from scenarios.cli.from_fields import declared
-from scenarios.spec.options import ENDPOINT as ENDPOINT
-from scenarios.spec.options import RunSpec
-
-Number = TypeVar("Number", int, float, None)
+from fleet.bus.exchange.channel import Channel
+from fleet.errors import FleetError, LogError, nearest, printable
+from fleet.fields import argument, option
+from scenarios.spec import options as spec_options
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.prepare.randomisation import Randomisation
     from scenarios.spec.schema import Scenario
     from twin.logs.recording import Recording
-
-
-def number(text: str, low: float, high: float, *names: str, above: bool = False, **more: Any) -> Any:
-    """Option whose number must be from `low` to `high`, or with `above` more than `low`; without a value, it is None.
-
-    Any: typer keeps the class of options private, and `more` goes to `typer.Option`.
-    """
-    known = Option(help=text, low=low, high=high, above=above)
-
-    def check(option: typer.CallbackParam, value: Number) -> Number:
-        if problem := known.problem(option.opts[0], value):
-            raise FleetError(problem)
-        return value
-
-    return typer.Option(*names, help=text, callback=check, **more)
-
-
-def check_name(option: typer.CallbackParam, value: str) -> str:
-    """Callback of a parameter that names a fleet or a participant, which becomes part of keys and of a file name.
-
-    Its default needs no check: "" for none.
-
-    Raises:
-        FleetError: it does not follow the rule for names.
-    """
-    if value != option.default and not is_name(value):
-        name = option.opts[0] if option.param_type_name == "option" else option.opts[0].upper()
-        raise FleetError(f"{name} must have {NAME_RULE} (got '{printable(value)}').")
-    return value
 
 
 def command_line(ctx: typer.Context) -> str:
@@ -68,70 +34,38 @@ def command_line(ctx: typer.Context) -> str:
     return shlex.join(words)
 
 
-ScenarioArg = Annotated[
-    str,
-    typer.Argument(
-        help="A library name (see `thermofleet show`), a .toml file, or an instance of the suite, as test/0017."
-    ),
-]
-SeedOption = Annotated[int, number("Random seed of jobs, sensor noise and policy.", 0, MAX_SEED)]
-DifficultyOption = Annotated[str, declared(RunSpec, "difficulty")]
-RiskOption = Annotated[str, declared(RunSpec, "risk")]
-RandomiseOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="FIELD=VALUE",
-        help="Randomise every shift of a scenario; the value is TOML: ambient_k=[LOW,HIGH] (K, added to the ambient "
-        "temperature), arrivals=[LOW,HIGH] (factor of the arrival rate), variants=[{...},...] (fleets to choose from, "
-        "as overrides of the scenario). May be repeated.",
-        show_default=False,
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result in --out.")]
-
-# Communication between the arms of a simulated shift.
-TopologyOption = Annotated[str, declared(Channel, "topology")]
-RadiusOption = Annotated[float, declared(Channel, "radius")]
-TopologySeedOption = Annotated[int, declared(Channel, "topology_seed")]
-DelayOption = Annotated[float, declared(Channel, "delay_s")]
-JitterOption = Annotated[float, declared(Channel, "jitter_s")]
-LossOption = Annotated[float, declared(Channel, "loss")]
-PartitionOption = Annotated[list[str] | None, declared(Channel, "partitions")]
+SCENARIO = argument("A library name (see `thermofleet show`), a .toml file, or an instance of the suite, as test/0017.")
+RANDOMISE = option(
+    "Randomise every shift of a scenario; the value is TOML: ambient_k=[LOW,HIGH] (K, added to the ambient "
+    "temperature), arrivals=[LOW,HIGH] (factor of the arrival rate), variants=[{...},...] (fleets to choose from, "
+    "as overrides of the scenario). May be repeated.",
+    None,
+    metavar="FIELD=VALUE",
+)
+WORKERS = option("Number of processes; default: one per core.", None, low=1, high=1024)
+JSON = option("Print JSON.", False, flag="--json")
+OVERWRITE = option("Replace an earlier result.", False)
 
 # Live fleets.
-EndpointOption = Annotated[str, typer.Option(envvar="THERMOFLEET_ENDPOINT", help="Endpoint of the fleet's router.")]
-FleetOption = Annotated[
-    str,
-    typer.Option(
-        envvar="THERMOFLEET_FLEET", help="Name of the fleet; not needed if there is only one.", callback=check_name
-    ),
-]
+ENDPOINT = option("Endpoint of the fleet's router.", spec_options.ENDPOINT, env="THERMOFLEET_ENDPOINT")
+FLEET = option("Name of the fleet; not needed if there is only one.", "", env="THERMOFLEET_FLEET", is_name=True)
 
 # Twins.
-ScenarioOrLog = Annotated[
-    str | None, typer.Argument(help="A library name (see `thermofleet show`) or a .toml file; or use --log.")
-]
-LogOption = Annotated[
-    Path | None, typer.Option("--log", help="A log of a real arm, or a folder of logs: .csv, .csv.gz, .parquet.")
-]
-DamagedOption = Annotated[bool, typer.Option("--skip-damaged", help="Skip damaged lines of a log.")]
-ArmOption = Annotated[str | None, typer.Option(help="Train only this arm; default: every arm of the scenario.")]
-TwinsArg = Annotated[Path, typer.Argument(help="A folder that `thermofleet twin train` wrote.")]
-WhichOption = Annotated[
-    str | None, typer.Option("--arm", help="Name of the arm, if the folder contains several twins.")
-]
+SCENARIO_OR_LOG = argument("A library name (see `thermofleet show`) or a .toml file; or use --log.", None)
+LOG = option("A log of a real arm, or a folder of logs: .csv, .csv.gz, .parquet.", None)
+SKIP_DAMAGED = option("Skip damaged lines of a log.", False)
+TWINS = argument("A folder that `thermofleet twin train` wrote.")
+TWIN_ARM = option("Name of the arm, if the folder contains several twins.", None)
+SCENARIO_ARM = option("Arm of the scenario; default: the first.", None)
 
 
-def channel_of(scenario: "Scenario", partition: Sequence[str] | None = None, **fields: Any) -> Channel:
+def channel_of(scenario: "Scenario", **fields: Any) -> Channel:
     """The channel that the command line describes; `fields` are those of `Channel`, which checks them (hence Any).
 
     Raises:
         FleetError: says what was given and what is allowed.
     """
     try:
-        if partition is not None:
-            fields["partitions"] = tuple(Partition.parse(text) for text in partition)
         channel = Channel(**fields)
         channel.check([arm.name for arm in scenario.arms])
     except ValueError as error:

@@ -12,6 +12,7 @@ import typer
 
 from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
+from fleet.fields import option
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, print_json, progress_bar, say
@@ -33,22 +34,19 @@ PAIR = "index.html"
 
 
 def run_command(
-    scenario: options.ScenarioArg,
+    scenario: str = options.SCENARIO,
+    *,
     given: Annotated[Given, From(RunSpec, "policy", "seed", "plant", "bus", "difficulty", "risk")],
     channel: Annotated[Given, From(Channel)],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the recording; default: runs/SCENARIO-POLICY-SEED.")
-    ] = None,
-    overwrite: options.OverwriteOption = False,
-    listen: Annotated[
-        int,
-        options.number(
-            "Loopback port of the router, so that other programs can subscribe. 0: a private router on a free port.",
-            0,
-            65535,
-        ),
-    ] = 0,
-    as_json: options.JsonOption = False,
+    out: Path | None = option("Folder of the recording; default: runs/SCENARIO-POLICY-SEED.", None),
+    overwrite: bool = options.OVERWRITE,
+    listen: int = option(
+        "Loopback port of the router, so that other programs can subscribe. 0: a private router on a free port.",
+        0,
+        low=0,
+        high=65535,
+    ),
+    as_json: bool = options.JSON,
 ) -> None:
     """Run one shift of a scenario and record it."""
     from scenarios.policy_loader import label, policy_of
@@ -91,17 +89,16 @@ def run_command(
 
 
 def demo_command(
-    out: Annotated[Path, typer.Option(help="Folder of the two recordings and of the page that compares them.")] = Path(
-        "out/demo"
-    ),
-    seed: options.SeedOption = 20,
+    out: Path = option("Folder of the two recordings and of the page that compares them.", Path("out/demo")),
+    *,
+    given: Annotated[Given, From(RunSpec, "seed", seed=20)],
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
     from scenarios.result_folder import disk_errors
     from scenarios.show.run_page import pair_page
     from scenarios.spec.load import load
 
-    chosen = load("quickstart")
+    chosen, seed = load("quickstart"), given["seed"]
     results: dict[str, RunLog] = {}
     fleet = None
     with progress_bar() as progress:

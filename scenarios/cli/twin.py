@@ -1,13 +1,9 @@
-"""`thermofleet twin identify`, `generate`, `recover` and `export`.
-
-`thermofleet twin verdict`.
-
-`thermofleet twin train`, `score` and `report`, and the list of the `twin` commands.
-"""
+"""Commands of the digital twin: `thermofleet twin …`."""
 
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import MISSING
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -15,50 +11,42 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from fleet.errors import FleetError
+from fleet.fields import MAX_SEED, argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
 from scenarios.cli.terminal import echo, out_console, print_json, print_wide, progress_bar, say
-from scenarios.result_folder import check_file, check_overwrite, disk_errors
+from scenarios.result_folder import check_file, check_free, check_overwrite, new_file, new_folder
 from scenarios.show.table import Table
-from scenarios.spec.load import load
-from scenarios.spec.parse import choose
-from twin.thermal.identify import AMBIENT_C
 from twin.vae.config import TwinConfig
 
 if TYPE_CHECKING:
     from twin.thermal.identify import Identified
-    from twin.vae.measures import Features
     from twin.vae.twin import Twin
-    from twin.verdict import Rule
 
-
-ArmOfScenario = Annotated[str | None, typer.Option("--arm", help="Arm of the scenario; default: the first.")]
-TwinsOption = Annotated[
-    Path | None, typer.Option("--twins", help="A folder of twins; default: the scenario's own, from the cache.")
-]
-FormatOption = Annotated[str, typer.Option("--format", help="parquet or csv.")]
-SeedOption = Annotated[int, options.number("Random seed.", 0, options.MAX_SEED)]
+KNOWN_TWINS = option("A folder of twins; default: the scenario's own, from the cache.", None, flag="--twins")
+SEED = option("Random seed.", 0, low=0, high=MAX_SEED)
+FORMAT = option("parquet or csv.", "parquet", flag="--format")
+Format = Literal["parquet", "csv"]
+_VERDICT = "Verdicts"
 
 
 def identify_command(
-    log: Annotated[Path, typer.Option("--log", help="A log with motor temperatures, or a folder of logs of one arm.")],
-    out: Annotated[Path | None, typer.Option(help="Folder of the result, rc.json.")] = None,
-    arm: Annotated[str, typer.Option(help="Name of the arm.", callback=options.check_name)] = "arm",
-    ambient: Annotated[
-        float | None, options.number(f"Ambient temperature, °C; default: {AMBIENT_C:g} is assumed.", -40, 60)
-    ] = None,
-    skip_damaged: options.DamagedOption = False,
-    overwrite: options.OverwriteOption = False,
-    as_json: options.JsonOption = False,
+    log: Path = option("A log with motor temperatures, or a folder of logs of one arm.", MISSING),
+    out: Path | None = option("Folder of the result, rc.json.", None),
+    arm: str = option("Name of the arm.", "arm", is_name=True),
+    ambient: float | None = option("Ambient temperature, °C; default: 22 is assumed.", None, low=-40, high=60),
+    skip_damaged: bool = options.SKIP_DAMAGED,
+    overwrite: bool = options.OVERWRITE,
+    as_json: bool = options.JSON,
 ) -> None:
     """Identify an arm's thermal network from its own logs: parameters with 95 % intervals, and the residual.
 
     A day of logs takes half a minute to a minute.
     """
     from twin.thermal.checkpoint import CARD, save
-    from twin.thermal.identify import identify
+    from twin.thermal.identify import AMBIENT_C, identify
 
     if out is not None and out.exists():
         if not out.is_dir():
@@ -103,42 +91,37 @@ def parameter_table(network: "Identified") -> Table:
 
 
 def generate_command(
-    scenario: options.ScenarioArg,
-    out: Annotated[Path, typer.Option(help="Folder of the motions and generated.json.")] = Path("runs/generated"),
-    arm: ArmOfScenario = None,
-    twins: TwinsOption = None,
-    count: Annotated[int, options.number("Number of motions.", 1, 10_000)] = 20,
-    strength: Annotated[
-        float, options.number("Perturbation in posterior standard deviations; 0 reconstructs.", 0, 100, "--s")
-    ] = 1.0,
-    seed: SeedOption = 0,
-    format_: FormatOption = "parquet",
-    overwrite: options.OverwriteOption = False,
-    as_json: options.JsonOption = False,
+    scenario: str = options.SCENARIO,
+    out: Path = option("Folder of the motions and generated.json.", Path("runs/generated")),
+    arm: str | None = options.SCENARIO_ARM,
+    twins: Path | None = KNOWN_TWINS,
+    count: int = option("Number of motions.", 20, low=1, high=10_000),
+    strength: float = option(
+        "Perturbation in posterior standard deviations; 0 reconstructs.", 1.0, flag="--s", low=0, high=100
+    ),
+    seed: int = SEED,
+    format_: Format = FORMAT,
+    overwrite: bool = options.OVERWRITE,
+    as_json: bool = options.JSON,
 ) -> None:
     """Generate new motion near known motion: inside the limits, predicted to stay cool, executed in the simulator.
 
     Takes about 20 s once the arm's twin is in the cache.
     """
     from scenarios.motion.generate import generate
-    from scenarios.motion.recover import GENERATED, Format, generated_summary, known_arm, save_generated
-    from scenarios.result_folder import check_free
+    from scenarios.motion.recover import GENERATED, generated_summary, known_arm, save_generated
+    from scenarios.spec.load import load
 
-    chosen, format_name = load(scenario), choose("format", format_, Format)
+    chosen = load(scenario)
     check_free(out, GENERATED, overwrite=overwrite)
     with progress_bar() as progress:
         known = known_arm(chosen, arm, twin=twin_of(twins, arm or chosen.arms[0].name), progress=progress)
-        how = {
-            "s": strength,
-            "count": count,
-            "seed": seed,
-            "verification": known.verification,
-            "fixtures": chosen.fixtures,
-        }
-        made = generate(known.twin, known.arm, known.sources, **how, progress=partial(progress, "generating"))
-    save_generated(made, out, format=format_name, overwrite=overwrite)
+        how: Any = {"verification": known.verification, "fixtures": chosen.fixtures, "seed": seed}
+        how |= {"s": strength, "count": count, "progress": partial(progress, "generating")}
+        made = generate(known.twin, known.arm, known.sources, **how)
+    save_generated(made, out, format=format_, overwrite=overwrite)
     if as_json:
-        print_json({"out": str(out), **generated_summary(made, format_name)})
+        print_json({"out": str(out), **generated_summary(made, format_)})
         return
     reasons = ", ".join(f"{reason} {times}" for reason, times in made.rejected.items()) or "none"
     cool = f"{made.truly_cool:.1%} truly stay below {made.verification.cool_c:g} °C"
@@ -148,80 +131,62 @@ def generate_command(
 
 
 def recover_command(
-    scenario: options.ScenarioArg,
-    out: Annotated[Path, typer.Option(help="Folder of the temperatures and recovery.json.")] = Path("runs/recovery"),
-    arm: ArmOfScenario = None,
-    twins: TwinsOption = None,
-    payload: Annotated[float, options.number("Payload held, kg.", 0, 100)] = 2.0,
-    posture: Annotated[str, typer.Option(help=f"{', '.join(POSTURES)}, or seven angles in degrees.")] = "raised",
-    warm: Annotated[float, options.number("Temperature of the hottest motor at the start, °C.", -40, 200)] = 50.0,
-    hold_s: Annotated[
-        float, options.number("Remaining time to hold, s.", 0, BOUNDS["dwell_s"].high, "--hold", above=True)
-    ] = 600.0,
-    seed: SeedOption = 0,
-    format_: FormatOption = "parquet",
-    overwrite: options.OverwriteOption = False,
-    as_json: options.JsonOption = False,
+    scenario: str = options.SCENARIO,
+    out: Path = option("Folder of the temperatures and recovery.json.", Path("runs/recovery")),
+    arm: str | None = options.SCENARIO_ARM,
+    twins: Path | None = KNOWN_TWINS,
+    payload: float = option("Payload held, kg.", 2.0, low=0, high=100),
+    posture: str = option(f"{', '.join(POSTURES)}, or seven angles in degrees.", "raised"),
+    warm: float = option("Temperature of the hottest motor at the start, °C.", 50.0, low=-40, high=200),
+    hold_s: float = option(
+        "Remaining time to hold, s.", 600.0, flag="--hold", low=0, high=BOUNDS["dwell_s"].high, above=True
+    ),
+    seed: int = SEED,
+    format_: Format = FORMAT,
+    overwrite: bool = options.OVERWRITE,
+    as_json: bool = options.JSON,
 ) -> None:
     """Find a nearby posture in which a warm arm holds its payload with less load; execute both in the simulator.
 
     Takes about 20 s once the arm's twin is in the cache.
     """
     from fleet.arm.model import ArmModel
-    from scenarios.motion.recover import (
-        RECOVERY,
-        Format,
-        Nearby,
-        check_hold,
-        check_hold_time,
-        hold_until,
-        known_arm,
-        parse_posture,
-        recover,
-        recovery_summary,
-        save_recovery,
-    )
-    from scenarios.result_folder import check_free
+    from scenarios.motion import recover
+    from scenarios.spec.load import load
 
-    chosen, format_name = load(scenario), choose("format", format_, Format)
+    chosen = load(scenario)
     spec = chosen.arms[0 if arm is None else chosen.index_of(arm)]
     model = ArmModel(spec.robot())
-    q = parse_posture(posture, model.position_range)
-    check_free(out, RECOVERY, overwrite=overwrite)
-    check_hold(model, q, payload)  # before the training
-    check_hold_time(hold_s, Nearby())
+    q = recover.parse_posture(posture, model.position_range)
+    check_free(out, recover.RECOVERY, overwrite=overwrite)
+    recover.check_hold(model, q, payload)  # before the training
+    recover.check_hold_time(hold_s, recover.Nearby())
     with progress_bar() as progress:
-        known = known_arm(chosen, spec.name, twin=twin_of(twins, spec.name), progress=progress)
+        known = recover.known_arm(chosen, spec.name, twin=twin_of(twins, spec.name), progress=progress)
         progress("recovering", 0.0)
-        start_c = hold_until(known.arm, q, payload, ambient_c=known.verification.ambient_c, until_c=warm)
-        how = {
-            "start_c": start_c,
-            "verification": known.verification,
-            "hold_s": hold_s,
-            "fixtures": chosen.fixtures,
-            "seed": seed,
-        }
-        recovery = recover(known.twin, known.arm, q, payload, **how)
-    save_recovery(recovery, out, format=format_name, overwrite=overwrite)
+        start_c = recover.hold_until(known.arm, q, payload, ambient_c=known.verification.ambient_c, until_c=warm)
+        how: Any = {"verification": known.verification, "fixtures": chosen.fixtures, "seed": seed}
+        found = recover.recover(known.twin, known.arm, q, payload, start_c=start_c, hold_s=hold_s, **how)
+    recover.save_recovery(found, out, format=format_, overwrite=overwrite)
     if as_json:
-        print_json({"out": str(out), **recovery_summary(recovery)})
+        print_json({"out": str(out), **recover.recovery_summary(found)})
         return
-    hot = recovery.hottest
+    hot = found.hottest
     say(
-        f"Joint {hot + 1} goes from {recovery.with_c[0, hot]:.1f} °C to {recovery.with_c[-1, hot]:.1f} °C in "
-        f"{hold_s:g} s; without the new posture to {recovery.without_c[-1, hot]:.1f} °C. The tool moves "
-        f"{recovery.tool_m:.2f} m. Written to {out}.",
+        f"Joint {hot + 1} goes from {found.with_c[0, hot]:.1f} °C to {found.with_c[-1, hot]:.1f} °C in "
+        f"{hold_s:g} s; without the new posture to {found.without_c[-1, hot]:.1f} °C. The tool moves "
+        f"{found.tool_m:.2f} m. Written to {out}.",
         out_console,
     )
 
 
 def export_command(
-    twins: options.TwinsArg,
-    out: Annotated[Path, typer.Option(help="A file that ends in .onnx.")] = Path("twin.onnx"),
-    arm: options.WhichOption = None,
-    overwrite: options.OverwriteOption = False,
+    twins: Path = options.TWINS,
+    out: Path = option("A file that ends in .onnx.", Path("twin.onnx")),
+    arm: str | None = options.TWIN_ARM,
+    overwrite: bool = options.OVERWRITE,
 ) -> None:
-    """Export a twin as ONNX, for scoring without Python; needs the extra onnx, which `make` installs."""
+    """Export a twin as ONNX, for scoring without Python; needs the extra `onnx`."""
     if out.suffix != ".onnx":
         raise FleetError(f"--out must name a file that ends in .onnx (got '{out}').")
     check_overwrite(out, overwrite)
@@ -239,112 +204,24 @@ def twin_of(folder: Path | None, arm: str) -> "Twin | None":
     return None if folder is None else open_twin(folder, arm)
 
 
-def verdict_command(
-    twins: options.TwinsArg,
-    scenario: Annotated[str | None, typer.Argument(help="Judge this scenario's jobs; or use --log.")] = None,
-    log: options.LogOption = None,
-    arm: options.WhichOption = None,
-    alpha: Annotated[
-        float, options.number("Largest share of cool jobs that may be called anomalous.", 0, 1, above=True)
-    ] = 0.05,
-    reading: Annotated[
-        str, typer.Option(help="load (torque above the reconstruction), d, or latent (distance from cool motion).")
-    ] = "load",
-    map_: Annotated[
-        Path | None, typer.Option("--map", help="Draw the latent plane with the verdicts in this PNG.")
-    ] = None,
-    format_: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
-    skip_damaged: options.DamagedOption = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier map.")] = False,
-) -> None:
-    """Call each job of a scenario, or each recording of a log, uncritical or anomalous.
-
-    The threshold is a conformal p-value: a new cool job is called anomalous with
-    probability alpha at most, if it is like the cool jobs that the twin held out
-    of its training. Motion files of `twin generate` are recordings, too. Takes
-    seconds; the first time for a scenario, half a minute for planning.
-    """
-    check_one_source(scenario, log)
-    choose("format", format_, Literal["table", "csv", "json"])
-    if map_ is not None:
-        check_file(map_, (".png",), overwrite, "--map")
-    import numpy as np
-
-    from scenarios.prepare.twins import open_twin
-    from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, render, with_verdicts
-    from twin.vae.measures import Features
-    from twin.verdict import Rule, log_features
-
-    chosen, twin = load(scenario) if scenario else None, open_twin(twins, arm)
-    rule = Rule(twin=twin, alpha=alpha, reading=reading)
-    if chosen is not None:
-        with progress_bar() as progress:
-            jobs = jobs_of_arm(twin, chosen, progress)
-        features = twin.features([plan for plan, _ in jobs], [times for _, times in jobs])
-        rows = job_rows(twin, jobs)
-    else:
-        recordings = options.recordings_of(Path(str(log)), skip_damaged)
-        features = Features(np.stack([log_features(twin, recording).packed for recording in recordings]))
-        rows = log_rows(twin, recordings)
-    judged = with_verdicts(rows, rule, features)
-    shown = render(judged, format_, caption=f"{rule.guarantee} Twin of {twin.arm}, version {twin.version}")
-    if isinstance(shown, str):
-        echo(shown, nl=False)
-    else:
-        print_wide(shown)
-    if map_ is not None:
-        draw_map(map_, rule, features)
-        say(f"Map written to {map_}.")
-
-
-def check_one_source(scenario: str | None, log: Path | None) -> None:
-    """Raise a FleetError unless either a scenario or a log is given."""
-    if (scenario is None) == (log is None):
-        given = "neither" if scenario is None else "both"
-        raise FleetError(f"Give either a scenario or --log FILE_OR_FOLDER (got {given}).")
-
-
-def draw_map(path: Path, rule: "Rule", features: "Features") -> None:
-    """Write the latent plane with the verdicts."""
-    from fleet.files import atomic_path
-    from scenarios.motion.latent_map import verdict_png
-
-    png = verdict_png(rule, features)
-    with disk_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as draft:
-            draft.write_bytes(png)
-
-
-twin_app = typer.Typer(
-    help="Train, score and use the digital twin of an arm: an LSTM variational autoencoder of its cool motion.",
-    no_args_is_help=True,
-    add_completion=False,
-)
-
-
-@twin_app.command("train")
 def train_command(
+    scenario: str | None = options.SCENARIO_OR_LOG,
+    log: Path | None = options.LOG,
+    out: Path = option("Folder of the twins.", Path("runs/twins")),
+    arm: str | None = option("Train only this arm; default: every arm of the scenario.", None),
+    *,
     given: Annotated[Given, From(TwinConfig)],
-    scenario: options.ScenarioOrLog = None,
-    log: options.LogOption = None,
-    out: Annotated[Path, typer.Option(help="Folder of the twins.")] = Path("runs/twins"),
-    arm: options.ArmOption = None,
-    size: Annotated[str | None, typer.Option(help="quick or full; default: as the scenario says.")] = None,
-    cool: Annotated[
-        float,
-        options.number("--log: temperature limit of joints 1 to 4 for training data, °C.", 0, 200),
-    ] = 40.0,
-    hold_out: Annotated[
-        float, options.number("--log: share of the cool recordings held out to calibrate verdicts.", 0, 0.9)
-    ] = 0.3,
-    seed: Annotated[
-        int | None,
-        options.number("Seed of weights and training. Default: the scenario's, for logs 0.", 0, options.MAX_SEED),
-    ] = None,
-    skip_damaged: options.DamagedOption = False,
-    overwrite: options.OverwriteOption = False,
-    as_json: options.JsonOption = False,
+    size: Literal["quick", "full"] | None = option("quick or full; default: as the scenario says.", None),
+    cool: float = option("--log: temperature limit of joints 1 to 4 for training data, °C.", 40.0, low=0, high=200),
+    hold_out: float = option(
+        "--log: share of the cool recordings held out to calibrate verdicts.", 0.3, low=0, high=0.9
+    ),
+    seed: int | None = option(
+        "Seed of weights and training. Default: the scenario's, for logs 0.", None, low=0, high=MAX_SEED
+    ),
+    skip_damaged: bool = options.SKIP_DAMAGED,
+    overwrite: bool = options.OVERWRITE,
+    as_json: bool = options.JSON,
 ) -> None:
     """Train the twins of a scenario's arms, or the twin of the arm whose logs are given.
 
@@ -352,10 +229,8 @@ def train_command(
     Cached twins take seconds. A twin of logs is kept in --out only.
     """
     check_source(scenario, log, arm)
-    if size is not None:
-        choose("size", size, Literal["quick", "full"])
     from scenarios.prepare.twins import TWINS, save_twins, train_arms, train_log
-    from scenarios.result_folder import check_free, new_folder
+    from scenarios.spec.load import load
 
     check_free(out, TWINS, overwrite=overwrite)
     bar = progress_bar() if log is None else progress_bar(kept="")  # the twin of a log is not cached
@@ -380,43 +255,87 @@ def train_command(
     say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
 
 
-@twin_app.command("score")
 def score_command(
-    twins: options.TwinsArg,
-    scenario: Annotated[str | None, typer.Argument(help="Score this scenario's jobs; or use --log.")] = None,
-    log: options.LogOption = None,
-    arm: options.WhichOption = None,
-    format_: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
-    skip_damaged: options.DamagedOption = False,
+    twins: Path = options.TWINS,
+    scenario: str | None = argument("Score this scenario's jobs; or use --log.", None),
+    log: Path | None = options.LOG,
+    arm: str | None = options.TWIN_ARM,
+    format_: Literal["table", "csv"] = option("table or csv.", "table", flag="--format"),
+    skip_damaged: bool = options.SKIP_DAMAGED,
+    as_json: bool = options.JSON,
+    verdict: bool = option(
+        "Call each job of a scenario, or each recording of a log, uncritical or anomalous.", False, panel=_VERDICT
+    ),
+    alpha: float | None = option(
+        "Largest share of cool jobs that may be called anomalous; default: 0.05.",
+        None,
+        low=0,
+        high=1,
+        above=True,
+        panel=_VERDICT,
+    ),
+    reading: Literal["load", "d", "latent"] | None = option(
+        "load (torque above the reconstruction), d, or latent (distance from cool motion); default: load.",
+        None,
+        panel=_VERDICT,
+    ),
+    map_: Path | None = option(
+        "Draw the latent plane with the verdicts in this PNG.", None, flag="--map", panel=_VERDICT
+    ),
+    overwrite: bool = options.OVERWRITE,
 ) -> None:
     """Score every job of a scenario, or a log window by window, with the version of the twin.
 
+    With --verdict a recording is one row, and a conformal p-value judges each row:
+    a new cool job is called anomalous with probability alpha at most, if it is like
+    the cool jobs that the twin held out of its training. Motion files of
+    `twin generate` are recordings, too.
     Takes seconds, and half a minute if the jobs must be planned first.
     """
     check_source(scenario, log)
-    choose("format", format_, Literal["table", "csv", "json"])
+    given: Given = {name: value for name, value in (("alpha", alpha), ("reading", reading)) if value is not None}
+    if not verdict and (given or map_ is not None):
+        raise FleetError("--alpha, --reading and --map are for --verdict: leave them out.")
+    if map_ is not None:
+        check_file(map_, (".png",), overwrite, "--map")
+    import numpy as np
+
+    from scenarios.motion.latent_map import verdict_png
     from scenarios.prepare.twins import open_twin
-    from scenarios.show.twin_scores import job_rows, jobs_of_arm, render, window_rows
+    from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, render, window_rows, with_verdicts
+    from scenarios.spec.load import load
+    from twin.vae.measures import Features
+    from twin.verdict import Rule, log_features
 
     chosen, twin = load(scenario) if scenario else None, open_twin(twins, arm)
+    rule = Rule(twin=twin, **given) if verdict else None
+    jobs, recordings = [], []
     if chosen is not None:
         with progress_bar() as progress:
-            rows = job_rows(twin, jobs_of_arm(twin, chosen, progress))
+            jobs = jobs_of_arm(twin, chosen, progress)
+            rows = job_rows(twin, jobs)
     else:
         recordings = options.recordings_of(Path(str(log)), skip_damaged)
-        rows = [row for recording in recordings for row in window_rows(twin, recording)]
-    shown = render(rows, format_, caption=f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}")
+        windows = (row for recording in recordings for row in window_rows(twin, recording))
+        rows = log_rows(twin, recordings) if rule else list(windows)
+    caption = f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}"
+    if rule:
+        if chosen is not None:
+            features = twin.features([plan for plan, _ in jobs], [times for _, times in jobs])
+        else:
+            features = Features(np.stack([log_features(twin, recording).packed for recording in recordings]))
+        rows = with_verdicts(rows, rule, features)
+        caption = f"{rule.guarantee} Twin of {twin.arm}, version {twin.version}"
+        if map_ is not None:
+            png = verdict_png(rule, features)
+            with new_file(map_) as draft:
+                draft.write_bytes(png)
+            say(f"Map written to {map_}.")
+    shown = render(rows, "json" if as_json else format_, caption=caption)
     if isinstance(shown, str):
         echo(shown, nl=False)
     else:
         print_wide(shown)
-
-
-twin_app.command("identify")(identify_command)
-twin_app.command("generate")(generate_command)
-twin_app.command("recover")(recover_command)
-twin_app.command("export")(export_command)
-twin_app.command("verdict")(verdict_command)
 
 
 def check_source(scenario: str | None, log: Path | None, arm: str | None = None) -> None:
@@ -440,16 +359,15 @@ def explain_in_options() -> Iterator[None]:
         raise FleetError(re.sub(fields, lambda f: f"--{f[1].replace('_', '-')}", str(error))) from error
 
 
-@twin_app.command("report")
 def report_command(
-    scenario: options.ScenarioOrLog = None,
-    log: options.LogOption = None,
-    out: Annotated[Path, typer.Option(help="Folder of report.html and report.json.")] = Path("runs/twin_report"),
-    arm: Annotated[str | None, typer.Option(help="Arm of the scenario; default: the first.")] = None,
-    seeds: Annotated[int, options.number("Number of trainings, whose results give the spread.", 1, 100)] = 3,
-    skip_damaged: options.DamagedOption = False,
-    overwrite: options.OverwriteOption = False,
-    as_json: options.JsonOption = False,
+    scenario: str | None = options.SCENARIO_OR_LOG,
+    log: Path | None = options.LOG,
+    out: Path = option("Folder of report.html and report.json.", Path("runs/twin_report")),
+    arm: str | None = options.SCENARIO_ARM,
+    seeds: int = option("Number of trainings, whose results give the spread.", 3, low=1, high=100),
+    skip_damaged: bool = options.SKIP_DAMAGED,
+    overwrite: bool = options.OVERWRITE,
+    as_json: bool = options.JSON,
 ) -> None:
     """Write the paper's figures and tables as one offline HTML page, with all numbers in report.json.
 
@@ -459,8 +377,8 @@ def report_command(
     """
     check_source(scenario, log, arm)
     from fleet.files import cache_folder
-    from scenarios.result_folder import check_free, new_folder
     from scenarios.show import twin_report
+    from scenarios.spec.load import load
 
     check_free(out, twin_report.REPORT, overwrite=overwrite)
     bar = progress_bar(kept="Twins already trained are")

@@ -17,6 +17,7 @@ from fleet.env.allocation_v1 import actions_of
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.observation import Layout, Observation
 from scenarios.evaluate.rollout import UNLIMITED, DecisionLimit
+from scenarios.spec.options import Budget
 
 Array = np.ndarray
 
@@ -200,21 +201,6 @@ class Hindsight:
     evaluations: int
     seconds: float
     """CPU time of the search after its first simulation."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Budget:
-    """When the search ends, at the first of both, and the proof of the upper bound.
-
-    Without a limit of seconds the result depends on nothing but the instance, the code and its libraries.
-    """
-
-    seconds: float = 30.0
-    """CPU time after the first simulation, which may compile the simulator; inf for no limit."""
-    evaluations: int = 1_000_000
-    """Simulated shifts."""
-    nodes: int = 2000
-    """Most nodes of the branch and bound of the upper bound, which has proved something by then; 0: none."""
 
 
 def hindsight(

@@ -19,7 +19,7 @@ from fleet.engine.observe import PEAK_HIGH_C, PEAK_LOW_C
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
 from scenarios.evaluate.references import Reference, load_references, reference_table
-from scenarios.evaluate.rollout import COUNTS, DECISION_LIMIT_S, FIGURES, Outcome
+from scenarios.evaluate.rollout import COUNTS, FIGURES, Outcome
 from scenarios.evaluate.runner import run_study
 from scenarios.evaluate.scores import Scores, Shift, normalised, ranked, references_of, score_cells, scores_of
 from scenarios.evaluate.study import CARD, Case, Key, Row, Study, suite_of
@@ -29,7 +29,7 @@ from scenarios.progress import Progress, quiet
 from scenarios.result_folder import disk_errors
 from scenarios.show.table import markdown_table as table
 from scenarios.spec.load import SPLITS
-from scenarios.spec.options import RiskName
+from scenarios.spec.options import DECISION_LIMIT_S, RiskName
 from scenarios.spec.schema import SplitName
 from scenarios.suite.instances import JUDGED
 from scenarios.suite.splits import Row as Line

@@ -18,7 +18,6 @@ from fleet.files import cache_folder
 from fleet.seeding import child
 from scenarios.evaluate.hindsight import (
     SIDE_BY_SIDE,
-    Budget,
     Claim,
     Replay,
     ShiftSimulator,
@@ -26,7 +25,7 @@ from scenarios.evaluate.hindsight import (
     hindsight,
     without_scores,
 )
-from scenarios.evaluate.rollout import DECISION_LIMIT_S, DecisionLimit
+from scenarios.evaluate.rollout import DecisionLimit
 from scenarios.evaluate.sources import Fleets, plan_content
 from scenarios.evaluate.study import suite_of
 from scenarios.evaluate.upper_bound import Relaxation, upper_bound
@@ -37,7 +36,7 @@ from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.log import code_hash
 from scenarios.spec.jobs import weights_of
-from scenarios.spec.options import RISK, DifficultyName
+from scenarios.spec.options import DECISION_LIMIT_S, RISK, Budget, DifficultyName
 from scenarios.spec.parse import scenario_hash
 from scenarios.spec.schema import Scenario
 

@@ -24,6 +24,7 @@ from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.fleet import Fleet, as_known, library_of, simulator_of
 from scenarios.run.metrics import HeatUse, common_figures
 from scenarios.spec.jobs import weights_of
+from scenarios.spec.options import DECISION_LIMIT_S
 
 Array = np.ndarray
 
@@ -236,8 +237,6 @@ def _simulator(fleet: Fleet) -> CellSimulator:
     return simulator_of(fleet, library_of(as_known(fleet)).tables)
 
 
-DECISION_LIMIT_S = 60.0
-"""Longest time of a decision by default."""
 AGAIN_S = 1.0
 """An alarm is repeated, in case the policy catches the first one."""
 MOST_CAUGHT = 5

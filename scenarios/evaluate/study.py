@@ -13,14 +13,14 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError, nearest
 from fleet.seeding import child
-from scenarios.evaluate.rollout import DECISION_LIMIT_S, FIGURES, DecisionLimit, Outcome, TooSlow
+from scenarios.evaluate.rollout import FIGURES, DecisionLimit, Outcome, TooSlow
 from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, plan_content
 from scenarios.evaluate.store import RowKind
 from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.run.log import code_hash
 from scenarios.spec.load import INSTANCE, SPLITS, library, load
-from scenarios.spec.options import RISK, RiskName
+from scenarios.spec.options import StudySpec
 from scenarios.spec.parse import scenario_hash
 from scenarios.spec.schema import Scenario
 from scenarios.suite.splits import Instance, instance, split
@@ -116,25 +116,20 @@ class Unit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study:
+class Study(StudySpec):
     """Policies, instances and everything that they are run with."""
 
     policies: Sequence[str]
     """Each runs with every one of `difficulties`, but POLICY@SOURCE with that source alone."""
     cases: Sequence[Case]
-    fleets: int = 1
-    trainings: int = 1
-    """Of sources that are trained; the others have one."""
     difficulties: Sequence[str] = ("twin",)
     """Sources of predictions, see `scenarios.evaluate.sources`."""
-    risk: RiskName = RISK
-    """Model of P(saturation) of the source `twin`."""
     randomise: Randomisation | None = None
     channel: Channel = PERFECT
     """Of scenarios that have no channel of their own."""
-    decision_limit_s: float | None = DECISION_LIMIT_S
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for what, given in (
             ("policy", self.policies),
             ("instance", [case.name for case in self.cases]),

@@ -125,7 +125,7 @@ def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
     return Table(
         head=tuple(Column(SHORT.get(head, head), words=isinstance(rows[0][head], str)) for head in shown),
         rows=tuple(tuple(_cell(row[head]) for head in shown) for row in rows),
-        notes=(f"{caption}; --format csv or json for every joint",),
+        notes=(f"{caption}; --format csv or --json for every joint",),
     )
 
 

@@ -5,7 +5,7 @@ Nothing here is slow to import, so that the help of a command is fast.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 from agents.registry import NAMES_HELP, WRAPPERS_HELP, names_of
 from fleet.bus.exchange.channel import PERFECT, Channel
@@ -39,18 +39,63 @@ class RunSpec:
     plant: PlantName = option(
         "profile (arms follow their plans exactly) or mujoco (all arms in closed loop in MuJoCo).",
         "profile",
-        choices=get_args(PlantName),
     )
-    bus: BusName = option(
-        "Transport between the arms: zenoh (in-process router) or memory.", "zenoh", choices=get_args(BusName)
-    )
-    difficulty: DifficultyName = option(DIFFICULTY_HELP, "twin", choices=get_args(DifficultyName))
-    risk: RiskName = option(RISK_HELP, RISK, choices=get_args(RiskName))
+    bus: BusName = option("Transport between the arms: zenoh (in-process router) or memory.", "zenoh")
+    difficulty: DifficultyName = option(DIFFICULTY_HELP, "twin")
+    risk: RiskName = option(RISK_HELP, RISK)
     channel: Channel = PERFECT
     """Topology, delay and loss of the arms' messages."""
 
     def __post_init__(self) -> None:
         check(self)
+
+
+DECISION_LIMIT_S = 60.0
+"""Longest time of a decision by default."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudySpec:
+    """How a study is run, without its policies and instances."""
+
+    fleets: int = option("Number of fleets: draws of the arms' deviations (spread.seed).", 1, low=1, high=100)
+    trainings: int = option("Number of trainings of each fleet's twins.", 1, low=1, high=20)
+    """Of sources that are trained; the others have one."""
+    risk: RiskName = option(RISK_HELP, RISK)
+    decision_limit_s: float | None = option(
+        "Longest time for one decision of a policy, s. A slower policy fails.",
+        DECISION_LIMIT_S,
+        low=0.001,
+        high=86_400,
+        flag="--decision-limit",
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """When the search for a bound ends, at the first of both, and the proof of the upper bound.
+
+    Without a limit of seconds the result depends on nothing but the instance, the code and its libraries.
+    """
+
+    seconds: float = option(
+        "CPU seconds of the search for each shift.", 30.0, low=0, high=86_400, above=True, flag="--budget"
+    )
+    """After the first simulation, which may compile the simulator; inf for no limit."""
+    evaluations: int = option(
+        "End the search after this number of simulated shifts; the file then does not depend on other load.",
+        1_000_000,
+        low=1,
+        high=10**9,
+        shown="",
+    )
+    nodes: int = option(
+        "Maximum nodes of the upper bound's branch and bound; 0: only the linear program.", 2000, low=0, high=10**6
+    )
+    """Those that have proved something by then."""
 
 
 PORT, PAGE_PORT = 7447, 8080
@@ -72,12 +117,11 @@ class LiveSpec:
         "matching",
     )
     speed: float = option("Fleet seconds per real second.", 1.0, low=MIN_SPEED, high=MAX_SPEED)
-    difficulty: LiveModel = option("Difficulty model.", "twin", choices=get_args(LiveModel))
-    risk: RiskName = option(RISK_HELP, RISK, choices=get_args(RiskName))
+    difficulty: LiveModel = option("Difficulty model.", "twin")
+    risk: RiskName = option(RISK_HELP, RISK)
     jobs: JobSource = option(
         "scenario: the scenario's job stream; none: submitted jobs only.",
         "scenario",
-        choices=get_args(JobSource),
         noun="source of jobs",
     )
     seed: int = option("Random seed of the scenario's jobs, the sensor noise and the policy.", 0, low=0, high=MAX_SEED)

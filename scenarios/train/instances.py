@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.learned.evolution import TrainingLength
+from agents.learned.config import TrainingLength
 from agents.pairs import scores
 from agents.policy import WAIT
 from agents.rules import matched_options

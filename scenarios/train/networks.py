@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.learned.evolution import CURVE, TrainingLength, TrainingLog, read_log
+from agents.learned.config import TrainingLength
+from agents.learned.evolution import CURVE, TrainingLog, read_log
 from agents.learned.policy import save_policy
 from agents.learned.ppo import PpoConfig, Trainer, imitate
 from fleet.engine.batch import RewardWeights

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.learned.evolution import CURVE, Evolution, EvolutionConfig, TrainingLength, TrainingLog, read_log
+from agents.learned.config import TrainingLength
+from agents.learned.evolution import CURVE, Evolution, EvolutionConfig, TrainingLog, read_log
 from agents.pairs import PARAMETERS, first_parameters, save_pairs
 from fleet.files import atomic_path
 from scenarios.train.instances import (

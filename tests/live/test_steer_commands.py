@@ -45,7 +45,7 @@ def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
     code, said = command("job", "submit", tmp_path / "jobs.json")
     assert (code, said.count("accepted")) == (0, 3)
     assert command("arm", "pause", "--by", "ann") == (0, "Paused: all arms.\n")
-    assert command("arm", "resume", "arm_0")[0] == 2
+    assert command("arm", "pause", "arm_0", "--end")[0] == 2
     assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles.\n")
     assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles. It is cancelled.\n")
     assert command("job", "change", "two", "--due", 900, "--value", 3) == (0, "two: waiting, 0 of 1 cycles.\n")
@@ -73,4 +73,4 @@ def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
     assert [arm["name"] for arm in cell["arms"]] == [f"arm_{i}" for i in range(4)]
     assert cell["limits"]["payload_kg"] == {"low": 0.0, "high": 10.0, "unit": "kg"}
     assert example("resume")[0] == 0
-    assert command("arm", "resume") == (0, "Paused: none. Nothing changed: it is so already.\n")
+    assert command("arm", "pause", "--end") == (0, "Paused: none. Nothing changed: it is so already.\n")

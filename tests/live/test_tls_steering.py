@@ -40,15 +40,9 @@ COMMANDS = {
     ("job", "cancel", "j"): Cancel("j"),
     ("job", "settle", "j", "redo"): Settle("j", "redo"),
     ("job", "change", "j", "--value", "2"): Change("j", value=2.0),
-    (
-        "arm",
-        "pause",
-    ): Pause("*"),
+    ("arm", "pause"): Pause("*"),
     ("arm", "pause", "a"): Pause("a"),
-    (
-        "arm",
-        "resume",
-    ): Resume("*"),
+    ("arm", "pause", "--end"): Resume("*"),
     ("arm", "clear", "a"): ClearRequest("a", "ann"),
     ("arm", "reset", "a"): ResetRequest("ann"),
 }

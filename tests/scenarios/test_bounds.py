@@ -15,7 +15,7 @@ from fleet.env.random_actions import random_legal
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.evaluate import references as stored
-from scenarios.evaluate.hindsight import Budget, Replay, Schedules, ShiftSimulator, hindsight, without_scores
+from scenarios.evaluate.hindsight import Replay, Schedules, ShiftSimulator, hindsight, without_scores
 from scenarios.evaluate.references import Task, load_references, reference, reference_table, references
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.scores import split_file
@@ -23,6 +23,7 @@ from scenarios.evaluate.upper_bound import HeatBudget, Relaxation, upper_bound
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare
 from scenarios.spec.jobs import weights_of
+from scenarios.spec.options import Budget
 from scenarios.spec.parse import parse_scenario
 from scenarios.spec.schema import SPLITS
 from scenarios.suite.splits import instance, manifest

@@ -11,6 +11,7 @@ from scenarios.spec.load import load
 
 QUICK = ("--difficulty", "blind", "--policy", "least_difficulty")
 HARD = ("--topology", "line", "--delay-s", 20, "--jitter-s", 5, "--loss", 0.2, "--partition", "30:60:left|right")
+CUTS = (Partition(0.0, 10.0, (("left",),)), Partition(20.0, 30.0, (("right",),)))
 
 
 def test_a_partition_is_read_from_a_text():
@@ -25,9 +26,8 @@ def test_a_text_that_is_no_partition_is_refused(text):
 
 
 def test_options_make_a_channel(small_toml):
-    made = channel_of(load(small_toml), ["0:10:left", "20:30:right"], topology="ring", delay_s=3.0)
-    cuts = (Partition(0.0, 10.0, (("left",),)), Partition(20.0, 30.0, (("right",),)))
-    assert made == Channel(topology="ring", delay_s=3.0, partitions=cuts)
+    made = channel_of(load(small_toml), partitions=CUTS, topology="ring", delay_s=3.0)
+    assert made == Channel(topology="ring", delay_s=3.0, partitions=CUTS)
     assert channel_of(load(small_toml)).perfect
 
 

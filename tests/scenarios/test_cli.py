@@ -10,6 +10,7 @@ import pytest
 
 from scenarios.run.log import FILES
 from scenarios.spec.load import library
+from scenarios.suite.instances import CELLS
 from tests.commands import REAL
 
 QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
@@ -90,6 +91,14 @@ def test_list_names_every_scenario_of_the_library(thermofleet):
     assert said.code == 0
     assert all(name in said.out for name in library())
     assert set(json.loads(thermofleet("show", "--json").out)) == set(library())
+
+
+def test_show_lists_the_cells_and_the_instances_of_a_split(thermofleet):
+    names = [row["name"] for row in json.loads(thermofleet("show", "--suite", "test", "--json").out)]
+    assert names[:2] == ["test/0000", "test/0001"]
+    assert all(name in thermofleet("show", "--suite", "test").out for name in names[:2])
+    cells = json.loads(thermofleet("show", "--suite", "cells", "--json").out)
+    assert set(cells) == {cell.name for cell in CELLS}
 
 
 def test_show_fits_eighty_columns_and_cuts_no_word(thermofleet, small_toml):

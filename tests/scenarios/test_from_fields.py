@@ -15,7 +15,8 @@ from fleet.robot import ThermalLimits
 from scenarios.cli.from_fields import From, Given, flags_of, with_fields
 from scenarios.cli.main import COMMANDS, GROUPS, MOVED, load_command
 from scenarios.live.gateway import ROLES
-from scenarios.spec.options import ENDPOINT, PORT, LiveSpec, RunSpec, Shot
+from scenarios.spec.options import ENDPOINT, PORT, Budget, LiveSpec, RunSpec, Shot, StudySpec
+from twin.thermal.identify import AMBIENT_C
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +38,7 @@ def run(*words, **defaults) -> Given | BaseException:
     """What a command is given by its words; or its error."""
     received: list[Given] = []
 
-    def bake(given: Annotated[Given, From(Oven, **defaults)], twice: bool = False) -> None:
+    def bake(given: Annotated[Given, From(Oven, **defaults)], twice: bool = option("Again.", False)) -> None:
         """Bake."""
         received.append(given)
 
@@ -92,7 +93,7 @@ def test_words_of_a_command_line_give_the_same_value():
     assert LiveSpec(**received[0]) == spec
 
 
-@pytest.mark.parametrize("kind", [RunSpec, LiveSpec, Shot, Channel])
+@pytest.mark.parametrize("kind", [RunSpec, LiveSpec, StudySpec, Budget, Shot, Channel])
 def test_defaults_are_allowed_and_each_option_has_a_sentence(kind):
     kind()
     defaults = {each.name: each.default for each in fields(kind)}
@@ -117,6 +118,8 @@ def test_defaults_that_the_help_states_are_those_of_the_modules_that_it_does_not
 
     assert default("arm run", "rate_hz") == STATE_HZ
     assert default("bus router", "state_hz") == CHANNEL["arm", "state"].limit_hz
+    ambient = next(each for each in load_command("twin identify").params if each.name == "ambient")
+    assert f"default: {AMBIENT_C:g} is assumed" in ambient.help
     limits = ThermalLimits()
     assert (default("bus ros2", "warning_c"), default("bus ros2", "error_c")) == (limits.warning_c, limits.error_c)
     assert ENDPOINT == f"tcp/127.0.0.1:{PORT}" == default("bus watch", "endpoint")

@@ -48,7 +48,7 @@ def test_help_imports_no_large_library():
     assert said.stdout.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize("module", ["run", "look", "evaluate", "live", "jobs", "keys"])
+@pytest.mark.parametrize("module", ["run", "look", "evaluate", "live", "jobs", "keys", "twin"])
 def test_a_command_is_declared_without_what_it_runs(module):
     """Its help takes 0.3 s; the schema of scenarios, Zenoh or MuJoCo would double that."""
     large = ("networkx", "torch", "zenoh", "plotly", "mujoco", "numba", "scenarios.spec.schema")
@@ -64,7 +64,7 @@ def test_a_command_is_declared_without_what_it_runs(module):
         ("thermofleet run --pl", ["--plant"]),
         ("thermofleet run quickstart --plant m", ["mujoco"]),
         ("thermofleet bus re", ["record", "replay"]),
-        ("thermofleet arm re", ["reset", "resume"]),
+        ("thermofleet arm re", ["reset"]),
     ],
 )
 def test_the_shell_completes_commands_and_their_options(words, completions):

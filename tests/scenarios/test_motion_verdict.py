@@ -1,4 +1,4 @@
-"""`thermofleet twin verdict`, and held-out recordings."""
+"""`thermofleet twin score --verdict`, and held-out recordings."""
 
 import json
 
@@ -67,13 +67,13 @@ def test_logs_get_a_verdict_and_a_map(thermofleet, folder, tmp_path) -> None:
     twins, drawn = tmp_path / "twins", tmp_path / "map.png"
     said = thermofleet("twin", "train", "--log", folder / "logs", *size, "--hold-out", 0.5, "--out", twins, "--json")
     assert json.loads(said.out)["twins"][0]["calibrated_on"] == 7
-    asked = ("twin", "verdict", twins, "--log")
-    said = thermofleet(*asked, folder / "heavy.csv", "--alpha", 0.125, "--format", "json", "--map", drawn)
+    asked = ("twin", "score", twins, "--verdict", "--log")
+    said = thermofleet(*asked, folder / "heavy.csv", "--alpha", 0.125, "--json", "--map", drawn)
     (row,) = json.loads(said.out)["rows"]
     assert (row["verdict"], row["p_value"], row["recording"]) == ("anomalous", 0.125, "heavy")
     assert row["latent"] > 0
     assert drawn.read_bytes().startswith(b"\x89PNG")
-    said = thermofleet(*asked, folder / "logs", "--alpha", 0.125, "--format", "json", "--reading", "d")
+    said = thermofleet(*asked, folder / "logs", "--alpha", 0.125, "--json", "--reading", "d")
     verdicts = [row["verdict"] for row in json.loads(said.out)["rows"]]
     assert len(verdicts) == 14
     assert verdicts.count("uncritical") >= 7

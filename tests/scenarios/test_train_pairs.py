@@ -7,7 +7,8 @@ from itertools import chain, repeat
 import numpy as np
 import pytest
 
-from agents.learned.evolution import LOG, EvolutionConfig, TrainingLength
+from agents.learned.config import TrainingLength
+from agents.learned.evolution import LOG, EvolutionConfig
 from agents.learned.ppo import PpoConfig
 from agents.pairs import PAIRS_CARD, PARAMETERS, Worth, first_parameters
 from fleet.errors import FleetError

@@ -120,7 +120,7 @@ def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_to
     said = thermofleet("twin", "train", small_toml, "--arm", "right", *TINY, "--out", out)
     assert said.code == 0
     assert [home.name for home in out.glob("*.twin")] == ["right.twin"]
-    said = thermofleet("twin", "score", out, small_toml, "--format", "json")
+    said = thermofleet("twin", "score", out, small_toml, "--json")
     rows = json.loads(said.out)["rows"]
     assert {row["job"] for row in rows} == {"hold bench", "sort shelf → bench"}
     assert all(0 <= row["d"] < 7 and row["why"] for row in rows)
@@ -147,6 +147,7 @@ def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_to
         (["score", "HERE", "quickstart"], "holds no twin"),
         (["score", "HERE"], "Give either a scenario or --log"),
         (["score", "HERE", "quickstart", "--format", "cvs"], "No format 'cvs'; did you mean 'csv'?"),
+        (["score", "HERE", "quickstart", "--alpha", "0.1"], "--alpha, --reading and --map are for --verdict: leave"),
         (["report", "quickstart", "--arm", "arm_9"], "No arm 'arm_9' in quickstart"),
         (["report", "--log", "HERE"], "holds no log; a log ends in"),
         (["identify", "--log", "HERE/nowhere"], "nowhere"),
@@ -267,6 +268,4 @@ def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_co
 def test_twin_help_does_not_wait_for_the_learning_library(thermofleet):
     said = thermofleet("twin", "--help")
     assert said.code == 0
-    assert all(
-        c in said.out for c in ("train", "score", "report", "reliability", "identify", "generate", "recover", "export")
-    )
+    assert all(c in said.out for c in ("train", "score", "report", "identify", "generate", "recover", "export"))
