@@ -20,6 +20,7 @@ import numpy as np
 from joblib import delayed
 
 from fleet.errors import FleetError
+from scenarios.evaluate.statistics import Interval, interval
 from scenarios.json_rows import Row, Rows
 from scenarios.processes import worker_processes
 from scenarios.progress import brief
@@ -61,6 +62,21 @@ class Table:
         lines.insert(1, tuple("-" * width for width in widths))
         padded = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines]
         return "\n".join([self.caption, *padded] if self.caption else padded)
+
+
+def mean_by_group(values: Iterable[tuple[str, float]]) -> Interval:
+    """The interval of the mean over groups that each have some values, such as arms under seeds of their own.
+
+    The groups are the sample; of a single group, its values are.
+
+    Args:
+        values: Name of the group, and a value of it.
+    """
+    groups = dict[str, list[float]]()
+    for name, value in values:
+        groups.setdefault(name, []).append(value)
+    several = list(groups.values())
+    return interval([np.mean(each) for each in several] if len(several) > 1 else several[0])
 
 
 def no_options(parser: ArgumentParser) -> None:

@@ -57,7 +57,6 @@ class RunLog:
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Names of the arms."""
         return tuple(arm.name for arm in self.scenario.arms)
 
     @property
