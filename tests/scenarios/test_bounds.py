@@ -206,8 +206,8 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
     )
 
     def counted(fleet, task, budget, *, known, **options):
-        calls.append((task.instance, len(known)))
-        found = replace(one, instance=task.instance, seed=task.seed, search_s=budget.seconds, nodes=budget.nodes)
+        calls.append((task.name, len(known)))
+        found = replace(one, instance=task.name, seed=task.seed, search_s=budget.seconds, nodes=budget.nodes)
         return replace(found, upper=100.0 - budget.seconds - budget.nodes / 1e6)
 
     monkeypatch.setattr(stored, "reference", counted)
