@@ -301,7 +301,7 @@ def tasks_of(names: str, seeds: int, first_seed: int) -> list[Instance]:
         else:
             tasks += [Instance(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
     for i, task in enumerate(tasks):
-        if task.name in {other.instance for other in tasks[:i]}:
+        if task.name in {other.name for other in tasks[:i]}:
             raise FleetError(f"The instance '{task.name}' is given twice.")
     return tasks
 
