@@ -11,8 +11,10 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any  # values of JSON
 
 import numpy as np
@@ -43,15 +45,25 @@ from benchmarks.result_tables import (
 )
 from fleet.bus.protocol.contract import asyncapi, schema_document
 from fleet.errors import FleetError
-from scenarios.evaluate.comparison import HEADINGS
-from scenarios.evaluate.leaderboard import BASELINE, SOURCE, Submission, benchmark_tables, read_all, split_references
+from scenarios.evaluate.leaderboard import (
+    BASELINE,
+    SOURCE,
+    Submission,
+    board_of,
+    board_text,
+    read_all,
+    split_references,
+)
+from scenarios.evaluate.references import load_references, reference_table
+from scenarios.evaluate.rollout import KINDS
 from scenarios.evaluate.scores import Normalised, Scores, normalised, ranked, scores_of
 from scenarios.evaluate.statistics import Interval, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
 from scenarios.show.table import markdown_table as table
-from scenarios.suite.instances import CELLS
-from scenarios.suite.splits import instance
+from scenarios.spec.schema import SPLITS
+from scenarios.suite.instances import CELLS, JUDGED
+from scenarios.suite.splits import instance, manifest
 
 Array = np.ndarray
 Tables = Mapping[str, Callable[[], str]]
@@ -99,7 +111,7 @@ def named(results: Path) -> str:
             if any(each["mean"] for each in own.values()):
                 base = one["baseline"]
                 cells = [mean_cell(each, is_base=policy == base) for policy, each in own.items()]
-                rows.append((f"`{one['scenario']}`: {HEADINGS[figure]}", *cells))
+                rows.append((f"`{one['scenario']}`: {KINDS[figure].heading}", *cells))
     return table(("", *(f"`{policy}`" for policy in files[0]["figures"])), rows)
 
 
@@ -116,6 +128,54 @@ def mean_cell(figure: dict[str, Any], *, is_base: bool) -> str:
 def decisions(measured: dict[str, Any]) -> str:
     rows = [(f"`{row['policy']}`", row["scope"], f"{row['median_ms']:.2f}") for row in measured["rows"]]
     return table(("policy", "scope", "median, ms of CPU time"), rows)
+
+
+def references_text() -> str:
+    """A line for each split: how its references were found, and how far their two bounds are apart, as Markdown."""
+    rows: list[tuple[str, ...]] = []
+    for split in SPLITS:
+        found = list(split_references(split).values())
+        rows.append(
+            (
+                split,
+                f"{len(found)} of {len(manifest(split))}",
+                span([each.evaluations for each in found]),
+                span([each.nodes for each in found]),
+                f"{median(each.gap for each in found):.2f}",
+                f"{median(each.normalised(each.best_rule) for each in found):.2f}",
+            )
+        )
+    heads = (
+        "split",
+        "instances",
+        "shifts of the last search",
+        "nodes",
+        "gap, median",
+        "score of the best starting policy, median",
+    )
+    return table(heads, rows)
+
+
+def span(numbers: Sequence[int]) -> str:
+    least, most = min(numbers), max(numbers)
+    return f"{least}" if least == most else f"{least} to {most}"
+
+
+def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
+    """Text of each table of docs/leaderboard.md and docs/bounds.md by the name in its mark.
+
+    Args:
+        results: docs/results.
+    """
+
+    def board(split: str) -> str:
+        return board_text(board_of(split, read_all(results / "leaderboard", split)), split)
+
+    return {
+        "bounds": lambda: reference_table(load_references(results / "bounds_library.jsonl")),
+        "references": references_text,
+        **{f"leaderboard_{split}": partial(board, split) for split in JUDGED},
+    }
 
 
 ABLATED = ("heat_wave", "active_waiting")
@@ -164,7 +224,7 @@ def ablation_rows(folder: Path, names: tuple[str, ...]) -> Iterator[tuple[str, l
         for name in names[1:]:
             f = effects[name][key] if name in effects else None
             cells.append(difference(f.difference, f.difference_low, f.difference_high, digits) if f else "–")
-        yield HEADINGS[key], cells
+        yield KINDS[key].heading, cells
 
 
 def sizes_text(folders: Mapping[str, Path]) -> str:

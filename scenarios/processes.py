@@ -34,29 +34,23 @@ class Work(Protocol[Result]):
     @property
     def name(self) -> str:
         """What it does, in a sentence about a process that died."""
-        ...
 
     @property
     def group(self) -> object:
         """Work of one group shares what a process keeps, such as a prepared fleet."""
-        ...
 
     @property
     def deaths(self) -> int:
         """How many processes died while they did it."""
-        ...
 
     def __call__(self) -> Result:
         """Do it, in whichever process this is."""
-        ...
 
     def after_death(self) -> "Sequence[Work[Result]]":
         """The same work, perhaps in smaller parts, each with one death more."""
-        ...
 
     def given_up(self) -> Result:
         """Its result after `MOST_DEATHS`."""
-        ...
 
 
 class Worker(Protocol):
@@ -64,19 +58,15 @@ class Worker(Protocol):
 
     def submit(self, work: Work[Result]) -> "Future[Result]":
         """Begin a piece of work."""
-        ...
 
     def died(self, error: BaseException) -> bool:
         """Whether an error of its work says that the process died."""
-        ...
 
     def renew(self) -> bool:
         """Replace a process that died; False if there is no place for another."""
-        ...
 
     def close(self) -> None:
         """End the process."""
-        ...
 
 
 class LocalWorker:
@@ -95,7 +85,6 @@ class LocalWorker:
         return ProcessPoolExecutor(1, initializer=_begin, initargs=(os.getpid(),), **how)
 
     def submit(self, work: Work[Result]) -> "Future[Result]":
-        """Begin a piece of work."""
         return self._pool.submit(work)
 
     def died(self, error: BaseException) -> bool:
@@ -103,13 +92,11 @@ class LocalWorker:
         return isinstance(error, BrokenProcessPool)
 
     def renew(self) -> bool:
-        """Replace a process that died."""
         self.close()
         self._pool = self._new()
         return True
 
     def close(self) -> None:
-        """End the process."""
         self._pool.shutdown(wait=True, kill_workers=True)
 
 
@@ -200,7 +187,6 @@ class Call(Generic[Result]):
 
     @property
     def name(self) -> str:
-        """Name of the function."""
         return getattr(self.function, "__qualname__", repr(self.function))
 
     @property
@@ -209,11 +195,9 @@ class Call(Generic[Result]):
         return "calls"
 
     def __call__(self) -> Result:
-        """Call it."""
         return self.function(*self.arguments, **self.options)
 
     def after_death(self) -> "list[Call[Result]]":
-        """The same call."""
         return [replace(self, deaths=self.deaths + 1)]
 
     def given_up(self) -> Result:

@@ -21,6 +21,7 @@ from joblib import delayed
 from rich.console import Console
 
 from fleet.errors import FleetError
+from scenarios.evaluate.statistics import Interval, interval
 from scenarios.json_rows import Row, Rows
 from scenarios.processes import worker_processes
 from scenarios.progress import brief
@@ -44,6 +45,21 @@ class Unit(NamedTuple):
 def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> Table:
     """A table of texts."""
     return Table(head=tuple(head), rows=tuple(map(tuple, rows)), caption=caption)
+
+
+def mean_by_group(values: Iterable[tuple[str, float]]) -> Interval:
+    """The interval of the mean over groups that each have some values, such as arms under seeds of their own.
+
+    The groups are the sample; of a single group, its values are.
+
+    Args:
+        values: Name of the group, and a value of it.
+    """
+    groups = dict[str, list[float]]()
+    for name, value in values:
+        groups.setdefault(name, []).append(value)
+    several = list(groups.values())
+    return interval([np.mean(each) for each in several] if len(several) > 1 else several[0])
 
 
 def no_options(parser: ArgumentParser) -> None:

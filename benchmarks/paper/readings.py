@@ -27,6 +27,7 @@ from benchmarks.paper.harness import (
     Experiment,
     Unit,
     content_key,
+    mean_by_group,
     names,
     one_row,
     scenarios_of,
@@ -40,7 +41,7 @@ from benchmarks.paper.subjects import ALARM_RATE, SCENARIOS, Sample, Study, arm_
 from fleet.arm.model import ArmModel
 from fleet.errors import FleetError
 from fleet.motion import Plan
-from scenarios.evaluate.statistics import Interval, mean_by_group
+from scenarios.evaluate.statistics import Interval
 from scenarios.json_rows import Row
 from scenarios.motion.generate import Rejected, planned
 from scenarios.prepare.twins import cold_peaks

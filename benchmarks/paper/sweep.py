@@ -23,6 +23,7 @@ from benchmarks.paper.harness import (
     Unit,
     content_key,
     matching,
+    mean_by_group,
     names,
     size_given,
     size_options,
@@ -47,7 +48,7 @@ from benchmarks.paper.subjects import (
 )  # fmt: skip
 from fleet.errors import FleetError, nearest
 from fleet.motion import RATE_HZ, Plan
-from scenarios.evaluate.statistics import Interval, mean_by_group
+from scenarios.evaluate.statistics import Interval
 from scenarios.json_rows import Row
 from scenarios.prepare.twins import records
 from scenarios.show.table import Table

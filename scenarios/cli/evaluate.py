@@ -121,7 +121,7 @@ def train_command(
         from scenarios.evaluate.scores import references_of
         from scenarios.evaluate.study import suite_of
         from scenarios.suite.splits import split
-        from scenarios.train.instances import grounds_of
+        from scenarios.train.instances import training_instances
 
         usual = (36, 60) if algorithm == "pairs" else (12, 24)
         train = split(suite)[: instances or usual[0]]
@@ -129,8 +129,8 @@ def train_command(
         cases = [*suite_of(suite, 1)[: len(train)], *suite_of("validation", 1)[: len(validation)]]
         known = {shift: (each.random, each.hindsight) for shift, each in references_of(cases).items()}
         with progress_bar() as progress:
-            grounds = grounds_of(train, **sources, known=known, progress=progress)
-            judging = grounds_of(validation, **sources, known=known, progress=progress)
+            grounds = training_instances(train, **sources, known=known, progress=progress)
+            judging = training_instances(validation, **sources, known=known, progress=progress)
         card |= {"prepared": len(grounds), "judges": len(judging)}
     for k, where in enumerate(places):
         goes_on = resume and (seeds == 1 or holds_training(where))
@@ -415,11 +415,10 @@ def submit_results(results: Path, author: str, about: str, policies: str | None,
     require_extra("report")
     from scenarios.evaluate.leaderboard import check, split_references, submissions_of, write
     from scenarios.evaluate.store import read_card, read_rows
-    from scenarios.evaluate.study import SHIFTS
     from scenarios.policy_loader import label
 
     try:
-        made: list[Submission] = submissions_of(read_card(results, SHIFTS), read_rows(results, SHIFTS), author, about)
+        made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
     except (KeyError, TypeError, AttributeError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else f"has a value of another type ({error})"
         raise FleetError(f"'{results}' is damaged: its study.json {what}. Run the comparison again.") from error

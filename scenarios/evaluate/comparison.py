@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
-from scenarios.evaluate.rollout import COUNTS, FIGURES, POSSIBLE, Outcome
+from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Normalised, Scores, Shift, and_trainings, normalised, scores_of
 from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, fewest, figure_rows, figures_of, remarks, unit
 from scenarios.evaluate.study import Row, Study, suite_label
@@ -17,6 +17,7 @@ from scenarios.policy_loader import has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
 from scenarios.show.table import Table
+from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, DifficultyName, RiskName
 from scenarios.spec.schema import Scenario
 
@@ -24,24 +25,6 @@ if TYPE_CHECKING:  # slow to import
     from scenarios.evaluate.references import Reference
 
 Array = np.ndarray
-
-
-HEADINGS = {
-    "reward": "reward",
-    "value": "value",
-    "finished": "jobs finished",
-    "on_time": "jobs on time",
-    "faults": "faults",
-    "above_warning_min": "min above warning",
-    "peak_c": "hottest motor, °C",
-    "availability": "availability, 0–1",
-    "insulation_ppb": "insulation, ppb",
-    "tool_drift_mm": "tool drift, mm",
-    "hot_surface_min": "hot surface, min",
-}
-"""Headings of the figures in the table, with units."""
-LEAST_DIGITS = {"availability": 3, "tool_drift_mm": 2}
-"""Decimals of a figure; 1 for others."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +89,9 @@ class Comparison:
             (label(policy), scope, "", "", "", "") for policy, scope in self.scopes.items()
         ]
         groups = {"scope": scopes}
-        for name in FIGURES:
+        for name, kind in KINDS.items():
             figures = {policy: each[name] for policy, each in self.figures.items()}
-            groups[HEADINGS[name]] = figure_rows(figures, self.baseline, label, LEAST_DIGITS.get(name, 1))
+            groups[kind.heading] = figure_rows(figures, self.baseline, label, kind.digits)
         notes = list(remarks(self.figures, self.draws))
         central = [label(policy) for policy, scope in self.scopes.items() if scope == "central"]
         if not perfect and central:
@@ -120,11 +103,11 @@ class Comparison:
 
 
 def compare(
-    scenario: Scenario,
+    scenario: str | Path | Scenario,
     policies: Sequence[str],
     *,
-    seeds: Sequence[int],
-    baseline: str,
+    seeds: Sequence[int] = range(20),
+    baseline: str | None = None,
     difficulty: DifficultyName = "twin",
     risk: RiskName = RISK,
     randomise: Randomisation | None = None,
@@ -136,28 +119,36 @@ def compare(
     """Run every policy on every seed, in memory and on the profile plant.
 
     Args:
+        scenario: A library name, a .toml file, or a `Scenario`.
+        policies: Names, FILE.py:CLASS, or folders of trained policies.
+        baseline: The policy that differences refer to; default: the first.
         randomise: Varies the shifts beyond what the scenario draws, the same for every policy.
         channel: Topology, delay and loss of the arms' messages, the same for every policy.
         workers: Processes, if there is work for more than some seconds; -1 for one per core. The result does not
             depend on it.
 
     Raises:
-        FleetError: unknown policy, one given twice, or a baseline that is not among the policies.
+        FleetError: no such scenario, no policies, an unknown one, one given twice, or a baseline that is not among
+            them.
     """
     from scenarios.evaluate.runner import run_study
     from scenarios.evaluate.study import Case, Study
 
+    chosen = scenario_with(scenario, {}, compare)
+    if not policies or not seeds:
+        raise FleetError(f"A comparison needs a policy and a seed (got {len(policies)} policies, {len(seeds)} seeds).")
     study = Study(
         policies=policies,
-        cases=[Case(name=scenario.name, scenario=scenario, seeds=tuple(seeds))],
+        cases=[Case(name=chosen.name, scenario=chosen, seeds=tuple(seeds))],
         difficulties=[difficulty],
         risk=risk,
         randomise=randomise,
-        channel=scenario.channel(channel),
+        channel=chosen.channel(channel),
     )
-    check_baseline(study, baseline)
+    base = baseline or next(iter(study.competitors.values()))
+    check_baseline(study, base)
     rows = run_study(study, cache_dir=cache_dir, workers=workers, progress=progress)
-    return comparison_of(study, rows, baseline)
+    return comparison_of(study, rows, base)
 
 
 def figures_of_shifts(
@@ -180,7 +171,7 @@ def figures_of_shifts(
         return by_training if has_trainings(policy) else by_training.mean(axis=0, keepdims=True)
 
     values = {policy: {name: values_of(policy, rows, name) for name in FIGURES} for policy, rows in by_policy.items()}
-    return figures_of(values, baseline, counts=COUNTS, possible=POSSIBLE)
+    return figures_of(values, baseline, KINDS)
 
 
 def check_baseline(study: Study, baseline: str) -> None:

@@ -41,11 +41,12 @@ class Simulated:
     claims: list[list[Claim]]
     """The claims of each schedule that were won, and jobs given back, in the order of time."""
 
-    def and_(self, other: "Simulated") -> "Simulated":
-        """These and other results of the same shift."""
-        names = ("reward", "start_s", "arm", "option")
-        arrays = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
-        return Simulated(*arrays, claims=[*self.claims, *other.claims])
+
+def joined(results: Sequence[Simulated]) -> Simulated:
+    """Several results of the same shift as one."""
+    names = ("reward", "start_s", "arm", "option")
+    arrays = (np.concatenate([getattr(each, name) for each in results]) for name in names)
+    return Simulated(*arrays, claims=[claims for each in results for claims in each.claims])
 
 
 class ShiftSimulator:

@@ -3,12 +3,10 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from math import isclose
 from pathlib import Path
-from statistics import median
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -18,8 +16,8 @@ from fleet.bus.exchange.channel import PERFECT
 from fleet.engine.observe import PEAK_HIGH_C, PEAK_LOW_C
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
-from scenarios.evaluate.references import Reference, load_references, reference_table
-from scenarios.evaluate.rollout import COUNTS, FIGURES, Outcome
+from scenarios.evaluate.references import Reference
+from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.runner import run_study
 from scenarios.evaluate.scores import Scores, Shift, normalised, ranked, references_of, score_cells, scores_of
 from scenarios.evaluate.study import CARD, Case, Key, Row, Study, suite_of
@@ -28,12 +26,10 @@ from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
 from scenarios.result_folder import disk_errors
 from scenarios.show.table import markdown_table as table
-from scenarios.spec.load import SPLITS
 from scenarios.spec.options import DECISION_LIMIT_S, RiskName
 from scenarios.spec.schema import SplitName
 from scenarios.suite.instances import JUDGED
-from scenarios.suite.splits import Row as Line
-from scenarios.suite.splits import cell_of_instance, instance, line_of, manifest
+from scenarios.suite.splits import ManifestLine, cell_of_instance, instance, line_of, manifest
 
 FORMAT = 1
 DIGITS = 10
@@ -78,7 +74,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     versions: dict[str, str | None]
 
 
-class Played(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ResultLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The other lines: one shift each."""
 
     instance: str
@@ -96,7 +92,7 @@ class Submission(msgspec.Struct, frozen=True, kw_only=True):
     """A result file."""
 
     card: Card
-    rows: tuple[Played, ...]
+    rows: tuple[ResultLine, ...]
 
     @property
     def name(self) -> str:
@@ -143,13 +139,13 @@ def split_references(split: str) -> dict[Shift, Reference]:
     return references_of(suite_of(split, 1))
 
 
-def played_of(row: Row, scenario: str) -> Played:
+def result_line(row: Row, scenario: str) -> ResultLine:
     """The line of a row of a study."""
     figures = None
     if row.outcome is not None:
         figures = [float(f"{value:.{DIGITS}g}") for value in asdict(row.outcome).values()]
     key = row.key
-    return Played(
+    return ResultLine(
         instance=key.instance,
         scenario=scenario,
         seed=key.seed,
@@ -193,7 +189,7 @@ def problems(submission: Submission, references: Mapping[Shift, Reference]) -> I
             yield from (f"{row.instance} {what}" for what in _of_shift(row, line, references))
 
 
-def _of_shift(row: Played, line: Line, references: Mapping[Shift, Reference]) -> Iterator[str]:
+def _of_shift(row: ResultLine, line: ManifestLine, references: Mapping[Shift, Reference]) -> Iterator[str]:
     if row.scenario != line.scenario:
         yield f"was another scenario (hash {row.scenario}, in the manifest {line.scenario})"
     if row.seed != line.seed:
@@ -210,8 +206,9 @@ def _of_shift(row: Played, line: Line, references: Mapping[Shift, Reference]) ->
         yield f"has {own['finished']:g} finished jobs, {own['on_time']:g} on time, of {line.count}"
     if min(value for name, value in own.items() if name not in ("reward", "peak_c")) < 0 or own["availability"] > 1:
         yield "has a figure below 0, or an availability above 1"
-    if any(own[name] % 1 for name in COUNTS):
-        yield f"has counts that are no whole numbers ({', '.join(COUNTS)})"
+    counts = [name for name, kind in KINDS.items() if kind.is_count]
+    if any(own[name] % 1 for name in counts):
+        yield f"has counts that are no whole numbers ({', '.join(counts)})"
     cell = cell_of_instance(line)
     longest_min = 60.0 * cell.hours * cell.arms
     if max(own["above_warning_min"], own["hot_surface_min"]) > longest_min + SLACK:
@@ -270,10 +267,10 @@ def read(path: Path) -> Submission:
         if path.stat().st_size > MOST_BYTES:
             raise FleetError(f"'{path}': a result has at most {MOST_BYTES} bytes.")
         first, *rest = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
-        card, rows = msgspec.json.decode(first, type=Card), list[Played]()
+        card, rows = msgspec.json.decode(first, type=Card), list[ResultLine]()
         for line in rest:
             number += 1
-            rows.append(msgspec.json.decode(line, type=Played))
+            rows.append(msgspec.json.decode(line, type=ResultLine))
     except OSError as error:
         raise FleetError(f"Cannot read '{path}': {error.strerror}.") from error
     except (ValueError, msgspec.DecodeError) as error:
@@ -321,7 +318,7 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
                 head = msgspec.convert(header, Card)
             except msgspec.ValidationError as error:
                 raise FleetError(f"The result of '{policy}' cannot be written: {error}.") from error
-            lines = tuple(played_of(row, card["instances"][row.key.instance]) for row in own)
+            lines = tuple(result_line(row, card["instances"][row.key.instance]) for row in own)
             made.append(Submission(card=head, rows=lines))
     return made
 
@@ -362,14 +359,14 @@ def read_all(folder: Path, split: str) -> list[Submission]:
     """
     if (folder / CARD).exists():
         raise FleetError(
-            f"'{folder}' is a folder of `thermofleet compare`; run `thermofleet submit-result` with it first."
+            f"'{folder}' is a folder of `thermofleet compare`; run `thermofleet leaderboard --submit` with it first."
         )
     references, found = split_references(split), list[Submission]()
     for path in sorted(folder.glob("*.jsonl")):
         if (named := path.stem.partition("-")[0]) not in JUDGED:
             raise FleetError(
-                f"'{path}' must have the name that `thermofleet submit-result` gives, SPLIT-POLICY-PREDICTIONS.jsonl "
-                f"with SPLIT {', '.join(JUDGED)}."
+                f"'{path}' must have the name that `thermofleet leaderboard --submit` gives, "
+                f"SPLIT-POLICY-PREDICTIONS.jsonl with SPLIT {', '.join(JUDGED)}."
             )
         if named != split:
             continue
@@ -458,54 +455,6 @@ def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
         card.author,
         f"`{card.code_hash[:8]}`",
     )
-
-
-def references_text() -> str:
-    """A line for each split: how its references were found, and how far their two bounds are apart, as Markdown."""
-    rows: list[tuple[str, ...]] = []
-    for split in SPLITS:
-        found = list(split_references(split).values())
-        rows.append(
-            (
-                split,
-                f"{len(found)} of {len(manifest(split))}",
-                _span([each.evaluations for each in found]),
-                _span([each.nodes for each in found]),
-                f"{median(each.gap for each in found):.2f}",
-                f"{median(each.normalised(each.best_rule) for each in found):.2f}",
-            )
-        )
-    heads = (
-        "split",
-        "instances",
-        "shifts of the last search",
-        "nodes",
-        "gap, median",
-        "score of the best starting policy, median",
-    )
-    return table(heads, rows)
-
-
-def _span(numbers: Sequence[int]) -> str:
-    least, most = min(numbers), max(numbers)
-    return f"{least}" if least == most else f"{least} to {most}"
-
-
-def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
-    """Text of each table of docs/leaderboard.md and docs/bounds.md by the name in its mark.
-
-    Args:
-        results: docs/results.
-    """
-
-    def board(split: str) -> str:
-        return board_text(board_of(split, read_all(results / "leaderboard", split)), split)
-
-    return {
-        "bounds": lambda: reference_table(load_references(results / "bounds_library.jsonl")),
-        "references": references_text,
-        **{f"leaderboard_{split}": partial(board, split) for split in JUDGED},
-    }
 
 
 CLOSE = 1e-6

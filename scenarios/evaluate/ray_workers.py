@@ -61,7 +61,6 @@ class RayWorker:
         return self._actor.ready.remote()
 
     def submit(self, work: Work[Result]) -> "Future[Result]":
-        """Begin a piece of work."""
         return self._actor.run.remote(work).future()
 
     def died(self, error: BaseException) -> bool:
@@ -75,7 +74,6 @@ class RayWorker:
         return self._actor is not None
 
     def close(self) -> None:
-        """End the actor."""
         if self._actor is not None:
             self._cluster.stop(self._actor)
             self._actor = None

@@ -4,7 +4,7 @@ import re
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial, reduce
+from functools import partial
 from math import isfinite
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from scenarios.evaluate.hindsight import (
     ShiftSimulator,
     Simulated,
     hindsight,
+    joined,
     without_scores,
 )
 from scenarios.evaluate.rollout import DecisionLimit
@@ -38,7 +39,7 @@ from scenarios.run.log import code_hash
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import DECISION_LIMIT_S, RISK, Budget, DifficultyName
 from scenarios.spec.parse import scenario_hash
-from scenarios.spec.schema import Scenario
+from scenarios.suite.splits import Instance
 
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""
@@ -96,18 +97,9 @@ class Reference:
         return (self.upper - self.hindsight) / span if span > 0 else 0.0
 
 
-@dataclass(frozen=True)
-class Task:
-    """One instance to bound."""
-
-    instance: str
-    scenario: Scenario
-    seed: int
-
-
 def reference(
     fleet: Fleet,
-    task: Task,
+    task: Instance,
     budget: Budget,
     *,
     difficulty: str = "oracle",
@@ -130,13 +122,12 @@ def reference(
     simulator = partial(simulator_of_shift, fleet, task.seed)
     rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key, simulator=simulator)
     # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
-    each = [_followed(rules, name, task) for name in policies]
-    starts = reduce(Simulated.and_, each)
+    starts = joined([_followed(rules, name, task) for name in policies])
     best = int(starts.reward.argmax())
     rule, best_rule = policies[best], float(starts.reward[best])
     bare = without_scores(world)
     if known:
-        starts = starts.and_(ShiftSimulator(bare, weights, 1).follow([Replay(known)]))
+        starts = joined([starts, ShiftSimulator(bare, weights, 1).follow([Replay(known)])])
     drawn = [policy_of("random") for _ in range(RANDOM_SHIFTS)]
     for n, policy in enumerate(drawn):
         policy.reset(np.random.default_rng(child(np.random.SeedSequence([task.seed, 2]), n)))
@@ -147,7 +138,7 @@ def reference(
     upper = upper_bound(Relaxation(world, weights), nodes=budget.nodes) if bound else None
     ended_s, timed = time.process_time(), isfinite(budget.seconds)
     return Reference(
-        instance=task.instance,
+        instance=task.name,
         scenario_hash=scenario_hash(task.scenario),
         seed=task.seed,
         difficulty=difficulty,
@@ -168,21 +159,21 @@ def reference(
     )
 
 
-def _followed(simulator: ShiftSimulator, name: str, task: Task) -> Simulated:
+def _followed(simulator: ShiftSimulator, name: str, task: Instance) -> Simulated:
     """The shift of a task under a policy.
 
     Raises:
         PolicyFailed: the policy is one of one's own, and raised something, was too slow or returned no action.
     """
     limit = DecisionLimit(DECISION_LIMIT_S)
-    with blaming(name, task.instance), limit.watching():
+    with blaming(name, task.name), limit.watching():
         with limit.decision():
             policy = policy_at(name, task.seed)
         return simulator.follow([policy], limit)
 
 
 def references(
-    tasks: Sequence[Task],
+    tasks: Sequence[Instance],
     path: Path,
     budget: Budget,
     *,
@@ -210,15 +201,15 @@ def references(
     rows.check_writable()
     keys = [key_of(task, difficulty) for task in tasks]
     known = {(each.instance, each.seed): each for each in _references_in(rows, keys)}
-    left = [task for task in tasks if not _enough(known.get((task.instance, task.seed)), budget)]
-    first: dict[object, Task] = {}
+    left = [task for task in tasks if not _enough(known.get((task.name, task.seed)), budget)]
+    first: dict[object, Instance] = {}
     cells = [first.setdefault(plan_content(task.scenario), task) for task in left]
     order = [task for cell in first.values() for task, own in zip(left, cells, strict=True) if own is cell]
     if workers > 1:
         for task in first.values():
             _fleet_of(task, difficulty, folder, progress)  # so that no two processes plan the same motions
     work = (
-        delayed(_bounded)(task, budget, difficulty, known.get((task.instance, task.seed)), folder, policies)
+        delayed(_bounded)(task, budget, difficulty, known.get((task.name, task.seed)), folder, policies)
         for task in order
     )
     done = len(tasks) - len(left)
@@ -236,13 +227,13 @@ def references(
 _fleets = Fleets()
 
 
-def _fleet_of(task: Task, difficulty: DifficultyName, folder: Path, progress: Progress = quiet) -> Fleet:
+def _fleet_of(task: Instance, difficulty: DifficultyName, folder: Path, progress: Progress = quiet) -> Fleet:
     """The prepared fleet of an instance; instances of one cell share it."""
     return _fleets.of(task.scenario, difficulty, RISK, folder, progress)
 
 
 def _bounded(
-    task: Task,
+    task: Instance,
     budget: Budget,
     difficulty: DifficultyName,
     known: Reference | None,
@@ -259,7 +250,7 @@ def _bounded(
             found = replace(found, upper=min(found.upper, known.upper))
         return found
     except ValueError as error:
-        raise ScenarioError(f"{task.instance}: {error}") from error
+        raise ScenarioError(f"{task.name}: {error}") from error
 
 
 def _enough(known: Reference | None, budget: Budget) -> bool:
@@ -276,9 +267,9 @@ def _place(row: Row) -> list[object]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", row["instance"])]
 
 
-def key_of(task: Task, difficulty: str) -> str:
+def key_of(task: Instance, difficulty: str) -> str:
     """What a row of a file of references is found by."""
-    return _key(task.instance, scenario_hash(task.scenario), task.seed, difficulty)
+    return _key(task.name, scenario_hash(task.scenario), task.seed, difficulty)
 
 
 def _key(instance: str, scenario: str, seed: int, difficulty: str) -> str:
@@ -300,17 +291,17 @@ def _references_in(rows: Rows, keys: Iterable[str]) -> list[Reference]:
         return msgspec.convert(rows.some(keys), list[Reference])
 
 
-def tasks_of(names: str, seeds: int, first_seed: int) -> list[Task]:
+def tasks_of(names: str, seeds: int, first_seed: int) -> list[Instance]:
     """What is to be bounded: a split, or names separated by commas. An instance has one seed."""
-    tasks: list[Task] = []
+    tasks: list[Instance] = []
     for case in suite_of(names, seeds, first_seed):
         if "/" in case.name:
-            tasks.append(Task(case.name, case.scenario, case.seeds[0]))
+            tasks.append(Instance(case.name, case.scenario, case.seeds[0]))
         else:
-            tasks += [Task(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
+            tasks += [Instance(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
     for i, task in enumerate(tasks):
-        if task.instance in {other.instance for other in tasks[:i]}:
-            raise FleetError(f"The instance '{task.instance}' is given twice.")
+        if task.name in {other.name for other in tasks[:i]}:
+            raise FleetError(f"The instance '{task.name}' is given twice.")
     return tasks
 
 

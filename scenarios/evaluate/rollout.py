@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -20,6 +20,7 @@ from fleet.env.allocation_v1 import actions_of
 from fleet.env.lookahead import CellSimulator
 from fleet.env.vector import BatchEnv, Library, Obs
 from fleet.observation import Observation
+from scenarios.evaluate.statistics import FigureKind
 from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.fleet import Fleet, as_known, library_of, simulator_of
 from scenarios.run.metrics import HeatUse, common_figures
@@ -50,18 +51,25 @@ class Outcome:
     hot_surface_min: float
 
 
-FIGURES = tuple(field.name for field in fields(Outcome))
-"""Names of the compared figures."""
-COUNTS = ("finished", "on_time", "faults")
-"""Figures that count events."""
-POSSIBLE = {name: (0.0, math.inf) for name in FIGURES if name not in ("reward", "peak_c")} | {
-    "availability": (0.0, 1.0)
+KINDS = {
+    "reward": FigureKind("reward", least=-math.inf),
+    "value": FigureKind("value"),
+    "finished": FigureKind("jobs finished", is_count=True),
+    "on_time": FigureKind("jobs on time", is_count=True),
+    "faults": FigureKind("faults", is_count=True),
+    "above_warning_min": FigureKind("min above warning"),
+    "peak_c": FigureKind("hottest motor, °C", least=-math.inf),
+    "availability": FigureKind("availability, 0–1", digits=3, most=1.0),
+    "insulation_ppb": FigureKind("insulation, ppb"),
+    "tool_drift_mm": FigureKind("tool drift, mm", digits=2),
+    "hot_surface_min": FigureKind("hot surface, min"),
 }
-"""Smallest and largest possible value of a figure."""
+"""The compared figures by their names in `Outcome`, in its order."""
+FIGURES = tuple(KINDS)
 
 
 @dataclass(frozen=True)
-class Played:
+class ShiftResult:
     """One shift under a policy."""
 
     outcome: Outcome | None
@@ -98,7 +106,7 @@ def play(
     seeds: Sequence[int],
     channel: Channel = PERFECT,
     limit_s: float | None = None,
-) -> list[Played]:
+) -> list[ShiftResult]:
     """The shift of each seed under a policy; an error of the policy ends its shift alone.
 
     The shifts are one batch, with an env, an exchange and a policy for each seed.
@@ -119,7 +127,7 @@ def play(
     obs, _ = env.reset()
     heat = HeatUse(env.temp_c, fleet.scenario.people.burn_c)
     running = np.ones(len(seeds), dtype=bool)
-    results: dict[int, Played] = {}
+    results: dict[int, ShiftResult] = {}
     policies: dict[int, Policy] = {}
     limit, dt_s, tick = DecisionLimit(limit_s), library.tables.dt_s, 0
 
@@ -132,7 +140,7 @@ def play(
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # whatever the policy raises
-            results[e], running[e] = Played(None, 0, error, tick * dt_s), False
+            results[e], running[e] = ShiftResult(None, 0, error, tick * dt_s), False
 
     def after_step(reward: Array, ended: Array) -> None:
         """Keep the figures of the shifts that have ended."""
@@ -153,7 +161,7 @@ def play(
                 tool_drift_mm=float(heat.tool_drift_mm[e].max()),
                 hot_surface_min=float(heat.hot_surface_min[e].sum()),
             )
-            results[e] = Played(found, int(state.illegal[e].sum()))
+            results[e] = ShiftResult(found, int(state.illegal[e].sum()))
 
     with limit.watching():
         for e, seed in enumerate(seeds):

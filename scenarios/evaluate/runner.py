@@ -9,7 +9,6 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, redi
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from traceback import format_tb
-from typing import Protocol
 
 from joblib import cpu_count
 
@@ -17,10 +16,10 @@ from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
 from fleet.files import cache_folder
 from scenarios.evaluate import rollout
-from scenarios.evaluate.rollout import Outcome, Played, play
+from scenarios.evaluate.rollout import Outcome, ShiftResult, play
 from scenarios.evaluate.sources import Fleets, is_trained, plan_content
-from scenarios.evaluate.store import opened
-from scenarios.evaluate.study import SHIFTS, Key, Row, Study, Unit, policy_hash
+from scenarios.evaluate.store import Store, opened
+from scenarios.evaluate.study import Row, Study, Unit, policy_hash
 from scenarios.extras import require_extra
 from scenarios.policy_loader import error_text, is_built_in
 from scenarios.prepare.fleet import Fleet
@@ -87,7 +86,7 @@ def run_unit(unit: Unit, settings: Settings) -> list[Row]:
     return [row_of(unit, i, each) for i, each in enumerate(played)]
 
 
-def row_of(unit: Unit, index: int, played: Played) -> Row:
+def row_of(unit: Unit, index: int, played: ShiftResult) -> Row:
     """The row of the unit's i-th shift."""
     key = unit.keys[index]
     if played.outcome is not None:
@@ -110,7 +109,6 @@ class UnitWork:
 
     @property
     def name(self) -> str:
-        """Policy, instance and first seed."""
         return f"'{self.unit.policy}' on {self.unit.case.name}, seed {self.unit.case.seeds[0]}"
 
     @property
@@ -119,7 +117,6 @@ class UnitWork:
         return self.unit.group
 
     def __call__(self) -> list[Row]:
-        """Run it."""
         return run_unit(self.unit, self.settings)
 
     def after_death(self) -> "list[UnitWork]":
@@ -174,27 +171,6 @@ def _one_thread() -> AbstractContextManager[None]:
     return one_thread()
 
 
-class Rows(Protocol):
-    """Where rows go."""
-
-    rows: dict[Key, Row]
-
-    def add(self, rows: list[Row]) -> None:
-        """Take the rows of a unit."""
-        ...
-
-
-class Memory:
-    """Rows in memory."""
-
-    def __init__(self) -> None:
-        self.rows: dict[Key, Row] = {}
-
-    def add(self, rows: list[Row]) -> None:
-        """Take the rows of a unit."""
-        self.rows |= {row.key: row for row in rows}
-
-
 def run_study(
     study: Study,
     *,
@@ -219,7 +195,9 @@ def run_study(
         MissingExtra: a library is not installed.
     """
     wanted = [key for unit in study.units(set()) for key in unit.keys]
-    with _opened(study, out) as store:
+    if out is not None:
+        require_extra("report")
+    with nullcontext(Store()) if out is None else opened(out, study.card) as store:
         # The largest first, so that processes end together; what shares plans follows.
         units = sorted(study.units(set(store.rows)), key=lambda unit: (-unit.size, unit.cell))
         folder = cache_dir or cache_folder()  # here: a worker may have started with another one
@@ -244,17 +222,9 @@ def _warm(units: list[Unit], study: Study, folder: Path, progress: Progress) -> 
             fleet_of(unit, study.risk, study.randomise, folder, progress)
 
 
-def _opened(study: Study, out: Path | None) -> AbstractContextManager[Rows]:
-    if out is None:
-        return nullcontext(Memory())
-    require_extra("report")
-    return opened(out, SHIFTS, study.card)
-
-
 def _run(
     units: list[Unit], settings: Settings, workers: int, ray: str | None, tell: Callable[[str], None]
 ) -> Iterator[list[Row]]:
-    """The rows of each unit."""
     began_s, todo, left_s = time.monotonic(), list(units), 0.0
     whole = left = sum(unit.size for unit in units)
     while todo and not ray and is_built_in(todo[0].played) and (workers == 1 or left_s < HERE_S):

@@ -159,7 +159,7 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
         raise ValueError(f"Scores need {FEWEST} instances or more (got {len(values.instances)}).")
     base, names = values.score[baseline], list(values.score)
     groups = values.groups
-    suite = aggregates(values.score, "both", groups=groups)
+    suite = aggregates(values.score, groups=groups)
     differences = [Interval(0.0, 0.0, 0.0) if name == baseline else values.difference(name, baseline) for name in names]
     adjusted = holm([each.p for each in differences]).tolist()
     return Scores(
@@ -176,7 +176,7 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
                 p_holm=p_holm,
                 iqm=suite[name].iqm,
                 optimality_gap=suite[name].optimality_gap,
-                improvement=improvement(values.score[name], base, "both", groups=groups),
+                improvement=improvement(values.score[name], base, groups=groups),
                 bound_gap=values.interval(values.to_bound[name]),
             )
             for name, difference, p_holm in zip(names, differences, adjusted, strict=True)

@@ -153,37 +153,32 @@ class Learned:
 
 
 @dataclass(frozen=True)
-class _Unweighted:
-    """The scores of a model with d = Σ_k d_k, as in the paper."""
+class _Changed:
+    """The predictions of a model, changed."""
 
     model: DifficultyModel
-
-    @property
-    def version(self) -> str:
-        return f"{self.model.version}, unweighted"
+    version: str
+    change: Callable[[Difficulty], Difficulty]
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
         score = self.model.score(plan, repetitions)
-        return score and replace(score, weight=None)
+        return score and self.change(score)
 
 
-@dataclass(frozen=True)
-class _Inverted:
+def unweighted(model: DifficultyModel) -> _Changed:
+    """The predictions of a model with d = Σ_k d_k, as in the paper."""
+    return _Changed(model, f"{model.version}, unweighted", lambda score: replace(score, weight=None))
+
+
+def inverted(model: DifficultyModel) -> _Changed:
     """The opposite of a model: d_k and P of hard work are those of easy work."""
 
-    model: DifficultyModel
-
-    @property
-    def version(self) -> str:
-        return f"inverted {self.model.version}"
-
-    def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
-        score = self.model.score(plan, repetitions)
-        if score is None:
-            return None
+    def opposite(score: Difficulty) -> Difficulty:
         assert score.risk is None or score.risk.offset.shape[-1] == 1, "the opposite of a maximum is not one"
         risk = score.risk and replace(score.risk, offset=-score.risk.offset, weight=-score.risk.weight)
         return Difficulty(np.minimum(1.0 - score.per_joint, BELOW_ONE), risk=risk, weight=score.weight)
+
+    return _Changed(model, f"inverted {model.version}", opposite)
 
 
 @dataclass(frozen=True)
@@ -242,7 +237,7 @@ def _vae(
 
 
 def _unweighted(planned: PlannedFleet, fleet: Fleet) -> Fleet:
-    return planned.scored([_Unweighted(arm.model) for arm in fleet.arms])
+    return planned.scored([unweighted(arm.model) for arm in fleet.arms])
 
 
 def _torque(planned: PlannedFleet) -> Fleet:
@@ -276,10 +271,6 @@ def _random(planned: PlannedFleet, training: int) -> Fleet:
     return planned.scored([_Random(training_seed(planned.scenario, training))] * len(planned.arms))
 
 
-def _inverted(planned: PlannedFleet, training: int) -> Fleet:
-    return planned.scored([_Inverted(model) for model in planned.learned(training, "excess")])
-
-
 def _sized(**changes: int) -> Source:
     """The VAE alone, with another configuration."""
     return Source(lambda planned, training: _vae(planned, training, changes=changes))
@@ -297,7 +288,7 @@ SOURCES: dict[str, Source] = {
     "rc-nominal": Source(lambda planned, _: _network(planned, "rc-nominal"), trained=False),
     "rc": Source(lambda planned, _: _network(planned, "rc"), trained=False),
     "random": Source(_random),
-    "inverted": Source(_inverted),
+    "inverted": Source(lambda planned, training: planned.scored([*map(inverted, planned.learned(training, "excess"))])),
     "constant": Source(lambda planned, _: planned.scored([_Constant()] * len(planned.arms)), trained=False),
     # The VAE with other windows and sizes.
     "trained-1s-16": _sized(window=12, hidden=16),

@@ -16,17 +16,13 @@ Several tests at once.
 Scores over the instances of a suite: IQM, optimality gap, performance profile, probability of improvement.
 
 After Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021. Scores are
-[run, instance], normalised so that 1 is the best known. Intervals are percentiles of bootstrap resamples. What is drawn
-is the unit that an interval is about:
+[run, instance], normalised so that 1 is the best known; a run is a training that does all instances. Intervals are
+percentiles of bootstrap resamples of both, so they are about other trainings and other instances of the same generator;
+a single run is given, not a sample. If instances belong to groups, such as cells, then groups are drawn, and instances
+within each.
 
-- `within`: runs of each instance apart (stratified, as in rliable): the same suite with other seeds.
-- `runs`: whole runs: the same suite with other trainings, each of which does all instances.
-- `instances`: instances, with their runs: other instances of the same generator. If instances belong to groups, such as
-  cells, then groups are drawn, and instances within each: other groups.
-- `both`: runs and instances; a single run is given, so that this is the same as `instances`.
-
-Percentiles of few independent draws are too narrow, so those of `instances` and `both` are farther out, as Student's t
-is (Hesterberg, What Teachers Should Know about the Bootstrap, The American Statistician 69, 2015, section 5.4).
+Percentiles of few independent draws are too narrow, so these are farther out, as Student's t is (Hesterberg, What
+Teachers Should Know about the Bootstrap, The American Statistician 69, 2015, section 5.4).
 
 Resamples are weights, so every figure of every policy is a product of one matrix. The mean over instances needs none:
 `means.interval` of [run, 1, instance], or of `by_group`.
@@ -35,10 +31,10 @@ Figures of several policies beside a baseline: means, paired differences, and Ho
 """
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,7 +72,6 @@ class Interval:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether the interval excludes 0."""
         return self.low > 0 or self.high < 0
 
     @property
@@ -128,7 +123,7 @@ def interval(values: ArrayLike, *, least: float = -np.inf, most: float = np.inf,
     return Interval(mean, max(least, mean - away), min(most, mean + away), note=note)
 
 
-def paired(values: ArrayLike, base: ArrayLike, *, level: float = LEVEL) -> Interval:
+def paired(values: ArrayLike, base: ArrayLike) -> Interval:
     """The interval of the mean difference of values to those of a baseline on the same fleets, trainings and seeds.
 
     Of [fleet, training, seed], one of the two may have a single fleet that stands for all.
@@ -140,22 +135,7 @@ def paired(values: ArrayLike, base: ArrayLike, *, level: float = LEVEL) -> Inter
     single = x.ndim == y.ndim == 3 and 1 in (len(x), len(y))
     if x.shape[single:] != y.shape[single:]:
         raise ValueError(f"Paired values need equal shapes (got {x.shape}, {y.shape}).")
-    return interval(x - y, level=level)
-
-
-def mean_by_group(values: Iterable[tuple[str, float]]) -> Interval:
-    """The interval of the mean over groups that each have some values, such as arms under seeds of their own.
-
-    The groups are the sample; of a single group, its values are.
-
-    Args:
-        values: Name of the group, and a value of it.
-    """
-    groups = dict[str, list[float]]()
-    for name, value in values:
-        groups.setdefault(name, []).append(value)
-    several = list(groups.values())
-    return interval([np.mean(each) for each in several] if len(several) > 1 else several[0])
+    return interval(x - y)
 
 
 def mean_bounds(values: Array, *, level: float = LEVEL) -> Bounds:
@@ -253,7 +233,7 @@ def _checked(values: ArrayLike) -> Array:
     return x if np.ptp(x, axis=1).any() else x[:, :1]  # without trainings of its own
 
 
-def share_bounds(hits: int, count: int, *, level: float = LEVEL) -> tuple[float, float]:
+def share_bounds(hits: int, count: int) -> tuple[float, float]:
     """Exact interval of a probability after some hits in `count` draws (Clopper & Pearson, Biometrika 26, 1934).
 
     Raises:
@@ -261,13 +241,13 @@ def share_bounds(hits: int, count: int, *, level: float = LEVEL) -> tuple[float,
     """
     if not 0 <= hits <= count or not count:
         raise ValueError(f"Hits must be 0 to the number of draws, at least one draw (got {hits} of {count}).")
-    tail = (1 - level) / 2
+    tail = (1 - LEVEL) / 2
     low = float(beta.ppf(tail, hits, count - hits + 1)) if hits else 0.0
     high = float(beta.ppf(1 - tail, hits + 1, count - hits)) if hits < count else 1.0
     return low, high
 
 
-def rate_bounds(events: int, count: int, *, level: float = LEVEL) -> tuple[float, float]:
+def rate_bounds(events: int, count: int) -> tuple[float, float]:
     """Exact interval of a Poisson mean after `events` in all of `count` draws (Garwood, Biometrika 28, 1936).
 
     Raises:
@@ -275,12 +255,12 @@ def rate_bounds(events: int, count: int, *, level: float = LEVEL) -> tuple[float
     """
     if events < 0 or count < 1:
         raise ValueError(f"Events must be >= 0 and draws >= 1 (got {events} in {count}).")
-    tail = (1 - level) / 2
+    tail = (1 - LEVEL) / 2
     low = float(chi2.ppf(tail, 2 * events)) / 2 if events else 0.0
     return low / count, float(chi2.ppf(1 - tail, 2 * events + 2)) / 2 / count
 
 
-def count_interval(values: ArrayLike, *, level: float = LEVEL) -> Interval:
+def count_interval(values: ArrayLike) -> Interval:
     """As `interval`, of counts of rare events (≥ 0); where none occurred, the bound of a Poisson mean.
 
     Args:
@@ -288,16 +268,16 @@ def count_interval(values: ArrayLike, *, level: float = LEVEL) -> Interval:
     """
     x = np.asarray(values, dtype=float)
     if x.any() or not x.size:
-        return interval(x, least=0.0, level=level)
-    return Interval(0.0, *rate_bounds(0, draws(x), level=level), 1.0, f"none in {draws(x)}, Poisson")
+        return interval(x, least=0.0)
+    return Interval(0.0, *rate_bounds(0, draws(x)), 1.0, f"none in {draws(x)}, Poisson")
 
 
-def paired_counts(values: ArrayLike, base: ArrayLike, *, level: float = LEVEL) -> Interval:
+def paired_counts(values: ArrayLike, base: ArrayLike) -> Interval:
     """As `paired`, of counts of rare events; where none occurred in either, the difference of two Poisson bounds."""
     x, y = np.asarray(values, dtype=float), np.asarray(base, dtype=float)
     if x.any() or y.any() or x.shape != y.shape:
-        return paired(x, y, level=level)
-    most = rate_bounds(0, draws(x), level=level)[1]
+        return paired(x, y)
+    most = rate_bounds(0, draws(x))[1]
     return Interval(0.0, -most, most, 1.0, f"none in {draws(x)}, Poisson")
 
 
@@ -320,8 +300,6 @@ def holm(p: ArrayLike) -> Array:
     result[np.isfinite(raw)] = adjusted
     return result
 
-
-Unit = Literal["within", "runs", "instances", "both"]
 
 DRAWS = 4000
 TRIM = 0.25
@@ -349,9 +327,7 @@ class Aggregate:
     """By how much scores are below 1 in the mean; those above count as 1. Less is better."""
 
 
-def aggregates(
-    scores: Mapping[str, ArrayLike], unit: Unit = "instances", *, groups: ArrayLike | None = None, level: float = LEVEL
-) -> dict[str, Aggregate]:
+def aggregates(scores: Mapping[str, ArrayLike], *, groups: ArrayLike | None = None) -> dict[str, Aggregate]:
     """IQM and optimality gap of each policy, with intervals.
 
     Args:
@@ -359,19 +335,12 @@ def aggregates(
         groups: Number of the group of each instance, from 0, [instance]; None if each is its own.
 
     Raises:
-        ValueError: scores that are not finite or not [run, instance], or a unit of which there is only one.
+        ValueError: scores that are not finite or not [run, instance], or a single instance.
     """
-    return {policy: _aggregate(_checked_scores(each), unit, groups, level) for policy, each in scores.items()}
+    return {policy: _aggregate(_checked_scores(each), groups) for policy, each in scores.items()}
 
 
-def profile(
-    scores: ArrayLike,
-    threshold: ArrayLike,
-    unit: Unit = "instances",
-    *,
-    groups: ArrayLike | None = None,
-    level: float = LEVEL,
-) -> Profile:
+def profile(scores: ArrayLike, threshold: ArrayLike, *, groups: ArrayLike | None = None) -> Profile:
     """The performance profile of one policy, with pointwise intervals.
 
     Args:
@@ -381,20 +350,13 @@ def profile(
     """
     x, at = _checked_scores(scores), np.asarray(threshold, dtype=float)
     above = (x[..., None] > at).astype(float)  # [run, instance, threshold]
-    drawn = _weights(x.shape, unit, groups).reshape(DRAWS, -1) @ above.reshape(x.size, -1) / x.size
-    share, (low, high) = above.mean(axis=(0, 1)), _percentiles(drawn, level, _clusters(x.shape, unit, groups))
-    most, least = _beyond(x.shape, unit, groups, level)
+    drawn = _weights(x.shape, groups).reshape(DRAWS, -1) @ above.reshape(x.size, -1) / x.size
+    share, (low, high) = above.mean(axis=(0, 1)), _percentiles(drawn, _clusters(x.shape, groups))
+    most, least = _beyond(x.shape, groups)
     return Profile(at, share, np.where(share == 1, least, low), np.where(share == 0, most, high))
 
 
-def improvement(
-    scores: ArrayLike,
-    base: ArrayLike,
-    unit: Unit = "instances",
-    *,
-    groups: ArrayLike | None = None,
-    level: float = LEVEL,
-) -> Interval:
+def improvement(scores: ArrayLike, base: ArrayLike, *, groups: ArrayLike | None = None) -> Interval:
     """Probability that a run is better than one of a baseline on the same instance; an equal score counts one half.
 
     Args:
@@ -411,13 +373,13 @@ def improvement(
     if x.shape[1] != y.shape[1]:
         raise ValueError(f"Scores need the same instances as the baseline (got {x.shape[1]} and {y.shape[1]}).")
     better = (x[:, None] > y) + 0.5 * (x[:, None] == y)  # [run, run of the baseline, instance]
-    own, other = (_run_weights(each.shape, unit, stream) for stream, each in enumerate((x, y), start=1))
-    instances = _instance_weights(x.shape[1], unit, groups)
+    own, other = (_run_weights(len(each), stream) for stream, each in enumerate((x, y), start=1))
+    instances = _instance_weights(x.shape[1], groups)
     drawn = np.einsum("dri,dqi,di,rqi->d", own, other, instances, better, optimize=True)
-    share, (most, least) = float(better.mean()), _beyond(x.shape, unit, groups, level)
+    share, (most, least) = float(better.mean()), _beyond(x.shape, groups)
     if share in (0, 1):
         return Interval(share, share and least, share or most, note="the same everywhere, Clopper–Pearson")
-    return percentile_interval(share, drawn / better.size, level=level, clusters=_clusters(x.shape, unit, groups))
+    return percentile_interval(share, drawn / better.size, clusters=_clusters(x.shape, groups))
 
 
 def by_group(scores: ArrayLike, groups: ArrayLike) -> Array:
@@ -435,28 +397,25 @@ def by_group(scores: ArrayLike, groups: ArrayLike) -> Array:
     return (mean + count / count.mean() * (means - mean))[:, None]
 
 
-def _clusters(shape: tuple[int, ...], unit: Unit, groups: ArrayLike | None) -> int | None:
-    """Independent draws of a unit with instances, the smaller number of those of instances and of runs; else None."""
-    if unit in ("within", "runs"):
-        return None
-    return fewest((shape[1] if groups is None else int(np.max(groups)) + 1, shape[0] if unit == "both" else 1))
+def _clusters(shape: tuple[int, ...], groups: ArrayLike | None) -> int:
+    """Independent draws: the smaller number of those of instances, or of their groups, and of runs."""
+    return fewest((shape[1] if groups is None else int(np.max(groups)) + 1, shape[0]))
 
 
-def _beyond(shape: tuple[int, ...], unit: Unit, groups: ArrayLike | None, level: float) -> tuple[float, float]:
+def _beyond(shape: tuple[int, ...], groups: ArrayLike | None) -> tuple[float, float]:
     """Bounds of a share that is 0 and of one that is 1 in everything that was drawn, which resamples cannot exceed."""
-    drawn = _clusters(shape, unit, groups) or shape[unit != "runs"]
-    most = share_bounds(0, drawn, level=level)[1]
+    most = share_bounds(0, _clusters(shape, groups))[1]
     return most, 1 - most
 
 
-def _aggregate(x: Array, unit: Unit, groups: ArrayLike | None, level: float) -> Aggregate:
-    weights, lack = _weights(x.shape, unit, groups), 1 - np.minimum(x, 1)
+def _aggregate(x: Array, groups: ArrayLike | None) -> Aggregate:
+    weights, lack = _weights(x.shape, groups), 1 - np.minimum(x, 1)
     iqm, whole = _trimmed(x, weights), _trimmed(x, np.ones((1, *x.shape)))
     gap = weights.reshape(DRAWS, -1) @ lack.ravel() / x.size
-    clusters = _clusters(x.shape, unit, groups)
+    clusters = _clusters(x.shape, groups)
     return Aggregate(
-        percentile_interval(float(whole[0]), iqm, level=level, clusters=clusters),
-        percentile_interval(float(lack.mean()), gap, level=level, clusters=clusters),
+        percentile_interval(float(whole[0]), iqm, clusters=clusters),
+        percentile_interval(float(lack.mean()), gap, clusters=clusters),
     )
 
 
@@ -472,28 +431,20 @@ def _trimmed(x: Array, weights: Array) -> Array:
     return kept @ x.ravel()[order] / (x.size - 2 * cut)
 
 
-def _weights(shape: tuple[int, ...], unit: Unit, groups: ArrayLike | None) -> Array:
+def _weights(shape: tuple[int, ...], groups: ArrayLike | None) -> Array:
     """How often each score is drawn, [draw, run, instance]; the same for every policy of one shape."""
-    return _run_weights(shape, unit, 1) * _instance_weights(shape[1], unit, groups)[:, None]
+    return _run_weights(shape[0], 1) * _instance_weights(shape[1], groups)[:, None]
 
 
-def _run_weights(shape: tuple[int, ...], unit: Unit, stream: int) -> Array:
-    """Of runs, [draw, run, instance or 1]."""
-    runs, instances = shape
-    if unit == "instances" or (unit == "both" and runs == 1):  # a single run is given
-        return np.ones((DRAWS, runs, 1))
-    if runs < 2:
-        raise ValueError(f"The unit '{unit}' needs two runs or more of each instance (got one).")
-    drawn = _drawn(runs, (DRAWS, instances if unit == "within" else 1), stream)
-    return drawn.transpose(0, 2, 1)
+def _run_weights(runs: int, stream: int) -> Array:
+    """Of runs, [draw, run, 1]; a single run is given."""
+    return np.ones((DRAWS, 1, 1)) if runs == 1 else _drawn(runs, (DRAWS, 1), stream).transpose(0, 2, 1)
 
 
-def _instance_weights(instances: int, unit: Unit, groups: ArrayLike | None) -> Array:
+def _instance_weights(instances: int, groups: ArrayLike | None) -> Array:
     """Of instances, [draw, instance], with the sum of their number."""
-    if unit in ("within", "runs"):
-        return np.ones((DRAWS, instances))
     if instances < 2:
-        raise ValueError(f"The unit '{unit}' needs two instances or more (got one).")
+        raise ValueError("Scores need two instances or more (got one).")
     return _drawn(instances, (DRAWS,), 0) if groups is None else _grouped(tuple(np.asarray(groups).tolist()))
 
 
@@ -515,7 +466,7 @@ def _drawn(count: int, size: tuple[int, ...], stream: int) -> Array:
     return rng.multinomial(count, np.full(count, 1 / count), size=size).astype(float)
 
 
-def percentile_interval(at: float, drawn: Array, *, level: float = LEVEL, clusters: int | None = None) -> Interval:
+def percentile_interval(at: float, drawn: Array, *, clusters: int | None = None) -> Interval:
     """The interval of a figure between the percentiles of its values in resamples, [draw].
 
     Args:
@@ -523,12 +474,12 @@ def percentile_interval(at: float, drawn: Array, *, level: float = LEVEL, cluste
     """
     if np.ptp(drawn) <= SAME * abs(at):
         return Interval(at, note=f"no variation in {len(drawn)} resamples")
-    low, high = _percentiles(drawn, level, clusters)
+    low, high = _percentiles(drawn, clusters)
     return Interval(at, float(low), float(high))
 
 
-def _percentiles(drawn: Array, level: float, clusters: int | None) -> tuple[Array, Array]:
-    tail = (1 - level) / 2
+def _percentiles(drawn: Array, clusters: int | None) -> tuple[Array, Array]:
+    tail = (1 - LEVEL) / 2
     if clusters is not None:
         n = max(clusters, 2)
         tail = float(norm.cdf(student.ppf(tail, n - 1) * np.sqrt(n / (n - 1))))
@@ -548,6 +499,22 @@ EQUAL = "all equal"
 HEAD = ("", "mean", "interval", "difference", "interval", "")
 MORE_DIGITS = 3
 """Decimals that a row may have beyond the least, so that no interval that excludes 0 seems to include it."""
+
+
+class FigureKind(NamedTuple):
+    """What a table says of a figure, and which values it can have."""
+
+    heading: str
+    """With its unit."""
+    digits: int = 1
+    """Least decimals."""
+    least: float = 0.0
+    most: float = math.inf
+    is_count: bool = False
+    """Of rare events; see `count_interval`."""
+
+
+ANY = FigureKind("", least=-math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -584,26 +551,21 @@ class Figure:
 
 
 def figures_of(
-    values: Mapping[str, Mapping[str, Array]],
-    baseline: str,
-    *,
-    counts: Collection[str] = (),
-    possible: Mapping[str, tuple[float, float]] | None = None,
+    values: Mapping[str, Mapping[str, Array]], baseline: str, kinds: Mapping[str, FigureKind]
 ) -> dict[str, dict[str, Figure]]:
     """The figures of every policy, by policy and name.
 
     Args:
         values: By policy and name of the figure, [seed] or [fleet, training, seed], the same for every policy.
         baseline: The policy that differences refer to.
-        counts: Names of counts of rare events; see `counts.count_interval`.
-        possible: Smallest and largest possible value by name.
+        kinds: By name of the figure; one that it lacks has any value.
     """
-    possible, made = possible or {}, dict[tuple[str, str], tuple[Interval, Interval]]()
+    made = dict[tuple[str, str], tuple[Interval, Interval]]()
     for policy, figures in values.items():
         for name, x in figures.items():
-            least, most = possible.get(name, (-math.inf, math.inf))
-            own = count_interval(x) if name in counts else interval(x, least=least, most=most)
-            to_base = (paired_counts if name in counts else paired)(x, values[baseline][name])
+            kind = kinds.get(name, ANY)
+            own = count_interval(x) if kind.is_count else interval(x, least=kind.least, most=kind.most)
+            to_base = (paired_counts if kind.is_count else paired)(x, values[baseline][name])
             made[policy, name] = own, Interval(0.0, 0.0, 0.0) if policy == baseline else to_base
     adjusted = dict(zip(made, holm([to_base.p for _, to_base in made.values()]).tolist(), strict=True))
     return {

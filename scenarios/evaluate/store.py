@@ -1,111 +1,63 @@
-"""Rows of long work in a folder, as Parquet: a small file for every finished piece, one file at the end.
+"""Rows of a study, in memory or in a folder: JSON lines while it runs, one Parquet file at its end.
 
-A card states what makes rows comparable, hashes and settings. The same work continues in its folder after an
+A card states what makes rows comparable, hashes and settings. The same study continues in its folder after an
 interruption, and does not continue in one with another card.
 """
 
 import fcntl
-import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar  # Any: values of columns and cards
+from typing import TYPE_CHECKING, Any  # Any: values of columns and cards
 
 from fleet.errors import FleetError
 from fleet.files import atomic_path
+from scenarios.evaluate.rollout import FIGURES
+from scenarios.evaluate.study import CARD, Key, Row, columns, row_of
+from scenarios.json_rows import Rows
 from scenarios.result_folder import disk_errors
 
 if TYPE_CHECKING:  # needs the extra `report`
     import pyarrow as pa
 
-RESULTS, PARTS = "results.parquet", "parts"
-MOST_PARTS = 500
-"""More are made one file at once."""
-Key = TypeVar("Key", bound=tuple[Any, ...])
-Row = TypeVar("Row")
+RESULTS, UNFINISHED = "results.parquet", "rows.jsonl"
+"""Files of the rows: of the last finished study, and of one that has not finished yet."""
+COMMAND = "thermofleet compare --out"
+"""That writes such a folder."""
+COLUMNS: dict[str, type] = {
+    **Key.__annotations__,
+    **dict.fromkeys(FIGURES, float),
+    "illegal": int,
+    "error": str,
+    "trace": str,
+}
+NAMED = {"instances": "instance", "policies": "policy"}
+"""Fields of a card that hold hashes by name and to which a later study may add, with the word for one of them."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RowKind(Generic[Key, Row]):
-    """A kind of rows, and how a file holds them."""
+class Store:
+    """Rows by key; `opened` gives one that also keeps them in a folder."""
 
-    work: str
-    """What the rows are of, in errors, as `study`."""
-    command: str
-    """That writes them."""
-    card: str
-    """Name of the file of the card."""
-    columns: Mapping[str, type]
-    """Type of each column: str, int, float or bool."""
-    key: Callable[[Row], Key]
-    """What a row is found and sorted by."""
-    values: Callable[[Row], Mapping[str, object]]
-    """The columns of a row; None for no value."""
-    row: Callable[[Mapping[str, Any]], Row]
-    """The row of its columns."""
-    named: Mapping[str, str] = field(default_factory=dict)
-    """Fields of a card, by name, that hold hashes by name and to which more work of the kind may add; with the word for
-    one of them."""
+    def __init__(self, rows: Mapping[Key, Row] | None = None, file: Rows | None = None) -> None:
+        self.rows = dict(rows or {})
+        self._file = file
 
-    @property
-    def schema(self) -> "pa.Schema":
-        """Of the files."""
-        import pyarrow as pa
-
-        types = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-        return pa.schema([(name, types[kind]) for name, kind in self.columns.items()])
-
-
-class Store(Generic[Key, Row]):
-    """A folder of rows; `opened` opens it."""
-
-    def __init__(self, out: Path, kind: RowKind[Key, Row], card: Mapping[str, object], rows: dict[Key, Row]) -> None:
-        self.out, self.rows = out, rows
-        self._kind, self._card, self._parts = kind, card, 0
-
-    def add(self, rows: Sequence[Row]) -> None:
-        """Write the rows of a piece of work: whole, or not at all."""
-        added = {self._kind.key(row): row for row in rows}
-        self.rows |= added
-        name = hashlib.sha256(repr(list(added)).encode()).hexdigest()[:24]
-        with disk_errors(self.out):
-            self._write(self.out / PARTS / f"{name}.parquet", rows)
-            self._parts += 1
-            if self._parts >= MOST_PARTS:
-                self.compact()
-
-    def compact(self) -> None:
-        """Make one file of all rows, sorted by key, so that it does not depend on the order in which they came."""
-        self._write(self.out / RESULTS, [self.rows[key] for key in sorted(self.rows)])
-        for part in _parts(self.out):
-            part.unlink()
-        self._parts = 0
-
-    def finish(self) -> None:
-        """Write the last state: one file of rows, and a card that says so."""
-        with disk_errors(self.out):
-            self.compact()
-            (self.out / PARTS).rmdir()
-            write_card(self.out / self._kind.card, {**self._card, "status": "finished"})
-
-    def _write(self, path: Path, rows: Sequence[Row]) -> None:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        table = pa.Table.from_pylist([dict(self._kind.values(row)) for row in rows], self._kind.schema)
-        with atomic_path(path) as file:
-            pq.write_table(table, file)
+    def add(self, rows: Iterable[Row]) -> None:
+        """Take the rows of a unit."""
+        for row in rows:
+            self.rows[row.key] = row
+            if self._file is not None:
+                self._file.append(" ".join(map(str, row.key)), columns(row))
 
 
 @contextmanager
-def opened(out: Path, kind: RowKind[Key, Row], card: Mapping[str, object]) -> Iterator[Store[Key, Row]]:
-    """The store in a folder: new, or with the rows of earlier work with the same card.
+def opened(out: Path, card: Mapping[str, object]) -> Iterator[Store]:
+    """The store in a folder: new, or with the rows of earlier studies with the same card.
 
     Raises:
-        FleetError: the folder holds something else or other work, cannot be written, or another process writes it.
+        FleetError: the folder holds something else or another study, cannot be written, or another process writes it.
     """
     with disk_errors(out):
         if out.exists() and not out.is_dir():
@@ -118,103 +70,110 @@ def opened(out: Path, kind: RowKind[Key, Row], card: Mapping[str, object]) -> It
         except BlockingIOError as error:
             raise FleetError(f"Another process writes to '{out}'. Wait for it, or choose another --out.") from error
         with disk_errors(out):
-            whole = _joined(out, kind, json.loads(json.dumps(card)))  # as a file gives it
-            rows = _read(out, kind) if (out / kind.card).exists() else {}
-            (out / PARTS).mkdir(exist_ok=True)
-            for draft in (out / PARTS).glob(".*"):  # of a process that was killed
-                draft.unlink()
-            write_card(out / kind.card, {**whole, "status": "interrupted"})
-        store = Store(out, kind, whole, rows)
+            whole = _joined(out, json.loads(json.dumps(card)))  # as a file gives it
+            file = Rows(out / UNFINISHED)
+            store = Store(_read(out, file), file)
+            _write_card(out, {**whole, "status": "interrupted"})
         yield store
-        store.finish()
+        with disk_errors(out):
+            _write_results(out, store.rows)
+            (out / UNFINISHED).unlink(missing_ok=True)
+            _write_card(out, {**whole, "status": "finished"})
     finally:
         os.close(handle)
 
 
-def write_card(path: Path, card: Mapping[str, object]) -> None:
-    """Write a card."""
-    with atomic_path(path) as file:
-        file.write_text(json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def _joined(out: Path, kind: RowKind[Key, Row], card: Mapping[str, Any]) -> dict[str, Any]:
-    """The card, with what the folder has already in the fields of `kind.named`."""
-    if not any(path.name != PARTS and not path.name.startswith(".") for path in out.iterdir()):
+def _joined(out: Path, card: Mapping[str, Any]) -> dict[str, Any]:
+    """The card, with what the folder has already in the fields of `NAMED`."""
+    if not any(not path.name.startswith(".") for path in out.iterdir()):
         return dict(card)
     try:
-        known = json.loads((out / kind.card).read_text(encoding="utf-8"))
-        for name in kind.named:
+        known = json.loads((out / CARD).read_text(encoding="utf-8"))
+        for name in NAMED:
             dict(known[name])
     except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
-        raise FleetError(
-            f"'{out}' holds other files; --out needs a new folder or that of an earlier {kind.work}."
-        ) from error
+        raise FleetError(f"'{out}' holds other files; --out needs a new folder or that of an earlier study.") from error
     joined = dict(card)
     for name, value in card.items():
-        if name in kind.named:
+        if name in NAMED:
             for each, digest in value.items():
                 if each in known[name] and known[name][each] != digest:
                     raise FleetError(
-                        f"'{out}' holds a {kind.work} in which {kind.named[name]} '{each}' was another one "
+                        f"'{out}' holds a study in which {NAMED[name]} '{each}' was another one "
                         f"(hash {known[name][each] or 'none'}, now {digest or 'none'}); give another --out."
                     )
             joined[name] = {**known[name], **value}
         elif known.get(name) != value:
             raise FleetError(
-                f"'{out}' holds a {kind.work} with {name} {known.get(name)!r}, not {value!r}; give another --out."
+                f"'{out}' holds a study with {name} {known.get(name)!r}, not {value!r}; give another --out."
             )
     return joined
 
 
-def read_rows(out: str | Path, kind: RowKind[Key, Row]) -> list[Row]:
+def read_rows(out: str | Path) -> list[Row]:
     """The rows of a folder, finished or interrupted, sorted by key.
 
     Raises:
         FleetError: it is no such folder, or damaged.
     """
     out = Path(out)
-    if not (out / kind.card).is_file():
-        raise FleetError(f"'{out}' holds no {kind.work} of `{kind.command}`.")
+    if not (out / CARD).is_file():
+        raise FleetError(f"'{out}' holds no study of `{COMMAND}`.")
     with disk_errors(out):
-        rows = _read(out, kind)
+        rows = _read(out, Rows(out / UNFINISHED))
     return [rows[key] for key in sorted(rows)]
 
 
-def read_card(out: Path, kind: RowKind[Any, Any]) -> dict[str, Any]:
+def read_card(out: Path) -> dict[str, Any]:
     """Content of the card of a folder.
 
     Raises:
-        FleetError: it holds no such rows.
+        FleetError: it holds no study.
     """
     try:
-        card = json.loads((out / kind.card).read_text(encoding="utf-8"))
+        card = json.loads((out / CARD).read_text(encoding="utf-8"))
         if isinstance(card, dict):
             return card
-        what = f"has a damaged {kind.card}, which holds no object"
+        what = f"has a damaged {CARD}, which holds no object"
     except ValueError as error:
-        what = f"has a damaged {kind.card} ({error})"
+        what = f"has a damaged {CARD} ({error})"
     except OSError:
-        what = f"holds no {kind.work} of `{kind.command}`" if out.is_dir() else "is no folder"
+        what = f"holds no study of `{COMMAND}`" if out.is_dir() else "is no folder"
     raise FleetError(f"'{out}' {what}; give the folder of such a command.")
 
 
-def _parts(out: Path) -> list[Path]:
-    return sorted((out / PARTS).glob("[!.]*.parquet"))
+def _write_card(out: Path, card: Mapping[str, object]) -> None:
+    with atomic_path(out / CARD) as draft:
+        draft.write_text(json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def _read(out: Path, kind: RowKind[Key, Row]) -> dict[Key, Row]:
+def _schema() -> "pa.Schema":
+    import pyarrow as pa
+
+    types = {str: pa.string(), int: pa.int64(), float: pa.float64()}
+    return pa.schema([(name, types[kind]) for name, kind in COLUMNS.items()])
+
+
+def _write_results(out: Path, rows: Mapping[Key, Row]) -> None:
+    """One file of all rows, sorted by key, so that it does not depend on the order in which they came."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    rows: dict[Key, Row] = {}
-    for path in [out / RESULTS, *_parts(out)]:
-        if not path.exists():
-            continue
-        try:
-            found = pq.read_table(path, schema=kind.schema).to_pylist()
-        except (pa.ArrowException, ValueError) as error:
-            raise FleetError(f"'{path}' is damaged ({error}); remove it, and its rows are computed again.") from error
-        for each in found:
-            row = kind.row(each)
-            rows[kind.key(row)] = row
-    return rows
+    table = pa.Table.from_pylist([columns(rows[key]) for key in sorted(rows)], _schema())
+    with atomic_path(out / RESULTS) as draft:
+        pq.write_table(table, draft)
+
+
+def _read(out: Path, unfinished: Rows) -> dict[Key, Row]:
+    """All rows of a folder: the finished ones, and those of its unfinished study."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = out / RESULTS
+    try:
+        finished = pq.read_table(path, schema=_schema()).to_pylist() if path.exists() else []
+    except (pa.ArrowException, ValueError) as error:
+        raise FleetError(f"'{path}' is damaged ({error}); remove it, and its rows are computed again.") from error
+    with unfinished.readable():
+        rows = [row_of(each) for each in (*finished, *unfinished.by_key.values())]
+    return {row.key: row for row in rows}

@@ -15,7 +15,6 @@ from fleet.errors import FleetError, nearest
 from fleet.seeding import child
 from scenarios.evaluate.rollout import FIGURES, DecisionLimit, Outcome, TooSlow
 from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, plan_content
-from scenarios.evaluate.store import RowKind
 from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.run.log import code_hash
@@ -205,7 +204,6 @@ class Study(StudySpec):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """The sources that are used."""
         return tuple(self._policies_with)
 
     @property
@@ -326,25 +324,6 @@ def row_of(found: Mapping[str, Any]) -> Row:
     failed = found["error"] is not None
     outcome = None if failed else Outcome(**{figure: found[figure] for figure in FIGURES})
     return Row(Key(*(found[name] for name in Key._fields)), outcome, found["illegal"], found["error"], found["trace"])
-
-
-SHIFTS: RowKind[Key, Row] = RowKind(
-    work="study",
-    command="thermofleet compare --out",
-    card=CARD,
-    columns={
-        **Key.__annotations__,
-        **dict.fromkeys(FIGURES, float),
-        "illegal": int,
-        "error": str,
-        "trace": str,
-    },
-    key=lambda row: row.key,
-    values=columns,
-    row=row_of,
-    named={"instances": "instance", "policies": "policy"},
-)
-"""How a folder holds the rows of a study."""
 
 
 MOST_NAMES = 3

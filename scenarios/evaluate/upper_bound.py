@@ -131,7 +131,6 @@ class Relaxation:
 
     @property
     def periods(self) -> int:
-        """Number of periods."""
         return len(self.edges_s) - 1
 
     @cached_property
@@ -185,7 +184,6 @@ class Relaxation:
 
     @property
     def jobs(self) -> int:
-        """Number of jobs."""
         return int(self.world.jobs.exists[0].sum())
 
     @cached_property
@@ -255,7 +253,6 @@ class Relaxation:
 
     @property
     def columns(self) -> int:
-        """Number of columns."""
         return self._blocks[4]
 
     @cached_property

@@ -73,7 +73,7 @@ class Fleet:
 
 
 def prepare(
-    scenario: Scenario,
+    scenario: str | Path | Scenario,
     *,
     difficulty: DifficultyName = "twin",
     risk: RiskName = RISK,
@@ -86,18 +86,19 @@ def prepare(
     """Plan every work for every arm, and give each arm its difficulty model; both are cached by content.
 
     Args:
+        scenario: A library name, a .toml file, or a `Scenario`.
         randomise: Beyond what a scenario draws for a shift: ambient temperature, arrivals, fleets.
         training: Which training of the twins, from 0.
         like: Prepared from a scenario with the same arms, cell and works: its plans and space, too, are this fleet's.
 
     Raises:
-        ScenarioError: no arm can do some work, arms at home are too close to each other, or a variant is no fleet of
-            the same arms and jobs.
+        ScenarioError: no such scenario, no arm can do some work, arms at home are too close to each other, or a
+            variant is no fleet of the same arms and jobs.
         MissingExtra: twins are wanted, and their libraries are not installed.
     """
     randomise = randomisation_of(randomise)
     check_progress(progress)
-    specs = randomise.scenarios_of(scenario)
+    specs = randomise.scenarios_of(scenario_with(scenario, {}, prepare))
     fleets: list[Fleet] = []
     for i, spec in enumerate(specs):
         share = progress if len(specs) == 1 else lambda stage, s, i=i: progress(stage, (i + s) / len(specs))

@@ -22,7 +22,6 @@ from scenarios.result_folder import new_folder
 from scenarios.run.log import RUN, RunLog, card_of, provenance
 from scenarios.run.metrics import HeatUse, metrics_of
 from scenarios.run.records import Offer, job_records, offers_of
-from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RunSpec
 from scenarios.spec.schema import Scenario
 
@@ -65,7 +64,7 @@ def run(
     elif options:
         raise FleetError(f"Give either a RunSpec or single options, not both (got {', '.join(options)}).")
     if not isinstance(fleet, Fleet):
-        fleet = prepare(scenario_with(fleet, {}, run), difficulty=spec.difficulty, risk=spec.risk, progress=progress)
+        fleet = prepare(fleet, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
     if out is not None:
         with new_folder(Path(out), RUN) as folder:
             log = run(fleet, spec, progress=progress, stopped=stopped, record=record, endpoint=endpoint)

@@ -238,7 +238,7 @@ def _score_charts(judged: Judged) -> list[Chart]:
     chosen = order[:MOST_CURVES]
     if judged.baseline not in chosen:
         chosen = [*chosen[:-1], judged.baseline]
-    curves = {name: profile(values.score[name], THRESHOLDS, "both", groups=values.groups) for name in chosen}
+    curves = {name: profile(values.score[name], THRESHOLDS, groups=values.groups) for name in chosen}
     bands = {label(name): (each.share, each.low, each.high) for name, each in curves.items()}
     share = "share of instances above"
     profiles = lines(THRESHOLDS, bands, {label(chosen[0]), base}, "normalised score", share)

@@ -485,7 +485,7 @@ def draw_axes(rng: np.random.Generator) -> Axes:
 def time_loads() -> dict[str, tuple[float, float]]:
     """By cell, time load of one job of each stream and payload in a shift: of the tasks that heat, and of the others.
 
-    As `scenarios.suite.freeze` computed them.
+    As `benchmarks/freeze_suite.py` computed them.
     """
     text = resources.files("scenarios").joinpath("suite/time_loads.json").read_text(encoding="utf-8")
     return json.loads(text)

@@ -1,4 +1,4 @@
-"""The frozen splits: instances with a manifest of hashes, which `scenarios.suite.freeze` writes."""
+"""The frozen splits: instances with a manifest of hashes, which `benchmarks/freeze_suite.py` writes."""
 
 import json
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ class Instance:
 
 
 @dataclass(frozen=True)
-class Row:
+class ManifestLine:
     """One line of a manifest."""
 
     name: str
@@ -75,7 +75,7 @@ def instance(name: str) -> Instance:
 
 
 @lru_cache(maxsize=len(SPLITS))
-def manifest(name: str) -> tuple[Row, ...]:
+def manifest(name: str) -> tuple[ManifestLine, ...]:
     """The frozen lines of a split.
 
     Raises:
@@ -83,10 +83,10 @@ def manifest(name: str) -> tuple[Row, ...]:
     """
     file = resources.files("scenarios").joinpath(f"suite/{choose('split', name, SplitName)}.jsonl")
     lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    return tuple(Row(**{**line, "axes": Axes(**line["axes"])}) for line in lines)
+    return tuple(ManifestLine(**{**line, "axes": Axes(**line["axes"])}) for line in lines)
 
 
-def cell_of_instance(row: Row) -> Cell:
+def cell_of_instance(row: ManifestLine) -> Cell:
     """The cell of a line of a manifest."""
     return next(cell for cell in CELLS if cell.name == row.cell)
 
@@ -99,7 +99,7 @@ def cell_name(instance: str) -> str:
     return name or number
 
 
-def drawn_rows(name: SplitName) -> Iterator[Row]:
+def drawn_rows(name: SplitName) -> Iterator[ManifestLine]:
     """The lines of a split, drawn anew: in turns from each of its cells."""
     cells = [cell for cell in CELLS if cell.split == name]
     turns = range(max(cell.instances for cell in cells))
@@ -108,13 +108,13 @@ def drawn_rows(name: SplitName) -> Iterator[Row]:
         entropy = np.random.SeedSequence([SUITE, SPLITS.index(name), number])
         seed = int(entropy.generate_state(1)[0])
         axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]))
-        row = Row(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
+        row = ManifestLine(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
         made = instance_of(row)
         jobs = jobs_content(made)
         yield replace(row, scenario=scenario_hash(made.scenario), jobs=hash_of(jobs), count=len(jobs))
 
 
-def line_of(row: Row) -> str:
+def line_of(row: ManifestLine) -> str:
     """The line of a manifest file."""
     return json.dumps(asdict(row))
 
@@ -129,7 +129,7 @@ def jobs_content(made: Instance) -> list[Any]:
     ]  # fmt: skip
 
 
-def instance_of(row: Row) -> Instance:
+def instance_of(row: ManifestLine) -> Instance:
     """The instance of a line of a manifest."""
     name = row.name.replace("/", "-")
     return Instance(row.name, scenario_of(name, cell_of_instance(row), row.axes, row.seed), row.seed)

@@ -32,12 +32,12 @@ SHIFTS = 4
 """Shifts of a validation instance: that of its own seed, and others."""
 
 
-Known = Mapping[tuple[str, int], tuple[float, float]]
+KnownRewards = Mapping[tuple[str, int], tuple[float, float]]
 """Rewards of random and of the hindsight in the shift of an instance and its seed."""
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class TrainingInstance:
     """One instance, ready for batches of its shifts."""
 
     name: str
@@ -57,7 +57,6 @@ class Ground:
 
     @property
     def arms(self) -> int:
-        """Number of arms."""
         return len(self.library.arms)
 
     def value(self, seed: int) -> float:
@@ -71,43 +70,45 @@ class Ground:
         return self.value(self.seed) if self.span is None else self.span
 
 
-def ground_of(
+def training_instance(
     instance: Instance,
     *,
     difficulty: DifficultyName = "oracle",
     risk: RiskName = RISK,
     cache: Path | None = None,
-    known: Known | None = None,
-) -> Ground:
+    known: KnownRewards | None = None,
+) -> TrainingInstance:
     """Prepare an instance; its cell is planned once."""
     fleet = prepare(instance.scenario, difficulty=difficulty, risk=risk, cache=cache)
     random, hindsight = (known or {}).get((instance.name, instance.seed), (0.0, None))
     span = None if hindsight is None else hindsight - random
-    return Ground(instance.name, instance.seed, library_of(fleet), weights_of(instance.scenario), random, span)
+    return TrainingInstance(
+        instance.name, instance.seed, library_of(fleet), weights_of(instance.scenario), random, span
+    )
 
 
-def grounds_of(
+def training_instances(
     instances: Sequence[Instance],
     *,
     difficulty: DifficultyName = "oracle",
     risk: RiskName = RISK,
     cache: Path | None = None,
-    known: Known | None = None,
+    known: KnownRewards | None = None,
     progress: Progress = quiet,
-) -> list[Ground]:
+) -> list[TrainingInstance]:
     """Prepare instances.
 
     Args:
         known: References of those instances that have one.
     """
-    grounds: list[Ground] = []
+    grounds: list[TrainingInstance] = []
     for instance in instances:
         progress(f"preparing {instance.name}", Count(len(grounds), len(instances)))
-        grounds.append(ground_of(instance, difficulty=difficulty, risk=risk, cache=cache, known=known))
+        grounds.append(training_instance(instance, difficulty=difficulty, risk=risk, cache=cache, known=known))
     return grounds
 
 
-def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
+def rewards(ground: TrainingInstance, parameters: Array, seeds: Sequence[int]) -> Array:
     """Reward of one shift for each row of parameters and its seed, [row].
 
     Perfect and immediate messages; decisions are asked for by events, which changes no result of a central policy.
@@ -129,6 +130,17 @@ def rewards(ground: Ground, parameters: Array, seeds: Sequence[int]) -> Array:
         return actions
 
     return rollout(env, env.reset(seed=list(seeds))[0], act)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Result of a training in all its sessions."""
+
+    iterations: int
+    best: float
+    """Validation of the saved policy."""
+    seconds: float
+    interrupted: bool
 
 
 TRAINING = "training.json"

@@ -27,7 +27,15 @@ from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import RISK, DifficultyName, RiskName
 from scenarios.spec.parse import scenario_hash
 from scenarios.spec.schema import Scenario
-from scenarios.train.instances import NETWORK_STATE, Ground, check_folder, holds_training, skip_complete, write_card
+from scenarios.train.instances import (
+    NETWORK_STATE,
+    Trained,
+    TrainingInstance,
+    check_folder,
+    holds_training,
+    skip_complete,
+    write_card,
+)
 
 Array = np.ndarray
 
@@ -42,18 +50,6 @@ class TrainingPlan(TrainingLength):
     validate_every: int = 20
     """Iterations from one validation to the next."""
     validation_envs: int = 32
-
-
-@dataclass(frozen=True)
-class Trained:
-    """Result of a training in all its sessions."""
-
-    iterations: int
-    env_steps: int
-    best: float
-    """Mean reward of a shift on the validation seeds, of the saved network."""
-    seconds: float
-    interrupted: bool
 
 
 def train(
@@ -97,13 +93,13 @@ def train(
     library, weights = library_of(fleet), weights_of(scenario)
     # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in training.
     env = BatchEnv(library, plan.validation_envs, weights=weights)
-    judge = Judge(env, [VALIDATION_SEED + i for i in range(plan.validation_envs)], np.ones(plan.validation_envs))
+    judge = Validation(env, [VALIDATION_SEED + i for i in range(plan.validation_envs)], np.ones(plan.validation_envs))
     return _train([(library, weights)], [judge], config, out, plan, card, resume, progress, tell)
 
 
 def train_on_split(
-    grounds: Sequence[Ground],
-    judges: Sequence[Ground],
+    grounds: Sequence[TrainingInstance],
+    judges: Sequence[TrainingInstance],
     config: PpoConfig,
     out: Path,
     plan: TrainingPlan,
@@ -123,7 +119,9 @@ def train_on_split(
     card = {**card, "config": asdict(config)}
     check_folder(out, card, NETWORK_STATE, resume=resume)
     judging = [
-        Judge(BatchEnv(judge.library, len(seeds), weights=judge.weights), seeds, np.array([*map(judge.value, seeds)]))
+        Validation(
+            BatchEnv(judge.library, len(seeds), weights=judge.weights), seeds, np.array([*map(judge.value, seeds)])
+        )
         for judge in judges
         for seeds in [judge.shifts]
     ]
@@ -132,7 +130,7 @@ def train_on_split(
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class Validation:
     """Validation shifts of one environment."""
 
     env: BatchEnv
@@ -147,7 +145,7 @@ class Judge:
 
 def _train(
     cells: Sequence[tuple[Library, RewardWeights]],
-    judges: Sequence[Judge],
+    judges: Sequence[Validation],
     config: PpoConfig,
     out: Path,
     plan: TrainingPlan,
@@ -162,7 +160,7 @@ def _train(
         numbers = trainer.load(out / NETWORK_STATE)
         best, before_s = numbers["best"], numbers.get("seconds", 0.0)
         if skip_complete(out, plan, trainer.done, before_s, tell):
-            return Trained(trainer.done, trainer.env_steps, best, before_s, interrupted=False)
+            return Trained(trainer.done, best, before_s, interrupted=False)
     elif config.warm_start:
         imitate_rule(trainer, cells, progress)
     out.mkdir(parents=True, exist_ok=True)
@@ -173,7 +171,7 @@ def _train(
         nonlocal best
         rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, number]))
 
-        def reward_of(judge: Judge) -> float:
+        def reward_of(judge: Validation) -> float:
             act = partial(trainer.act, judge.env.layout, rng=rng)
             return judge.reward(lambda obs, _: act(obs["observation"], obs["action_mask"]))
 
@@ -215,7 +213,7 @@ def _train(
         if iteration is not None and validated < iteration.number:
             validate(iteration.number, iteration.env_steps)
     draw_curves(out)
-    return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
+    return Trained(trainer.done, best, time.monotonic() - began_s, interrupted)
 
 
 def trainer_of(cells: Sequence[tuple[Library, RewardWeights]], config: PpoConfig) -> Trainer:

@@ -13,7 +13,8 @@ from agents.pairs import PARAMETERS, first_parameters, save_pairs
 from fleet.files import atomic_path
 from scenarios.train.instances import (
     PAIRS_STATE,
-    Ground,
+    Trained,
+    TrainingInstance,
     check_folder,
     holds_training,
     rewards,
@@ -38,24 +39,9 @@ class PairPlan(TrainingLength):
     validate_every: int = 8
 
 
-@dataclass(frozen=True)
-class TrainedPairs:
-    """Result of a training in all its sessions, in normalised scores."""
-
-    iterations: int
-    shifts: int
-    """Simulated in these iterations."""
-    teacher: float
-    """Of `wsept` in validation."""
-    best: float
-    """Of the kept parameters."""
-    seconds: float
-    interrupted: bool
-
-
 def train_pairs(
-    grounds: Sequence[Ground],
-    judges: Sequence[Ground],
+    grounds: Sequence[TrainingInstance],
+    judges: Sequence[TrainingInstance],
     config: EvolutionConfig,
     out: Path,
     plan: PairPlan,
@@ -63,7 +49,7 @@ def train_pairs(
     card: dict[str, object],
     resume: bool = False,
     tell: Callable[[str], None] = lambda sentence: None,
-) -> TrainedPairs:
+) -> Trained:
     """Write into a folder the parameters with the best validation as a policy, the last state, and the curves.
 
     Iteration 0 is `agents.pairs.first_parameters`, the teacher is `wsept`. Ctrl-C ends the training early and
@@ -86,9 +72,8 @@ def train_pairs(
         teacher, best, before_s = numbers["teacher"], numbers["best"], numbers.get("seconds", 0.0)
     began_s = time.monotonic() - before_s  # as if the sessions had followed each other
 
-    def result() -> TrainedPairs:
-        shifts = search.done * config.samples * min(plan.instances, len(grounds))
-        return TrainedPairs(search.done, shifts, teacher, best, time.monotonic() - began_s, interrupted)
+    def result() -> Trained:
+        return Trained(search.done, best, time.monotonic() - began_s, interrupted)
 
     if resume and skip_complete(out, plan, search.done, before_s, tell):
         return result()
@@ -131,13 +116,13 @@ def train_pairs(
     return result()
 
 
-def validation(judges: Sequence[Ground], parameters: Array) -> float:
+def validation(judges: Sequence[TrainingInstance], parameters: Array) -> float:
     """Mean normalised score of the shifts of the judges' own seeds."""
     scores = [(rewards(judge, parameters[None], [judge.seed])[0] - judge.random) / judge.unit for judge in judges]
     return float(np.mean(scores))
 
 
-def _fitness(grounds: Sequence[Ground], search: Evolution, count: int) -> Array:
+def _fitness(grounds: Sequence[TrainingInstance], search: Evolution, count: int) -> Array:
     """Mean reward of every sample over the span of the instance, on shifts that all samples share, [sample].
 
     Large fleets are drawn less often, as their shifts take longer.

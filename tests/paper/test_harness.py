@@ -9,8 +9,9 @@ import pytest
 
 from benchmarks.paper import harness
 from benchmarks.paper.__main__ import STUDIES, main
-from benchmarks.paper.harness import Experiment, Unit, compute, one_row, seeded, table_of, wholes
+from benchmarks.paper.harness import Experiment, Unit, compute, mean_by_group, one_row, seeded, table_of, wholes
 from fleet.errors import FleetError
+from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Rows
 
 
@@ -140,3 +141,9 @@ def test_every_study_has_help(name, capsys) -> None:
         main([name, "--help"])
     assert end.value.code == 0
     assert STUDIES[name]().help.splitlines()[0][:40] in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_groups_are_the_sample_if_there_are_several() -> None:
+    values = [("a", 1.0), ("a", 3.0), ("b", 5.0), ("c", 5.0), ("c", 6.0)]
+    assert mean_by_group(values) == interval([2.0, 5.0, 5.5])
+    assert mean_by_group(values[:2]) == interval([1.0, 3.0])

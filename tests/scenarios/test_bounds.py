@@ -16,7 +16,7 @@ from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.evaluate import references as stored
 from scenarios.evaluate.hindsight import Replay, Schedules, ShiftSimulator, hindsight, without_scores
-from scenarios.evaluate.references import Task, load_references, reference, reference_table, references
+from scenarios.evaluate.references import load_references, reference, reference_table, references
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.scores import split_file
 from scenarios.evaluate.upper_bound import HeatBudget, Relaxation, upper_bound
@@ -26,7 +26,7 @@ from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import Budget
 from scenarios.spec.parse import parse_scenario
 from scenarios.spec.schema import SPLITS
-from scenarios.suite.splits import instance, manifest
+from scenarios.suite.splits import Instance, instance, manifest
 from tests.exhaustive import optimum
 
 HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
@@ -173,7 +173,7 @@ def fleet(three_arms, job_streams, plans: Path) -> Fleet:
 
 
 def test_a_reference_is_between_its_parts_and_its_schedule_can_be_replayed(fleet: Fleet):
-    task = Task("three/4", fleet.scenario, 4)
+    task = Instance("three/4", fleet.scenario, 4)
     found = reference(fleet, task, Budget(evaluations=64), difficulty="blind")
     shipped = {name: outcomes(fleet, name, [4])[0].reward for name in RULES if name != "random"}
     assert found.best_rule == pytest.approx(max(shipped.values()), abs=1e-9)
@@ -188,7 +188,7 @@ def test_a_reference_is_between_its_parts_and_its_schedule_can_be_replayed(fleet
 
 
 def test_a_search_starts_from_a_known_schedule(fleet: Fleet):
-    task = Task("three/1", fleet.scenario, 1)
+    task = Instance("three/1", fleet.scenario, 1)
     found = reference(fleet, task, Budget(evaluations=200), difficulty="blind", bound=False)
     again = reference(fleet, task, Budget(evaluations=1), difficulty="blind", bound=False, known=found.claims)
     assert again.hindsight >= found.hindsight - 1e-9 > found.best_rule
@@ -202,16 +202,18 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
     fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     calls: list[tuple[str, int]] = []
-    one = reference(fleet, Task("three/1", fleet.scenario, 1), Budget(evaluations=1), difficulty="blind", bound=False)
+    one = reference(
+        fleet, Instance("three/1", fleet.scenario, 1), Budget(evaluations=1), difficulty="blind", bound=False
+    )
 
     def counted(fleet, task, budget, *, known, **options):
-        calls.append((task.instance, len(known)))
-        found = replace(one, instance=task.instance, seed=task.seed, search_s=budget.seconds, nodes=budget.nodes)
+        calls.append((task.name, len(known)))
+        found = replace(one, instance=task.name, seed=task.seed, search_s=budget.seconds, nodes=budget.nodes)
         return replace(found, upper=100.0 - budget.seconds - budget.nodes / 1e6)
 
     monkeypatch.setattr(stored, "reference", counted)
     monkeypatch.setattr(stored, "_fleet_of", lambda *_: fleet)
-    tasks = [Task(f"three/{seed}", fleet.scenario, seed) for seed in (1, 2)]
+    tasks = [Instance(f"three/{seed}", fleet.scenario, seed) for seed in (1, 2)]
     path = tmp_path / "bounds.jsonl"
     short = references(tasks, path, Budget(seconds=1.0), difficulty="blind")
     assert references(tasks, path, Budget(seconds=1.0), difficulty="blind") == short
@@ -228,7 +230,7 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
 
 
 def test_a_budget_of_evaluations_gives_the_same_file_in_any_order(fleet: Fleet, tmp_path: Path):
-    tasks = [Task(f"three/{seed}", fleet.scenario, seed) for seed in (2, 10)]
+    tasks = [Instance(f"three/{seed}", fleet.scenario, seed) for seed in (2, 10)]
     budget, plans = Budget(seconds=np.inf, evaluations=64, nodes=5), tmp_path / "plans"
     once = references(tasks, tmp_path / "once.jsonl", budget, difficulty="blind", cache=plans)
     for task in reversed(tasks):  # as of a run that was stopped

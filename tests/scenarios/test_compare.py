@@ -3,7 +3,7 @@
 import io
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,8 @@ from rich.console import Console
 
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
-from scenarios.evaluate.comparison import FIGURES, HEADINGS, Comparison, compare
+from scenarios.evaluate.comparison import Comparison, compare
+from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.statistics import Figure
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
@@ -37,6 +38,13 @@ def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, mo
     assert compared(scenario, plans, workers=1, **how) == alone
     monkeypatch.setattr("scenarios.evaluate.runner.HERE_S", 0.0)
     assert compared(scenario, plans, workers=2, **how) == alone
+
+
+def test_a_scenario_is_a_file_too_and_the_first_policy_the_default_baseline(small_toml, scenario, plans):
+    how = {"seeds": range(3), "difficulty": "blind", "cache_dir": plans, "workers": 1}
+    found = compare(small_toml, ["round_robin", "random"], **how)
+    assert found == compare(scenario, ["round_robin", "random"], baseline="round_robin", **how)
+    assert found.baseline == "round_robin"
 
 
 def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
@@ -69,6 +77,7 @@ def test_figures_are_means_over_seeds_with_intervals_around_them(scenario, plans
     ("changes", "sentence"),
     [
         ({"policies": ("rnd", "round_robin")}, "No policy 'rnd'; did you mean 'random'?"),
+        ({"policies": ()}, "A comparison needs a policy and a seed (got 0 policies, 3 seeds)."),
         ({"policies": ("random", "random")}, "The policy 'random' is given twice"),
         ({"baseline": "coolest_first"}, "The baseline 'coolest_first' is not among the policies compared: random, "),
     ],
@@ -86,11 +95,11 @@ def test_the_table_fits_eighty_columns_without_losing_a_word(scenario, plans):
     text = page.getvalue()
     assert "…  " not in text
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
-    assert tuple(HEADINGS) == FIGURES
-    for name in (*HEADINGS.values(), *POLICIES):
+    assert tuple(field.name for field in fields(Outcome)) == FIGURES
+    for name in (*(kind.heading for kind in KINDS.values()), *POLICIES):
         assert name in text
     figure = result.figures["random"]["peak_c"]
-    row = text.partition(HEADINGS["peak_c"])[2].splitlines()[1]
+    row = text.partition(KINDS["peak_c"].heading)[2].splitlines()[1]
     mean, low, high, difference, *bounds = (float(number) for number in re.findall(r"[+-]?\d+\.\d+", row))
     assert [mean, low, high] == pytest.approx([figure.mean, figure.low, figure.high], abs=0.05)
     differences = [figure.difference, figure.difference_low, figure.difference_high]

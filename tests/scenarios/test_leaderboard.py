@@ -15,7 +15,7 @@ from scenarios.evaluate import leaderboard
 from scenarios.evaluate.leaderboard import (
     MOST_BYTES,
     Card,
-    Played,
+    ResultLine,
     Submission,
     board_of,
     board_text,
@@ -28,7 +28,7 @@ from scenarios.evaluate.leaderboard import (
 from scenarios.evaluate.references import Reference
 from scenarios.evaluate.rollout import FIGURES, Outcome
 from scenarios.evaluate.store import opened
-from scenarios.evaluate.study import SHIFTS, Row, Study, suite_of
+from scenarios.evaluate.study import Row, Study, suite_of
 from scenarios.policy_loader import policy_of, scope_of
 from scenarios.suite.splits import manifest
 
@@ -70,7 +70,7 @@ def finished(study: Study, out: Path, rewards: dict[str, float], failed: int = 0
     """The folder of a study without running it; wsept fails in the first shifts."""
     keys = [key for unit in study.units(set()) for key in unit.keys]
     rows = [Row(key, replace(BLANK, reward=rewards[key.policy])) for key in keys]
-    with opened(out, SHIFTS, study.card) as store:
+    with opened(out, study.card) as store:
         for n, row in enumerate(row for row in rows if row.key.policy == "wsept"):
             if n < failed:
                 rows[rows.index(row)] = Row(row.key, None, 0, "Oops: x", "line 1")
@@ -175,7 +175,7 @@ def good(study: Study) -> Submission:
     )  # fmt: skip
     figures = [12.0 if name == "reward" else 50.0 if name == "value" else 0.0 for name in FIGURES]
     rows = [
-        Played(instance=case.name, scenario=scenarios[case.name], seed=case.seeds[0], training=0, figures=figures,
+        ResultLine(instance=case.name, scenario=scenarios[case.name], seed=case.seeds[0], training=0, figures=figures,
                illegal=0)
         for case in study.cases
     ]  # fmt: skip

@@ -10,7 +10,7 @@ from scenarios.cli.options import parse_randomisation
 from scenarios.evaluate import runner
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.store import read_rows
-from scenarios.evaluate.study import SHIFTS, Case, Study
+from scenarios.evaluate.study import Case, Study
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.spec.load import load
@@ -35,9 +35,7 @@ def test_a_constant_offset_equals_a_scenario_with_a_warmer_cell(thermofleet, sma
         ("cool", small_toml, ()),
     ):
         assert thermofleet("compare", file, *BLIND, "--out", tmp_path / name, *more).code == 0
-    offset, warm, cool = (
-        [row.outcome for row in read_rows(tmp_path / name, SHIFTS)] for name in ("offset", "warm", "cool")
-    )
+    offset, warm, cool = ([row.outcome for row in read_rows(tmp_path / name)] for name in ("offset", "warm", "cool"))
     for one, other, without in zip(offset, warm, cool, strict=True):
         assert one is not None
         assert other is not None

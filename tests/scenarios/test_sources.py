@@ -12,9 +12,8 @@ from scipy import stats
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from scenarios.evaluate import runner
 from scenarios.evaluate.rollout import FIGURES
-from scenarios.evaluate.sources import _Inverted, _Random
+from scenarios.evaluate.sources import _Random, inverted
 from scenarios.evaluate.store import read_rows
-from scenarios.evaluate.study import SHIFTS
 
 
 def plan(profile: np.ndarray) -> SimpleNamespace:
@@ -33,7 +32,7 @@ def test_random_scores_are_uniform_and_repeat() -> None:
 def test_the_inverse_has_the_opposite_order_and_probability() -> None:
     risk = Forecast(np.array([-3.0]), np.full((1, KNOWN), 0.05))
     hard = SimpleNamespace(version="v", score=lambda *_: Difficulty(np.linspace(0.0, 0.9, 7), risk=risk))
-    opposite, known_c = _Inverted(hard).score(plan(np.zeros((2, 3, 7))), 1), np.full(KNOWN, 30.0)
+    opposite, known_c = inverted(hard).score(plan(np.zeros((2, 3, 7))), 1), np.full(KNOWN, 30.0)
     assert opposite is not None
     assert opposite.per_joint == pytest.approx(np.linspace(1.0, 0.1, 7))
     assert (opposite.per_joint < 1.0).all()
@@ -113,7 +112,7 @@ def rewards(thermofleet, file: Path, out: Path, names: Iterable[str]) -> dict[st
     done = thermofleet("compare", file, "--policies", ",".join(names), *how)
     assert done.code == 0, done.err
     found: dict[str, list[float]] = {}
-    for row in read_rows(out, SHIFTS):
+    for row in read_rows(out):
         assert row.outcome is not None
         found.setdefault(f"{row.key.policy}@{row.key.difficulty}", []).append(row.outcome.reward)
     return found
@@ -138,7 +137,7 @@ def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monk
     assert done.code == 0, done.err
     for name in ("wspt@blind", "wspt@random", "wspt@constant", "wspt@oracle", "round_robin@blind"):
         assert done.out.count(f"  {name} ") == 1 + len(FIGURES)  # its scope, and each figure
-    assert len(read_rows(out, SHIFTS)) == 2 * 2 * (1 + 2 + 1 + 1 + 1)  # random numbers have two trainings
+    assert len(read_rows(out)) == 2 * 2 * (1 + 2 + 1 + 1 + 1)  # random numbers have two trainings
     again = thermofleet(*call, "--seeds", 2, "--json")
     alone = thermofleet("compare", small_toml, "--policies", "round_robin", "--difficulty", "blind", *how, "--seeds", 2,
                         "--json")  # fmt: skip

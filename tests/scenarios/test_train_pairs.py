@@ -21,15 +21,15 @@ from scenarios.spec.parse import override
 from scenarios.suite.splits import Instance, instance
 from scenarios.train import instances as suite_batches
 from scenarios.train import pairs
-from scenarios.train.instances import PAIRS_STATE, TRAINING, ground_of, holds_training, rewards
-from scenarios.train.networks import Judge, TrainingPlan, train_on_split
+from scenarios.train.instances import PAIRS_STATE, TRAINING, holds_training, rewards, training_instance
+from scenarios.train.networks import TrainingPlan, Validation, train_on_split
 from scenarios.train.pairs import CURVE, PairPlan, train_pairs, validation
 
 
 @pytest.fixture(scope="module")
 def ground():
     scenario = override(load("quickstart"), horizon_s=1200.0)
-    return ground_of(Instance("train/9999", scenario, 3), difficulty="oracle")
+    return training_instance(Instance("train/9999", scenario, 3), difficulty="oracle")
 
 
 def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
@@ -52,7 +52,7 @@ def test_validation_is_the_normalised_score_of_the_shift_of_the_benchmark(ground
     assert validation([half, none], np.zeros(PARAMETERS)) == pytest.approx(0.25)
     assert validation([ground], np.zeros(PARAMETERS)) == pytest.approx(reward / ground.value(ground.seed))
     own = replace(instance("train/0005"), name="x", seed=3)
-    made = ground_of(own, known={("x", 3): (40.0, 60.0), ("x", 4): (0.0, 1.0)})
+    made = training_instance(own, known={("x", 3): (40.0, 60.0), ("x", 4): (0.0, 1.0)})
     assert (made.random, made.unit) == (40.0, 20.0)
 
 
@@ -66,21 +66,22 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
         return train_pairs([ground], [ground], config, out, plan, card=card, resume=resume, tell=told.append)
 
     done = trained(2)
-    assert (done.iterations, done.shifts) == (2, 8)
+    assert done.iterations == 2
     rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
     judged = [row["validation"] for row in rows if "validation" in row]
     assert len(told) == len(judged) == 3
-    assert rows[0]["teacher"] == done.teacher
+    teacher = rows[0]["teacher"]
     assert done.best == max(judged)
     assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
     assert scope_of(str(out)) == "central"
     with pytest.raises(FleetError, match="holds a training already"):
         trained(3)
     with np.load(out / PAIRS_STATE) as saved:
+        assert saved["teacher"] == teacher
         assert 0.0 < saved["seconds"] <= done.seconds
         np.savez(out / PAIRS_STATE, **{**saved, "seconds": np.array(100.0)})
     again = trained(3, resume=True)
-    assert (again.iterations, again.shifts, again.teacher) == (3, 12, done.teacher)
+    assert again.iterations == 3
     assert again.best >= done.best
     assert again.seconds > 100.0
     with pytest.raises(FleetError, match=r"has samples = 4 \(got 6\)"):
@@ -134,8 +135,9 @@ def test_a_split_is_trained_by_ppo_in_turns_of_its_cells(tmp_path, ground) -> No
     plan = TrainingPlan(minutes=5.0, iterations=2, validate_every=2)
     card: dict[str, object] = {"suite": "train"}
     done = train_on_split([ground, small], [ground], config, tmp_path / "ppo", plan, card=card)
-    assert (done.iterations, done.env_steps) == (2, 32)
+    assert done.iterations == 2
     rows = [json.loads(line) for line in (tmp_path / "ppo" / LOG).read_text().splitlines()]
+    assert [row["env_steps"] for row in rows if "env_steps" in row] == [16, 32]
     judged = {row["iteration"]: row["validation_reward"] for row in rows if "validation_reward" in row}
     assert list(judged) == [0, 2]
     assert done.best == max(judged.values())
@@ -162,7 +164,7 @@ def test_ctrl_c_before_the_first_state_of_ppo_leaves_no_training(tmp_path, groun
     monkeypatch.setattr("scenarios.train.networks.imitate_rule", lambda *args: None)
     with monkeypatch.context() as patch:
         rewards_of = iter([0.5])  # of the teacher, and then an interruption
-        patch.setattr(Judge, "reward", lambda *args: next(rewards_of, None) or interrupt())
+        patch.setattr(Validation, "reward", lambda *args: next(rewards_of, None) or interrupt())
         with pytest.raises(KeyboardInterrupt):
             trained()
     assert not (out / TRAINING).exists()
@@ -185,7 +187,7 @@ def test_time_of_a_session_or_in_total() -> None:
 
 def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(suite_batches, "grounds_of", lambda *args, **options: [ground])
+    monkeypatch.setattr(suite_batches, "training_instances", lambda *args, **options: [ground])
     monkeypatch.setattr("scenarios.evaluate.scores.references_of", lambda cases: {})
     words = ["--suite", "train", "--difficulty", "oracle", "--instances", "1", "--validation-instances", "1"]
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from scenarios.evaluate.statistics import FARTHEST, SKEW_BIAS, holm, interval, mean_bounds, mean_by_group, paired, unit
+from scenarios.evaluate.statistics import FARTHEST, SKEW_BIAS, holm, interval, mean_bounds, paired, unit
 
 SYMMETRIC = np.array([-4.0, -1.0, 0.0, 1.0, 4.0]) + 2.0
 
@@ -101,12 +101,6 @@ def test_what_has_a_single_fleet_stands_for_all_in_a_difference() -> None:
     several, single = rng.normal(1.0, 1.0, (3, 1, 20)), rng.normal(size=(1, 1, 20))
     assert paired(several, single) == paired(several, np.tile(single, (3, 1, 1)))
     assert paired(several, single).mean == -paired(single, several).mean
-
-
-def test_groups_are_the_sample_if_there_are_several() -> None:
-    values = [("a", 1.0), ("a", 3.0), ("b", 5.0), ("c", 5.0), ("c", 6.0)]
-    assert mean_by_group(values) == interval([2.0, 5.0, 5.5])
-    assert mean_by_group(values[:2]) == interval([1.0, 3.0])
 
 
 def test_the_unit_says_what_is_fixed() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenarios.evaluate.statistics import EQUAL, figure_rows, figures_of, holm, interval, paired, remarks
+from scenarios.evaluate.statistics import EQUAL, FigureKind, figure_rows, figures_of, holm, interval, paired, remarks
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def values() -> dict[str, dict[str, np.ndarray]]:
 
 
 def test_differences_are_paired_and_corrected_over_the_table(values):
-    found = figures_of(values, "base", counts=("faults",))
+    found = figures_of(values, "base", {"faults": FigureKind("faults", is_count=True)})
     better, luck = found["better"]["value"], found["luck"]["value"]
     expected = paired(values["better"]["value"], values["base"]["value"])
     assert (better.difference, better.difference_low) == (expected.mean, expected.low)
@@ -32,7 +32,7 @@ def test_differences_are_paired_and_corrected_over_the_table(values):
 
 
 def test_a_policy_differs_from_itself_by_nothing_and_two_without_faults_by_a_bound(values):
-    found = figures_of(values, "base", counts=("faults",))
+    found = figures_of(values, "base", {"faults": FigureKind("faults", is_count=True)})
     base, other = found["base"]["faults"], found["better"]["faults"]
     assert (base.difference_low, base.difference_high) == (0.0, 0.0)
     assert (other.low, other.high) == (0.0, pytest.approx(0.369, abs=0.001))
@@ -40,7 +40,7 @@ def test_a_policy_differs_from_itself_by_nothing_and_two_without_faults_by_a_bou
 
 
 def test_cells_without_variation_say_so(values):
-    found = figures_of(values, "base", counts=("faults",))
+    found = figures_of(values, "base", {"faults": FigureKind("faults", is_count=True)})
     shown = figure_rows({policy: each["value"] for policy, each in found.items()}, "base", str)
     rows = {name: cells for name, *cells in shown}
     assert rows["same"][-3:] == ["+2.0", EQUAL, ""]

@@ -1,4 +1,4 @@
-"""Compute the suite anew: python -m scenarios.suite.freeze [CELL …]. What is frozen must not change any more.
+"""Compute the suite anew: python -m benchmarks.freeze_suite [CELL …]. What is frozen must not change any more.
 
 Time loads are computed for the named cells, and for those without any; then all manifests are written. It plans every
 cell (minutes) and needs no twins.
@@ -16,7 +16,7 @@ from scenarios.spec.schema import SPLITS, JobStream
 from scenarios.suite.instances import CELLS, TRADES, Axes, Cell, scenario_of
 from scenarios.suite.splits import drawn_rows, line_of
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).parents[1] / "scenarios" / "suite"
 PLAIN = Axes(
     heat="warm", due="usual", arrivals="poisson", precedence="none", air="warm", faults="attended", bus="perfect"
 )
