@@ -792,9 +792,9 @@ def origin_of(subjects: Sequence[Subject]) -> dict[str, str]:
 def report_page(title: str, chapters: Sequence[Section], origin: Mapping[str, str]) -> str:
     """The page as HTML text, which opens offline; the same input gives the same text."""
     facts = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
-    sections = [*chapters, Section(key="origin", title="Origin", tables=(facts,))]
-    content = {"lead": LIMITS, "sections": sections, "failed": [each.title for each in sections if each.failed]}
-    charts = [chart for each in sections for chart in each.charts]
+    failed = [each.title for each in chapters if each.failed]
+    content = {"lead": LIMITS, "sections": chapters, "failed": failed, "origin": facts}
+    charts = [chart for each in chapters for chart in each.charts]
     return Page(title=title, template="sections.html", content=content, charts=charts, narrow=True).html()
 
 

@@ -114,7 +114,7 @@ def test_the_key_j_shows_all_joints_and_q_ends(fleet):
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")} | {"TERM": "xterm"}
     process = subprocess.Popen(
-        [*commands.REAL, "watch", "--endpoint", fleet.endpoint],
+        [*commands.REAL, "bus", "watch", "--endpoint", fleet.endpoint],
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
