@@ -177,7 +177,7 @@ def test_asyncapi_has_every_key_and_no_loose_end():
 @pytest.mark.parametrize(
     ("nodes", "role"),
     [
-        (("arm/node", "arm/publications", "arm/auctioneer_client", "consensus/node"), "arm"),
+        (("arm/node", "consensus/node"), "arm"),
         (("auction/node",), "auction"),
     ],
 )

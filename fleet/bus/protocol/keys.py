@@ -12,7 +12,7 @@ wildcard, a `/` or a leading `@` (no wildcard matches a chunk that begins with `
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 from urllib.parse import quote, unquote
 
 import msgspec
@@ -137,8 +137,7 @@ PUBLISHED: Mapping[Channel, MessageType] = {
 MESSAGES: tuple[MessageType, ...] = tuple(dict.fromkeys(kind for channel in CHANNELS for kind in channel.messages))
 """Every message that travels by itself, in the order of the keys."""
 TOPICS: Mapping[Role, tuple[str, ...]] = {
-    role: tuple(channel.topic for channel in CHANNELS if channel.role == role)
-    for role in dict.fromkeys(channel.role for channel in CHANNELS)
+    role: tuple(channel.topic for channel in CHANNELS if channel.role == role) for role in get_args(Role)
 }
 ASKED: Mapping[str, Role] = {channel.topic: channel.role for channel in CHANNELS if channel.names_querier}
 """Role of the replier, by topic, for keys that end in the name of the querying arm."""
