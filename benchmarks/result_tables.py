@@ -10,7 +10,7 @@ from typing import Any  # values of JSON
 
 import numpy as np
 
-from scenarios.evaluate.rollout import KINDS
+from scenarios.evaluate.rollout import KINDS as FIGURE_KINDS
 from scenarios.evaluate.statistics import Figure, Interval, figures_of, interval, paired, paired_counts
 from scenarios.json_rows import Row, Rows
 from scenarios.show.table import markdown_table as table
@@ -219,7 +219,7 @@ class StoredAblation:
         """Figures by name of each policy and source, with differences to the first one."""
         names = (first, *(name for name in self.shifts if name != first))
         values = {name: {figure: self._values(name, figure) for figure in FIGURES} for name in names}
-        return figures_of(values, first, KINDS)
+        return figures_of(values, first, FIGURE_KINDS)
 
     def _values(self, name: str, figure: str) -> Array:
         """[fleet, training, seed]; the same for every training if the source has none."""
