@@ -1,20 +1,97 @@
-"""A line to the bus over a real router: what is said arrives, what is asked is answered, and rubbish harms nobody."""
+"""A client of the bus over a real router, and its queue: what is said arrives, what is asked is answered."""
 
 import json
+import math
+import signal
 import socket
 import threading
 import time
 from contextlib import ExitStack
+from queue import Empty
 
 import pytest
 
 from fleet.bus.client import MOST_REPLIES, BusClient, Refused, Replies
+from fleet.bus.mailbox import Mailbox
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, ArmEvent, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, decode, encode, encoding
 from fleet.bus.router import Router
 from fleet.errors import BusError
+from fleet.live.supervisor import Supervisor
 from tests.waiting import PATIENCE_S, serve_until
+
+WAIT_S = 0.05
+
+
+def get(mailbox, until_s):
+    with pytest.raises(Empty):
+        mailbox.get(until_s)
+
+
+@pytest.fixture
+def late_signal():
+    """A signal amid a wait, whose handler returns when the time of the wait is over; the next one ends it."""
+    rung = []
+
+    def ring(*_):
+        rung.append(time.monotonic())
+        assert len(rung) == 1, "still waiting ten seconds after the time was up"
+        until_s = rung[0] + WAIT_S
+        while time.monotonic() < until_s:
+            pass
+
+    before = signal.signal(signal.SIGALRM, ring)
+    yield lambda: signal.setitimer(signal.ITIMER_REAL, WAIT_S / 2, 10.0)
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize(
+    "wait",
+    [
+        lambda until_s, _: get(Mailbox(), until_s),
+        lambda until_s, _: Mailbox().wait(4, until_s),
+        lambda until_s, _: BusClient("tcp/127.0.0.1:1", "f").serve(until_s),
+        lambda until_s, folder: Supervisor(folder).poll(until_s - time.monotonic()),
+    ],
+    ids=["Mailbox.get", "Mailbox.wait", "BusClient.serve", "Supervisor.look"],
+)
+def test_a_signal_that_takes_as_long_as_the_wait_does_not_make_it_endless(late_signal, wait, tmp_path):
+    until_s = time.monotonic() + WAIT_S
+    late_signal()
+    wait(until_s, tmp_path)
+    assert WAIT_S / 2 <= time.monotonic() - until_s + WAIT_S < 10.0
+
+
+def test_what_several_threads_put_in_comes_out_once_and_in_the_order_of_each():
+    mailbox, threads, each = Mailbox(), 4, 2000
+
+    def talk(name):
+        for number in range(each):
+            mailbox.put((name, number))
+
+    talkers = [threading.Thread(target=talk, args=(name,)) for name in range(threads)]
+    for talker in talkers:
+        talker.start()
+    until_s = time.monotonic() + PATIENCE_S
+    got = [mailbox.get(until_s) for _ in range(threads * each)]
+    for talker in talkers:
+        talker.join()
+    assert len(mailbox) == 0
+    assert [[number for name, number in got if name == one] for one in range(threads)] == [list(range(each))] * threads
+
+
+def test_one_that_waits_is_woken_and_a_bell_left_over_is_not_taken_for_a_word():
+    mailbox = Mailbox()
+    mailbox.put("first")
+    assert mailbox.get() == "first"  # without waiting: its bell still rings
+    begun_s = time.monotonic()
+    get(mailbox, begun_s + WAIT_S)
+    assert time.monotonic() - begun_s >= WAIT_S
+    threading.Timer(WAIT_S, lambda: mailbox.put("second")).start()
+    assert mailbox.get(math.inf) == "second"
+    get(mailbox, -math.inf)
 
 
 @pytest.fixture
@@ -53,7 +130,7 @@ def test_an_answer_reaches_the_one_who_asked(bus):
 
 def test_a_question_to_nobody_is_over_at_once(bus):
     asker = bus()
-    answers = asker.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=30.0)
+    answers = asker.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENCE_S)
     assert not answers.messages
     assert answers.took_s < PATIENCE_S
 
@@ -213,13 +290,17 @@ def test_a_closed_line_says_so(bus):
 
 def test_a_line_closes_soon_though_a_router_that_stands_still_has_taken_its_call():
     """In place of the router is somebody who accepts and never says a word; Zenoh itself would wait for ten seconds."""
-    router = Router().open()
-    port = int(router.endpoint.rpartition(":")[2])
-    line = BusClient(router.endpoint, "f").open()
-    router.close()
-    with socket.create_server(("127.0.0.1", port)) as silent:
-        silent.settimeout(PATIENCE_S)
-        with silent.accept()[0]:
-            begun_s = time.monotonic()
-            line.close()
-            assert time.monotonic() - begun_s < 9.0
+
+    def seconds_to_close() -> float:
+        router = Router().open()
+        port = int(router.endpoint.rpartition(":")[2])
+        line = BusClient(router.endpoint, "f").open()
+        router.close()
+        with socket.create_server(("127.0.0.1", port)) as silent:
+            silent.settimeout(PATIENCE_S)
+            with silent.accept()[0]:
+                begun_s = time.monotonic()
+                line.close()
+                return time.monotonic() - begun_s
+
+    assert any(seconds_to_close() < 9.0 for _ in range(3))  # a busy machine delays one attempt, a defect all
