@@ -114,11 +114,7 @@ def test_the_key_j_shows_all_joints_and_q_ends(fleet):
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")} | {"TERM": "xterm"}
     process = subprocess.Popen(
-        [*commands.REAL, "watch", "--endpoint", fleet.endpoint],
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,
-        env=env,
+        [*commands.REAL, "watch", "--endpoint", fleet.endpoint], stdin=theirs, stdout=theirs, stderr=theirs, env=env
     )
     os.close(theirs)
 
@@ -142,15 +138,12 @@ def test_the_key_j_shows_all_joints_and_q_ends(fleet):
         os.close(ours)
 
 
-def test_a_small_screen_shows_the_arms_with_least_headroom():
+def test_a_small_screen_shows_the_arms_with_least_headroom_and_an_empty_fleet_says_so():
     names = [arm_now(f"arm_{number}", headroom_k=float(number)) for number in range(30)]
     told = shown(fleet_of(names), height=12)
     assert "arm_0 " in told
     assert "arm_29" not in told
     assert "more with more headroom" in told
-
-
-def test_an_empty_fleet_is_shown_as_empty():
     told = shown(FleetSnapshot("f", (), (), {}, ()))
     assert "no auctioneer" in told
     assert "jobs: none" in told

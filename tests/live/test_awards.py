@@ -1,10 +1,21 @@
-"""Award executor: accepted awards, allowed cycles and reports."""
+"""Award executor: accepted awards, allowed cycles and reports, also after a crash."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import Lease, Receipt
-from fleet.live.arm.awards import CLOCK_DRIFT, ArmHistory, ExecutorConfig
+from fleet.live.arm.awards import (
+    CLOCK_DRIFT,
+    MAX_PAST_AWARDS,
+    ArmHistory,
+    ArmRecord,
+    AwardExecutor,
+    ExecutorConfig,
+    Started,
+)
+from fleet.live.journal import Journal
 from tests.live.award_shop import JOB, LEASE_S, OTHER, VALID_S, award_on, finished, quoted, shop, taken
 from tests.live.disk import Disk
 
@@ -39,21 +50,29 @@ def test_an_award_that_does_not_match_is_refused_with_the_reason(change, now_s, 
     assert not executor.active
 
 
-def test_a_quote_is_valid_until_its_end():
+def test_quotes_are_unique_few_and_valid_until_their_end():
+    names, disk = [], Disk()
+    for life in range(3):
+        executor, _ = shop(disk, boot_nonce=f"n{life}")
+        names += [quoted(executor) for _ in range(100)]
+    wiped, _ = shop(boot_nonce="n9")
+    names += [quoted(wiped) for _ in range(100)]
+    assert len(set(names)) == 400
     executor, _ = shop()
     assert executor.answer_award(award_on(quoted(executor), lease_s=60.0), VALID_S).accepted
+    executor, _ = shop(quotes=4)
+    names = [quoted(executor) for _ in range(6)]
+    assert "no quote" in executor.answer_award(award_on(names[1]), 0.0).reason
+    assert executor.answer_award(award_on(names[2]), 0.0).accepted
 
 
-def test_an_arm_that_is_unfit_full_or_unable_refuses():
+def test_an_unfit_full_or_unable_arm_refuses_and_a_refusal_is_final():
     executor, _ = shop()
     assert "too hot" in executor.answer_award(award_on(quoted(executor)), 0.0, "I am too hot").reason
     assert "cannot do it" in executor.answer_award(award_on(quoted(executor, can=False)), 0.0).reason
     taken(executor)
     full = executor.answer_award(award_on(quoted(executor, OTHER), OTHER), 0.0)
     assert "I have 1 job(s)" in full.reason
-
-
-def test_a_refusal_is_final_although_the_reason_has_ended():
     executor, _ = shop()
     award = award_on(quoted(executor))
     refused = executor.answer_award(award, 0.0, "I am too hot")
@@ -87,23 +106,6 @@ def test_a_later_award_of_the_current_job_replaces_the_earlier():
     assert executor.answer_award(again, 10.0).accepted
     assert [held.award for held in executor.active] == [again]
     assert list(ArmHistory().replay(disk.records).active) == ["w2"]
-
-
-def test_names_of_quotes_are_unique():
-    names, disk = [], Disk()
-    for life in range(3):
-        executor, _ = shop(disk, boot_nonce=f"n{life}")
-        names += [quoted(executor) for _ in range(100)]
-    wiped, _ = shop(boot_nonce="n9")
-    names += [quoted(wiped) for _ in range(100)]
-    assert len(set(names)) == 400
-
-
-def test_the_number_of_quotes_is_limited():
-    executor, _ = shop(quotes=4)
-    names = [quoted(executor) for _ in range(6)]
-    assert "no quote" in executor.answer_award(award_on(names[1]), 0.0).reason
-    assert executor.answer_award(award_on(names[2]), 0.0).accepted
 
 
 # Leases and leave
@@ -234,7 +236,7 @@ def test_a_report_is_repeated_with_back_off_until_its_receipt():
     assert not executor.due_reports(200.0)
 
 
-def test_a_finished_job_is_reported_once_the_disk_has_space():
+def test_with_a_full_disk_no_work_is_taken_and_a_finished_job_is_reported_later():
     executor, disk = shop()
     award = taken(executor)
     executor.apply_lease(Lease("x", LEASE_S, (award.award,), (), (award.award,)), 1.0)
@@ -248,9 +250,6 @@ def test_a_finished_job_is_reported_once_the_disk_has_space():
     executor.retry_writes()
     ((_, report),) = executor.due_reports(3.0)
     assert (report.outcome, report.cycles, report.time_s) == ("finished", 3, 33.0)
-
-
-def test_an_arm_with_a_full_disk_takes_no_work():
     executor, disk = shop()
     award = award_on(quoted(executor))
     disk.full = True
@@ -287,3 +286,84 @@ def test_an_arm_with_only_the_last_cycle_left_requests_permission_early(repetiti
 def test_config_values_must_be_positive(name):
     with pytest.raises(ValueError, match=rf"ExecutorConfig\.{name}"):
         ExecutorConfig(**{name: 0})
+
+
+def test_a_finished_job_is_reported_again_after_a_restart():
+    executor, disk = shop()
+    finished(executor, taken(executor))
+    next_life, _ = shop(disk)
+    ((auctioneer, report),) = next_life.due_reports(0.0)
+    assert (auctioneer, report.outcome, report.time_s) == ("x", "finished", 33.0)
+    next_life.apply_receipt(Receipt("x", report.award))
+    assert not shop(disk)[0].due_reports(0.0)
+
+
+def test_an_active_job_is_returned_after_a_restart_with_the_cycles_on_disk():
+    executor, disk = shop()
+    taken(executor, cycles=1)
+    executor.record_progress(2, 9.0)  # not on disk yet
+    ((_, report),) = shop(disk)[0].due_reports(0.0)
+    assert (report.outcome, report.cycles, report.time_s, report.unsure) == ("returned", 1, 7.0, False)
+
+
+def test_an_arm_that_may_have_finished_a_job_returns_it_as_unsure():
+    executor, disk = shop()
+    award = taken(executor)
+    executor.record_progress(2, 0.0)
+    ((auctioneer, request),) = executor.lease_requests(1.0)
+    assert (auctioneer, request.entries[0].phase, request.entries[0].cycles) == ("x", "finishing", 2)
+    executor.apply_lease(Lease("x", LEASE_S, (award.award,), (), (award.award,)), 1.0)
+    restarted, _ = shop(disk)
+    assert not restarted.active
+    ((_, report),) = restarted.due_reports(0.0)
+    assert (report.outcome, report.cycles, report.unsure) == ("returned", 2, True)
+    assert restarted.answer_award(award, 0.2).accepted  # the same answer after the restart
+    assert not restarted.answer_award(replace(award, award="other"), 0.2).accepted  # on the same quote
+
+
+def test_an_award_is_kept_over_many_restarts_and_the_journal_stays_small():
+    disk = Disk()
+    for life in range(MAX_PAST_AWARDS + 50):
+        executor, _ = shop(disk, boot_nonce=str(life))
+        award = taken(executor, award=f"w{life}")
+        finished(executor, award)
+        executor.apply_receipt(Receipt("x", award.award))
+    executor, _ = shop(disk)
+    assert executor.answer_award(award, 99.0).accepted
+    assert len(disk.records) <= MAX_PAST_AWARDS + 2
+    assert ArmHistory().replay(disk.records).boot == MAX_PAST_AWARDS + 51
+
+
+@given(st.integers(0, 5), st.booleans(), st.booleans())
+def test_a_compacted_history_is_the_same_history(cycles, leave, closed):
+    executor, disk = shop(capacity=3)
+    award = taken(executor)
+    executor.record_progress(min(cycles, 2), 0.0)
+    executor.lease_requests(3.0)
+    if leave:
+        executor.apply_lease(Lease("x", 4.0, (), (), (award.award,)), 1.0)
+    if closed:
+        executor.return_all(5.0, 1.0, "too hot")
+    history = ArmHistory().replay(disk.records)
+    told = ArmHistory().replay(history.compact())
+    assert (told.boot, told.accepted, told.reports) == (history.boot, history.accepted, history.reports)
+    assert {n: (h.award, h.cycles, h.may_commit) for n, h in told.active.items()} == {
+        n: (h.award, h.cycles, h.may_commit) for n, h in history.active.items()
+    }
+
+
+def test_a_journal_on_disk_restores_the_history(tmp_path):
+    with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
+        history = ArmHistory().replay(journal.records()).after_restart("a", 0.0)
+        journal.rewrite(*history.compact())
+        award = taken(AwardExecutor("a", journal.append, history, nonce="n"))
+    with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
+        again = ArmHistory().replay(journal.records())
+    assert list(again.active) == [award.award]
+    assert again.boot == 1
+
+
+def test_a_first_start_is_the_first_boot():
+    assert ArmHistory().after_restart("a", 0.0).boot == 1
+    history = ArmHistory().replay([Started(boot=4)]).after_restart("a", 0.0)
+    assert history.compact() == (Started("a", boot=5),)
