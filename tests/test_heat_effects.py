@@ -1,13 +1,17 @@
-"""Insulation ageing and drift of the tool point: closed forms, bounds, and the geometry of MuJoCo."""
+"""Insulation ageing, drift of the tool point, burns and housings: closed forms, sources, geometry of MuJoCo."""
 
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.integrate import simpson
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import simpson, solve_ivp
 
 from fleet.arm.cell import cell_model
 from fleet.arm.model import ArmModel
+from fleet.engine.shift import step
+from fleet.engine.state import initial
 from fleet.heat.effects import (
     ALUMINIUM_PER_K,
     CLASSES,
@@ -16,13 +20,17 @@ from fleet.heat.effects import (
     SEGMENTS,
     Insulation,
     arrhenius_rate,
+    burn_threshold_c,
     drift_m,
     life_used,
     montsinger_rate,
     most_drift_m,
+    seconds_above,
     segment_temperatures,
+    surface_c,
 )
-from fleet.heat.thermal import HOUSING, NODES, WINDING
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import HOUSING, NODES, WINDING, gen3_network, housing_observer, thermal_model
 from fleet.robot import JOINTS, Mount, Robot
 from scenarios.run.metrics import HeatUse
 
@@ -121,3 +129,76 @@ def test_the_heat_of_a_shift_is_that_of_its_most_aged_winding_and_of_the_largest
     used_h = simpson(arrhenius_rate(temp_c[..., JOINTS - 1]), dx=dt_s, axis=0) / 3600.0
     assert heat.insulation_ppb == pytest.approx(1e9 * used_h / GEN3_INSULATION.rated_life_h, rel=1e-3)
     assert heat.tool_drift_mm == pytest.approx(1e3 * 23.6e-6 * 30.0 * shape * sum(GEN3_SEGMENTS_M))
+
+
+TEMPERATURES = st.floats(20.0, 80.0)
+
+
+@pytest.mark.parametrize(("contact_s", "burn_c"), [(1.0, 65.0), (60.0, 51.0), (600.0, 48.0), (28800.0, 43.0)])
+def test_uncoated_metal_has_the_thresholds_of_the_standard(contact_s, burn_c):
+    """DIN EN 563, quoted in BGV D34 § 12: 1 s 65 to 70 °C, 1 min 51, 10 min 48, 8 h 43."""
+    assert burn_threshold_c(contact_s) == pytest.approx(burn_c)
+
+
+@given(st.floats(1.0, 28800.0), st.floats(1.0, 28800.0))
+def test_a_longer_contact_burns_at_a_lower_temperature(one, other):
+    assert burn_threshold_c(min(one, other)) >= burn_threshold_c(max(one, other))
+
+
+@pytest.mark.parametrize("contact_s", [0.5, 28801.0, float("nan")])
+def test_other_contact_times_have_no_value(contact_s):
+    with pytest.raises(ValueError, match=r"between 1 and 28800 s \(got"):
+        burn_threshold_c(contact_s)
+
+
+@given(TEMPERATURES, TEMPERATURES, TEMPERATURES)
+def test_the_time_above_a_limit_is_that_of_a_straight_line(before_c, after_c, limit_c):
+    course = np.linspace(before_c, after_c, 20_001)
+    wanted = 10.0 * np.mean(course > limit_c)
+    assert seconds_above(np.array(before_c), np.array(after_c), limit_c, 10.0) == pytest.approx(wanted, abs=0.01)
+
+
+def test_surfaces_are_housings_and_their_hot_minutes_add_up():
+    """A housing that rises by 1 K a minute from 40 °C to 60 °C is above 48 °C for 12 minutes."""
+    temp_c = np.full((2, 2 * JOINTS), 40.0)
+    temp_c[:, :JOINTS] = 90.0  # windings, which nobody can touch
+    heat = HeatUse(temp_c, 48.0)
+    for minute in range(1, 21):
+        temp_c = temp_c.copy()
+        temp_c[1, JOINTS + 2] = 40.0 + minute
+        heat.add(temp_c, 60.0)
+    np.testing.assert_allclose(heat.hot_surface_min, [0.0, 12.0])
+    np.testing.assert_allclose(heat.surface_c, [40.0, 60.0])
+    np.testing.assert_allclose(surface_c(temp_c), [40.0, 60.0])
+
+
+MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
+
+
+@pytest.mark.parametrize("dt_s", [1.0, 10.0, 400.0])
+def test_a_step_solves_the_heat_balance_of_the_housings(dt_s) -> None:
+    rng = np.random.default_rng(0)
+    motor_c, housing_c, friction_w = rng.uniform(30, 60, 7), rng.uniform(25, 45, 7), rng.uniform(0, 3, 7)
+
+    def slope(_, temp_c):
+        heat = -THERMAL.laplacian[HOUSING, HOUSING] @ temp_c - THERMAL.laplacian[HOUSING, WINDING] @ motor_c
+        return (heat + THERMAL.to_ambient[HOUSING] * 22.0 + MOTORS.idle_w + friction_w) / THERMAL.capacity[HOUSING]
+
+    exact = solve_ivp(slope, (0.0, dt_s), housing_c, rtol=1e-10, atol=1e-10).y[:, -1]
+    estimate = housing_observer(THERMAL, MOTORS, dt_s).step(housing_c, motor_c, 22.0, friction_w)
+    assert estimate == pytest.approx(exact, abs=1e-6)
+
+
+def test_an_arm_that_knows_itself_estimates_its_housings(small) -> None:
+    """The true network, from a start that is 8 K wrong; the error decays with the time constants of the housings."""
+    content = small.work(payload_kg=3.0)
+    world, plant = small.shop([[small.job("a", content, repetitions=900)]], arms=1, ticks=1000)
+    state = initial(world)
+    state.housing_c[:] += 8.0
+    errors = []
+    for tick in range(world.ticks):
+        state = step(world, state, np.array([[int(tick == 0)]]), plant).state
+        errors.append(np.abs(state.housing_c[0, 0] - state.temp_c[0, 0, HOUSING]).max())
+    assert errors[0] > 7.0
+    assert errors[-1] < 0.3
+    assert state.temp_c[0, 0, HOUSING].max() > 27.0  # they warmed meanwhile
