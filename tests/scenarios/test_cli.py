@@ -326,7 +326,7 @@ def test_help_imports_no_large_library():
     assert said.stdout.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize("module", ["run", "look", "evaluate", "live", "jobs", "keys", "twin"])
+@pytest.mark.parametrize("module", ["run", "look", "evaluate", "live", "jobs", "keys"])
 def test_a_command_is_declared_without_what_it_runs(module):
     """Its help takes 0.3 s; the schema of scenarios, Zenoh or MuJoCo would double that."""
     large = ("networkx", "torch", "zenoh", "plotly", "mujoco", "numba", "scenarios.spec.schema")
