@@ -80,7 +80,7 @@ MU = "joint_3.mu.weight"
         (card(lambda told: told.update(arm="arm_9")), "changed since it was saved"),
         (card(lambda told: told["config"].update(score_stride=6)), "changed since it was saved"),
         (card(lambda told: told["config"].update(hidden=8)), "not float32"),
-        (card(lambda told: told["config"].update(hidden=-8)), "hidden must be >= 1"),
+        (card(lambda told: told["config"].update(hidden=-8)), r"hidden must be 1 to 1024 \(got -8\)"),
         (card(lambda told: told["std"].pop()), "must each have 7 joints"),
         (card(lambda told: told["fits"].pop()), r"needs 7 network\(s\) and fits \(got 7 and 6\)"),
         (card(lambda told: told["config"].update(scope="arm")), "missing tensor"),
