@@ -11,7 +11,6 @@ from fleet.observation import Layout
 from scenarios.evaluate.upper_bound import check_signs
 
 Array = np.ndarray
-
 ROWS = 256
 """States that are stepped at a time."""
 MOST_STATES = 100_000

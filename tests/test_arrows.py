@@ -13,7 +13,6 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fleet", "twin", "agents", "scenarios")
 SOURCES = sorted(path.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-
 LAWS = ("motor", "thermal", "motion")
 NOUNS_OF_LAWS = ("robot", "job", "errors", "jit")
 """What laws need besides: the number of joints, the kinds of work, the errors, and compilation."""
@@ -35,7 +34,6 @@ def name_of(path: Path) -> str:
 MODULES = {name_of(path) for path in SOURCES}
 NOUN_FOLDERS = (Path("fleet"), Path("fleet/heat"))
 NOUNS = {name_of(path) for path in SOURCES if path.parent in NOUN_FOLDERS and path.name != "__init__.py"}
-LARGEST_FOLDER = 16
 """Most files in a folder, without `__init__.py`."""
 LONGEST_FILE = 900
 """Lines."""
@@ -113,12 +111,7 @@ def library_allowed(importer: str, library: str) -> bool:
         return below(importer, "fleet.planning", "fleet.physics")
     if library == "zenoh":
         # ros2: other keys, bytes and attachments than ours, which `BusClient` knows nothing of.
-        return importer in (
-            "fleet.bus.exchange.zenoh",
-            "fleet.bus.router",
-            "fleet.bus.client",
-            "fleet.ros2.node",
-        )
+        return importer in ("fleet.bus.exchange.zenoh", "fleet.bus.router", "fleet.bus.client", "fleet.ros2.node")
     if library in NEIGHBOURS:
         return importer == NEIGHBOURS[library]
     if library in TRAINERS:

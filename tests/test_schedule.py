@@ -1,18 +1,19 @@
-"""A schedule read from an event log: what each arm did, without overlaps and without gaps in the telling."""
+"""A schedule and metrics read from an event log."""
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.events import Event
+from scenarios.run.metrics import gini
 from scenarios.run.schedule import schedule
 
 ARMS = ("arm_0", "arm_1")
 HORIZON_S = 1000.0
 ENDINGS = ("home", "fault", "late fault", "idle fault", "give back", "back fault")
-
 gaps = st.integers(min_value=1, max_value=40).map(lambda n: n * 0.5)
 
 
@@ -150,3 +151,49 @@ def test_an_impossible_log_is_refused_with_its_reason(kinds: tuple, words: str) 
 def test_an_arm_of_another_fleet_is_refused() -> None:
     with pytest.raises(ValueError, match=r"No arm 'arm_9' in this fleet.*arm_0, arm_1"):
         schedule([Event(time_s=0.0, kind="award", arm="arm_9", job="a-1")], ARMS, 100.0)
+
+
+shares = st.lists(st.floats(0.0, 1e6), min_size=1, max_size=12)
+
+
+@pytest.mark.parametrize("arms", [1, 2, 5, 64])
+def test_one_arm_with_everything_among_n_is_1_minus_1_over_n(arms) -> None:
+    assert gini(np.eye(arms)[0]) == pytest.approx(1 - 1 / arms)
+
+
+@pytest.mark.parametrize("arms", [1, 2, 7])
+def test_all_alike_is_zero(arms) -> None:
+    assert gini(np.full(arms, 3.7)) == pytest.approx(0.0)
+    assert gini(np.zeros(arms)) == 0.0
+
+
+def test_shares_1_to_n_have_the_closed_form() -> None:
+    # Σ|i − j| = n (n² − 1)/3 and mean (n + 1)/2, so G = (n − 1)/(3 n).
+    for n in (2, 10, 101):
+        assert gini(np.arange(1, n + 1)) == pytest.approx((n - 1) / (3 * n))
+
+
+def test_an_exponential_fleet_is_near_a_half() -> None:
+    # The Gini coefficient of the exponential distribution is 1/2; its estimate has deviation about 0.29/√n.
+    drawn = np.random.default_rng(1).exponential(size=2000)
+    assert gini(drawn) == pytest.approx(0.5, abs=4 * 0.29 / np.sqrt(2000))
+
+
+@given(shares, st.floats(1e-3, 1e3), st.randoms())
+def test_it_knows_neither_unit_nor_order(values, scale, random) -> None:
+    g = gini(np.array(values))
+    assert 0.0 <= g < 1.0
+    mixed = [scale * v for v in values]
+    random.shuffle(mixed)
+    assert gini(np.array(mixed)) == pytest.approx(g, abs=1e-9)
+
+
+@given(shares, st.floats(1.0, 1e6))
+def test_a_gift_to_all_makes_it_less(values, gift) -> None:
+    assert gini(np.array(values) + gift) <= gini(np.array(values)) + 1e-12
+
+
+@pytest.mark.parametrize(("values", "says"), [([1.0, -0.1], "must be >= 0"), ([], "at least one")])
+def test_shares_that_cannot_be_are_refused(values, says) -> None:
+    with pytest.raises(ValueError, match=says):
+        gini(np.array(values))

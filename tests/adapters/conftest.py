@@ -19,7 +19,6 @@ from fleet.env.vector import BatchEnv
 from fleet.files import user_cache_folder
 
 PAGE = Path(__file__).parents[2] / "docs" / "trainers.md"
-
 ELSEWHERE = """
 import hashlib, importlib.util, sys
 loaded = []

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 pytestmark = [pytest.mark.adapter, pytest.mark.filterwarnings("default")]
-
 Parameters = dict[str, np.ndarray]
 
 

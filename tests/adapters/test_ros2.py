@@ -34,7 +34,6 @@ pytestmark = [pytest.mark.adapter, pytest.mark.filterwarnings("ignore::Deprecati
 rclpy = pytest.importorskip("rclpy")
 SOURCE = Path(__file__).parents[2] / "fleet" / "ros2" / "thermofleet_msgs"
 PATIENCE_S = 20.0
-
 texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9)
 numbers = st.floats(allow_nan=False)
 UNHURRIED = settings(deadline=None, max_examples=200)

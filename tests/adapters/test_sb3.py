@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 pytestmark = pytest.mark.adapter
-
 ARMS, ENVS, TICKS = 3, 4, 15
 BRIEF = {"jobs": 1, "ambient_c": 20.0, "ticks": 30}
 """Shifts of one job: every env finishes it, each at another time."""

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 pytestmark = pytest.mark.adapter
-
 Parameters = dict[str, np.ndarray]
 
 

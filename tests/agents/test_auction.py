@@ -1,13 +1,215 @@
-"""The auction algorithm against the Hungarian method of scipy, and its bound."""
+"""Assignments and auctions, with and without an auctioneer, against every assignment and the Hungarian method."""
 
+from dataclasses import replace
+from itertools import product
+
+import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from agents.auction import auction
+from agents.auction import NOBODY, Belief, agree, auction, bid, merge
+from agents.registry import RULES, make_policy
+from agents.rules import RISK, cheapest_pairs, matching, quickest, thermal
+from fleet.observation import LONG_S, Layout, Observation
 from tests.profiles import examples
+
+INF = np.inf
+ASSIGNMENTS = {"ssi": cheapest_pairs, "matching": matching}
+COSTS = {"thermal": thermal, "quickest": quickest}
+
+
+@st.composite
+def costs(draw) -> np.ndarray:
+    arms, jobs = draw(st.integers(1, 4)), draw(st.integers(1, 4))
+    cell = st.sampled_from([-2.0, 0.0, 0.5, 0.5, 1.0, 3.0, 10.0, INF])
+    return np.array(draw(st.lists(st.lists(cell, min_size=jobs, max_size=jobs), min_size=arms, max_size=arms)))
+
+
+def allowed(cost: np.ndarray, pairs: list[tuple[int, int]]) -> bool:
+    arms, jobs = [a for a, _ in pairs], [j for _, j in pairs]
+    once = len(set(arms)) == len(arms) and len(set(jobs)) == len(jobs)
+    return once and all(np.isfinite(cost[a, j]) for a, j in pairs)
+
+
+def every_assignment(cost: np.ndarray):
+    """All that are allowed, by trying every arm, or none, for every job."""
+    for choice in product((None, *range(len(cost))), repeat=cost.shape[1]):
+        pairs = [(arm, job) for job, arm in enumerate(choice) if arm is not None]
+        if allowed(cost, pairs):
+            yield pairs
+
+
+def worth(cost: np.ndarray, pairs: list[tuple[int, int]]) -> tuple[int, float]:
+    return -len(pairs), float(sum(cost[a, j] for a, j in pairs))
+
+
+@examples(200)
+@given(costs())
+def test_matching_is_the_best_of_all_assignments(cost):
+    best = min(worth(cost, pairs) for pairs in every_assignment(cost))
+    assert worth(cost, matching(cost)) == pytest.approx(best)
+
+
+@pytest.mark.parametrize("rule", ASSIGNMENTS.values(), ids=ASSIGNMENTS)
+@examples(200)
+@given(cost=costs())
+def test_no_rule_gives_what_is_not_allowed(rule, cost):
+    assert allowed(cost, rule(cost))
+
+
+@examples(200)
+@given(costs())
+def test_ssi_leaves_nothing_that_an_arm_could_have(cost):
+    pairs = cheapest_pairs(cost)
+    for arm, job in np.argwhere(np.isfinite(cost)).tolist():
+        assert not allowed(cost, [*pairs, (arm, job)])
+
+
+def test_ssi_takes_the_cheapest_pair_first_and_settles_ties_by_order():
+    assert cheapest_pairs(np.array([[1.0, 2.0], [0.0, 9.0]])) == [(1, 0), (0, 1)]
+    assert cheapest_pairs(np.array([[1.0, 1.0], [1.0, 1.0]])) == [(0, 0), (1, 1)]
+
+
+def test_matching_sees_what_the_greedy_rule_does_not():
+    # The cheapest pair (0) leaves the expensive one (10); together 1 + 1 is less.
+    cost = np.array([[0.0, 1.0], [1.0, 10.0]])
+    assert cheapest_pairs(cost) == [(0, 0), (1, 1)]
+    assert sorted(matching(cost)) == [(0, 1), (1, 0)]
+
+
+def test_a_large_matching_beats_a_cheap_small_one():
+    # Only arm 0 can do job 1; the cheap job 0 must go to arm 1.
+    assert sorted(matching(np.array([[0.0, 5.0], [100.0, INF]]))) == [(0, 1), (1, 0)]
+
+
+@pytest.mark.parametrize("rule", ASSIGNMENTS.values(), ids=ASSIGNMENTS)
+def test_nothing_is_given_where_nothing_is_possible(rule):
+    assert rule(np.array([[INF, INF]])) == []
+    assert rule(np.zeros((0, 2))) == []
+    assert rule(np.zeros((2, 0))) == []
+
+
+# cost
+
+
+def fleet(difficulty, **other) -> list[Observation]:
+    """What the arms know that find the jobs so difficult, [arm][slot], NaN unknown; every arm may claim every job."""
+    d = np.array(difficulty, dtype=float)
+    layout = Layout(*d.shape)
+    blank = layout.read(np.zeros(layout.size, np.float32), np.array([1] * (layout.slots + 1) + [0], np.int8))
+    base = {
+        "known": ~np.isnan(d),
+        "difficulty": np.nan_to_num(d),
+        "slack_s": np.full(d.shape, LONG_S),
+        "value": np.ones(d.shape),
+        **{name: np.broadcast_to(np.array(value, dtype=float), d.shape) for name, value in other.items()},
+    }
+    return [replace(blank, **{name: value[arm] for name, value in base.items()}) for arm in range(len(d))]
+
+
+def test_thermal_cost_is_difficulty_against_the_average_by_probability_and_unknown_is_average():
+    # Job 0 is new to both twins; what counts is who finds it easier.
+    assert thermal(fleet([[5.0, 1.0], [5.5, 0.2]])).tolist() == [[-0.25, 0.4], [0.25, -0.4]]
+    # Alike but for the risk: 1·(1 + RISK·0.5) against 1.
+    cost = thermal(fleet([[1.0], [1.0]], p_saturation=[[0.5], [0.0]]))
+    assert cost[:, 0].tolist() == [RISK / 4, -RISK / 4]
+    nan = np.nan
+    assert thermal(fleet([[2.0], [nan], [4.0]]))[:, 0].tolist() == [-1.0, 0.0, 1.0]
+    cost = thermal(fleet([[np.nan], [np.nan]], duration_s=[[600.0], [60.0]]))
+    assert cost[1, 0] < cost[0, 0]
+
+
+def test_late_and_valuable_work_comes_first_and_quickest_is_the_time_until_the_finish():
+    late = {"slack_s": [[-3600.0, 0.0, -3600.0]], "value": [1.0, 1.0, 4.0]}
+    cost = thermal(fleet([[1.0, 1.0, 1.0]], **late))[0]
+    assert cost[2] < cost[0] < cost[1]
+    one, two = fleet([[9.0, 0.0], [0.0, 0.0]], duration_s=[[5.0, 7.0], [5.0, 7.0]])
+    assert quickest([one, replace(two, busy_s=np.float32(10.0))]).tolist() == [[5.0, 7.0], [15.0, 17.0]]
+
+
+@pytest.mark.parametrize("cost", COSTS.values(), ids=COSTS)
+@examples(150)
+@given(data=st.data())
+def test_every_cost_is_infinite_exactly_where_an_arm_may_not_claim(cost, data):
+    arms, jobs = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 4))
+
+    def table(values):
+        return np.array([[data.draw(values) for _ in range(jobs)] for _ in range(arms)], dtype=float)
+
+    some = fleet(
+        table(st.one_of(st.just(np.nan), st.floats(0, 7))),
+        p_saturation=table(st.floats(0, 1)),
+        duration_s=table(st.floats(0, 1e4)),
+        slack_s=table(st.floats(-1e4, 1e4)),
+    )
+    legal = table(st.integers(0, 1))
+    some = [
+        replace(seen, action_mask=np.pad(row, 1, constant_values=(1, 0)).astype(np.int8))
+        for seen, row in zip(some, legal, strict=True)
+    ]
+    matrix = cost(some)
+    assert not np.isnan(matrix).any()
+    assert (np.isposinf(matrix) == (legal == 0)).all()
+
+
+@examples(150)
+@given(st.lists(st.floats(0, 7), min_size=2, max_size=5), st.data())
+def test_more_risk_never_makes_an_arm_cheaper_than_before(difficulty, data):
+    p = data.draw(st.lists(st.floats(0, 0.5), min_size=len(difficulty), max_size=len(difficulty)))
+    before = thermal(fleet([[d] for d in difficulty], p_saturation=[[x] for x in p]))[:, 0]
+    p[0] += data.draw(st.floats(0, 0.5))
+    after = thermal(fleet([[d] for d in difficulty], p_saturation=[[x] for x in p]))[:, 0]
+    assert (after[0] - after[1:] >= before[0] - before[1:] - 1e-8).all()
+
+
+def test_the_arm_that_would_get_hot_does_not_get_the_job():
+    one_job = fleet([[1.0], [1.1]], p_saturation=[[0.9], [0.0]], duration_s=[[10.0], [20.0]])
+    seen = dict(zip("hc", one_job, strict=True))
+    for name in ("ssi", "matching"):
+        assert make_policy(name).act(seen) == {"h": 0, "c": 1}
+        assert make_policy(f"quickest_{name}").act(seen) == {"h": 1, "c": 0}
+
+
+def test_a_job_waits_for_the_arm_that_is_home_soon_and_finishes_it_first() -> None:
+    """A free arm needs 900 s; another one 100 s, once it is home."""
+    free, busy = fleet([[1.0], [1.0]], duration_s=[[900.0], [100.0]], value=[4.0], feasible=1.0, offered=1.0)
+    free, busy = replace(free, idle=np.array(1.0)), replace(busy, working=np.array(1.0))
+    none, stations = np.array([1, 0, 0], np.int8), np.ones(1)
+
+    def claim(name: str, busy_s: float, station_free=stations, **changes) -> dict[str, int]:
+        other = replace(busy, action_mask=none, busy_s=np.array(busy_s), station_free=station_free, **changes)
+        return make_policy(name).act({"free": free, "busy": other})
+
+    assert claim("wsept_ahead", 60.0) == {"free": 0, "busy": 0}
+    assert claim("wsept_ahead", 900.0) == {"free": 1, "busy": 0}
+    assert claim("wsept_ahead", 60.0, duration_s=np.array([850.0])) == {"free": 1, "busy": 0}
+    assert claim("wsept_ahead", 60.0, np.zeros(1)) == {"free": 1, "busy": 0}
+    assert claim("wsept", 60.0) == {"free": 1, "busy": 0}
+    # Late by 2 min, a job of value 4 costs 0.13 of difficulty: 0.8 is still better than 1, 0.9 is not.
+    late = {"slack_s": np.zeros(1), "duration_s": np.array([900.0])}
+    assert claim("matching_ahead", 120.0, difficulty=np.array([0.8]), **late) == {"free": 0, "busy": 0}
+    assert claim("matching_ahead", 120.0, difficulty=np.array([0.9]), **late) == {"free": 1, "busy": 0}
+
+
+@pytest.mark.parametrize("name", [name for name, rule in RULES.items() if rule.scope == "central" and not rule.plans])
+@examples(25)
+@given(seed=st.integers(0, 2**32))
+def test_a_central_policy_reads_no_messages(name, seed):
+    rng, layout = np.random.default_rng(seed), Layout(3, 4)
+    mask = np.pad(rng.integers(0, 2, (3, 4)), ((0, 0), (1, 1)), constant_values=((0, 0), (1, 0))).astype(np.int8)
+    low, high = layout.bounds
+    vectors = rng.uniform(np.maximum(low, -100.0), np.minimum(high, 100.0), (2, 3, layout.size)).astype(np.float32)
+    first = [layout.read(vectors[0, arm], mask[arm]) for arm in range(3)]
+    other = [layout.read(vectors[1, arm], mask[arm]) for arm in range(3)]
+    told = [
+        replace(one, **{field: value for field, value in vars(two).items() if field.startswith("peer_")})
+        for one, two in zip(first, other, strict=True)
+    ]
+    named = [dict(zip("abc", seen, strict=True)) for seen in (first, told)]
+    assert make_policy(name).act(named[0]) == make_policy(name).act(named[1])
 
 
 def total(benefit: np.ndarray, pairs) -> float:
@@ -39,3 +241,124 @@ def test_nothing_is_given_where_nothing_gains_and_epsilon_must_be_positive() -> 
     assert auction(np.zeros((2, 3)), 0.1) == auction(np.full((2, 1), -1.0), 0.1) == auction(np.zeros((2, 0)), 0.1) == []
     with pytest.raises(ValueError, match="epsilon must be > 0"):
         auction(np.ones((1, 1)), 0.0)
+
+
+FEW = st.sampled_from([0.0, 0.5, 1.0, 1.5, 2.0, np.inf])
+MANY = st.floats(-7, 7) | st.just(np.inf)
+
+
+@st.composite
+def auctions(draw, bids=FEW, connected: bool = True) -> tuple[np.ndarray, nx.Graph]:
+    """Costs [arm, job] and an undirected graph over the arms."""
+    arms, jobs = draw(st.integers(1, 7)), draw(st.integers(0, 6))
+    cost = np.array(draw(st.lists(bids, min_size=arms * jobs, max_size=arms * jobs)), dtype=float).reshape(arms, jobs)
+    graph = nx.Graph()
+    graph.add_nodes_from(range(arms))
+    if connected:  # a random tree, and some more
+        graph.add_edges_from((a, draw(st.integers(0, a - 1))) for a in range(1, arms))
+    pairs = st.tuples(st.integers(0, arms - 1), st.integers(0, arms - 1)).filter(lambda pair: pair[0] != pair[1])
+    if arms > 1:
+        graph.add_edges_from(draw(st.lists(pairs, max_size=arms)))
+    return cost, graph
+
+
+def greedy(cost: np.ndarray, arms: list[int]) -> dict[int, int]:
+    """The cheapest pair first, among these arms; ties: the first job, then the first arm."""
+    pairs = sorted((cost[a, j], j, a) for a in arms for j in range(cost.shape[1]) if np.isfinite(cost[a, j]))
+    claims: dict[int, int] = {}
+    for _, job, arm in pairs:
+        if arm not in claims and job not in claims.values():
+            claims[arm] = job
+    return {arm: claims.get(arm, NOBODY) for arm in arms}
+
+
+def matrix(graph: nx.Graph) -> np.ndarray:
+    return nx.to_numpy_array(graph, nodelist=sorted(graph), dtype=bool).T
+
+
+@examples(300)
+@given(auctions())
+def test_connected_arms_agree_in_time_without_conflict_on_what_the_greedy_one_would_choose(auction):
+    """Choi, Brunet & How 2009: theorem 1 (rounds, agreement) and its corollary (the sequential greedy outcome)."""
+    cost, graph = auction
+    arms, jobs = cost.shape
+    found = agree(cost, matrix(graph))
+    claims = found.claims.tolist()
+    assert dict(enumerate(claims)) == greedy(cost, list(range(arms)))
+    assert found.rounds <= max(1, nx.diameter(graph)) * min(arms, jobs)
+    assert (found.belief.winner == found.belief.winner[0]).all()  # everybody knows who does what
+    assert (found.belief.cost == found.belief.cost[0]).all()
+    taken = [job for job in claims if job != NOBODY]
+    assert len(taken) == len(set(taken))
+    assert all(np.isfinite(cost[arm, job]) for arm, job in enumerate(claims) if job != NOBODY)
+
+
+@given(auctions(connected=False))
+def test_each_part_of_a_broken_graph_agrees_as_if_the_others_were_not(auction):
+    cost, graph = auction
+    found = agree(cost, matrix(graph))
+    for part in nx.connected_components(graph):
+        members = sorted(part)
+        assert {arm: int(found.claims[arm]) for arm in members} == greedy(cost, members)
+        assert (found.belief.winner[members] == found.belief.winner[members[0]]).all()
+
+
+@given(auctions(bids=MANY), st.randoms(use_true_random=False))
+def test_relabelling_arms_and_jobs_relabels_the_outcome(auction, random):
+    cost, graph = auction
+    finite = cost[np.isfinite(cost)]
+    if len(set(finite.tolist())) < finite.size:
+        return  # ties are settled by place
+    arms, jobs = cost.shape
+    of_arm, of_job = random.sample(range(arms), arms), random.sample(range(jobs), jobs)
+    moved = agree(cost[np.ix_(of_arm, of_job)], matrix(graph)[np.ix_(of_arm, of_arm)]).claims
+    plain = agree(cost, matrix(graph)).claims
+    for new, old in enumerate(of_arm):
+        assert plain[old] == (of_job[moved[new]] if moved[new] != NOBODY else NOBODY)
+
+
+@given(auctions(connected=False), st.data())
+def test_links_that_carry_one_way_come_to_an_end_and_strong_ones_agree(auction, data):
+    cost, graph = auction
+    one_way = nx.DiGraph(graph.to_directed())
+    one_way.remove_edges_from([edge for edge in list(one_way.edges()) if data.draw(st.booleans())])
+    found = agree(cost, matrix(one_way))
+    for part in nx.strongly_connected_components(one_way):
+        members = sorted(part)
+        assert (found.belief.winner[members] == found.belief.winner[members[0]]).all()
+
+
+def test_news_must_cross_the_line():
+    """The first arm is best at everything, so the last one cannot know before that word went all the way."""
+    arms = 6
+    cost = np.add.outer(np.arange(arms, dtype=float), 10.0 * np.arange(2))
+    found = agree(cost, matrix(nx.path_graph(arms)))
+    assert found.claims.tolist() == [0, 1, *[NOBODY] * 4]
+    assert arms - 1 <= found.rounds <= 2 * (arms - 1)
+
+
+def test_a_round_by_hand():
+    """Two arms hear each other; both want job 0 most. The cheaper keeps it, the other bids for its next."""
+    cost = np.array([[3.0, 5.0], [2.0, 9.0]])
+    nothing = Belief(np.full((2, 2), np.inf), np.full((2, 2), NOBODY))
+    said = bid(nothing, cost, np.arange(2))
+    assert said.cost.tolist() == [[3.0, np.inf], [2.0, np.inf]]
+    assert said.winner.tolist() == [[0, NOBODY], [1, NOBODY]]
+    told = merge(said)  # one of the two, who heard both
+    assert (told.cost.tolist(), told.winner.tolist()) == ([2.0, np.inf], [1, NOBODY])
+    outbid = bid(told, cost[0], 0)
+    assert (outbid.cost.tolist(), outbid.winner.tolist()) == ([2.0, 5.0], [1, 0])
+    kept = bid(told, cost[1], 1)
+    assert (kept.cost.tolist(), kept.winner.tolist()) == ([2.0, np.inf], [1, NOBODY])
+
+
+def test_the_edges_of_a_directed_graph_carry_from_tail_to_head():
+    cost = np.array([[1.0, 5.0], [2.0, 2.0]])
+    assert agree(cost, matrix(nx.DiGraph([(0, 1)]))).claims.tolist() == [0, 1]
+    assert agree(cost, matrix(nx.DiGraph([(1, 0)]))).claims.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("cost", [[[]], [[], []], [[np.inf], [1.0]]])
+def test_arms_that_can_do_nothing_claim_nothing(cost):
+    claims = agree(np.array(cost), np.ones((len(cost), len(cost)), bool)).claims.tolist()
+    assert claims == [0 if row == [1.0] else NOBODY for row in cost]

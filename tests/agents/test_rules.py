@@ -1,8 +1,9 @@
-"""The dispatching rules: each does what its name says, and none ever claims what it may not."""
+"""Dispatching rules: each does what its name says, and a theorem says where one is the best."""
 
 import pickle
 from dataclasses import replace
 from fractions import Fraction
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy import stats
 
 from agents.policy import WAIT, EveryArm, for_all_arms, legal_options, only_choices
 from agents.registry import RULES, make_policy
-from agents.rules import LeastDifficulty, RandomLegal
+from agents.rules import LeastDifficulty, RandomLegal, Wspt, WsptCool
 from fleet.env.allocation_v1 import parallel_env
 from fleet.observation import LONG_S, Layout, Observation
 from tests.profiles import examples
@@ -181,10 +182,11 @@ def test_random_is_uniform_over_what_is_legal() -> None:
 # least_difficulty
 
 
-def test_least_difficulty_takes_the_pair_with_most_advantage_first() -> None:
+def test_least_difficulty_takes_the_pair_with_most_advantage_first_ties_by_age_and_place() -> None:
     # Arm 1 finds both easier, but slot 2 by more; against the average that is -1.25, its slot 1 -0.5.
     assert act("least_difficulty", fleet([[2.0, 3.0], [1.0, 0.5]])) == [[1, 2]]
     assert act("least_difficulty", fleet([[2.0], [1.9], [2.1]])) == [[0, 1, 0]]
+    assert act("least_difficulty", fleet([[1.0, 1.0, 1.0]] * 3)) == [[1, 2, 3]]
 
 
 def test_least_difficulty_does_not_starve_work_that_is_new_to_everybody() -> None:
@@ -192,22 +194,18 @@ def test_least_difficulty_does_not_starve_work_that_is_new_to_everybody() -> Non
     assert act("least_difficulty", fleet([[5.0, 1.0], [5.0, 0.5]], free=[1, 0])) == [[1, 0]]
 
 
-def test_least_difficulty_leaves_nothing_to_a_peer_that_is_at_work() -> None:
+def test_least_difficulty_leaves_nothing_to_who_is_at_work_and_waits_for_no_station() -> None:
     assert act("least_difficulty", fleet([[2.0], [1.0]], free=[1, 0])) == [[1, 0]]
-
-
-def test_least_difficulty_does_not_wait_for_a_station() -> None:
     # The older job is easiest for arm 0, but its station is busy.
     assert act("least_difficulty", fleet([[0.1, 2.0], [0.2, 3.0]], mask=[[0, 1], [0, 1]])) == [[2, 0]]
 
 
-def test_least_difficulty_settles_ties_by_age_and_place_in_the_fleet() -> None:
-    assert act("least_difficulty", fleet([[1.0, 1.0, 1.0]] * 3)) == [[1, 2, 3]]
-
-
-def test_least_difficulty_without_any_score_hands_out_the_oldest_in_order() -> None:
+def test_without_any_score_the_oldest_are_handed_out_in_order() -> None:
     assert act("least_difficulty", fleet([[np.nan, np.nan]])) == [[1]]
     assert act("least_difficulty", fleet([[np.nan, np.nan]] * 2)) == [[1, 2]]
+    assert act("consensus", fleet([[np.nan, np.nan]] * 2)) == [[1, 2]]
+    # A job without a score comes after all that have one.
+    assert act("consensus", fleet([[np.nan, 5.0], [np.nan, 0.0]], free=[1, 0])) == [[2, 0]]
 
 
 @pytest.mark.parametrize("name", ["least_difficulty", "consensus"])
@@ -282,12 +280,6 @@ def test_consensus_lets_every_arm_bid_for_itself_where_words_are_late() -> None:
     assert act("consensus", late) == [[1, 1, 1]]
 
 
-def test_consensus_without_any_score_hands_out_the_oldest_in_order() -> None:
-    assert act("consensus", fleet([[np.nan, np.nan]] * 2)) == [[1, 2]]
-    # A job without a score comes after all that have one.
-    assert act("consensus", fleet([[np.nan, 5.0], [np.nan, 0.0]], free=[1, 0])) == [[2, 0]]
-
-
 @examples(100)
 @given(st.data())
 def test_consensus_gives_no_job_twice_on_any_connected_graph(data) -> None:
@@ -298,3 +290,132 @@ def test_consensus_gives_no_job_twice_on_any_connected_graph(data) -> None:
     (actions,) = act("consensus", cut(fleet(d), links))
     claims = [action for action in actions if action]
     assert len(claims) == len(set(claims)) == min(arms, slots)
+
+
+def seen(value, duration_s, p, mask) -> dict[str, Observation]:
+    arms, slots = np.shape(value)
+    layout = Layout(arms, slots)
+    blank = layout.read(np.zeros(layout.size, np.float32), np.zeros(slots + 2, np.int8))
+    return {
+        f"arm_{a}": replace(
+            blank,
+            value=np.array(value[a], dtype=float),
+            duration_s=np.array(duration_s[a], dtype=float),
+            p_saturation=np.array(p[a], dtype=float),
+            action_mask=np.pad(mask[a], 1, constant_values=(1, 0)).astype(np.int8),
+        )
+        for a in range(arms)
+    }
+
+
+def test_value_per_time_decides_and_each_job_goes_once() -> None:
+    everything = seen([[2, 3], [2, 3]], [[60, 300], [100, 100]], np.zeros((2, 2)), np.ones((2, 2)))
+    assert Wspt().act(everything) == {"arm_0": 1, "arm_1": 2}
+
+
+def test_the_careful_one_rests_where_it_would_run_warm() -> None:
+    warm = seen([[9, 1]], [[60, 60]], [[0.51, 0.5]], [[1, 1]])
+    assert Wspt().act(warm) == {"arm_0": 1}
+    assert WsptCool().act(warm) == {"arm_0": 2}
+    assert WsptCool().act(seen([[9]], [[60]], [[0.9]], [[1]])) == {"arm_0": 0}
+
+
+@examples(60)
+@given(data=st.data(), arms=st.integers(1, 3), slots=st.integers(1, 3))
+def test_no_other_first_pair_is_worth_more(data, arms, slots) -> None:
+    def draw(low, high):
+        return np.array(data.draw(st.lists(st.integers(low, high), min_size=arms * slots, max_size=arms * slots)))
+
+    value, duration_s = draw(1, 9).reshape(arms, slots), 30 * draw(1, 9).reshape(arms, slots)
+    mask = draw(0, 1).reshape(arms, slots)
+    actions = list(Wspt().act(seen(value, duration_s, np.zeros((arms, slots)), mask)).values())
+    claimed = [(a, k - 1) for a, k in enumerate(actions) if k]
+    assert all(mask[a, k] for a, k in claimed)
+    assert len({k for _, k in claimed}) == len(claimed)
+    rate = np.where(mask, value / duration_s, -1.0)
+    if mask.any():
+        assert max(rate[a, k] for a, k in claimed) == rate.max()
+    waiting = [a for a in range(arms) if not actions[a]]
+    left = [k for k in range(slots) if k not in {k for _, k in claimed}]
+    assert not mask[np.ix_(waiting, left)].any()  # nothing is left lying that a waiting arm could do
+
+
+def queue(duration_s, due_s, value, now_s: float = 0.0, **fields) -> Observation:
+    """What a free arm knows that may claim every job of a queue, the oldest first."""
+    d = np.array(duration_s, dtype=float)
+    layout = Layout(1, len(d))
+    blank = layout.read(np.zeros(layout.size, np.float32), np.array([1] * (len(d) + 1) + [0], np.int8))
+    known = {"duration_s": d, "slack_s": np.array(due_s) - now_s - d, "value": np.array(value, dtype=float)}
+    return replace(blank, offered=np.ones(len(d)), feasible=np.ones(len(d)), **known, **fields)
+
+
+def sequence(name: str, duration_s, due_s, value) -> list[int]:
+    """Jobs in the order in which one arm does them by a rule."""
+    policy, left, done, now_s = make_policy(name), list(range(len(duration_s))), [], 0.0
+    while left:
+        durations, dues, values = ([row[job] for job in left] for row in (duration_s, due_s, value))
+        seen = queue(durations, dues, values, now_s)
+        done.append(left.pop(policy.act({"arm": seen})["arm"] - 1))
+        now_s += duration_s[done[-1]]
+    return done
+
+
+def finish_s(order, duration_s) -> np.ndarray:
+    return np.cumsum([duration_s[job] for job in order])
+
+
+jobs = st.lists(st.tuples(st.integers(1, 900), st.integers(1, 3000), st.integers(1, 9)), min_size=1, max_size=5)
+
+
+@examples(60)
+@given(jobs)
+def test_on_one_arm_each_rule_is_the_best_of_all_sequences_for_its_criterion(drawn) -> None:
+    """Smith 1956: spt for the sum of finish times, wspt for the weighted one. Jackson 1955: edd for the lateness."""
+    duration_s, due_s, value = (list(row) for row in zip(*drawn, strict=True))
+
+    def total(order) -> float:
+        return float(finish_s(order, duration_s).sum())
+
+    def weighted(order) -> float:
+        return float(finish_s(order, duration_s) @ [value[job] for job in order])
+
+    def lateness(order) -> float:
+        return float((finish_s(order, duration_s) - [due_s[job] for job in order]).max())
+
+    every = list(permutations(range(len(drawn))))
+    for name, criterion in (("spt", total), ("wspt", weighted), ("edd", lateness)):
+        assert criterion(sequence(name, duration_s, due_s, value)) == pytest.approx(min(map(criterion, every)))
+    assert sequence("fifo", duration_s, due_s, value) == list(range(len(drawn)))
+
+
+@examples(60)
+@given(jobs)
+def test_atc_is_wspt_when_everything_is_late_and_least_slack_when_all_else_is_equal(drawn) -> None:
+    duration_s, due_s, value = (np.array(row, dtype=float) for row in zip(*drawn, strict=True))
+    late = queue(duration_s, np.zeros(len(drawn)), value)
+    assert make_policy("atc").act({"a": late}) == make_policy("wspt").act({"a": late})
+    alike = queue(np.full(len(drawn), 500.0), due_s + 500.0, np.ones(len(drawn)))
+    assert make_policy("atc").act({"a": alike})["a"] - 1 == int(due_s.argmin())
+
+
+def test_the_quicker_arm_gets_the_job_of_fifo_and_edd_and_spt() -> None:
+    slow, quick = queue([600.0, 300.0], [9e3, 9e3], [1, 1]), queue([500.0, 400.0], [9e3, 9e3], [1, 1])
+    for name in ("fifo", "edd"):
+        assert make_policy(name).act({"slow": slow, "quick": quick}) == {"slow": 2, "quick": 1}
+    assert make_policy("spt").act({"slow": slow, "quick": quick}) == {"slow": 2, "quick": 1}
+
+
+def test_the_arm_with_less_work_gets_the_next_job_and_a_lost_claim_is_no_work() -> None:
+    long, short = queue([900.0], [9e3], [1]), queue([100.0], [9e3], [1])
+    nothing = replace(long, action_mask=np.array([1, 0, 0], np.int8))
+    policy = make_policy("least_loaded")
+    assert policy.act({"a": long, "b": nothing}) == {"a": 1, "b": 0}
+    assert [policy.act({"a": short, "b": short}) for _ in range(2)] == [{"a": 0, "b": 1}] * 2
+    assert policy.act({"a": long, "b": nothing}) == {"a": 1, "b": 0}
+    lost = replace(short, last_award=np.array(-1.0))
+    assert policy.act({"a": lost, "b": nothing}) == {"a": 1, "b": 0}  # 900 s, and 100 s of this claim
+    policy.act({"a": lost, "b": nothing})  # and once more lost, then nobody may claim
+    assert policy.act({"a": replace(nothing, last_award=np.array(-1.0)), "b": nothing}) == {"a": 0, "b": 0}
+    assert policy.act({"a": short, "b": nothing}) == {"a": 1, "b": 0}
+    many = [policy.act({"a": short, "b": short}) for _ in range(9)]
+    assert [claims["b"] for claims in many] == [1] * 8 + [0]  # from 200 s to 1000 s, which is equal: the first arm

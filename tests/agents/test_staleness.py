@@ -67,10 +67,7 @@ def test_advantage_is_against_the_average_by_weight_and_fades_with_it():
     np.testing.assert_allclose(found[:, 0], [1.0 - average, (4.0 - average) / math.e])
 
 
-@given(
-    st.lists(st.floats(0, 7) | st.just(np.nan), min_size=4, max_size=4),
-    st.floats(1, 1e6),
-)
+@given(st.lists(st.floats(0, 7) | st.just(np.nan), min_size=4, max_size=4), st.floats(1, 1e6))
 def test_at_age_zero_every_trust_is_the_same_to_the_last_bit(told, fading_s):
     seen = heard(told[:2], [told[2:]], [0.0])
     slots = np.array([True, True])

@@ -1,12 +1,25 @@
-"""Messages: what is said arrives to the last bit, and what is no number is refused on both ends."""
+"""Keys, messages and their documents: what is built is parsed back to the last bit, and rubbish is refused."""
 
+import ast
+import copy
 import json
 import math
+import re
+from pathlib import Path
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
 
+from docs.tables import fill_tables, main
+from fleet.bus.client import BusClient
+from fleet.bus.protocol import auction as trade
+from fleet.bus.protocol import keys, messages
+from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.contract import EXAMPLES, asyncapi, descriptions, schema_document
+from fleet.bus.protocol.keys import ASKED, NAMELESS, TOPICS, Key
 from fleet.bus.protocol.messages import (
     DifficultyScores,
     Info,
@@ -19,7 +32,183 @@ from fleet.bus.protocol.messages import (
     schema,
 )
 from fleet.bus.protocol.operator import ControlRequest
-from fleet.errors import BusError
+from fleet.bus.protocol.registry import CHANNELS, channel_of
+from fleet.errors import BusError, is_name
+from fleet.events import EVENT_KINDS, MEANINGS
+from fleet.live.arm.body import _REPORTED
+from scenarios.live.recording import MESSAGES
+
+chunks = st.text(st.characters(exclude_categories=["Cs", "Cc", "Cf"]), min_size=1, max_size=30).filter(is_name)
+wild = st.sampled_from(["*", "**", "@", "@v1", "a b", "$*", "?", "#", "%", "%2F", "ä", "机", "a.b", "a.."])
+PLACES = [(role, topic) for role, topics in TOPICS.items() for topic in topics]
+
+
+def keys_at(places: list[tuple[str, str]]) -> st.SearchStrategy[Key]:
+    """Keys of some roles and topics."""
+    return st.sampled_from(places).flatmap(
+        lambda place: st.builds(
+            Key,
+            fleet=chunks | wild,
+            role=st.just(place[0]),
+            name=st.just("") if place[0] in NAMELESS else chunks | wild,
+            topic=st.just(place[1]),
+            asker=chunks | wild if place[1] in ASKED else st.just(""),
+        )
+    )
+
+
+concrete = keys_at(PLACES)
+
+
+@given(concrete)
+def test_a_parsed_key_is_the_key_that_was_built(key):
+    assert keys.parse(str(key)) == key
+
+
+@given(concrete)
+def test_every_chunk_is_legal_and_visible_to_wildcards(key):
+    chunks = str(key).split("/")
+    assert all(chunks)
+    assert not any(chunk.startswith("@") for chunk in chunks)
+    assert not set("*$?#@ ") & set(str(key))
+    assert str(key).isascii()
+
+
+@given(concrete, concrete)
+def test_different_names_have_different_keys(one, other):
+    assert (str(one) == str(other)) == (one == other)
+
+
+@given(concrete, concrete)
+def test_all_of_one_is_what_it_says_and_no_word_of_another(one, other):
+    """Zenoh itself is asked what the key expressions include."""
+    own = zenoh.KeyExpr(keys.all_of(one.fleet, one.role, one.name))
+    assert own.includes(str(one))
+    assert own.includes(str(other)) == ((one.fleet, one.role, one.name) == (other.fleet, other.role, other.name))
+    assert zenoh.KeyExpr(keys.all_of_fleet(one.fleet)).includes(str(other)) == (one.fleet == other.fleet)
+    assert zenoh.KeyExpr(keys.STATES).includes(str(one)) == ((one.role, one.topic) == ("arm", "state"))
+    cache = f"{one}/@adv/pub/1/2"
+    assert not own.includes(cache)
+    assert zenoh.KeyExpr(keys.caches_of(str(own))).includes(cache)
+
+
+@pytest.mark.parametrize(
+    ("built", "written"),
+    [
+        (keys.of_arm("f", "arm_0", "state"), "thermofleet/v4/f/arm/arm_0/state"),
+        (keys.of_arm("hall 2", "a+b", "alive"), "thermofleet/v4/hall%202/arm/a%2Bb/alive"),
+        (keys.of_every_arm("x", "difficulty"), "thermofleet/v4/x/arm/*/difficulty"),
+        (keys.of_auction("f", "@boss", "announce"), "thermofleet/v4/f/auction/%40boss/announce"),
+        (keys.of_jobs("f", "submit"), "thermofleet/v4/f/jobs/submit"),
+        (keys.of_clock("f"), "thermofleet/v4/f/clock/now"),
+        (keys.of_every_auction("f", "result"), "thermofleet/v4/f/auction/*/result"),
+        (keys.asked_by("f", "a", "lease", "arm 1&b"), "thermofleet/v4/f/auction/a/lease/arm%201%26b"),
+        (keys.asked_by_every_arm("f", "x", "report"), "thermofleet/v4/f/auction/x/report/*"),
+        (keys.asked_of_all("f", "report", "x"), "thermofleet/v4/f/auction/*/report/x"),
+        (keys.asked_by("f", "a", "claim", "arm 1&b"), "thermofleet/v4/f/arm/a/claim/arm%201%26b"),
+        (keys.asked_by_every_arm("f", "x", "claim"), "thermofleet/v4/f/arm/x/claim/*"),
+        (keys.asked_of_all("f", "claim", "x"), "thermofleet/v4/f/arm/*/claim/x"),
+    ],
+)
+def test_keys_are_written_as_the_design_says(built, written):
+    assert built == written
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "thermofleet/v4",
+        "thermofleet/v1/f/arm/a/state",
+        "other/v4/f/arm/a/state",
+        "thermofleet/v4/f/arm/*/state",
+        "thermofleet/v4/**",
+        "thermofleet/v4/f/arm//state",
+        "thermofleet/v4//arm/a/state",
+        "thermofleet/v4/f/arm/a/state/x",
+        "thermofleet/v4/f/arm/a/announce",
+        "thermofleet/v4/f/auction/a/state",
+        "thermofleet/v4/f/auction/a/lease",
+        "thermofleet/v4/f/auction/a/lease/",
+        "thermofleet/v4/f/auction/a/lease/*",
+        "thermofleet/v4/f/auction/a/lease/%61",
+        "thermofleet/v4/f/auction/a/lease/x/y",
+        "thermofleet/v4/f/auction/a/result/x",
+        "thermofleet/v4/f/arm/a/lease/x",
+        "thermofleet/v4/f/arm/a/claim",
+        "thermofleet/v4/f/auction/a/claim/x",
+        "thermofleet/v4/f/jobs/a/lease/x",
+        "thermofleet/v4/f/jobs/a/submit",
+        "thermofleet/v4/f/arm/state",
+        "thermofleet/v4/f/robot/a/state",
+        "thermofleet/v4/f/arm/a%zz/state",
+        "thermofleet/v4/f/arm/%ff/state",
+        "thermofleet/v4/f/arm/a b/state",
+        "thermofleet/v4/f/arm/%61/state",
+        "thermofleet/v4/f/arm/a%2f/state",
+        "thermofleet/v4/@f/arm/a/state",
+    ],
+)
+def test_what_is_no_concrete_key_is_refused(text):
+    with pytest.raises(ValueError, match=re.escape(f"'{text}'")):
+        keys.parse(text)
+
+
+@given(keys_at([place for place in PLACES if place[1] in ASKED]))
+def test_an_answer_goes_under_the_key_of_the_one_who_asked(key):
+    everybody = keys.asked_by_every_arm(key.fleet, key.name, key.topic)
+    assert zenoh.KeyExpr(everybody).includes(str(key))
+    assert keys.answered(everybody, str(key)) == str(key)
+    assert keys.answered(everybody, keys.asked_of_all(key.fleet, key.topic, key.asker)) == str(key)
+    assert keys.answered("any/concrete/key", str(key)) == "any/concrete/key"
+
+
+@pytest.mark.parametrize(
+    "asked", ["auction/a/lease/*", "auction/a/lease/%61", "auction/a/**", "**", "auction/a/lease/$*"]
+)
+def test_who_asks_as_nobody_is_not_answered(asked):
+    with pytest.raises(ValueError, match=r"no key of this bus|not written|no such place"):
+        keys.answered(keys.asked_by_every_arm("f", "a", "lease"), f"thermofleet/v4/f/{asked}")
+
+
+def test_nobody_speaks_for_another_arm_and_only_what_an_arm_asks_as_itself_ends_in_its_name():
+    with pytest.raises(ValueError, match=r"Keys of 'result' do not end in a querier's name \(got 'x'\)"):
+        str(Key("f", "auction", "a", "result", "x"))
+    with pytest.raises(ValueError, match="must have 1 to 128"):
+        str(Key("f", "auction", "a", "lease"))
+    with pytest.raises(MalformedMessage, match="'arm_1' claims to be by 'arm_0'"):
+        received(State, encode(STATE), "arm_1")
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_parsed_or_refused(text):
+    try:
+        key = keys.parse(text)
+    except ValueError:
+        return
+    assert str(key) == text
+
+
+@pytest.mark.parametrize("name", ["", "\ud800", "a/b", "..", "a\u202eb", "a\nb", "x" * 129])
+def test_names_that_cannot_be_written_are_refused(name):
+    with pytest.raises(ValueError, match="name"):
+        keys.of_arm("f", name, "state")
+    with pytest.raises(ValueError, match="name"):
+        keys.of_auction(name, "a", "result")
+
+
+def test_a_key_that_was_read_before_is_not_taken_apart_again_unless_it_is_very_long():
+    short, long = (keys.of_arm("f", name, "state") for name in ("arm_0", "机" * 100))
+    assert keys.parse(short) is keys.parse(short)
+    assert keys.parse(long) == keys.parse(long)
+    assert keys.parse(long) is not keys.parse(long)
+
+
+def test_many_keys_fill_no_memory():
+    for i in range(2 * keys.MAX_CACHED):
+        keys.parse(keys.of_arm("f", f"arm_{i}", "state"))
+    assert keys._parse_cached.cache_info().currsize == keys.MAX_CACHED
+
 
 numbers = st.floats(-1e12, 1e12)
 names = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12)
@@ -43,7 +232,6 @@ def difficulty_words(draw):
 
 
 infos = st.builds(Info, arm=names, joints=st.integers(1, 9), twin=names)
-
 STATE = State("arm_0", 3, 30.0, "working", (41.5, 40.0), 18.5)
 WORD = DifficultyScores("arm_0", 3, 30.0, "twin-1", ("a", "b"), (0.25, None), (None, 1e-300))
 
@@ -132,11 +320,6 @@ def test_a_malformed_difficulty_is_refused(payload):
         received(DifficultyScores, payload, "arm_0")
 
 
-def test_nobody_speaks_for_another_arm():
-    with pytest.raises(MalformedMessage, match="'arm_1' claims to be by 'arm_0'"):
-        received(State, encode(STATE), "arm_1")
-
-
 def test_a_malformed_message_is_a_bus_error_and_a_value_error():
     assert issubclass(MalformedMessage, BusError)
     assert issubclass(MalformedMessage, ValueError)
@@ -161,3 +344,255 @@ def test_the_arm_of_a_pause_has_the_bounds_of_a_name(action, arm):
     request = {"request": "1", "action": {"action": action, "arm": arm}}
     with pytest.raises(MalformedMessage, match="length"):
         decode(ControlRequest, json.dumps(request).encode())
+
+
+ROOT = Path(__file__).parents[2]
+DOCUMENT = schema_document()
+VALIDATORS = {
+    word: Draft202012Validator({"$ref": f"#/$defs/{word.__name__}", "$defs": DOCUMENT["$defs"]}) for word in MESSAGES
+}
+
+NAMED = [pytest.param(word, id=word.__name__) for word in MESSAGES]
+JUNK = st.sampled_from([None, True, -1, 0, 2.5, "", "x", [], [0.5], [""], {}, 10**9, "idle"])
+
+
+def example(word):
+    """The specimen of a word as plain JSON values."""
+    return json.loads(messages.encode(EXAMPLES[word]))
+
+
+def refused(word, value) -> str:
+    """Why the struct refuses a value: "" if it does not, "schema" for its types and bounds, "rule" for any other."""
+    try:
+        messages.decode(word, json.dumps(value).encode())
+    except MalformedMessage as error:
+        by_rule = isinstance(error.__cause__, BaseException) and isinstance(error.__cause__.__cause__, ValueError)
+        return "rule" if by_rule and " must be between " not in str(error) else "schema"
+    return ""
+
+
+def places(value, path=()):
+    """Paths to every field and item of a JSON value."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, part in items:
+        yield (*path, name)
+        yield from places(part, (*path, name))
+
+
+def test_every_key_of_the_bus_is_in_the_contract():
+    topics = {(role, topic) for role, all_topics in keys.TOPICS.items() for topic in all_topics}
+    assert {(channel.role, channel.topic) for channel in CHANNELS} == topics
+    assert len(CHANNELS) == len(topics)
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
+def test_an_address_filled_in_is_a_key(channel):
+    key = channel.address.format(fleet="f", arm="a", auctioneer="a", policy="a", peer="b")
+    parsed = keys.parse(key)
+    assert (parsed.role, parsed.topic) == (channel.role, channel.topic)
+
+
+def test_every_word_has_an_example():
+    assert set(EXAMPLES) == set(MESSAGES)
+
+
+def test_the_schemas_are_schemas():
+    Draft202012Validator.check_schema(DOCUMENT)
+
+
+@pytest.mark.parametrize("word", NAMED)
+def test_an_example_is_accepted_by_struct_and_schema(word):
+    for value in (example(word), {**example(word), "from a later version": 1}):
+        VALIDATORS[word].validate(value)
+        assert refused(word, value) == ""
+    assert messages.decode(word, messages.encode(EXAMPLES[word])) == EXAMPLES[word]
+
+
+@pytest.mark.parametrize("word", NAMED)
+@given(data=st.data())
+def test_struct_and_schema_refuse_the_same(word, data):
+    value = copy.deepcopy(example(word))
+    changes = data.draw(st.integers(1, 2))
+    for _ in range(changes):
+        all_places = list(places(value))
+        if not all_places:
+            break
+        *path, last = data.draw(st.sampled_from(all_places))
+        where = value
+        for name in path:
+            where = where[name]
+        if data.draw(st.booleans()):
+            where[last] = copy.deepcopy(data.draw(JUNK))
+        else:
+            del where[last]
+    why = refused(word, value)
+    if why != "rule":
+        assert VALIDATORS[word].is_valid(value) == (why == ""), (why, value)
+    elif changes == 1:  # two could break a rule and the schema
+        assert VALIDATORS[word].is_valid(value)
+
+
+@pytest.mark.parametrize(
+    ("word", "change"),
+    [
+        (messages.State, {"q": [0.0]}),
+        (messages.DifficultyScores, {"difficulty": [0.1]}),
+        (messages.DifficultyScores, {"jobs": ["twice", "twice"]}),
+        (JobSpec, {"places": ["one"]}),
+        (JobSpec, {"kind": "hold"}),
+        (JobSpec, {"release_s": 10.0, "due_s": 9.0}),
+    ],
+)
+def test_what_only_the_structs_refuse(word, change):
+    whole = example(trade.Submission)["jobs"][0] if word is JobSpec else example(word)
+    value = {**whole, **change}
+    assert Draft202012Validator({"$ref": f"#/$defs/{word.__name__}", "$defs": DOCUMENT["$defs"]}).is_valid(value)
+    assert refused(word, value) == "rule"
+
+
+@pytest.mark.parametrize("word", NAMED)
+def test_every_required_field_is_required_by_both(word):
+    for name in DOCUMENT["$defs"][word.__name__].get("required", ()):
+        value = {field: part for field, part in example(word).items() if field != name}
+        assert not VALIDATORS[word].is_valid(value)
+        assert refused(word, value) == "schema"
+
+
+def test_a_whole_number_written_with_a_point_is_the_one_known_difference():
+    """JSON schema takes 3.0 for an integer, the structs do not; docs/bus/messages.md says so."""
+    value = {**example(messages.State), "tick": 3.0}
+    assert VALIDATORS[messages.State].is_valid(value)
+    assert refused(messages.State, value) == "schema"
+    assert "`3`, not `3.0`" in (ROOT / "docs" / "bus" / "messages.md").read_text(encoding="utf-8")
+
+
+def test_fields_are_described_by_the_text_under_them():
+    assert descriptions(messages.State)["tau"] == "N·m at the joint output, [joint]."
+    assert descriptions(JobSpec)["payload_kg"].startswith("Carried from grasp to release")
+    assert descriptions(JobSpec)["release_s"] == "Earliest start, fleet time."
+
+
+def test_asyncapi_has_every_key_and_no_loose_end():
+    document = asyncapi()
+    assert [channel["address"] for channel in document["channels"].values()] == [c.address for c in CHANNELS]
+    for action in ("send", "receive"):  # both sides of every key with messages
+        done = [each["channel"]["$ref"] for each in document["operations"].values() if each["action"] == action]
+        assert done == [f"#/channels/{c.name}" for c in CHANNELS if c.message is not None]
+    assert "security" in document["servers"]["routerTls"]
+
+    def references(value):
+        if isinstance(value, dict):
+            if isinstance(value.get("$ref"), str):
+                yield value["$ref"]
+            for part in value.values():
+                yield from references(part)
+        elif isinstance(value, list):
+            for part in value:
+                yield from references(part)
+
+    for reference in set(references(document)):
+        where = document
+        for name in reference.removeprefix("#/").split("/"):
+            where = where[name]
+    for message in document["components"]["messages"].values():
+        schema = {"$ref": message["payload"]["$ref"], "components": document["components"]}
+        Draft202012Validator(schema).validate(message["examples"][0]["payload"])
+
+
+@pytest.mark.parametrize(
+    ("nodes", "role"),
+    [
+        (("arm/node", "consensus/node"), "arm"),
+        (("auction/node",), "auction"),
+    ],
+)
+def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
+    """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind)` and `link.reply_to(…)`."""
+    source = "\n".join((ROOT / "fleet" / "live" / f"{node}.py").read_text(encoding="utf-8") for node in nodes)
+    found = {}
+    for call in ast.walk(ast.parse(source)):
+        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and len(call.args) > 1):
+            continue
+        if call.func.attr in ("publisher", "reply_to") and isinstance(call.args[0], ast.Call):
+            key = ast.unparse(call.args[0])
+            topic = re.search(r"'(\w+)'\)$", key)
+            place = {"asked_by_every_arm": role}.get(key.split(".")[1].split("(")[0]) or key.split("of_")[1]
+            found[place.split("(")[0], topic[1] if topic else "now"] = ast.unparse(call.args[1])
+    expected = {
+        (channel.role, channel.topic): channel.message.__name__
+        for channel in CHANNELS
+        if channel.message is not None
+        # Where there is no auctioneer, arms reply to outsiders.
+        and (channel.sender == {"arm": "arm", "auction": "auctioneer"}[role] or channel.role in keys.NAMELESS)
+    }
+    assert found == expected
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
+def test_a_key_is_used_as_the_registry_says_or_not_at_all(channel):
+    key = channel.address.format(fleet="f", arm="a", auctioneer="a", policy="a", peer="b")
+    assert channel_of(key) is channel
+    assert channel_of(key.replace("/a/", "/*/")) is channel
+    client = BusClient("tcp/127.0.0.1:1", "f")
+    with pytest.raises(ValueError, match="is for"):
+        client.publisher(key, messages.Refusal)
+    with pytest.raises(ValueError, match="is for"):
+        client.subscribe(key, messages.Refusal, print)
+    with pytest.raises(ValueError, match="is for"):
+        client.reply_to(key, messages.Refusal, print)
+
+
+def test_no_binding_is_claimed_that_asyncapi_does_not_know():
+    assert '"bindings"' not in json.dumps(asyncapi())
+
+
+def test_the_committed_documents_are_current(capsys):
+    assert main(["--check"]) == 0
+    names = (
+        "schemas.json",
+        "asyncapi.json",
+        "messages.md",
+        "cli.md",
+        "env.md",
+        "leaderboard.md",
+        "paper.md",
+        "policies.md",
+    )
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in names)
+
+
+def test_stale_documents_are_named_and_made_anew(tmp_path, capsys):
+    docs = ["--docs", str(tmp_path)]
+    assert main([*docs, "--check"]) == 1
+    assert "schemas.json" in capsys.readouterr().out
+    assert not (tmp_path / "contract").exists()
+    (tmp_path / "bus.md").write_text("a\n<!-- made by docs/tables.py: patterns -->\nold\n<!-- end -->\nz\n")
+    assert main(docs) == 0
+    page = (tmp_path / "bus.md").read_text()
+    assert "old" not in page
+    assert page.startswith("a\n")
+    assert page.endswith("<!-- end -->\nz\n")
+    assert fill_tables(page) == page
+    assert main([*docs, "--check"]) == 0
+
+
+def test_every_kind_of_event_has_a_meaning_and_live_ones_are_those_that_arms_report():
+    live = {kind for kind, meaning in MEANINGS.items() if meaning.live}
+    assert tuple(MEANINGS) == EVENT_KINDS
+    assert live == {*_REPORTED, "award", "finish", "return"}
+    page = Path("docs/bus/messages.md").read_text(encoding="utf-8")
+    assert all(f"| `{kind}` | {meaning.text} | {meaning.value} |" in page for kind, meaning in MEANINGS.items())
+
+
+def test_the_table_of_a_job_has_the_unit_of_every_bounded_field():
+    page = Path("docs/bus/messages.md").read_text(encoding="utf-8")
+    rows = [line.split(" | ") for line in page.partition("### JobSpec")[2].partition("### ")[0].splitlines()]
+    units = {row[0].strip("| `"): row[2] for row in rows if len(row) == 5}
+    assert {name: units[name].strip() for name in ("payload_kg", "force_n", "dwell_s", "due_s", "value")} == {
+        "payload_kg": "kg",
+        "force_n": "N",
+        "dwell_s": "s",
+        "due_s": "s",
+        "value": "",
+    }

@@ -28,7 +28,6 @@ API = json.loads((CONTRACT / "asyncapi.json").read_text(encoding="utf-8"))
 SCHEMAS = json.loads((CONTRACT / "schemas.json").read_text(encoding="utf-8"))
 EXAMPLES = {name: message["examples"][0]["payload"] for name, message in API["components"]["messages"].items()}
 CHANNELS = {name: (channel["address"], channel["x-zenoh"]) for name, channel in API["channels"].items()}
-PUBLISHED = {name for name, (_, how) in CHANNELS.items() if how["pattern"] == "publish"}
 QUERIED = {name for name, (_, how) in CHANNELS.items() if how["pattern"] == "query"}
 ARM = {"arm_alive", "arm_state", "arm_info", "arm_difficulty"}
 """What a simulated shift has."""
@@ -141,7 +140,7 @@ class Outsider:
             encoding=encoding,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=2.0,
+            timeout=60.0,
         ):
             if reply.ok is not None:
                 key, said = str(reply.ok.key_expr), str(reply.ok.encoding)

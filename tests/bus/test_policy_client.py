@@ -253,7 +253,7 @@ def test_a_process_that_leaves_its_client_open_ends(router, served):
     code = f"""
 from fleet.live.policy_client import PolicyClient
 from tests.bus.test_policy_client import seen
-policy = PolicyClient("mine", fleet="f", endpoint="{router.endpoint}", limit_s=10.0)
+policy = PolicyClient("mine", fleet="f", endpoint="{router.endpoint}", limit_s=120.0)
 print(policy.act(seen()))
 """
     ended = subprocess.run(

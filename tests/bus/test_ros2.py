@@ -1,37 +1,355 @@
-"""A ROS 2 node over a real router: keys, tokens and attachments are those of rmw_zenoh.
-
-Its subscribers are played by bare Zenoh sessions, with rmw_zenoh's default settings; no ROS 2 runs here.
-"""
+"""Messages and a node of ROS 2, against decoders that are not ours and the keys of rmw_zenoh."""
 
 import json
+import math
 import queue
+import random
 import struct
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
+from pycdr2 import IdlStruct
+from pycdr2.types import float64, int32, sequence, uint8, uint32
+from rosbags.typesys import Stores, get_typestore
 from zenoh.ext import Int64, z_deserialize
 
+from fleet.bus.protocol.messages import DifficultyScores, MalformedMessage, State
 from fleet.bus.router import Router
 from fleet.errors import BusError
-from fleet.ros2.conversion import plain_name
-from fleet.ros2.node import (
-    NO_HASH,
-    Node,
-    Topic,
-    attachment,
-    gid,
-    node_token,
-    publisher_token,
+from fleet.robot import ThermalLimits
+from fleet.ros2.cdr import (
+    DIAGNOSTICS,
+    JOINT_STATE,
+    MAX_ITEMS,
+    SPARE_BYTES,
+    read_diagnostics,
+    read_joints,
+    type_hash,
+    write_diagnostics,
+    write_joints,
 )
+from fleet.ros2.conversion import (
+    ERROR,
+    OK,
+    STALE,
+    WARN,
+    Diagnostic,
+    Joints,
+    diagnostics_of,
+    in_order,
+    joint_names,
+    joints_of,
+    plain_name,
+    temperatures,
+)
+from fleet.ros2.node import NO_HASH, Node, Topic, attachment, gid, node_token, publisher_token
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S
+
+STORES = {name: get_typestore(Stores[f"ROS2_{name}"]) for name in ("HUMBLE", "JAZZY", "LYRICAL")}
+UNHURRIED = examples(50)
+"""The first message of a kind builds its reader."""
+
+HEADER = b"\x00\x01\x00\x00"
+"""CDR, little endian, no options (OMG DDSI-RTPS 2.5, table 10.3)."""
+
+
+@dataclass
+class Time(IdlStruct):
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Header(IdlStruct):
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class JointState(IdlStruct):
+    header: Header
+    name: sequence[str]
+    position: sequence[float64]
+    velocity: sequence[float64]
+    effort: sequence[float64]
+
+
+@dataclass
+class KeyValue(IdlStruct):
+    key: str
+    value: str
+
+
+@dataclass
+class DiagnosticStatus(IdlStruct):
+    level: uint8
+    name: str
+    message: str
+    hardware_id: str
+    values: sequence[KeyValue]
+
+
+@dataclass
+class DiagnosticArray(IdlStruct):
+    header: Header
+    status: sequence[DiagnosticStatus]
+
+
+texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
+numbers = st.floats(width=64)
+times = st.tuples(st.integers(-(2**31), 2**31 - 1), st.integers(0, 999_999_999))
+
+
+@st.composite
+def joint_states(draw):
+    """Names, and lists that are empty or as long, as ROS allows; any float, NaN too."""
+    names = draw(st.lists(texts, max_size=9, unique=True))
+    lists = [draw(st.just([]) | st.lists(numbers, min_size=len(names), max_size=len(names))) for _ in range(3)]
+    return names, lists
+
+
+def same(one, other):
+    """Equal to the last bit; NaN equals NaN."""
+    return np.array_equal(np.asarray(one, float), np.asarray(other, float), equal_nan=True)
+
+
+def test_the_hash_of_a_string_is_the_published_one():
+    """Origin: github.com/ros2/rmw_zenoh, docs/design.md, the key of the topic `chatter`."""
+    assert type_hash("std_msgs/msg/String") == "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+
+
+def test_the_hash_of_a_joint_state_is_the_published_one():
+    """Origin: `ros2 topic info --verbose` of joint_state_broadcaster's /joint_states, as found in users' reports."""
+    assert type_hash(JOINT_STATE) == "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+
+
+@pytest.mark.parametrize("kind", [JOINT_STATE, DIAGNOSTICS])
+def test_the_types_are_the_same_in_every_version(kind):
+    assert {store.hash_rihs01(kind) for store in STORES.values()} == {type_hash(kind)}
+
+
+@UNHURRIED
+@given(joint_states(), st.integers(0, 2**22), st.integers(0, 1023))
+def test_rosbags_and_pycdr2_decode_our_joint_state(state, sec, fraction):
+    names, (q, qd, tau) = state
+    payload = write_joints(Joints(sec + fraction / 1024, tuple(names), tuple(q), tuple(qd), tuple(tau)))
+    assert payload[:4] == HEADER
+    for message in (*(store.deserialize_cdr(payload, JOINT_STATE) for store in STORES.values()),
+                    JointState.deserialize(payload)):  # fmt: skip
+        assert (message.header.stamp.sec, message.header.frame_id) == (sec, "")
+        assert abs(message.header.stamp.nanosec - fraction * 1e9 / 1024) <= 0.5
+        assert message.name == names
+        for said, values in ((message.position, q), (message.velocity, qd), (message.effort, tau)):
+            assert same(said, values)
+
+
+@UNHURRIED
+@given(joint_states(), times, texts)
+def test_a_joint_state_of_pycdr2_is_decoded_and_encoded_byte_for_byte(state, stamp, frame):
+    names, lists = state
+    payload = JointState(Header(Time(*stamp), frame), names, *lists).serialize()
+    joints = read_joints(payload)
+    assert joints.names == tuple(names)
+    assert joints.time_s == pytest.approx(stamp[0] + stamp[1] * 1e-9, abs=1e-6)
+    for said, values in zip((joints.q, joints.qd, joints.tau), lists, strict=True):
+        assert same(said, values)
+    if not frame and abs(stamp[0]) < 2**20:  # a float holds the nanoseconds of so many seconds
+        assert write_joints(joints) == payload
+
+
+@UNHURRIED
+@given(st.lists(st.tuples(st.integers(0, 3), texts, texts, texts, st.lists(st.tuples(texts, texts), max_size=4)),
+                max_size=5))  # fmt: skip
+def test_diagnostics_are_decoded_as_encoded(said):
+    statuses = tuple(Diagnostic(*rest, values=tuple(values)) for *rest, values in said)
+    payload = write_diagnostics(12.5, statuses)
+    assert read_diagnostics(payload) == statuses
+    for message in (*(store.deserialize_cdr(payload, DIAGNOSTICS) for store in STORES.values()),
+                    DiagnosticArray.deserialize(payload)):  # fmt: skip
+        assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 500_000_000)
+        found = [(s.level, s.name, s.message, s.hardware_id, [(v.key, v.value) for v in s.values])
+                 for s in message.status]  # fmt: skip
+        assert found == said
+    again = [DiagnosticStatus(*rest, [KeyValue(*v) for v in values]) for *rest, values in said]
+    assert DiagnosticArray(Header(Time(12, 500_000_000), ""), again).serialize() == payload
+
+
+def test_a_zero_in_a_name_is_replaced():
+    (status,) = read_diagnostics(write_diagnostics(0.0, [Diagnostic(0, "a\0b", "", "")]))
+    assert status.name == "a\N{REPLACEMENT CHARACTER}b"
+
+
+@pytest.mark.parametrize("time_s", [math.inf, math.nan, 1e300, -math.inf, 2.0**31, -(2.0**31) - 1])
+def test_a_time_out_of_range_is_refused(time_s):
+    with pytest.raises(ValueError, match="A ROS 2 time is"):
+        write_joints(Joints(time_s, ()))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "field"), [((1, 2, 2), "position"), ((2, 3, 0), "velocity"), ((2, 2, 1), "effort")]
+)
+def test_lists_that_do_not_fit_the_names_are_refused(lengths, field):
+    payload = JointState(Header(Time(0, 0), ""), ["a", "b"], *([0.0] * length for length in lengths)).serialize()
+    with pytest.raises(MalformedMessage, match=field):
+        read_joints(payload)
+
+
+@UNHURRIED
+@given(st.binary(max_size=200) | st.binary(max_size=200).map(lambda rest: HEADER + rest))
+def test_random_bytes_raise_nothing_else(payload):
+    for read in (read_joints, read_diagnostics):
+        with suppress(MalformedMessage):
+            read(payload)
+
+
+@pytest.mark.parametrize("count", [MAX_ITEMS, MAX_ITEMS + 1])
+def test_a_list_that_is_too_long_is_refused(count):
+    payload = JointState(Header(Time(0, 0), ""), ["j"] * count, [], [], []).serialize()
+    if count <= MAX_ITEMS:
+        assert len(read_joints(payload).names) == count
+    else:
+        with pytest.raises(MalformedMessage, match="Not a sensor_msgs/msg/JointState"):
+            read_joints(payload)
+
+
+def test_a_few_bytes_may_follow_a_message():
+    """As after `serialize_message` of rclpy, which returns its whole buffer."""
+    payload = write_joints(Joints(1.0, ("a", "b"), (0.5, 1.5)))
+    for spare in range(SPARE_BYTES + 1):
+        assert read_joints(payload + b"\x7f" * spare).q == (0.5, 1.5)
+    with pytest.raises(MalformedMessage, match="size mismatch"):
+        read_joints(payload + b"\x7f" * (SPARE_BYTES + 4))
+
+
+LIMITS = ThermalLimits()
+finite = st.floats(allow_nan=False, allow_infinity=False)
+seven = st.tuples(*[finite] * 7)
+NAMES = joint_names(7)
+
+
+def state(temp_c=(30.0,) * 7, **change):
+    words = {"arm": "arm_0", "tick": 1, "time_s": 12.5, "mode": "idle", "headroom_k": 60.0 - max(temp_c), **change}
+    return State(temp_c=temp_c, **words)
+
+
+def told(word=None, age_s=0.0, **change):
+    return diagnostics_of("f", state(**change), word, LIMITS, age_s, 3.0)
+
+
+@UNHURRIED
+@given(q=seven, qd=st.just(()) | seven, tau=st.just(()) | seven, time_s=st.floats(0, 1e6))
+def test_joint_states_survive_a_round_trip(q, qd, tau, time_s):
+    said = joints_of(state(q=q, qd=qd, tau=tau, time_s=time_s))
+    assert said.names == NAMES
+    back = in_order(read_joints(write_joints(said)), NAMES)
+    assert back is not None
+    assert (back.q, back.qd, back.tau) == (q, qd, tau)
+    assert back.time_s == pytest.approx(time_s, abs=1e-9)
+
+
+@UNHURRIED
+@given(q=seven, qd=st.just(()) | seven, tau=st.just(()) | seven, seed=st.integers(0, 999), more=st.integers(0, 4))
+def test_order_and_other_joints_do_not_matter(q, qd, tau, seed, more):
+    """Arms with grippers name those too, and joint_state_broadcaster sorts as it likes."""
+    rng = random.Random(seed)
+    columns = dict(zip(NAMES, range(7), strict=True)) | {f"finger_{number}": -1 for number in range(more)}
+    names = rng.sample(sorted(columns), len(columns))
+
+    def shuffled(values):
+        return tuple(values[columns[name]] if columns[name] >= 0 else math.nan for name in names) if values else ()
+
+    mixed = Joints(1.0, tuple(names), shuffled(q), shuffled(qd), shuffled(tau))
+    assert in_order(read_joints(write_joints(mixed)), NAMES) == Joints(1.0, NAMES, q, qd, tau)
+
+
+def test_joints_of_other_devices_are_ignored():
+    assert in_order(Joints(0.0, ("finger",), (math.nan,)), NAMES) is None
+
+
+@pytest.mark.parametrize(
+    ("joints", "complaint"),
+    [
+        (Joints(0.0, ("joint_1",), (1.0,)), "not joint_2"),
+        (Joints(0.0, ("joint_1", "joint_2", "joint_1"), (1.0, 2.0, 1.0)), "joint_1 twice"),
+        (Joints(0.0, ("joint_1", "joint_2"), (1.0, math.nan)), "nan for position of joint_2"),
+        (Joints(0.0, ("joint_1", "joint_2"), (math.nan, math.nan)), "nan for position of joint_1"),
+        (Joints(0.0, ("joint_2", "joint_1"), (1.0, 1.0), (math.nan, 0.0)), "nan for velocity of joint_2"),
+        (Joints(0.0, ("joint_1", "joint_2"), (1.0, 1.0), (), (math.inf, 0.0)), "inf for effort of joint_1"),
+    ],
+)
+def test_an_incomplete_reading_is_refused(joints, complaint):
+    with pytest.raises(MalformedMessage, match=complaint):
+        in_order(joints, ("joint_1", "joint_2"))
+
+
+def test_an_effort_that_is_nan_throughout_is_not_measured():
+    both = (math.nan, math.nan)
+    found = in_order(Joints(0.0, ("joint_1", "joint_2"), (1.0, 2.0), both, both), ("joint_1", "joint_2"))
+    assert found == Joints(0.0, ("joint_1", "joint_2"), (1.0, 2.0))
+
+
+@pytest.mark.parametrize(("temp_c", "level"), [(59.99, OK), (60.0, WARN), (74.99, WARN), (75.0, ERROR), (200.0, ERROR)])
+def test_a_motor_is_judged_by_its_limits(temp_c, level):
+    """60 and 75 °C: Kinova Gen3 user guide, safety thresholds of the motor temperature."""
+    whole, *motors = told(temp_c=(20.0, 20.0, temp_c, 20.0))
+    assert whole.level == OK
+    assert [motor.level for motor in motors] == [OK, OK, level, OK]
+    assert motors[2].name == "f/arm_0: joint_3"
+    assert motors[2].hardware == "f/arm_0/joint_3"
+    assert dict(motors[2].values) == {"temperature_c": repr(temp_c), "headroom_k": repr(60.0 - temp_c)}
+
+
+def test_a_fault_is_an_error_of_the_arm():
+    assert told(mode="faulted")[0].level == ERROR
+
+
+def test_an_old_state_is_stale():
+    assert {status.level for status in told(age_s=3.5, word=WORD)} == {STALE}
+    assert {status.level for status in told(age_s=2.5, word=WORD)} == {OK}
+
+
+WORD = DifficultyScores("arm_0", 1, 12.0, "twin-1", ("j", "k", "l"), (0.5, None, 0.25), (0.1, None, None))
+
+
+def test_the_difficulty_of_every_open_job_is_published():
+    status = told(WORD)[-1]
+    assert status.name == "f/arm_0: difficulty"
+    assert status.message == "3 job(s) on offer, the easiest l"
+    assert dict(status.values) == {
+        "twin": "twin-1", "time_s": "12.0", "d j": "0.5", "p_saturation j": "0.1", "d k": "unknown",
+        "p_saturation k": "unknown", "d l": "0.25", "p_saturation l": "unknown",
+    }  # fmt: skip
+
+
+@UNHURRIED
+@given(st.tuples(*[st.floats(-50, 200)] * 7))
+def test_temperatures_survive_a_round_trip(temp_c):
+    statuses = read_diagnostics(write_diagnostics(1.0, told(temp_c=temp_c)))
+    assert temperatures(statuses, NAMES, "f/arm_0") == dict(zip(NAMES, temp_c, strict=True))
+    assert temperatures(statuses, NAMES, "f/arm_1") == {}
+
+
+def test_stale_temperatures_are_ignored():
+    assert temperatures(told(age_s=9.0), NAMES, "f/arm_0") == {}
+
+
+@pytest.mark.parametrize("said", ["warm", "nan", "inf", ""])
+def test_a_temperature_that_is_no_number_is_refused(said):
+    status = Diagnostic(OK, "n", "", "joint_1", (("temperature_c", said),))
+    with pytest.raises(MalformedMessage, match="temperature_c of joint_1"):
+        temperatures([status], NAMES, "")
+
 
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = Topic("/chatter", STRING, STRING_HASH)
+
 # Of github.com/ros2/rmw_zenoh, docs/design.md: the talker and the listener of demo_nodes_cpp.
 CHATTER_KEY = f"0/chatter/std_msgs::msg::dds_::String_/{STRING_HASH}"
 LISTENER_TOKEN = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"

@@ -1,11 +1,21 @@
-"""Tables of the pages from small results whose cells are worked out by hand."""
+"""Tables and figures of the pages are made from files and current, and the site needs no network."""
 
+import importlib.util
 import json
 import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
 
 from benchmarks.paper.cooling import cooling_tables
-from benchmarks.result_tables import difference, live_table, steps_table
+from benchmarks.result_tables import difference, efficiency_table, live_table, steps_table, trainings
 from docs.tables import tables_of
+from scenarios.json_rows import Rows
 
 
 def cells(text: str) -> list[list[str]]:
@@ -80,3 +90,183 @@ def test_a_live_shift_stands_beside_the_simulated_one() -> None:
         "live": {"finished": 66, "faults": 1},
     }
     assert cells(live_table({"rows": [row]})) == [["`wspt`", "central", "65", "0", "66", "1"]]
+
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+MADE = re.compile(r"<!-- made by [^:>]+: \w+ -->.*?<!-- end -->", re.DOTALL)
+FIGURE = re.compile(r"^\W*\d|\d\.\d")
+"""In a cell: it begins with a number (after a sign, `**` and the like), or has a decimal one."""
+
+SHARE = 1 / 6
+"""Least share of figures among the cells of a table of figures, without the first column."""
+
+BY_HAND = {
+    ("docs/concepts/cooling.md", "°C"): "published limits",
+    ("docs/concepts/cooling.md", "contact"): "published limits",
+    ("docs/faults.md", "fault"): "`make chaos` prints it: half an hour of real processes",
+    ("docs/identification.md", "question"): "`benchmarks.paper` prints it, from logs that are not in the repository",
+    (
+        "docs/performance.md",
+        "env steps per CPU-second, unless a unit is given",
+    ): "times of one machine; `make bench-env`",
+    ("docs/performance.md", ""): "times of one machine; the commands beside the tables print them",
+    ("docs/performance.md", "arms"): "times of one machine; `benchmarks/bench_exchange.py` prints them",
+    ("docs/ros2.md", "ROS 2"): "settings",
+    ("docs/scaling.md", ""): "to be made from files",
+    ("docs/scaling.md", "arms, sites"): "to be made from files",
+    ("docs/scaling.md", "asked"): "to be made from files",
+    ("docs/security.md", ""): "times of one machine; `benchmarks/bench_tls.py` prints them",
+    ("docs/several_machines.md", "fault"): "`make mesh` prints it: 256 arms",
+    ("docs/suite.md", "split"): "the definition of the suite",
+    ("docs/suite.md", "axis of a cell"): "the definition of the suite",
+    ("docs/trainers.md", "trainer"): "versions",
+    ("docs/twin.md", "scenario"): "`benchmarks.paper reliability` prints it: an hour; labelled with its revision",
+    ("docs/twin.md", "question"): "hours; labelled with its revision, the commands are beside it",
+}
+"""Tables that are kept by hand, by page and first heading, and why."""
+
+
+def tables_of_figures(text: str) -> list[str]:
+    """First headings of the tables of figures that no command makes."""
+    found = list[str]()
+    for block in re.findall(r"(?:^ *\|.*\n?)+", MADE.sub("", text), re.MULTILINE):
+        rows = [
+            [cell.strip() for cell in line.strip().split("|")[1:-1]] for line in block.replace("\\|", "").splitlines()
+        ]
+        cells = [cell for row in rows[2:] for cell in row[1:]]
+        if sum(FIGURE.search(cell) is not None for cell in cells) >= SHARE * len(cells):
+            found.append(rows[0][0])
+    return found
+
+
+def test_figures_come_from_files() -> None:
+    by_hand = {
+        (page.relative_to(ROOT).as_posix(), head)
+        for page in PAGES
+        for head in tables_of_figures(page.read_text(encoding="utf-8"))
+    }
+    assert not by_hand - BY_HAND.keys(), "Make the table from a file (docs/tables.py)."
+    assert not BY_HAND.keys() - by_hand, "The list has tables that the pages no longer have by hand."
+
+
+def test_a_table_of_figures_without_a_mark_is_found() -> None:
+    figures = "| policy | value |\n|---|---|\n| `wspt` | **+3.1 (+2.0 … +4.2)** |\n"
+    words = "| option | meaning |\n|---|---|\n| `--seeds` | number of seeds, 20 by default |\n"
+    marked = f"<!-- made by docs/tables.py: ladder -->\n\n{figures}\n<!-- end -->\n"
+    assert tables_of_figures(f"{words}\n{marked}\n{figures}") == ["policy"]
+
+
+FILE = Path(__file__).parents[2] / "docs/results/sample_efficiency/heat_wave.jsonl"
+
+
+def points(*rewards: float) -> list[dict[str, float]]:
+    return [
+        {"env_steps": 1000.0 * n, "hours": 10.0 * n, "cpu_s": 50.0 + n, "reward": reward}
+        for n, reward in enumerate(rewards)
+    ]
+
+
+def test_a_cell_is_the_mean_over_trainings_with_its_t_interval(tmp_path) -> None:
+    rows = Rows(tmp_path / "rows.jsonl")
+    rows.append("random/0", {"method": "random", "seed": 0, "points": points(7.0), "config": {}})
+    for seed, end in enumerate((1.0, 2.0, 3.0)):
+        row = {"method": "mappo", "seed": seed, "points": points(0.0, 5.0, 5.0, 5.0, end), "config": {}}
+        rows.append(f"mappo/{seed}", row)
+    *_, random, mappo = efficiency_table(trainings(rows.path)).splitlines()
+    assert random == "| `random` | 1 | 7.0 |  |  |  | 0 | 0 |"
+    # Student's t of two degrees of freedom: 2 ± 4.3027 / √3.
+    assert mappo == "| `--algo mappo` | 3 | 0.0 | 5.0 | 5.0 | 2.0 [-0.5, 4.5] | 40 | 4 |"
+
+
+def test_all_trainings_of_the_page_have_the_same_shifts_code_and_evaluations() -> None:
+    found = trainings(FILE)
+    rows = [row for own in found.values() for row in own]
+    for own in found.values():
+        assert [row["seed"] for row in own] == list(range(len(own)))
+    for name in ("scenario", "difficulty", "shifts", "code"):
+        assert all(row[name] == rows[0][name] for row in rows), name
+    trained = [row for row in rows if len(row["points"]) > 1]
+    assert trained
+    for row in trained:
+        assert [point["env_steps"] for point in row["points"]] == pytest.approx(range(0, 24_001, 6_000))
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(folder)]
+    env = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.ci_slow
+def test_pages_are_made_from_readme_docstrings_and_notebooks(site: Path) -> None:
+    for page, content in (
+        ("index.html", "Two commands"),
+        ("api/scenarios.html", "scenarios.evaluate.comparison.Comparison"),
+        ("notebooks/quick_look.html", "data:image/png"),
+        ("examples/own_policy.html", "HEADROOM_K"),
+        ("cli.html", "thermofleet twin train"),
+    ):
+        assert content in (site / page).read_text(encoding="utf-8"), page
+
+
+@pytest.mark.ci_slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_search_works_from_a_folder_without_network(site: Path) -> None:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        view = browser.new_page(viewport={"width": 1280, "height": 900})
+        outside, errors = list[str](), list[str]()
+        view.on("request", lambda request: request.url.startswith("http") and outside.append(request.url))
+        view.on("pageerror", lambda error: errors.append(str(error)))
+        view.goto((site / "index.html").as_uri())
+        view.click(".md-search__input")
+        view.keyboard.type("clearance")
+        found = view.locator(".md-search-result__link").first
+        found.wait_for(timeout=120_000)
+        found.click()
+        view.wait_for_selector("article:has-text('clearance')", timeout=120_000)
+        for page in ("index", "cli", "bus/messages", "tutorials/judge_a_policy", "notebooks/evaluate_policies"):
+            view.set_viewport_size({"width": 390, "height": 844})
+            view.goto((site / f"{page}.html").as_uri())
+            width = view.evaluate("document.documentElement.scrollWidth")
+            assert width <= 390, f"{page} is {width} px wide"
+        browser.close()
+    assert outside == []
+    assert errors == []
+
+
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+SHOWN = {
+    "quick_look": r"arm_1 stopped.*jobs finished",
+    "evaluate_policies": r"<td>round_robin</td>.*<td>wsept</td>",
+    "twin_on_own_logs": r"arm_2: 3600 samples",
+}
+"""What the HTML or text outputs of each notebook contain."""
+
+
+@pytest.mark.ci_slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = importlib.util.spec_from_file_location("notebooks", ROOT / "docs" / "notebooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    done = module.execute(path, tmp_path)
+    outputs = [output for cell in done.cells for output in cell.get("outputs", ())]
+    text = "".join(str(output.get("data", {}).get("text/html", output.get("text", ""))) for output in outputs)
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert re.search(SHOWN[path.stem], text, re.DOTALL), text

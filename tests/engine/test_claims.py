@@ -92,7 +92,7 @@ def test_awards_equal_the_reference(small, data) -> None:
 
     value = st.sampled_from([0.1, 0.5, 0.5, 2.0, float("nan")])
     for _ in range(3):
-        # 9 gives the current job back, see tests/engine/test_give_back.py.
+        # 9 gives the current job back, see tests/engine/test_stopped.py.
         action = st.integers(-2, 10).filter(lambda action: action != 9)
         actions = np.array(data.draw(st.lists(action, min_size=arms, max_size=arms)))
         row = st.lists(value, min_size=2 * count, max_size=2 * count)

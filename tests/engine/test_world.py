@@ -106,9 +106,12 @@ def test_the_job_table_equals_the_jobs(small) -> None:
     assert [column[0, 0] for column in row] == [5.0, 9.0, 7.0, 2.0, 4]
 
 
-def test_cyclic_predecessors_are_refused(small) -> None:
+def test_cyclic_predecessors_and_an_arm_that_overheats_at_home_are_refused(small) -> None:
     with pytest.raises(ValueError, match="in a cycle"):
         small.shop([[small.job("a", after=("b",)), small.job("b", after=("a",))]])
+    arm = replace(small.arm(0, [small.work()]), rest_tau=np.full(7, 500.0))
+    with pytest.raises(ValueError, match="Arm 'arm_0' has no steady state when idle at home at 25 °C"):
+        small.shop([[small.job("a")]], arms=[arm], start_warm=True)
 
 
 def test_arms_begin_at_ambient_or_idle_warm(small) -> None:
@@ -118,12 +121,6 @@ def test_arms_begin_at_ambient_or_idle_warm(small) -> None:
     assert (initial(cold).temp_c == 21.0).all()
     assert initial(warm).temp_c[0, 0] == pytest.approx(warm_start(arms[0], 21.0))
     assert (initial(warm).temp_c > 21.0).all()
-
-
-def test_an_arm_that_overheats_standing_at_home_is_refused(small) -> None:
-    arm = replace(small.arm(0, [small.work()]), rest_tau=np.full(7, 500.0))
-    with pytest.raises(ValueError, match="Arm 'arm_0' has no steady state when idle at home at 25 °C"):
-        small.shop([[small.job("a")]], arms=[arm], start_warm=True)
 
 
 def test_offers_index_rows_of_the_risk_table(small) -> None:

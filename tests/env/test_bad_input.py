@@ -144,10 +144,7 @@ def test_actions_may_have_any_integer_type_and_memory_order(batch, play, kind) -
     env.reset()
     other.reset()
     actions = np.array([[1, 2, 0], [0, 3, 100]])
-    given = [
-        env.step(np.asfortranarray(actions.astype(kind))),
-        other.step(actions.tolist()),
-    ]
+    given = [env.step(np.asfortranarray(actions.astype(kind))), other.step(actions.tolist())]
     play.same(play.rows(given[0], range(2)), play.rows(given[1], range(2)))
 
 
@@ -193,25 +190,16 @@ def test_seeds_count_up_past_the_largest_integer_of_their_type(batch, play, seed
     play.same(play.rows(counted.step(nobody), range(2)), play.rows(listed.step(nobody), range(2)))
 
 
-@pytest.mark.parametrize("rows", [[2], [-1], [0, 1, 2]])
-def test_rows_out_of_range_are_refused(batch, rows) -> None:
+@pytest.mark.parametrize("rows", [[2], [-1], [0, 1, 2], 1, "x", [[0]], [0.5], np.array([True]), {0}])
+def test_rows_out_of_range_or_of_wrong_shape_or_beside_a_seed_are_refused(batch, rows) -> None:
     env = batch(2, seed=0)
     env.reset()
-    with pytest.raises(ValueError, match=r"rows must be from 0 to 1 \(got "):
+    number = isinstance(rows, list) and all(type(row) is int for row in rows)
+    said = r"rows must be from 0 to 1 \(got " if number else r"rows must be int \[n\] or bool \[2\] \(got "
+    with pytest.raises(ValueError, match=said):
         env.reset(rows=rows)
-
-
-@pytest.mark.parametrize("rows", [1, "x", [[0]], [0.5], np.array([True]), {0}])
-def test_rows_of_wrong_shape_are_refused(batch, rows) -> None:
-    env = batch(2, seed=0)
-    env.reset()
-    with pytest.raises(ValueError, match=r"rows must be int \[n\] or bool \[2\] \(got "):
-        env.reset(rows=rows)
-
-
-def test_seed_and_rows_exclude_each_other(batch) -> None:
     with pytest.raises(ValueError, match="give seed or rows, not both"):
-        batch(2).reset(seed=0, rows=[0])
+        env.reset(seed=0, rows=[0])
 
 
 @pytest.mark.parametrize("count", [0, -3, 2.5, "x", None, True])
@@ -263,18 +251,19 @@ def test_unknown_overrides_are_refused_with_the_nearest_name(cell, plans) -> Non
             make_batch(cell, 2, difficulty="blind", cache=plans, **{name: value})
 
 
-def test_a_seed_override_is_refused_with_where_it_belongs(cell, plans) -> None:
+def test_a_seed_override_and_a_batch_that_cannot_fit_are_refused_and_a_cache_may_be_a_string(cell, plans) -> None:
     with pytest.raises(ScenarioError, match=r"make_env\(\) takes no seed: give it to reset\(seed=…\)"):
         make_env(cell, difficulty="blind", cache=plans, seed=3)
+    with pytest.raises(ValueError, match=r"num_envs must be at most \d+, as this machine has \d+ GB: the observations"):
+        make_batch(cell, 10**9, difficulty="blind", cache=plans)
+    make_env(cell, difficulty="blind", cache=str(plans)).reset(seed=0)
+    make_batch(cell, 1, difficulty="blind", cache=str(plans)).reset()
 
 
 def test_overrides_may_be_numpy_numbers(cell, plans) -> None:
     own, numpys = (
         make_env(cell, difficulty="blind", cache=plans, horizon_s=horizon_s, slots=slots, ambient={"points": points})
-        for horizon_s, slots, points in (
-            (60, 3, [[0.0, 30.0]]),
-            (np.int64(60), np.uint8(3), np.array([[0.0, 30.0]])),
-        )
+        for horizon_s, slots, points in ((60, 3, [[0.0, 30.0]]), (np.int64(60), np.uint8(3), np.array([[0.0, 30.0]])))
     )
     for env in (own, numpys):
         env.reset(seed=0)
@@ -282,23 +271,6 @@ def test_overrides_may_be_numpy_numbers(cell, plans) -> None:
     assert own.observation_space("left") == numpys.observation_space("left")
     with pytest.raises(ScenarioError, match="expected numbers, texts, lists and tables, got <object"):
         make_env(cell, difficulty="blind", cache=plans, horizon_s=object())
-
-
-def test_progress_must_be_a_function(cell, plans) -> None:
-    wrong: Any = 3
-    for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
-        with pytest.raises(ScenarioError, match=r"progress must be a function of .* \(got 3\)"):
-            make(cell, difficulty="blind", cache=plans, progress=wrong)
-
-
-def test_a_batch_that_cannot_fit_is_refused_before_it_is_made(cell, plans) -> None:
-    with pytest.raises(ValueError, match=r"num_envs must be at most \d+, as this machine has \d+ GB: the observations"):
-        make_batch(cell, 10**9, difficulty="blind", cache=plans)
-
-
-def test_a_cache_folder_may_be_a_string(cell, plans) -> None:
-    make_env(cell, difficulty="blind", cache=str(plans)).reset(seed=0)
-    make_batch(cell, 1, difficulty="blind", cache=str(plans)).reset()
 
 
 def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, plans) -> None:
@@ -309,6 +281,8 @@ def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, plans) -> N
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
         with pytest.raises(ScenarioError, match=r"cache must be the path of a folder \(got 0\.3\)"):
             make(cell, difficulty="blind", cache=wrong)
+        with pytest.raises(ScenarioError, match=r"progress must be a function of .* \(got 0\.3\)"):
+            make(cell, difficulty="blind", cache=plans, progress=wrong)
     for name in ("autoreset", "stagger"):
         with pytest.raises(ValueError, match=rf"{name} must be True or False \(got 0\.3\)"):
             make_batch(cell, 2, difficulty="blind", cache=plans, **{name: wrong})
@@ -317,7 +291,9 @@ def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, plans) -> N
     for make in (make_env, lambda scenario: make_batch(scenario, 2)):
         with pytest.raises(ScenarioError, match=r"scenario must be a library name, .+ \(got 0\.3\)"):
             make(wrong)
-    with pytest.raises(ScenarioError, match=r"randomise must be a scenarios\.run\.batch\.Randomisation \(got 0\.3\)"):
+    with pytest.raises(
+        ScenarioError, match=r"randomise must be a scenarios\.prepare\.fleet\.Randomisation \(got 0\.3\)"
+    ):
         make_batch(cell, 2, difficulty="blind", cache=plans, randomise=wrong)
 
 

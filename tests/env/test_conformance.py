@@ -1,13 +1,20 @@
-"""The contract of the environment: PettingZoo's tests, and what they do not check."""
+"""The contract of the environment: PettingZoo's tests, what they do not check, and the entry points."""
 
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pettingzoo
 import pytest
 from gymnasium.spaces import Dict
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.test import (
     api_test,
     max_cycles_test,
@@ -17,9 +24,15 @@ from pettingzoo.test import (
     seed_test,
     state_test,
 )
+from scipy.stats import chisquare
 
+import scenarios
 from fleet.engine.batch import TERMS
 from fleet.env import allocation_v1
+from fleet.env.allocation_v1 import AllocationEnv
+from fleet.env.random_actions import random_legal
+from fleet.env.vector import BatchEnv
+from fleet.offered_plans import PLANS
 
 HOT = {"arms": 3, "ambient_c": 38.0}
 
@@ -108,10 +121,10 @@ def test_results_of_a_parallel_env_are_in_its_spaces(make, play, seed, options) 
         if not env.agents:
             break
         observations, rewards, terminated, truncated, infos = env.step(play.wild(env, rng))
-        for given in (rewards, terminated, truncated):
-            assert list(given) == env.possible_agents
-            assert len(set(given.values())) == 1
-        assert [type(given["arm_0"]) for given in (rewards, terminated, truncated)] == [float, bool, bool]
+        for each in (rewards, terminated, truncated):
+            assert list(each) == env.possible_agents
+            assert len(set(each.values())) == 1
+        assert [type(each["arm_0"]) for each in (rewards, terminated, truncated)] == [float, bool, bool]
         assert rewards["arm_1"] == pytest.approx(sum(infos["arm_1"][f"reward_{name}"] for name in TERMS), abs=1e-12)
         ended.append(terminated["arm_0"] + truncated["arm_0"])
     assert ended == [0] * (len(ended) - 1) + [1]
@@ -248,3 +261,100 @@ def test_returned_arrays_of_a_batch_belong_to_the_caller(batch, play) -> None:
             play.same(play.rows(handed, range(6)), play.rows(kept, range(6)))
             actions = np.where(np.isin(np.arange(6), [1, 4])[:, None], 0, actions)
         handed, kept = env.step(actions), untouched.step(actions)
+
+
+NAME = "thermofleet/allocation_v1"
+
+
+def test_pettingzoo_makes_the_env_by_name(cell, plans, play) -> None:
+    options = {"scenario": cell, "difficulty": "blind", "cache": plans, "max_cycles": 5}
+    env = pettingzoo.make("parallel", NAME, **options, mask_in="both")
+    assert isinstance(env, ParallelEnv)
+    assert isinstance(env.unwrapped, AllocationEnv)
+    ours = scenarios.make_env(cell, difficulty="blind", cache=plans, max_cycles=5, mask_in="both")
+    assert play.plain(env.reset(seed=1)) == play.plain(ours.reset(seed=1))
+    for _ in range(5):
+        assert play.plain(env.step({"left": 1})) == play.plain(ours.step({"left": 1}))
+    assert env.agents == []
+    turns = pettingzoo.make("aec", NAME, **options)
+    assert isinstance(turns, AECEnv)
+    turns.reset(seed=1)
+    assert turns.possible_agents == ["left", "right", "far"]
+    first, *_ = turns.last()
+    np.testing.assert_array_equal(first["observation"], ours.reset(seed=1)[0]["left"]["observation"])
+
+
+def test_overrides_are_fields_of_the_scenario_or_options_of_the_env(cell, plans) -> None:
+    env = pettingzoo.make("parallel", NAME, scenario=cell, difficulty="blind", cache=plans, horizon_s=100, slots=2)
+    env.reset(seed=0)
+    assert env.action_space("left").n == 1 + 2 * PLANS + 1
+    assert env.unwrapped.world.ticks == 10
+
+
+@pytest.mark.parametrize("kind", ["parallel", "aec"])
+def test_an_unknown_scenario_is_named(kind) -> None:
+    with pytest.raises(Exception, match="No scenario 'quickstrat'; did you mean 'quickstart'"):
+        pettingzoo.make(kind, NAME, scenario="quickstrat")
+
+
+def test_make_batch_takes_a_scenario(cell, plans) -> None:
+    batch = scenarios.make_batch(cell, num_envs=3, seed=0, difficulty="blind", cache=plans, slots=2, max_cycles=4)
+    assert isinstance(batch, BatchEnv)
+    obs, info = batch.reset()
+    assert obs["observation"].shape == (3, 3, batch.layout.size)
+    assert obs["action_mask"].shape == (3, 3, 1 + 2 * PLANS + 1)
+    assert batch.agents == ("left", "right", "far")
+    given = [batch.step(np.zeros((3, 3), int)) for _ in range(4)]
+    assert [step[3].all() for step in given] == [False] * 3 + [True]
+    assert list(info) == list(given[-1][-1])
+
+
+def test_make_batch_staggers_envs(cell, plans) -> None:
+    batch = scenarios.make_batch(cell, 2, 0, difficulty="blind", cache=plans, max_cycles=4, stagger=True)
+    batch.reset()
+    ends = [batch.step(np.zeros((2, 3), int))[3].tolist() for _ in range(4)]
+    assert ends == [[False, False], [True, False], [False, False], [False, True]]
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import pettingzoo, scenarios",
+        "import scenarios, pettingzoo; scenarios.make_env",
+        "import scenarios.prepare.env_registration",
+    ],
+)
+def test_importing_scenarios_registers_the_name(first) -> None:
+    code = f"{first}; import pettingzoo as p; print([p.spec(kind, {NAME!r}).name for kind in ('parallel', 'aec')])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
+    assert done.stdout.strip() == "['allocation', 'allocation']", done.stderr
+
+
+masks = npst.arrays(
+    np.int8, st.tuples(st.integers(1, 4), st.integers(1, 5), st.integers(1, 9)), elements=st.integers(0, 1)
+)
+
+
+@given(mask=masks, seed=st.integers(0, 2**32))
+def test_every_action_is_legal_if_one_is(mask, seed) -> None:
+    actions = random_legal(mask, np.random.default_rng(seed))
+    assert actions.shape == mask.shape[:-1]
+    assert actions.dtype == np.int64
+    chosen = np.take_along_axis(mask, actions[..., None], axis=-1)[..., 0]
+    np.testing.assert_array_equal(chosen == 1, mask.any(axis=-1))
+    assert (actions[~mask.any(axis=-1)] == 0).all()
+
+
+def test_legal_actions_are_equally_likely() -> None:
+    mask = np.zeros((60_000, 9), np.int8)
+    legal = [0, 3, 4, 8]
+    mask[:, legal] = 1
+    counts = np.bincount(random_legal(mask, np.random.default_rng(3)), minlength=9)
+    assert counts.sum() == counts[legal].sum() == len(mask)
+    assert chisquare(counts[legal]).pvalue > 0.001
+
+
+def test_masks_may_be_boolean_and_a_seed_repeats() -> None:
+    mask = np.random.default_rng(0).random((7, 3, 5)) < 0.5
+    one, other = (random_legal(each, np.random.default_rng(1)) for each in (mask, mask.astype(np.int8)))
+    np.testing.assert_array_equal(one, other)

@@ -1,33 +1,98 @@
-"""The picture of a fleet: colours, visibility, the array."""
+"""The scene, picture, floor plan and window of a fleet."""
 
+import logging
+import pickle
+import subprocess
+import sys
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from fleet.engine.shift import step
+from fleet.engine.state import initial
 from fleet.env.render.floor_plan import (
     LARGEST,
     NORMAL,
+    SMALLEST,
     Cell,
     FloorPlan,
+    MountKind,
     Pixel,
     QueuedJob,
     Scene,
     floor_plan,
     grid_cell,
+    mount_kind,
+    scene_of,
     shortened,
     text_width,
 )
-from fleet.env.render.picture import Picture, heat_colour, legend_ends, legend_row, time_left
+from fleet.env.render.picture import Picture, Renderer, heat_colour, legend_ends, legend_row, time_left
+from fleet.errors import FleetError
 from fleet.job import Fixture
-from fleet.robot import JOINTS
+from fleet.robot import JOINTS, Mount, rotation
 from fleet.telemetry import FAULTED, IDLE, WORKING
+from tests.profiles import examples
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "kind"),
+    [
+        ((0, 0, 0), "floor"),
+        ((0, 0, 180), "floor"),
+        ((180, 0, 0), "ceiling"),
+        ((0, 90, 0), "wall"),
+        ((90, 0, 0), "wall"),
+        ((0, -90, 30), "wall"),
+        ((45, 0, 0), "tilted"),
+        ((0, 140, 0), "tilted"),
+    ],
+)
+def test_mounts_are_named(tilt_deg, kind) -> None:
+    assert mount_kind(Mount(tilt_deg=tilt_deg)) == kind
+
+
+def test_a_scene_equals_the_state_of_its_world(small) -> None:
+    work, heavy = small.work("bench"), small.work("rack", payload_kg=2.5)
+    jobs = [small.job("now", work), small.job("next", heavy, due_s=5.0), small.job("late", work, release_s=500.0)]
+    arms = [small.arm(0, [work]), small.arm(1, [work, heavy])]
+    world, plant = small.shop([jobs], arms=arms)
+    state = step(world, initial(world), np.array([[1, 0]]), plant).state
+    observed = scene_of(world, state, title="two arms")
+    assert (observed.time_s, observed.horizon_s, observed.finished, observed.waiting, observed.faults) == (
+        10.0,
+        600.0,
+        0,
+        1,
+        0,
+    )
+    assert (observed.mode, observed.job, observed.at) == ((WORKING, IDLE), ("now", ""), (("bench",), ()))
+    assert observed.progress == (pytest.approx(10.0 / (3.0 + 3 * 10.0 + 2.0)), 0.0)
+    assert observed.queue == (
+        QueuedJob(job="next", payload_kg=2.5, due_in_s=-5.0, able=(False, True), free=(False, True)),
+    )
+    np.testing.assert_array_equal(observed.temp_c, state.temp_c[0, :, :JOINTS])
+    with pytest.raises(ValueError, match=r"The cell has the arms arm_0; the world has arm_0, arm_1\."):
+        scene_of(world, state, grid_cell(("arm_0",), ()))
+
+
+def test_a_finished_job_and_a_fault_are_counted(small) -> None:
+    world, plant = small.shop([[small.job("a", small.work("bench"), repetitions=1)]])
+    state = initial(world)
+    for action in (1, 0):
+        state = step(world, state, np.array([[action, 0]]), plant).state
+    state.faults[0, 1] = 2
+    observed = scene_of(world, state)
+    assert (observed.finished, observed.waiting, observed.faults, observed.job) == (1, 0, 2, ("", ""))
+
 
 FAULT = (0xCC, 0x22, 0x22)
 """Red of the report."""
+
 BENCHES = (("bench", (0.5, 0.5, 0.2)), ("rack", (-0.5, 0.5, 0.2)))
 
 
@@ -275,3 +340,158 @@ def test_inconsistent_scenes_are_refused() -> None:
         row(0)
     with pytest.raises(ValueError, match="must be finite"):
         replace(row(1), mounts_m=((0.0, np.nan, 0.0),))
+
+
+metres = st.floats(-50, 50)
+points = st.tuples(metres, metres, metres)
+sizes = st.tuples(st.integers(SMALLEST[0], 1300), st.integers(SMALLEST[1], 1000))
+kinds = st.sampled_from(get_args(MountKind))
+
+
+@st.composite
+def cells(draw: st.DrawFn) -> Cell:
+    arms, stations = draw(st.integers(1, 64)), draw(st.integers(0, 30))
+    return Cell(
+        arms=tuple(f"arm_{i}" for i in range(arms)),
+        mounts_m=tuple(draw(st.lists(points, min_size=arms, max_size=arms))),
+        kinds=tuple(draw(st.lists(kinds, min_size=arms, max_size=arms))),
+        stations=tuple((f"s{i}", p) for i, p in enumerate(draw(st.lists(points, max_size=stations)))),
+    )
+
+
+def inside(x: float, y: float, box: tuple[int, int, int, int], margin: float = 0.0) -> bool:
+    left, top, right, bottom = box
+    return left + margin <= x <= right - margin and top + margin <= y <= bottom - margin
+
+
+@examples(40)
+@given(cells(), sizes)
+def test_every_arm_and_station_is_on_the_floor(cell, size) -> None:
+    plan = floor_plan(cell, size)
+    floor = plan.floor
+    assert inside(floor[0], floor[1], (0, 0, *size))
+    assert inside(floor[2], floor[3], (0, 0, *size))
+    assert len(plan.centres) == len(cell.arms)
+    for a, (x, y) in enumerate(plan.centres.tolist()):
+        assert inside(x, y, floor, plan.reach)
+        assert y + plan.reach + plan.rows * plan.text <= floor[3]
+        assert len(np.unique(plan.motors[a], axis=0)) == JOINTS
+        assert all(inside(u, v, floor, plan.motor) for u, v in plan.motors[a])
+    assert all(inside(x, y, floor, plan.station) for x, y in (*plan.stations, *plan.bases))
+
+
+@given(
+    st.tuples(*[st.floats(-5, 5)] * 3), st.tuples(*[st.floats(0.001, 10)] * 3), st.tuples(*[st.floats(-180, 180)] * 3)
+)
+def test_a_fixture_is_drawn_around_its_centre_and_as_large_as_its_shadow(position_m, size_m, tilt_deg) -> None:
+    """By Cauchy, the shadow of a box is the sum of its faces' areas times the cosines of their tilts."""
+    box = Fixture(name="box", position_m=position_m, size_m=size_m, tilt_deg=tilt_deg)
+    cell = Cell(
+        arms=("a",), mounts_m=((0.0, 0.0, 0.0),), kinds=("floor",), stations=(("s", (2.0, 1.0, 0.0)),), fixtures=(box,)
+    )
+    plan = floor_plan(cell)
+    (outline,) = plan.fixtures
+    px_per_m = (plan.stations[0, 0] - plan.bases[0, 0]) / 2.0
+    centre = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    np.testing.assert_allclose((centre - plan.bases[0]) / px_per_m, [position_m[0], -position_m[1]], atol=0.05)
+    x, y = outline.T
+    area = abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
+    faces = np.array([size_m[1] * size_m[2], size_m[0] * size_m[2], size_m[0] * size_m[1]])
+    assert area / px_per_m**2 == pytest.approx(faces @ np.abs(rotation(tilt_deg)[2]), rel=0.02, abs=1e-6)
+
+
+@given(st.lists(points, min_size=1, max_size=6))
+def test_distances_on_the_floor_plan_are_to_scale(stations) -> None:
+    """One scale for both directions, x to the right and y up."""
+    cell = replace(grid_cell(("arm_0",), ()), stations=tuple((f"s{i}", p) for i, p in enumerate(stations)))
+    plan = floor_plan(cell)
+    apart_px = np.array(plan.stations) - plan.bases[0]
+    apart_m = np.array(stations)[:, :2] * [1.0, -1.0]
+    farthest = np.unravel_index(np.abs(apart_m).argmax(), apart_m.shape)
+    if abs(apart_m[farthest]) > 0.2:
+        per_m = apart_px[farthest] / apart_m[farthest]
+        assert per_m > 0
+        np.testing.assert_allclose(apart_px, per_m * apart_m, atol=2.5)  # whole pixels
+
+
+@pytest.mark.parametrize("arms", [2, 3, 4, 7, 16])
+@pytest.mark.parametrize("size", [(960, 640), (480, 320)])
+def test_arms_at_one_place_do_not_cover_each_other(arms, size) -> None:
+    """An arm on the ceiling above one on the floor."""
+    names = tuple(f"arm_{i}" for i in range(arms))
+    cell = replace(grid_cell(names, ("bench", "rack")), mounts_m=((0.0, 0.0, 0.0),) * arms)
+    plan = floor_plan(cell, size)
+    rings = plan.centres
+    gaps = np.linalg.norm(rings[:, None] - rings[None], axis=-1)[~np.eye(arms, dtype=bool)]
+    assert gaps.min() >= 1.82 * plan.reach  # motors; the arcs of the work done may touch
+
+
+@examples(40)
+@given(cells(), sizes)
+def test_names_of_stations_cover_no_arm_and_no_other_name(cell, size) -> None:
+    plan = floor_plan(cell, size)
+    boxes = [(*at, text_width(text, plan.text)) for text, at, _ in plan.labels]
+    for i, (x, y, long) in enumerate(boxes):
+        assert inside(x, y, plan.floor)
+        assert inside(x + long, y, plan.floor)
+        for u, v in plan.centres:
+            nearest = min(max(u, x), x + long)
+            assert np.hypot(nearest - u, y - v) >= plan.reach
+        assert all(abs(y - v) >= plan.text or x + long < u or u + other < x for u, v, other in boxes[:i])
+
+
+BLACK = np.zeros((240, 320, 3), np.uint8)
+
+
+def test_without_a_display_it_warns_once_and_continues(monkeypatch, caplog) -> None:
+    monkeypatch.setattr("matplotlib.get_backend", lambda: "agg")
+    window = Renderer()
+    with caplog.at_level(logging.WARNING):
+        assert [window.show(BLACK) for _ in range(3)] == [False] * 3
+        assert window.show(BLACK + 255) is False
+    assert len(caplog.messages) == 1
+    assert "render_mode='rgb_array'" in caplog.messages[0]
+    assert "thermofleet film" in caplog.messages[0]
+    window.close()
+    pickle.loads(pickle.dumps(window))
+
+
+def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
+    """Use matplotlib's canvas in place of a window."""
+    import matplotlib.pyplot as plt
+    from matplotlib.backend_bases import FigureManagerBase
+
+    monkeypatch.setattr("matplotlib.get_backend", lambda: "TkAgg")
+    monkeypatch.setattr(FigureManagerBase, "show", lambda self: None)
+    plt.switch_backend("agg")
+    window = Renderer(title="test")
+    assert window.show(BLACK)
+    assert window.show(BLACK + 255)
+    (figure,) = map(plt.figure, plt.get_fignums())
+    assert (figure.axes[0].images[0].get_array() == 255).all()
+    assert figure.get_size_inches().tolist() == [3.2, 2.4]
+    copied = pickle.loads(pickle.dumps(window))
+    plt.close(figure)  # as a user does
+    assert not window.show(BLACK)
+    assert plt.get_fignums() == []
+    window.close()
+    assert window.show(BLACK)
+    window.close()
+    copied.close()
+    assert plt.get_fignums() == []
+
+
+def test_matplotlib_is_loaded_for_frames_alone() -> None:
+    code = (
+        "import sys; import fleet.env.allocation_v1, fleet.env.render.picture; "
+        "print([m for m in ('matplotlib', 'PIL', 'torch', 'mujoco', 'zenoh', 'tkinter') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)
+    assert done.stdout.strip() == "[]"
+
+
+def test_without_matplotlib_the_error_names_the_extra(monkeypatch, small) -> None:
+    world, _ = small.shop([[small.job("a", small.work("bench"))]])
+    monkeypatch.setitem(sys.modules, "fleet.env.render.picture", None)
+    with pytest.raises(FleetError, match=r"pip install -e '\.\[report\]'"):
+        Renderer().frame(world, initial(world))

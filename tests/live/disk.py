@@ -1,8 +1,10 @@
-"""A journal in memory that may be full, and at which a process may crash; for tests of state machines."""
+"""A journal in memory that may be full, and relations of plans that exclude each other; for state machines."""
 
+import random
 from dataclasses import dataclass, field
 
 from fleet.errors import JournalFull
+from fleet.live.space import ANYWHERE
 
 
 class Crash(Exception):
@@ -28,3 +30,14 @@ class Disk:
         self.records.extend(records)
         if crash == "after":
             raise Crash
+
+
+def random_conflicts(seed: int, share: float):
+    """Return a symmetric relation in which this share of all plans exclude each other, and unknown ones all others."""
+
+    def excludes(arm: str, space: str, other: str, other_space: str) -> bool:
+        if ANYWHERE in (space, other_space):
+            return True
+        return random.Random(f"{seed} {sorted([space, other_space])}").random() < share
+
+    return excludes

@@ -135,10 +135,7 @@ class ModelArm:
     def request(self) -> LeaseRequest:
         entries = tuple(
             LeaseEntry(
-                name,
-                w.award.job.name,
-                w.cycles,
-                "finishing" if w.cycles >= w.award.job.repetitions - 1 else "working",
+                name, w.award.job.name, w.cycles, "finishing" if w.cycles >= w.award.job.repetitions - 1 else "working"
             )
             for name, w in self.current.items()
         )

@@ -136,10 +136,7 @@ def test_an_arm_publishes_info_and_state(bus):
     watcher, heard = bus.link(), {}
     for topic, kind, history in (("state", State, False), ("info", Info, True)):
         watcher.subscribe(
-            keys.of_every_arm("f", topic),
-            kind,
-            lambda arm, word, t=topic: heard.update({t: word}),
-            history=history,
+            keys.of_every_arm("f", topic), kind, lambda arm, word, t=topic: heard.update({t: word}), history=history
         )
     there = []
     watcher.watch_tokens(keys.of_every_arm("f", "alive"), lambda name, is_there: there.append((name, is_there)))
@@ -353,18 +350,23 @@ def test_planning_delays_state_messages_by_one_plan_at_most(bus):
     line.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: came.append(state.time_s))
     bus.arm(plan=slowly, speed=1.0)
     bus.serve(lambda: len(came) > 3)
-    jobs = tuple(JobSpec(name=f"j{i}", kind="hold", places=("bench",), payload_kg=i / 2) for i in range(20))
-    del came[:-1]
-    began_s = time.monotonic()
-    quote = bus.ask(line, "quote", request(*jobs), Quote)
-    assert time.monotonic() - began_s < PLANNING_S + 0.4
-    bus.serve(lambda: came and came[-1] - came[0] > 0.5)
-    assert np.diff(came).max() < 0.8 * PLANNING_S
-    late = [o.job for o in quote.estimates if o.reason == NOT_PLANNED]
-    assert 0 < len(late) < 20
-    bus.serve(lambda: len(planned) == 20)
-    quote = bus.ask(line, "quote", request(*jobs), Quote)
-    assert [o.feasible for o in quote.estimates] == [True] * 19 + [False]
+
+    def in_time(attempt: int) -> bool:
+        payloads_kg = [i / 2 - attempt / 100 for i in range(1, 21)]
+        jobs = tuple(JobSpec(f"{attempt} {kg}", "hold", ("bench",), payload_kg=kg) for kg in payloads_kg)
+        del came[:-1]
+        began_s = time.monotonic()
+        quote = bus.ask(line, "quote", request(*jobs), Quote)
+        took_s = time.monotonic() - began_s
+        bus.serve(lambda: came and came[-1] - came[0] > 0.5)
+        longest_s = np.diff(came).max()
+        late = [o.job for o in quote.estimates if o.reason == NOT_PLANNED]
+        bus.serve(lambda: len(planned) == 20 * (attempt + 1))
+        quote = bus.ask(line, "quote", request(*jobs), Quote)
+        assert [o.feasible for o in quote.estimates] == [kg <= 9 for kg in payloads_kg]
+        return took_s < PLANNING_S + 0.4 and longest_s < 0.8 * PLANNING_S and 0 < len(late) < 20
+
+    assert any(in_time(attempt) for attempt in range(5))  # a busy machine delays one attempt, a defect all
 
 
 def test_a_replayed_log_is_an_arm_that_takes_no_work(bus):

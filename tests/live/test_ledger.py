@@ -44,7 +44,7 @@ def names(jobs) -> list[str]:
 # admission
 
 
-def test_an_identical_job_is_accepted_again_and_another_of_its_name_is_not():
+def test_an_identical_job_is_accepted_again_another_is_not_and_their_number_is_limited():
     known = {"a": spec("a")}
     same, other, twice, third = admit([spec("a"), spec("a", value=2.0), spec("b"), spec("b", value=9.0)], known)
     assert same.accepted
@@ -52,13 +52,13 @@ def test_an_identical_job_is_accepted_again_and_another_of_its_name_is_not():
     assert not other.accepted
     assert not third.accepted
     assert other.reason == "Another job has the name 'a'; names must be unique."
+    admissions = admit([spec("b"), spec("c"), spec("a")], {"a": spec("a")}, limit=2)
+    assert [a.accepted for a in admissions] == [True, False, True]
+    assert admissions[1].reason == "There are 2 open jobs already; submit it again when some are finished."
 
 
-def test_jobs_of_one_submission_may_name_predecessors_in_any_order():
+def test_a_submission_may_name_predecessors_in_any_order_but_those_that_can_never_begin():
     assert all(a.accepted for a in admit([spec("c", "b"), spec("b", "a"), spec("a")], {}))
-
-
-def test_a_job_that_can_never_begin_is_rejected_with_the_reason():
     jobs = [spec("a", "unknown"), spec("b", "a"), spec("c", "d"), spec("d", "c"), spec("e", "e"), spec("f")]
     a, b, c, d, e, f = admit(jobs, {})
     assert a.reason == "It waits for 'unknown', which is unknown or was not accepted."
@@ -67,18 +67,9 @@ def test_a_job_that_can_never_begin_is_rejected_with_the_reason():
     assert d.reason == "Jobs wait for each other in a ring: d → c → d."
     assert e.reason == "Jobs wait for each other in a ring: e → e."
     assert f.accepted
-
-
-def test_a_job_at_an_unknown_place_is_rejected_with_its_successors():
     first, second = admit([spec("a", place="moon"), spec("b", "a")], {}, places=frozenset({"rack", "bin"}))
     assert first.reason == "No place 'moon' in this cell. Places: bin, rack."
     assert second.reason == "It waits for 'a', which is unknown or was not accepted."
-
-
-def test_the_number_of_jobs_is_limited():
-    admissions = admit([spec("b"), spec("c"), spec("a")], {"a": spec("a")}, limit=2)
-    assert [a.accepted for a in admissions] == [True, False, True]
-    assert admissions[1].reason == "There are 2 open jobs already; submit it again when some are finished."
 
 
 @examples(200)

@@ -1,4 +1,4 @@
-"""Commands over TLS work with a valid certificate, and report an invalid one in one sentence."""
+"""Commands over TLS: an operator's certificate works, any other is refused in one sentence."""
 
 import http.client
 import json
@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
 import pytest
+from msgspec.structs import replace
 from typer.testing import CliRunner
 
 from fleet.bus.client import BusClient
@@ -27,8 +28,23 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.messages import State
-from fleet.bus.router import Router
+from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.contract import EXAMPLES
+from fleet.bus.protocol.messages import State, encode, encoding
+from fleet.bus.protocol.operator import (
+    Cancel,
+    Change,
+    Cleared,
+    ClearRequest,
+    Controlled,
+    ControlRequest,
+    Pause,
+    ResetReply,
+    ResetRequest,
+    Resume,
+    Settle,
+)
+from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
@@ -169,8 +185,6 @@ def not_yet(place, true):
 
 
 MINUTE = r"20\d\d-\d\d-\d\d \d\d:\d\d UTC"
-
-
 WRONG = {
     "none": r"^Endpoint '\S+' needs a certificate; name it, as tls/\S+#FOLDER/NAME\.$",
     "plain": r"^No router answered at tcp/\S+ within 5\.0 s \(the server expects TLS: .* are needed\)\.$",
@@ -180,7 +194,6 @@ WRONG = {
     "expired": rf"^The certificate '/\S+/k/monitor\.pem' expired on {MINUTE}, and it is {MINUTE} now; issue a new ",
     "not yet": rf"^The certificate '/\S+/k/monitor\.pem' is valid only from {MINUTE} to {MINUTE}, and it is {MINUTE} ",
 }
-
 
 SLOW = ("plain", "another authority")
 """Tried until the time for it is over: with one command each."""
@@ -212,3 +225,108 @@ def test_the_doctor_mentions_a_certificate_unknown_to_the_router(fleet, tmp_path
     done = run("doctor", f"{fleet.endpoint}#{tmp_path}/k/spy")
     assert done.exit_code == 1
     assert "the router does not know this certificate" in " ".join(done.stdout.split())
+
+
+STEERING = {
+    ("job", "cancel", "j"): Cancel("j"),
+    ("job", "settle", "j", "redo"): Settle("j", "redo"),
+    ("job", "change", "j", "--value", "2"): Change("j", value=2.0),
+    ("arm", "pause"): Pause("*"),
+    ("arm", "pause", "a"): Pause("a"),
+    ("arm", "resume"): Resume("*"),
+    ("arm", "clear", "a"): ClearRequest("a", "ann"),
+    ("arm", "reset", "a"): ResetRequest("ann"),
+}
+
+OTHERS = ("monitor", "submitter", "recorder", "b")
+
+
+@pytest.fixture(scope="module")
+def steered_fleet(tmp_path_factory):
+    """A router with TLS, and an arm and an auctioneer that keep every request."""
+    place, stop, received = tmp_path_factory.mktemp("keys") / "f", threading.Event(), []
+    make(place, of_arms("f", ["a"], [Participant("b", "arm")]), days=30)
+
+    def keep(reply):
+        return lambda request: (received.append(request), reply(request))[1]
+
+    def controlled(request):
+        return Controlled("auctioneer", request.request, True, "", JobStatus("j", "waiting"), {})
+
+    with ExitStack() as stack:
+        router = stack.enter_context(Router(tls=Tls(place, "router")))
+        arm, auctioneer = (
+            stack.enter_context(BusClient(Tls(place, name).endpoint(router.endpoint), "f"))
+            for name in ("a", "auctioneer")
+        )
+        arm.reply_to(keys.of_arm("f", "a", "reset"), ResetRequest, keep(lambda _: ResetReply("a", True)))
+        auctioneer.reply_to(keys.of_jobs("f", "control"), ControlRequest, keep(controlled))
+        auctioneer.reply_to(keys.of_jobs("f", "clear"), ClearRequest, keep(lambda _: Cleared("auctioneer", "a")))
+        cell = replace(EXAMPLES[Cell], auctioneer="auctioneer")
+        auctioneer.reply_to(keys.of_jobs("f", "cell"), CellRequest, keep(lambda _: cell))
+
+        def serve():
+            while not stop.is_set():
+                for each in (arm, auctioneer):
+                    each.serve(time.monotonic() + 0.02)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield SimpleNamespace(received=received, endpoint=lambda who: Tls(place, who).endpoint(router.endpoint))
+        stop.set()
+        thread.join(PATIENCE_S)
+
+
+@pytest.mark.parametrize("command", STEERING, ids=" ".join)
+def test_an_operator_may(steered_fleet, command):
+    steered_fleet.received.clear()
+    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", steered_fleet.endpoint("operator")])
+    assert done.exit_code == 0, done.exception
+    (request,) = steered_fleet.received
+    assert request.by == "ann"
+    assert STEERING[command] in (request, getattr(request, "action", None))
+
+
+@pytest.mark.parametrize("who", OTHERS)
+@pytest.mark.parametrize("command", STEERING, ids=" ".join)
+def test_nobody_else_may(steered_fleet, command, who):
+    steered_fleet.received.clear()
+    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", steered_fleet.endpoint(who)])
+    assert isinstance(done.exception, BusError)
+    assert "may not query" in str(done.exception)
+    assert "a certificate of the role" in str(done.exception)
+    assert "operator" in str(done.exception)
+    assert steered_fleet.received == []
+
+
+@pytest.mark.parametrize("who", OTHERS)
+def test_the_router_drops_what_a_client_sends_against_its_role(steered_fleet, who):
+    """Without our client's own check."""
+    steered_fleet.received.clear()
+    messages = [
+        *((keys.of_jobs("f", "control"), ControlRequest(str(i), a)) for i, a in enumerate([Cancel("j"), Pause("*")])),
+        (keys.of_jobs("f", "clear"), ClearRequest("a", "ann")),
+        (keys.of_arm("f", "a", "reset"), ResetRequest("ann")),
+    ]
+    session = open_client(steered_fleet.endpoint(who), timeout_s=PATIENCE_S)
+    try:
+        for key, message in messages:
+            replies = session.get(key, payload=encode(message), encoding=encoding(type(message)), timeout=0.5)
+            assert [reply for reply in replies if reply.ok is not None] == []
+    finally:
+        session.close()
+    test_an_operator_may(steered_fleet, ("arm", "pause"))  # whatever came before would have been served by now
+    assert len(steered_fleet.received) == 1
+
+
+@pytest.mark.parametrize(("who", "may"), [("operator", True), ("submitter", True), ("b", False)])
+def test_the_cell_is_described_to_those_who_submit(steered_fleet, who, may):
+    steered_fleet.received.clear()
+    with BusClient(steered_fleet.endpoint(who), "f") as link:
+        if may:
+            replies = link.query_and_wait(keys.of_jobs("f", "cell"), CellRequest(), Cell, timeout_s=PATIENCE_S)
+            assert [cell.scenario for cell in replies.messages.values()] == [EXAMPLES[Cell].scenario]
+        else:
+            with pytest.raises(BusError, match="may not query"):
+                link.query_and_wait(keys.of_jobs("f", "cell"), CellRequest(), Cell, timeout_s=PATIENCE_S)
+    assert len(steered_fleet.received) == may

@@ -17,7 +17,6 @@ PAGES = (
 )
 COMMAND = re.compile(r"python -m benchmarks\.paper ([\w-]+)((?: [^`#\n>]+)?)")
 RESULTS = "docs/results/"
-
 TINY = {
     "readings": "--scenarios quickstart --train 20 --exploration 6 --reference 125 --test 60 --novel 70",
     "sides": "--count 2 --train 20 --exploration 6 --reference 20 --test 60 --novel 2",

@@ -1,7 +1,12 @@
-"""Measures by hand, and scores of tiny studies with untrained networks."""
+"""Measures by hand, scores of tiny studies, the alarm, and P(saturation) of stand-ins that report the true heat."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binom
 
 from benchmarks.paper.quality import (
     QUALITY,
@@ -12,13 +17,36 @@ from benchmarks.paper.quality import (
     spread,
     window_statistics,
 )
-from benchmarks.paper.subjects import CARRIER, Jobs, detection, jobs_of, make_study
+from benchmarks.paper.saturation import (
+    PastWork,
+    _plans,
+    _true_peak,
+    judge_networks,
+    judge_twin,
+    past_work,
+    reliability_rows,
+)
+from benchmarks.paper.subjects import (
+    CARRIER,
+    Jobs,
+    Study,
+    TooFewJobs,
+    alarm_threshold,
+    detection,
+    jobs_of,
+    make_study,
+    raised,
+)
 from fleet.errors import FleetError
+from fleet.events import Event
 from fleet.heat.thermal import NODES
-from fleet.motion import CHANNELS
+from fleet.motion import CHANNELS, drive
+from scenarios.prepare import twins
 from scenarios.prepare.identify import identify_from_work
+from scenarios.spec.load import load
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.config import TwinConfig
+from twin.vae.measures import PARTS, Features, p_value
 from twin.vae.window import Scaler, cut_jobs, windows_of
 
 SEED = np.random.SeedSequence(1)
@@ -149,3 +177,167 @@ def test_a_spread_is_the_sample_deviation():
     assert spread([1.0, 3.0]) == "2.000 ± 1.414"
     assert spread([-0.5]) == "-0.500"
     assert spread([float("nan")]) == "–"
+
+
+@dataclass(frozen=True)
+class Seer:
+    """Stands in for a twin: reports the true copper heat of each joint, or noise."""
+
+    study: Study
+    sees: bool
+    version: str = "seer"
+
+    def features(self, plans, repetitions) -> Features:
+        heat = np.array([drive(plan.cycle.profile, self.study.motors).current_sq for plan in plans])
+        if not self.sees:
+            heat = np.random.default_rng(0).exponential(1.0, heat.shape)
+        return Features(np.repeat(heat[..., None], PARTS, axis=-1))
+
+
+@pytest.fixture(scope="module")
+def saturation_study() -> Study:
+    return make_study(np.random.SeedSequence(5), train=0, reference=0, test=360, novel=20)
+
+
+@pytest.fixture(scope="module")
+def work(saturation_study: Study) -> PastWork:
+    return past_work(saturation_study, seed=5, labelled=120, watched=100)
+
+
+@pytest.fixture(scope="module")
+def judged(saturation_study: Study, work: PastWork):
+    """Predictions by name and alarms by score, of a twin that sees noise and of one that sees the heat."""
+    return [judge_twin(work, Seer(saturation_study, sees)) for sees in (False, True)]
+
+
+def test_who_sees_the_heat_is_trusted_and_who_sees_noise_is_not(judged, work) -> None:
+    (noise, _), (heat, _) = judged
+    assert heat["excess, logistic"]["auroc"] > 0.97
+    assert heat["excess, logistic"]["brier"] < 0.06
+    # Duration and temperature remain to who sees noise: better than chance, and no more.
+    assert 0.5 < noise["excess, logistic"]["auroc"] < 0.9
+    assert len(work.held_out) == 140
+
+
+def test_alarms_are_rarely_false_whatever_they_go_by(judged, work) -> None:
+    for _, alarms in judged:
+        for alarm in alarms.values():
+            # A calibration at its worst of a thousand, and the luck of the held-out jobs on top.
+            calm = round(140 * (1 - work.jobs.passed[work.held_out].mean()))
+            assert alarm["false_alarms"] <= binom.ppf(0.999, calm, 0.13) / calm
+    assert judged[1][1]["excess"]["caught"] > 0.85 > judged[0][1]["excess"]["caught"]
+
+
+def test_a_study_repeats(saturation_study, judged) -> None:
+    again = judge_twin(past_work(saturation_study, seed=5, labelled=120, watched=100), Seer(saturation_study, True))
+    assert again[1] == judged[1][1]
+
+
+def test_nothing_held_out_is_refused(saturation_study) -> None:
+    with pytest.raises(ValueError, match=r"more than 300 \+ 60 test jobs \(got 360\)"):
+        past_work(saturation_study, seed=5, labelled=300, watched=60)
+
+
+def test_an_identified_arm_knows_its_peaks_and_both_are_trusted():
+    study = make_study(np.random.SeedSequence(5), train=0, reference=0, test=160, novel=0)
+    found = judge_networks(past_work(study, seed=5, labelled=80, watched=0))
+    nominal, identified = found.values()
+    assert list(found) == ["rc nominal", "rc identified"]
+    assert min(each["auroc"] for each in found.values()) > 0.95
+    assert max(each["brier"] for each in found.values()) < 0.08
+    assert identified["peak_error_k"] < 0.7 * nominal["peak_error_k"]
+    with pytest.raises(ValueError, match="more than 150 \\+ 10 test jobs"):
+        past_work(study, seed=5, labelled=150, watched=10)
+
+
+class Plain:
+    """Stands in for the learned twin, which P by `rc` does not need: every plan is equally difficult."""
+
+    version = "plain"
+    joint_weight = None
+
+    def features(self, plans, repetitions) -> Features:
+        return Features(np.full((len(plans), 7, PARTS), 0.1))
+
+
+def test_p_and_peaks_come_true_in_the_shift(monkeypatch) -> None:
+    monkeypatch.setattr(
+        twins, "train_twins", lambda scenario, planned, folder, progress, seed: [Plain()] * len(planned)
+    )
+    ((key, row),) = reliability_rows(load("heat_wave"), (10_000, 10_001), 1, "rc", {"key": "wspt"}, ["key"])
+    assert (key, row["policy"]) == ("key", "wspt")
+    said = row["groups"]["all"]
+    assert said["awards"] > 100
+    assert 20 < said["passed"] < said["awards"] - 20
+    assert said["ece"] <= 0.05
+    assert said["brier"] <= 0.05
+    assert said["auroc"] >= 0.95
+    assert said["peak_rms_k"] < 2.0
+    assert row["groups"]["warm"]["brier"] <= 0.05
+    assert row["groups"]["warm"]["awards"] + row["groups"]["cool"]["awards"] == said["awards"]
+
+
+def test_a_plan_ends_at_home_or_by_a_fault_and_else_its_outcome_is_unknown() -> None:
+    times = {
+        "a": [("award", 0), ("home", 50), ("award", 60), ("fault", 90), ("recover", 200), ("award", 210)],
+        "b": [("award", 10), ("give_back", 40), ("home", 60)],
+    }
+    events = [Event(time_s=t, kind=kind, arm=arm) for arm, log in times.items() for kind, t in log]  # pyright: ignore
+    assert list(_plans(events)) == [
+        ("a", 0, 50, False),
+        ("a", 60, 90, True),
+        ("a", 210, None, False),
+        ("b", 10, None, False),
+    ]
+
+
+def test_the_first_two_minutes_do_not_count_but_in_short_plans() -> None:
+    ends_c = 80.0 - np.arange(60.0)[:, None]  # cooling by 1 K in each step of 10 s
+    assert _true_peak(ends_c, 10.0, 0.0, 400.0) == 80.0 - 11  # at 120 s
+    assert _true_peak(ends_c, 10.0, 100.0, 150.0) == 80.0 - 14  # at its end
+    assert _true_peak(-ends_c, 10.0, 100.0, 400.0) == 39.0 - 80.0
+
+
+@pytest.mark.parametrize("draw", ["normal", "exponential", "coarse"])
+@pytest.mark.parametrize(("alpha", "n"), [(0.05, 19), (0.05, 150), (0.2, 37)])
+def test_false_alarms_stay_below_alpha_whatever_the_scores_are_like(draw, alpha, n) -> None:
+    rng = np.random.default_rng([n, round(100 * alpha)])
+    trials = 1500
+    scores = rng.integers(0, 9, (trials, n + 1)) if draw == "coarse" else getattr(rng, draw)(size=(trials, n + 1))
+    false = sum(row[-1] > alarm_threshold(row[:-1], alpha) for row in scores)
+    # Exactly floor(alpha (n + 1))/(n + 1) without ties, and less with them.
+    exact = np.floor(alpha * (n + 1) + 1e-9) / (n + 1)
+    assert exact <= alpha + 1e-9
+    assert false <= binom.ppf(0.9999, trials, exact)
+    if draw != "coarse":
+        assert false >= binom.ppf(0.0001, trials, exact)
+
+
+@given(
+    scores=st.lists(st.floats(-5, 5), min_size=9, max_size=60),
+    alpha=st.floats(0.1, 0.9),
+    asked=st.lists(st.floats(-6, 6), min_size=1),
+)
+def test_the_alarm_is_a_small_p_value(scores, alpha, asked) -> None:
+    threshold = alarm_threshold(scores, alpha)
+    new = np.array([*asked, *scores])
+    counted = np.array([(1 + sum(s >= x for s in scores)) / (len(scores) + 1) for x in new])
+    np.testing.assert_allclose(p_value(np.sort(scores), new), counted)
+    np.testing.assert_array_equal(new > threshold, counted <= alpha + 1e-9 / (len(scores) + 1))
+
+
+def test_too_few_jobs_promise_nothing() -> None:
+    assert alarm_threshold(np.arange(19), 0.05) == 18
+    with pytest.raises(TooFewJobs, match=r"0\.05 needs 19 or more jobs without the event \(got 18\)"):
+        alarm_threshold(np.arange(18), 0.05)
+
+
+def test_what_has_no_score_is_warned_of() -> None:
+    assert raised(np.array([np.nan, 18.0, 18.5]), alarm_threshold(np.arange(19))) == 2 / 3
+
+
+def test_what_makes_no_alarm_is_refused() -> None:
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        alarm_threshold([1.0, 2.0], 0.0)
+    with pytest.raises(ValueError, match="finite"):
+        alarm_threshold([1.0, np.nan], 0.5)

@@ -9,30 +9,8 @@ from benchmarks.paper.readings import JOINTS, MEASURES, TOTALS, Errors, reading_
 from benchmarks.paper.real_logs import QUESTIONS, Windows, answers, judged_windows
 from fleet.errors import FleetError
 from scenarios.evaluate.statistics import interval
-from twin.logs.recording import Recording
-from twin.vae.config import TwinConfig
+from tests.logs import COOL, TINY, WARM
 from twin.vae.measures import PARTS, Calibration, Features, moments
-
-RATE_HZ = 2.0
-TINY = TwinConfig(
-    hidden=4, epochs=3, max_windows=100, restarts=1, rate_hz=RATE_HZ, record_hz=RATE_HZ, allow_collapse=True
-)
-
-
-def logged(name: str, *, load: float = 1.0, celsius: float = 31.0, seed: int = 0, seconds: float = 80.0) -> Recording:
-    """Seven joints that swing at 2 Hz, joint 2 at one temperature."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
-    omega, shift = rng.uniform(0.1, 0.6, 7), rng.uniform(0, 6, 7)
-    q = 0.5 * np.sin(np.outer(time_s, omega) + shift)
-    tau = load * 10 * np.cos(q) + rng.normal(0, 0.2, q.shape)
-    temp_c = np.full(q.shape, 30.0)
-    temp_c[:, 1] = celsius
-    return Recording(name=name, time_s=time_s, q=q, qd=np.gradient(q, time_s, axis=0), tau=tau, temp_c=temp_c)
-
-
-COOL = [logged(f"cool_{i}", seed=i) for i in range(14)]
-WARM = logged("warm", celsius=45.0, seed=90)
 
 
 def windows_of(file: list[str], d: list[float], rms: list[float], temp_c: list[float]) -> Windows:

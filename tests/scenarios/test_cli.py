@@ -1,17 +1,37 @@
-"""The command line, called as a person calls it."""
+"""The command line: options, ranges, help and errors, called as a person calls it."""
 
 import json
 import os
 import re
 import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
+from agents.registry import RULES
+from fleet.bus.exchange.channel import TOPOLOGIES, Channel, Partition
+from fleet.bus.protocol.keys import CHANNEL, STATE_HZ
+from fleet.errors import MAX_NAME, FleetError
+from fleet.fields import check, option, options_of
+from fleet.robot import ThermalLimits
+from scenarios.cli.from_fields import From, Given, flags_of, with_fields
+from scenarios.cli.main import COMMANDS, GROUPS, MOVED, load_command
+from scenarios.cli.options import channel_of
+from scenarios.live.gateway import ROLES
 from scenarios.run.log import FILES
-from scenarios.spec.load import library
+from scenarios.spec.load import library, load
+from scenarios.spec.options import ENDPOINT, PORT, Budget, LiveSpec, RunSpec, Shot, StudySpec
 from scenarios.suite.instances import CELLS
 from tests.commands import REAL
+from twin.thermal.identify import AMBIENT_C
 
 QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
 
@@ -38,29 +58,18 @@ def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml,
 
 
 @pytest.mark.parametrize("plant", ["profile", "mujoco"])
-def test_the_same_seed_gives_the_same_files(thermofleet, small_toml, tmp_path, plant):
+def test_the_same_seed_gives_the_same_files_also_in_another_process(thermofleet, small_toml, tmp_path, plans, plant):
     one, two = tmp_path / "one", tmp_path / "two"
-    for out in (one, two):
-        assert thermofleet("run", small_toml, *QUICK, "--plant", plant, "--seed", 3, "--out", out).code == 0
+    command = ("run", small_toml, *QUICK, "--plant", plant, "--seed", 3)
+    assert thermofleet(*command, "--out", one).code == 0
+    if plant == "mujoco":
+        assert thermofleet(*command, "--out", two).code == 0
+    else:
+        env = {**os.environ, "THERMOFLEET_CACHE": str(plans), "PYTHONHASHSEED": "7"}
+        words = [*REAL, *map(str, command), "--out", str(two)]
+        subprocess.run(words, check=True, env=env, capture_output=True, timeout=300)
     for name in FILES:
         assert (one / name).read_bytes() == (two / name).read_bytes(), name
-
-
-def test_the_same_seed_gives_the_same_files_in_another_process(thermofleet, small_toml, tmp_path, plans):
-    one, two = tmp_path / "one", tmp_path / "two"
-    assert thermofleet("run", small_toml, *QUICK, "--out", one).code == 0
-    env = {**os.environ, "THERMOFLEET_CACHE": str(plans), "PYTHONHASHSEED": "7"}
-    command = [*REAL, "run", str(small_toml), *QUICK]
-    subprocess.run([*command, "--out", str(two)], check=True, env=env, capture_output=True, timeout=300)
-    for name in FILES:
-        assert (one / name).read_bytes() == (two / name).read_bytes(), name
-
-
-def test_zenoh_and_memory_record_the_same_shift(thermofleet, small_toml, tmp_path):
-    for bus in ("zenoh", "memory"):
-        assert thermofleet("run", small_toml, *QUICK, "--bus", bus, "--out", tmp_path / bus).code == 0
-    for name in ("telemetry.parquet", "events.parquet"):
-        assert (tmp_path / "zenoh" / name).read_bytes() == (tmp_path / "memory" / name).read_bytes(), name
 
 
 def test_json_is_one_object_and_nothing_else(thermofleet, small_toml, tmp_path):
@@ -113,19 +122,13 @@ def test_show_fits_eighty_columns_and_cuts_no_word(thermofleet, small_toml):
     assert json.loads(thermofleet("show", small_toml, "--json").out)["name"] == "heat"
 
 
-def test_compare_prints_a_table_or_json(thermofleet, small_toml, monkeypatch):
+def test_compare_prints_a_table_or_json_against_round_robin_or_the_first_policy(thermofleet, small_toml, monkeypatch):
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
-    some = ("compare", small_toml, "--seeds", 2, "--policies", "random, round_robin", "--difficulty", "blind")
-    told = json.loads(thermofleet(*some, "--json").out)
-    assert set(told["figures"]) == {"random", "round_robin"}
-    assert "min above warning" in thermofleet(*some).out
-
-
-def test_without_round_robin_the_first_policy_is_the_baseline(thermofleet, small_toml, monkeypatch):
-    monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
-    some = ("compare", small_toml, "--seeds", 2, "--difficulty", "blind", "--json", "--policies")
-    for policies, baseline in (("random,coolest_first", "random"), ("random,round_robin", "round_robin")):
-        assert json.loads(thermofleet(*some, policies).out)["baseline"] == baseline
+    some = ("compare", small_toml, "--seeds", 2, "--difficulty", "blind", "--policies")
+    for policies, baseline in (("random,coolest_first", "random"), ("random, round_robin", "round_robin")):
+        told = json.loads(thermofleet(*some, policies, "--json").out)
+        assert (set(told["figures"]), told["baseline"]) == (set(policies.replace(" ", "").split(",")), baseline)
+    assert "min above warning" in thermofleet(*some, "random, round_robin").out
 
 
 @pytest.mark.ci_slow
@@ -149,3 +152,378 @@ def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypa
     for link in re.findall(r'href="([^"]+)"', page):
         assert (tmp_path / "demo" / link).is_file()
     assert page.count("<section>") == page.count("href=") == 2
+
+
+def unreachable(text: str) -> str:
+    return text.replace("position_m = [0.0, 0.2, 0.25]", "position_m = [9.0, 0.2, 0.25]")
+
+
+def too_heavy(text: str) -> str:
+    return text.replace("payload_kg = [2.0]", "payload_kg = [9.0]")
+
+
+BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
+    ("unknown key", lambda t: t + "\n[reward]\nfaullts = 1\n", [], "heat.toml: reward: unknown key 'faullts'; did you"),
+    ("wrong type", lambda t: t.replace("= 180", '= "long"'), [], "heat.toml: horizon_s: expected a number, got a text"),
+    (
+        "negative mass",
+        lambda t: t.replace("[2.0]", "[-2.0]"),
+        [],
+        "jobs[0].payload_kg must be between 0 and 10 kg (got -2.0).",
+    ),
+    ("one place", lambda t: t.replace("[0.45, 0", "[-0.45, 0"), [], "'right' is 0.00 m from 'left' (arms[0]);"),
+    ("not a number", lambda t: t.replace("= 180", "= nan"), [], "heat.toml: horizon_s: expected a finite number,"),
+    ("bad TOML", lambda t: t + "\n[[", [], "heat.toml: not valid TOML: "),
+    (
+        "no arm",
+        lambda t: t.replace("[[arms]]", "[[places]]").replace("tilt_deg", "tool_deg").replace('home = "retract"', ""),
+        [],
+        "there are no arms",
+    ),
+    ("no trace", lambda t: t.replace('"batch", count = 2', '"trace", file = "t.txt"'), [], "there is no file '"),
+    ("unreachable", unreachable, [], "jobs[0].places: no arm can do 'hold' with 2 kg (left at 'bench': reach:"),
+    ("too heavy", too_heavy, [], "jobs[0].places: no arm can do 'hold' with 9 kg (left at 'bench': 9 kg at 0."),
+    ("policy", None, ["--policy", "raundom"], "No policy 'raundom'; did you mean 'random'? Allowed: "),
+    ("plant", None, ["--plant", "mojoco"], "No plant 'mojoco'; did you mean 'mujoco'? Allowed: mujoco, profile."),
+    ("bus", None, ["--bus", "zeno"], "No bus 'zeno'; did you mean 'zenoh'? Allowed: memory, zenoh."),
+    (
+        "difficulty",
+        None,
+        ["--difficulty", "blnd"],
+        "No difficulty 'blnd'; did you mean 'blind'? Allowed: blind, oracle",
+    ),
+    ("seed text", None, ["--seed", "one"], "parse string as an integer (got 'one'). See"),
+    ("option", None, ["--sed", "1"], "No such option: --sed"),
+    ("out is a file", None, ["--out", "HERE/heat.toml"], "it is a file; --out needs a folder."),
+    ("out below a file", None, ["--out", "HERE/heat.toml/run"], "heat.toml' is a file, not a folder."),
+    ("out is taken", None, ["--out", "HERE"], "holds other files ('heat.toml'); --out needs a new folder"),
+]
+
+
+@pytest.mark.parametrize(("edit", "options", "sentence"), [row[1:] for row in BAD_INPUT], ids=[r[0] for r in BAD_INPUT])
+def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(
+    thermofleet, small_toml, tmp_path, edit, options, sentence
+):
+    if edit is not None:
+        small_toml.write_text(edit(small_toml.read_text(encoding="utf-8")), encoding="utf-8")
+    options = [option.replace("HERE", str(tmp_path)) for option in options]
+    said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run", *options)
+    assert said.code == 2
+    assert said.err.startswith("Error: ")
+    assert sentence in said.err
+    assert said.err.count("\n") == (2 if edit is unreachable else 1)  # two jobs need the place
+    assert said.err.endswith(".\n")
+    assert "Traceback" not in said.err
+    assert said.out == ""
+    assert [p.name for p in tmp_path.iterdir()] == ["heat.toml"]
+
+
+WRONG_WORDS = {
+    "run quikstart": "No scenario 'quikstart'; did you mean 'quickstart'? Allowed: ",
+    "run nowhere.toml": "There is no scenario file 'nowhere.toml'.",
+    "show quikstart": "No scenario 'quikstart'; did you mean 'quickstart'? Allowed: ",
+    "run": "Missing argument 'scenario'.",
+    "rnu": "No such command 'rnu'. Did you mean 'run'?",
+    "submit jobs.json": "`thermofleet submit` is now `thermofleet job submit`.",
+    "suite --split test": "`thermofleet suite` is now `thermofleet show --suite`.",
+    "arm resume arm_0": "`thermofleet arm resume` is now `thermofleet arm pause --end`.",
+    "show quickstart --suite test": "--suite needs no scenario; leave 'quickstart' out.",
+    "show --suite tst": "No suite 'tst'; did you mean 'test'? Allowed: cells, sizes, test, train, validation.",
+    "arm quickstart arm_0": "`thermofleet arm SCENARIO NAME` is now `thermofleet arm run SCENARIO NAME`.",
+    "show quickstart --hold 1": "--hold needs no scenario; leave 'quickstart' out.",
+    "compare quickstart --policies random,rnd": "No policy 'rnd'; did you mean 'random'?",
+    "compare quickstart --baseline best": "The baseline 'best' is not among the policies compared: ",
+    "show --hold 1 --posture hom": "No posture 'hom'; did you mean 'home'?",
+} | {
+    f"{command} heat.toml {words}": sentence
+    for command in ("run", "compare")
+    for words, sentence in {
+        "--topology rign": "Error: No topology 'rign'; did you mean 'ring'?",
+        "--partition soon": "Error: --partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM",
+        "--partition 0:9:lefft": "Error: A partition names an unknown arm 'lefft'; did you mean 'left'?",
+    }.items()
+}
+
+
+@pytest.mark.parametrize("words", WRONG_WORDS)
+def test_every_command_tells_what_is_wrong(thermofleet, small_toml, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    said = thermofleet(*words.split())
+    assert said.code == 2
+    assert WRONG_WORDS[words] in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_a_cache_that_cannot_be_written_is_told(thermofleet, small_toml, tmp_path, monkeypatch):
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(small_toml / "cache"))
+    said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run")
+    assert said.code == 2
+    assert said.err.startswith("Error: Cannot keep plans and twins in '")
+
+
+HUGE = "9" * 30
+WRONG = {int: (HUGE, f"-{HUGE}"), float: (HUGE, f"-{HUGE}", "nan", "inf", "-inf")}
+
+
+def numbers() -> Iterator[tuple[tuple[str, ...], str, type]]:
+    """Words of a command, one of its numeric options, and its type."""
+    for name in COMMANDS:
+        for parameter in load_command(name).params:
+            kind = parameter.type_descriptor.annotation if parameter.param_type_name == "option" else None
+            if kind in WRONG:
+                yield tuple(name.split()), parameter.opts[0], kind
+
+
+NUMBERS = list(numbers())
+
+
+@pytest.mark.parametrize(("words", "option", "kind"), NUMBERS, ids=[" ".join((*w, o)) for w, o, _ in NUMBERS])
+def test_a_number_out_of_range_is_refused_in_one_sentence(thermofleet, words, option, kind):
+    for value in WRONG[kind]:
+        said = thermofleet(*words, f"{option}={value}")
+        assert said.code == 2, value
+        assert said.err.startswith(f"Error: {option} must be ")
+        assert said.err.count("\n") == 1
+        assert said.out == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("bus", "auctioneer", "--name"),
+        ("bus", "record"),
+        ("arm", "run", "quickstart"),
+        ("bus", "ros2", "listen", "--arm"),
+    ],
+)
+@pytest.mark.parametrize("name", ["", "a/b", "a\nb", "x" * (MAX_NAME + 1), "\udcff"])
+def test_a_name_of_another_form_is_refused(thermofleet, words, name):
+    said = thermofleet(*words, name)
+    assert said.code == 2
+    assert f"1 to {MAX_NAME} printable characters" in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_help_names_every_command_by_group_and_run_names_every_policy_and_topology(thermofleet):
+    said = thermofleet("--help")
+    assert said.code == 0
+    assert all(f"│ {name.split()[0]} " in said.out for name in COMMANDS)
+    assert all(f"─ {entry.panel} ─" in said.out for entry in COMMANDS.values())
+    wide = " ".join(thermofleet("run", "--help").out.replace("│", " ").split())
+    assert all(name in wide for name in (*RULES, *TOPOLOGIES))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_listed_command_can_be_imported_and_explains_itself(thermofleet, name):
+    said = thermofleet(*name.split(), "--help")
+    assert said.code == 0
+    assert f"Usage: thermofleet {name}" in said.out
+
+
+def test_the_version_is_printed(thermofleet):
+    said = thermofleet("--version")
+    assert (said.code, said.out) == (0, f"thermofleet {version('thermofleet')}\n")
+
+
+def test_help_imports_no_large_library():
+    """The page takes 0.2 s of CPU time; NumPy alone would take as much again."""
+    program = textwrap.dedent("""
+        import contextlib, sys
+        from scenarios.cli.main import main
+
+        with contextlib.suppress(SystemExit):
+            main(["--help"])
+        print([m for m in ("numpy", "networkx", "torch", "zenoh", "plotly", "mujoco", "numba") if m in sys.modules])
+    """)
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
+    assert said.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize("module", ["run", "look", "evaluate", "live", "jobs", "keys", "twin"])
+def test_a_command_is_declared_without_what_it_runs(module):
+    """Its help takes 0.3 s; the schema of scenarios, Zenoh or MuJoCo would double that."""
+    large = ("networkx", "torch", "zenoh", "plotly", "mujoco", "numba", "scenarios.spec.schema")
+    program = f"import sys, scenarios.cli.{module}; print([name for name in {large} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "completions"),
+    [
+        ("thermofleet re", ["report"]),
+        ("thermofleet run --pl", ["--plant"]),
+        ("thermofleet run quickstart --plant m", ["mujoco"]),
+        ("thermofleet bus re", ["record", "replay"]),
+        ("thermofleet arm re", ["reset"]),
+    ],
+)
+def test_the_shell_completes_commands_and_their_options(words, completions):
+    program = "from scenarios.cli.main import main; main()"
+    last = str(len(words.split()) - 1)
+    asked = {"_THERMOFLEET_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": last}
+    command = [sys.executable, "-c", program]
+    said = subprocess.run(command, env={**os.environ, **asked}, capture_output=True, text=True, timeout=300, check=True)
+    assert sorted(said.stdout.split()) == completions
+
+
+def test_a_warning_is_one_line_where_there_is_no_terminal():
+    warn = "logging.getLogger('fleet.live').warning('%s', 'word ' * 60)"
+    code = f"import logging, scenarios.cli.main as cli; cli.app = lambda **_: {warn}; cli.main([])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
+    assert done.stderr == f"WARNING  fleet.live: {'word ' * 60}\n"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Oven:
+    """An oven."""
+
+    heat_c: float = option("Temperature, °C.", 180.0, low=0, high=300)
+    mode: str = option("fan or grill.", "fan", choices=("fan", "grill"))
+    minutes: int | None = option("Time, min.", None, low=0, high=600, above=True)
+    shelves: tuple[int, ...] = option("Shelves.", (), flag="--shelf", parse=int)
+    clean: bool = option("Clean it afterwards.", False)
+    maker: str = "nobody"
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def run(*words, **defaults) -> Given | BaseException:
+    """What a command is given by its words; or its error."""
+    received: list[Given] = []
+
+    def bake(given: Annotated[Given, From(Oven, **defaults)], twice: bool = option("Again.", False)) -> None:
+        """Bake."""
+        received.append(given)
+
+    app = typer.Typer()
+    app.command()(with_fields(bake))
+    done = CliRunner().invoke(app, [*words])
+    return received[0] if received else done.exception or AssertionError(done.output)
+
+
+def test_a_command_receives_what_is_given_and_no_defaults():
+    assert run() == {}
+    assert run("--heat-c", "90", "--twice") == {"heat_c": 90.0}
+    assert run("--shelf", "1", "--shelf", "3", "--clean") == {"shelves": (1, 3), "clean": True}
+    assert run("--mode", "fan") == {"mode": "fan"}  # given, although it is the default
+
+
+def test_a_command_may_have_a_default_of_its_own():
+    assert run(heat_c=100.0) == {"heat_c": 100.0}
+    assert run("--heat-c", "90", heat_c=100.0) == {"heat_c": 90.0}
+
+
+@pytest.mark.parametrize(
+    ("word", "value", "said"),
+    [
+        ("heat-c", 301.0, "must be 0 to 300 (got 301)."),
+        ("heat-c", float("nan"), "must be 0 to 300 (got nan)."),
+        ("minutes", 0, "must be > 0 and at most 600 (got 0)."),
+        ("mode", "gril", "No mode 'gril'; did you mean 'grill'? Allowed: fan, grill."),
+    ],
+)
+def test_the_same_bounds_hold_on_the_command_line_and_in_python(word, value, said):
+    error = run(f"--{word}", str(value))
+    assert isinstance(error, FleetError)
+    field = word.replace("-", "_")
+    assert str(error) == (said if said.startswith("No ") else f"--{word} {said}")
+    with pytest.raises(ValueError) as raised:  # noqa: PT011  # the sentence is compared below
+        Oven(**{field: value})
+    assert str(raised.value) == (said if said.startswith("No ") else f"Oven.{field} {said}")
+
+
+def test_words_of_a_command_line_give_the_same_value():
+    spec = LiveSpec(policy="wspt", speed=12345.678e-3, jobs="none", new_epoch=True)
+    names = [name for name in options_of(LiveSpec)]
+    received: list[Given] = []
+
+    def live(given: Annotated[Given, From(LiveSpec)]) -> None:
+        received.append(given)
+
+    app = typer.Typer()
+    app.command()(with_fields(live))
+    assert CliRunner().invoke(app, list(flags_of(spec, *names))).exit_code == 0
+    assert LiveSpec(**received[0]) == spec
+
+
+@pytest.mark.parametrize("kind", [RunSpec, LiveSpec, StudySpec, Budget, Shot, Channel])
+def test_defaults_are_allowed_and_each_option_has_a_sentence(kind):
+    kind()
+    defaults = {each.name: each.default for each in fields(kind)}
+    for name, known in options_of(kind).items():
+        assert known.help.endswith("."), name
+        assert not known.problem(name, defaults[name]), name
+
+
+def test_an_earlier_name_of_a_command_names_a_present_one():
+    for old, new in MOVED.items():
+        command, *options = new.partition(" --")[0], *new.split()[2:]
+        assert command in COMMANDS, old
+        flags = {flag for option in load_command(command).params for flag in getattr(option, "opts", ())}
+        assert {word for word in options if word.startswith("--")} <= flags, old
+        assert old not in {name.split()[0] for name in COMMANDS}, old
+    assert {name.split()[0] for name in COMMANDS if " " in name} == set(GROUPS)
+
+
+def test_defaults_that_the_help_states_are_those_of_the_modules_that_it_does_not_load():
+    def default(command, name):
+        return next(each.default for each in load_command(command).params if each.name == name)
+
+    assert default("arm run", "rate_hz") == STATE_HZ
+    assert default("bus router", "state_hz") == CHANNEL["arm", "state"].limit_hz
+    ambient = next(each for each in load_command("twin identify").params if each.name == "ambient")
+    assert f"default: {AMBIENT_C:g} is assumed" in ambient.help
+    limits = ThermalLimits()
+    assert (default("bus ros2", "warning_c"), default("bus ros2", "error_c")) == (limits.warning_c, limits.error_c)
+    assert ENDPOINT == f"tcp/127.0.0.1:{PORT}" == default("bus watch", "endpoint")
+    tokens = next(each for each in load_command("bus gateway").params if each.name == "tokens")
+    assert ", ".join(ROLES) in tokens.help
+
+
+BLIND = ("--difficulty", "blind", "--policy", "least_difficulty")
+HARD = ("--topology", "line", "--delay-s", 20, "--jitter-s", 5, "--loss", 0.2, "--partition", "30:60:left|right")
+CUTS = (Partition(0.0, 10.0, (("left",),)), Partition(20.0, 30.0, (("right",),)))
+
+
+def test_a_partition_is_read_from_a_text():
+    assert Partition.parse("600:1200:a, b|c") == Partition(600.0, 1200.0, (("a", "b"), ("c",)))
+    assert Partition.parse("0:1e3:arm:1") == Partition(0.0, 1000.0, (("arm:1",),))
+    for text in ("", "600", "600:1200", "a:b:left", "1200:600:left|right", "0:10:left|", "0:10:a,a"):
+        with pytest.raises(ValueError, match=r"partition .*\(got|names 'a' twice"):
+            Partition.parse(text)
+
+
+def test_options_make_a_channel(small_toml):
+    made = channel_of(load(small_toml), partitions=CUTS, topology="ring", delay_s=3.0)
+    assert made == Channel(topology="ring", delay_s=3.0, partitions=CUTS)
+    assert channel_of(load(small_toml)).perfect
+
+
+def test_a_run_records_its_channel_and_is_the_same_over_either_bus(thermofleet, small_toml, tmp_path):
+    told = {}
+    for bus in ("memory", "zenoh"):
+        out = tmp_path / bus
+        assert thermofleet("run", small_toml, *BLIND, *HARD, "--bus", bus, "--out", out).code == 0
+        told[bus] = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    assert told["memory"]["channel"] == {
+        "topology": "line",
+        "delay_s": 20.0,
+        "jitter_s": 5.0,
+        "loss": 0.2,
+        "partitions": [{"from_s": 30.0, "to_s": 60.0, "groups": [["left"], ["right"]]}],
+    }
+    assert told["memory"] | {"bus": "zenoh"} == told["zenoh"]
+    assert (tmp_path / "memory/events.parquet").read_bytes() == (tmp_path / "zenoh/events.parquet").read_bytes()
+    words = 2 * 19  # 18 ticks and the one of the reset, two links
+    assert 0 < told["memory"]["metrics"]["messages"] < words
+
+
+def test_a_comparison_says_what_lay_between(thermofleet, small_toml):
+    call = ("compare", small_toml, "--difficulty", "blind", "--seeds", 2, "--policies", "round_robin")
+    plain, hard = thermofleet(*call), thermofleet(*call, *HARD)
+    assert "Channel" not in plain.out
+    said = "Channel: line, 20 to 25 s late, 20 % lost, cut from 30 to 60 s."
+    assert said in " ".join(hard.out.split())
+    assert json.loads(thermofleet(*call, *HARD, "--json").out)["channel"]["delay_s"] == 20.0

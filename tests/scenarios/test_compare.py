@@ -1,19 +1,39 @@
-"""Comparisons: paired by seed, the same on any number of cores."""
+"""Comparisons of policies and sources: paired by seed, the same on any number of cores, and their page."""
 
+import base64
+import gzip
 import io
+import json
 import math
 import re
+import shlex
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
+import plotly.graph_objects as go
 import pytest
+import typer
+from plotly.offline import get_plotlyjs
 from rich.console import Console
+from scipy import stats
 
 from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.errors import FleetError
-from scenarios.evaluate.comparison import Comparison, compare
+from scenarios.cli import options
+from scenarios.evaluate import runner
+from scenarios.evaluate.comparison import Comparison, compare, comparisons, scores_over_all
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
+from scenarios.evaluate.scores import Shift
+from scenarios.evaluate.sources import _Random, inverted
 from scenarios.evaluate.statistics import Figure
+from scenarios.evaluate.store import read_rows
+from scenarios.evaluate.study import Case, Key, Row, Study
+from scenarios.prepare.randomisation import Randomisation
+from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
 
@@ -48,6 +68,7 @@ def test_a_scenario_is_a_file_too_and_the_first_policy_the_default_baseline(smal
 
 
 def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
+    monkeypatch.setattr("scenarios.evaluate.runner.HERE_S", 1e9)  # on however slow a machine
     monkeypatch.setattr("scenarios.evaluate.runner.LocalWorker", None)
     told: list[tuple[str, float]] = []
     compared(scenario, plans, workers=2, progress=lambda stage, share: told.append((stage, share)))
@@ -153,3 +174,294 @@ def test_a_title_names_seeds_that_follow_each_other(seeds, title):
     """Seeds of the suite's instances are 32-bit numbers; a range from the first to the last would take all memory."""
     result = Comparison("s", seeds, "u", 2, "a", {}, {}, PERFECT.described(), "")
     assert result.title == title
+
+
+REWARD = {"wspt": 10.0, "wsept": 14.0, "fifo": 6.0}
+
+
+class Known:
+    """What scores read of a reference: random 0, hindsight 20, bound 40."""
+
+    random, hindsight, upper = 0.0, 20.0, 40.0
+
+    def __init__(self, instance: str) -> None:
+        self.instance = instance
+
+
+@pytest.fixture
+def study() -> Study:
+    scenario = load("quickstart")
+    case = Case(name=scenario.name, scenario=scenario, seeds=tuple(range(6)))
+    return Study(policies=[*REWARD, "random"], cases=[case], difficulties=["blind"])
+
+
+def rows_of(study: Study, error: str | None = None, failing: str = "random") -> list[Row]:
+    """Rewards around those of `REWARD`; a policy fails in its last shift if there is an error."""
+    blank, rng = Outcome(**dict.fromkeys(FIGURES, 0.0)), np.random.default_rng(0)
+    rows: list[Row] = []
+    for policy in study.policies:
+        for seed in study.cases[0].seeds:
+            key = Key(policy, study.cases[0].name, 0, 0, "blind", seed)
+            reward = REWARD.get(policy, 0.0) + 0.5 * rng.normal()
+            failed = error is not None and policy == failing and seed == 5
+            rows.append(Row(key, None, 0, error, "line 3") if failed else Row(key, replace(blank, reward=reward), 2))
+    return rows
+
+
+def judged(study: Study, rows: list[Row], known: dict[Shift, Known]) -> Judged:
+    return Judged(
+        title="Comparison <here>",
+        results=comparisons(study, rows, "wspt", references=known),  # pyright: ignore[reportArgumentType]  # a stand-in
+        values=scores_over_all(study, rows, known),  # pyright: ignore[reportArgumentType]
+        card=study.card,
+        command="thermofleet compare quickstart",
+    )
+
+
+def test_randomised_shifts_have_no_normalised_scores(study: Study):
+    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
+    warmer = replace(study, randomise=Randomisation(ambient_k=(0.0, 5.0)))
+    plain, varied = (judged(each, rows_of(each), known) for each in (study, warmer))
+    assert plain.results[0].scores is not None
+    assert varied.results[0].scores is None
+    assert varied.values is None
+    assert "Randomisation: ambient temperature +0 to +5 K." in comparison_page(varied)
+    assert "Randomisation: none." in comparison_page(plain)
+
+
+def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
+    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
+    rows = rows_of(study, "Oops: <script>alert(1)</script>")
+    about = judged(study, rows, known)
+    first, second, failed = verdict(about)
+    mean = np.mean([row.outcome.reward for row in rows[6:12] if row.outcome]) / 20
+    better = mean - np.mean([row.outcome.reward for row in rows[:6] if row.outcome]) / 20
+    assert first.startswith(f"wsept beats the baseline wspt by {better:.2f} [")
+    assert "; it beats the next one, fifo by " in first
+    assert second.startswith(f"Its mean score is {mean:.2f} [")
+    assert failed.startswith("Failed: random;")
+    page = comparison_page(about)
+    assert page == comparison_page(about)
+    packed, *drawn = re.findall(r'<script type="text/plain" id="\w+">([^<]*)</script>', page)
+    assert gzip.decompress(base64.b64decode(packed)).decode() == get_plotlyjs()
+    own = page.replace(packed, "")
+    assert not re.search(r"https?://|src=", own)
+    assert own.count("<script") == 1 + 1 + len(drawn)
+    assert "Oops: &lt;script&gt;" in page
+    assert "Illegal actions, which count as waits: wspt 12" in page
+    assert page.count("data-drawn=") == len(drawn) == 3
+    for figure in drawn:
+        go.Figure(json.loads(figure))  # raises on any property or value that Plotly does not know
+
+
+def test_a_baseline_that_failed_has_no_differences(study: Study):
+    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
+    about = judged(study, rows_of(study, "Oops", failing="wspt"), known)
+    without, failed = verdict(about)
+    assert without.endswith("no differences, as the baseline wspt failed.")
+    assert failed.startswith("Failed: wspt;")
+    assert "Normalised score" not in comparison_page(about)
+
+
+def test_the_best_of_several_must_be_significant_among_them(study: Study):
+    about = judged(study, rows_of(study), {})
+    (result,) = about.results
+    for p, said in (
+        (0.016, "more reward than wspt."),
+        (0.02, "more reward than wspt, which is not significant."),
+    ):  # of three
+        reward = replace(result.figures["wsept"]["reward"], p=p)
+        figures = result.figures | {"wsept": result.figures["wsept"] | {"reward": reward}}
+        (only,) = verdict(replace(about, results=[replace(result, figures=figures)]))
+        assert said in only
+
+
+def test_without_references_the_verdict_is_of_rewards(study: Study):
+    (only,) = verdict(judged(study, rows_of(study), {}))
+    assert re.fullmatch(
+        r"quickstart, 6 seeds, this fleet only: wsept has the most reward, 14\.\d; "
+        r"[34]\.\d \[[234]\.\d, [45]\.\d\] more reward than wspt\.",
+        only,
+    )
+
+
+def test_charts_place_points_by_value():
+    chart = spans([("a", 0.0, -0.5, 0.5), ("b", 1.0, 0.9, 1.1), ("c", -9.0, -9.9, 2.0)], "score", least=-1.0)
+    (dots,) = chart["data"]
+    assert (dots["x"], dots["y"]) == ([0.0, 1.0], [0, 1])
+    assert dots["error_x"]["array"] == pytest.approx([0.5, 0.1])
+    assert dots["error_x"]["arrayminus"] == pytest.approx([0.5, 0.1])
+    assert [note["text"] for note in chart["layout"]["annotations"]] == ["◂ -9.00"]
+    unknown = float("nan")
+    near = points([("a", (1.0, 0.5, 2.5), (2.0, unknown, unknown)), ("b", (1.0, 1.0, 1.0), (2.0, 2.0, 2.0))], "x", "y")
+    (dots,) = near["data"]
+    assert (dots["error_x"]["array"], dots["error_x"]["arrayminus"]) == ([1.5, 0.0], [0.5, 0.0])
+    assert (dots["error_y"]["array"], dots["error_y"]["arrayminus"]) == ([0.0, 0.0], [0.0, 0.0])
+    assert len(set(dots["textposition"])) == 2  # labels of points at one place are apart
+
+
+def test_a_comparison_is_one_table_in_every_form(study: Study):
+    (result,) = judged(study, rows_of(study), {}).results
+    page = io.StringIO()
+    Console(file=page, width=120).print(result.table)
+    figure = result.figures["wsept"]["reward"]
+    text, html, markdown, csv = page.getvalue(), result.table.html(), result.table.markdown(), result.table.csv()
+    assert re.search(rf"^  wsept +{figure.mean:.1f} ", text, re.MULTILINE)
+    assert f"<td>{figure.mean:.1f}</td>" in html
+    assert f"| wsept | {figure.mean:.1f} |" in markdown
+    assert f"reward,wsept,{figure.mean:.1f}," in csv
+    assert result._repr_html_() == html
+
+
+def test_the_command_line_has_what_is_no_default():
+    told: list[str] = []
+    app = typer.Typer()
+
+    @app.command("compare")
+    def _(
+        ctx: typer.Context, names: list[str], seeds: int = 3, more: list[str] | None = None, fast: bool = False
+    ) -> None:
+        told.append(options.command_line(ctx))
+
+    typer.main.get_command(app).main(
+        ["a", "my b", "--seeds", "5", "--more", "1", "--more", "2", "--fast"], "compare", standalone_mode=False
+    )
+    typer.main.get_command(app).main(["a", "--seeds", "3"], "compare", standalone_mode=False)
+    assert shlex.split(told[0]) == [
+        "thermofleet",
+        "compare",
+        "a",
+        "my b",
+        *["--seeds", "5", "--more", "1", "--more", "2", "--fast"],
+    ]
+    assert told[1] == "thermofleet compare a"
+
+
+def plan(profile: np.ndarray) -> SimpleNamespace:
+    return SimpleNamespace(arm="a", cycle=SimpleNamespace(profile=profile))
+
+
+def test_random_scores_are_uniform_and_repeat() -> None:
+    rng, scores = np.random.default_rng(0), _Random(3)
+    plans = [plan(rng.standard_normal((20, 3, 7))) for _ in range(400)]
+    drawn = np.array([[*score.per_joint, score.p_saturation] for score in (scores.score(each, 4) for each in plans)])
+    assert stats.kstest(drawn.ravel(), "uniform").pvalue > 0.01
+    assert scores.score(plans[0], 4).per_joint.tolist() == drawn[0, :7].tolist()
+    assert _Random(4).score(plans[0], 4).per_joint.tolist() != drawn[0, :7].tolist()
+
+
+def test_the_inverse_has_the_opposite_order_and_probability() -> None:
+    risk = Forecast(np.array([-3.0]), np.full((1, KNOWN), 0.05))
+    hard = SimpleNamespace(version="v", score=lambda *_: Difficulty(np.linspace(0.0, 0.9, 7), risk=risk))
+    opposite, known_c = inverted(hard).score(plan(np.zeros((2, 3, 7))), 1), np.full(KNOWN, 30.0)
+    assert opposite is not None
+    assert opposite.per_joint == pytest.approx(np.linspace(1.0, 0.1, 7))
+    assert (opposite.per_joint < 1.0).all()
+    assert opposite.p_at(known_c) == pytest.approx(1.0 - risk.at(known_c))
+
+
+def rewards_of(text: str) -> dict[str, list[float]]:
+    """The rewards of each POLICY@SOURCE in a text of names, each with its numbers after it."""
+    found: dict[str, list[float]] = {}
+    for word in text.split():
+        if "@" in word:
+            numbers = found[word] = []
+        else:
+            numbers.append(float(word))
+    return found
+
+
+QUICK = rewards_of("""
+wspt@rc-nominal
+    5.99749417852418 8.997540478131903 5.997348023627421 8.997400913679169
+wspt@random
+    5.997495397180928 8.997542830431069 5.99749417852418 8.997541705519062
+    5.99734675079658 8.997398132164946 5.99734675079658 8.997398382846647
+wspt@constant
+    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
+wspt@blind
+    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
+wspt@oracle
+    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
+round_robin@blind
+    5.997494576202657 8.997540477589707 5.9973476880432175 8.997400912449335
+""")
+"""Rewards of the small scenario with seeds 10000 and 10001, of each of two fleets and two trainings, as an earlier
+implementation, `thermofleet ablate`, computed them."""
+
+TRAINED = rewards_of("""
+wspt@trained
+    5.997495397180928 8.997542830431069 5.997495397180928 8.997541460698054
+    5.99734675079658 8.997398383369463 5.99734675079658 8.997398629429464
+wspt@unweighted
+    5.997495397180928 8.997543052291434 5.997495397180928 8.997543052291434
+    5.99734675079658 8.997398132164946 5.99734675079658 8.997398132164946
+wspt@untrained
+    5.99749417852418 8.997540478131903 5.997495397180928 8.99754169904697
+    5.99734675079658 8.99739964131719 5.99734675079658 8.997398383369463
+wspt@torque
+    5.997495397180928 8.9975423294294 5.99734675079658 8.997398132164946
+wspt@weighted-torque
+    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
+wspt@rc
+    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
+wspt@inverted
+    5.99749417852418 8.997541466873425 5.99749417852418 8.997541961857248
+    5.997348023627421 8.997399875725273 5.997348023627421 8.997399651469813
+least_difficulty@rc
+    5.9974948357982685 8.997541818562766 5.997347333903775 8.997399587617933
+""")
+
+
+def rewards(thermofleet, file: Path, out: Path, names: Iterable[str]) -> dict[str, list[float]]:
+    """Of each POLICY@SOURCE, in the order of `QUICK`."""
+    how = ("--fleets", 2, "--trainings", 2, "--seeds", 2, "--first-seed", 10_000, "--out", out)
+    done = thermofleet("compare", file, "--policies", ",".join(names), *how)
+    assert done.code == 0, done.err
+    found: dict[str, list[float]] = {}
+    for row in read_rows(out):
+        assert row.outcome is not None
+        found.setdefault(f"{row.key.policy}@{row.key.difficulty}", []).append(row.outcome.reward)
+    return found
+
+
+def test_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path) -> None:
+    assert rewards(thermofleet, small_toml, tmp_path / "out", QUICK) == QUICK
+
+
+@pytest.mark.slow
+def test_trained_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path) -> None:
+    small_toml.write_text(f'{small_toml.read_text()}\n[twin]\nsize = "quick"\n')
+    assert rewards(thermofleet, small_toml, tmp_path / "out", TRAINED) == TRAINED
+
+
+def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monkeypatch) -> None:
+    out = tmp_path / "sources"
+    how = ("--fleets", 2, "--trainings", 2, "--first-seed", 10_000, "--workers", 1)
+    names = ("--policies", "wspt,round_robin@blind", "--difficulty", "blind,random,constant,oracle")
+    call = ("compare", small_toml, *names, *how, "--out", out)
+    done = thermofleet(*call, "--seeds", 2)
+    assert done.code == 0, done.err
+    for name in ("wspt@blind", "wspt@random", "wspt@constant", "wspt@oracle", "round_robin@blind"):
+        assert done.out.count(f"  {name} ") == 1 + len(FIGURES)  # its scope, and each figure
+    assert len(read_rows(out)) == 2 * 2 * (1 + 2 + 1 + 1 + 1)  # random numbers have two trainings
+    again = thermofleet(*call, "--seeds", 2, "--json")
+    alone = thermofleet("compare", small_toml, "--policies", "round_robin", "--difficulty", "blind", *how, "--seeds", 2,
+                        "--json")  # fmt: skip
+    in_all, single = (json.loads(each.out)["figures"] for each in (again, alone))
+    assert in_all["round_robin@blind"]["value"]["mean"] == single["round_robin"]["value"]["mean"]
+
+    units, real = [], runner.run_unit
+    monkeypatch.setattr(runner, "run_unit", lambda unit, settings: units.append(unit) or real(unit, settings))
+    assert thermofleet(*call, "--seeds", 3).code == 0
+    assert [unit.case.seeds for unit in units] == [(10_002,)] * 12
+
+
+def test_bad_sources_are_named(thermofleet, small_toml) -> None:
+    for words in (("--difficulty", "trained,oracel"), ("--policies", "wspt@oracel")):
+        said = thermofleet("compare", small_toml, *words)
+        assert said.code == 2
+        assert "No difficulty 'oracel'; did you mean 'oracle'?" in said.err
+    said = thermofleet("compare", small_toml, "--policies", "wspt,wspt@blind", "--difficulty", "blind")
+    assert said.code == 2
+    assert "The policy 'wspt@blind' is given twice" in said.err

@@ -78,14 +78,11 @@ def test_splitting_a_job_costs_only_the_way_there_and_back(small):
     assert halves.thermal - whole.thermal == pytest.approx(share * way_s / 2 / HORIZON_S)
 
 
-def test_a_job_that_one_arm_cannot_do_loads_the_other(small):
+def test_a_job_that_one_arm_cannot_do_loads_the_other_and_twice_the_jobs_are_twice_the_load(small):
     content, other = small.work(payload_kg=small.WARM), small.work("rack", payload_kg=small.WARM)
     arms = [small.arm(0, [content, other]), small.arm(1, [other])]
     found = load_of(small, [small.job("a", content)], arms)
     assert found.time == pytest.approx(ONE_JOB_S / HORIZON_S)
-
-
-def test_doubling_the_jobs_doubles_the_load_and_no_job_is_none(small):
     content = small.work(payload_kg=small.WARM)
     arms = equal_arms(small, 2, content)
     jobs = [small.job(f"job_{i}", content) for i in range(4)]

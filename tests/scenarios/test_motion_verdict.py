@@ -6,30 +6,10 @@ import numpy as np
 import pytest
 
 from scenarios.prepare.twins import train_log
-from twin.logs.recording import Recording, cool_stretches
-from twin.vae.config import TwinConfig, hash_records
+from tests.logs import COOL, RATE_HZ, TINY, WARM, logged
+from twin.logs.recording import cool_stretches
+from twin.vae.config import hash_records
 from twin.verdict import log_features
-
-RATE_HZ = 2.0
-TINY = TwinConfig(
-    hidden=4, epochs=3, max_windows=100, restarts=1, rate_hz=RATE_HZ, record_hz=RATE_HZ, allow_collapse=True
-)
-
-
-def logged(name: str, *, load: float = 1.0, celsius: float = 31.0, seed: int = 0, seconds: float = 80.0) -> Recording:
-    """Seven joints that swing at 2 Hz, joint 2 at one temperature."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
-    omega, shift = rng.uniform(0.1, 0.6, 7), rng.uniform(0, 6, 7)
-    q = 0.5 * np.sin(np.outer(time_s, omega) + shift)
-    tau = load * 10 * np.cos(q) + rng.normal(0, 0.2, q.shape)
-    temp_c = np.full(q.shape, 30.0)
-    temp_c[:, 1] = celsius
-    return Recording(name=name, time_s=time_s, q=q, qd=np.gradient(q, time_s, axis=0), tau=tau, temp_c=temp_c)
-
-
-COOL = [logged(f"cool_{i}", seed=i) for i in range(14)]
-WARM = logged("warm", celsius=45.0, seed=90)
 
 
 def test_a_twin_of_logs_is_calibrated_on_whole_recordings_that_it_was_not_trained_on() -> None:

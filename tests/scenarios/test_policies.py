@@ -1,5 +1,7 @@
-"""Policies by name: rules, own files, own modules, and what is said when there is none."""
+"""Policies by name, from own files and modules; one that fails is named in one sentence."""
 
+import time
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -9,7 +11,9 @@ from agents.policy import EveryArm
 from agents.registry import RULES
 from agents.rules import LeastDifficulty
 from fleet.errors import FleetError
-from scenarios.policy_loader import arm_policy_of, label, policy_of, scope_of
+from scenarios.evaluate.study import check_policy
+from scenarios.policy_loader import PolicyFailed, arm_policy_of, failure, label, policy_of, scope_of
+from tests.waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -81,10 +85,7 @@ def test_an_own_class_from_a_file_or_a_module(own):
         ("least_dificulty", "did you mean 'least_difficulty'"),
         ("{own}:Idel", "did you mean 'Idle'"),
         ("{own}:No", r"is no policy: of scope central it needs the methods reset\(rng\) and act\(observations\)"),
-        (
-            "{own}:Old",
-            r"Old' has no scope \(got None\). Add to the class: scope = .central. if its act",
-        ),
+        ("{own}:Old", r"Old' has no scope \(got None\). Add to the class: scope = .central. if its act"),
         (
             "{own}:Needy",
             r"must be a class or function that is called without arguments \(missing a required argument: 'size'\)",
@@ -113,3 +114,86 @@ def test_an_own_file_that_cannot_be_loaded_is_said_with_its_line(tmp_path, text,
     file.write_text(text)
     with pytest.raises(FleetError, match=f"mine.py' cannot be loaded: {said}"):
         policy_of(f"{file}:Idle")
+
+
+POLICY = """
+class Bad:
+    scope = "central"
+
+    def reset(self, rng):
+        pass
+
+    def act(self, observations):
+        return {}
+
+
+class Raises(Bad):
+    def act(self, observations):
+        raise ValueError("boom")
+
+
+class Speaks(Bad):
+    def act(self, observations):
+        return {arm: "left" for arm in observations}
+
+
+class Exits(Bad):
+    def act(self, observations):
+        raise SystemExit(0)
+
+
+class Misplans(Bad):
+    def plan_in(self, cell):
+        raise ValueError("no plan")
+
+
+class Endless(Bad):
+    def __init__(self):
+        while True:
+            pass
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "bad.py"
+    path.write_text(POLICY, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("policy", "expected"),
+    [
+        ("Raises", "ValueError: boom (FILE, line 14)"),
+        ("Speaks", "(got 'left')"),
+        ("Exits", "SystemExit: 0 (FILE, line 24)"),
+        ("Misplans", "ValueError: no plan (FILE, line 29)"),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "bounds"])
+def test_it_is_one_sentence(thermofleet, small_toml, tmp_path, file, command, policy, expected) -> None:
+    name = f"{file}:{policy}"
+    words = {
+        "run": (small_toml, "--policy", name, "--difficulty", "blind", "--bus", "memory"),
+        "bounds": (small_toml, "--starts", name, "--evaluations", 2, "--nodes", 0, "--difficulty", "blind"),
+    }
+    result = thermofleet(command, *words[command], "--out", tmp_path / "out")
+    assert result.code == 2
+    assert "Traceback" not in result.err
+    message = " ".join(result.err.split())
+    assert f"The policy '{name}' failed in heat/" in message
+    assert expected.replace("FILE", str(file)) in message
+
+
+def test_a_policy_that_is_never_made_is_refused_in_time(file) -> None:
+    began_s = time.monotonic()
+    with pytest.raises(FleetError, match=r"takes longer than 0\.2 s to load"):
+        check_policy(f"{file}:Endless", 0.2)
+    assert time.monotonic() - began_s < PATIENCE_S
+
+
+def test_errors_of_rules_and_errors_of_ours_stay_as_they_are() -> None:
+    ours, other = FleetError("bus lost"), ValueError("a defect")
+    assert failure("mine.py:X", ours, "here") is ours
+    assert failure("wspt", other, "here") is other
+    assert isinstance(failure("mine.py:X", other, "here"), PolicyFailed)

@@ -1,21 +1,34 @@
-"""A shift from beginning to end: reproducible, complete, and the same over either bus."""
+"""A shift from beginning to end: its jobs, files and trace; the same over either bus."""
 
 import json
 import re
-from dataclasses import replace
+import shutil
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from agents.registry import RULES
+from fleet.bus.protocol.auction import ArmEvent, ArmOffer, JobStatus, PlanQuote, Result
+from fleet.errors import FleetError
+from fleet.events import Event
+from fleet.robot import ThermalLimits
+from fleet.telemetry import Telemetry
+from scenarios.cli.look import last_folder
+from scenarios.cli.main import main
+from scenarios.cli.terminal import out_console
+from scenarios.live.recorder import Recorder
 from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.run.log import FILES, code_hash, event_table, telemetry_table
+from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.shift import RunLog, run
+from scenarios.show.run_page import verdict
+from scenarios.show.trace import NOT_RECORDED, rows_of, thread_of, thread_table
 from scenarios.spec.load import load
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import scenario_hash
-
-TICKS = 18
 
 
 @pytest.fixture(scope="module")
@@ -171,3 +184,254 @@ def test_the_hash_names_the_content_of_a_scenario(fleet):
     scenario = fleet.scenario
     assert scenario_hash(scenario) == scenario_hash(replace(scenario))
     assert scenario_hash(scenario) != scenario_hash(replace(scenario, horizon_s=190.0))
+
+
+@pytest.fixture
+def result(small_toml: Path, plans: Path) -> RunLog:
+    fleet = prepare(load(small_toml), difficulty="blind", cache=plans)
+    return run(fleet, RunSpec(policy="round_robin", bus="memory", difficulty="blind"))
+
+
+def test_a_disk_that_refuses_at_the_end_is_told(result, tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    shutil.rmtree(gone)
+    with pytest.raises(FleetError, match=r"Cannot write to '.*gone': No such file or directory"):
+        result.write(gone)
+
+
+def test_the_files_of_a_run_read_back_as_documented(result, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    result.write(folder)
+    assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
+    told = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    assert told["status"] == "finished"
+    telemetry = pq.read_table(folder / "telemetry.parquet")
+    joints = [f"{name}_{j}" for name in ("q", "qd", "tau", "current_a", "temp_c") for j in range(1, 8)]
+    assert telemetry.column_names == ["time_s", "arm", "mode", *joints]
+    assert telemetry.num_rows == 2 * round(told["time_s"])
+    assert set(telemetry["arm"].to_pylist()) == {"left", "right"}
+    assert set(telemetry["mode"].to_pylist()) <= {"idle", "working", "faulted"}
+    events = pq.read_table(folder / "events.parquet")
+    assert events.column_names == ["time_s", "kind", "arm", "job", "joint", "value", "reason"]
+    assert events.num_rows == len(result.events)
+    assert "<html" in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_telemetry_rows_go_arm_by_arm_within_a_moment(result):
+    table = telemetry_table(result.readings, ["left", "right"])
+    rows = table.slice(6, 2).to_pylist()
+    assert [(row["time_s"], row["arm"]) for row in rows] == [(4.0, "left"), (4.0, "right")]
+    for a, row in enumerate(rows):
+        assert row["temp_c_2"] == pytest.approx(float(result.readings.temp_c[3, a, 1]), rel=1e-6)
+        assert row["qd_7"] == pytest.approx(float(result.readings.qd[3, a, 6]), rel=1e-6)
+
+
+def test_events_keep_their_order_and_their_values(result):
+    rows = event_table(result.events).to_pylist()
+    assert [row["time_s"] for row in rows] == sorted(event.time_s for event in result.events)
+    awards = [row for row in rows if row["kind"] == "award"]
+    assert {row["arm"] for row in awards} <= {"left", "right"}
+    assert awards[0]["job"]
+
+
+LOG = [
+    Event(time_s=float(i), kind=kind, arm=arm, job=job)  # pyright: ignore[reportArgumentType]
+    for i, (kind, arm, job) in enumerate(
+        [("release", "", "a"), ("award", "left", "a"), ("fault", "left", "a"), ("return", "left", "a"),
+         ("award", "right", "a"), ("warning", "right", "a"), ("finish", "right", "a"), ("award", "left", "b")]
+    )
+]  # fmt: skip
+
+
+@pytest.fixture
+def folder(small_toml: Path, plans: Path, tmp_path: Path) -> Path:
+    out = tmp_path / "runs" / "one"
+    out.mkdir(parents=True)
+    fleet = prepare(load(small_toml), difficulty="oracle", cache=plans)
+    run(fleet, RunSpec(policy="least_difficulty", bus="memory", difficulty="oracle")).write(out)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("asked", "rows"),
+    [
+        ("0", [0]),
+        ("7", [7]),
+        ("award", [1, 4, 7]),
+        ("award@left", [1, 7]),
+        ("award@a", [1, 4]),
+        ("a", [1, 4]),
+        ("b", [7]),
+    ],
+)
+def test_events_are_named_by_row_kind_arm_and_job(asked, rows) -> None:
+    assert rows_of(LOG, asked) == rows
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("8", "No event 8: rows of the event log are 0 to 7."),
+        ("falt", "did you mean 'fault'"),
+        ("contact", "No event of kind 'contact' was recorded. Recorded: release, award, fault"),
+        ("award@lef", "No event 'award' of 'lef'; did you mean 'left'"),
+    ],
+)
+def test_what_is_no_event_is_said_with_what_there_is(asked, said) -> None:
+    with pytest.raises(FleetError, match=said.replace("(", r"\(")):
+        rows_of(LOG, asked)
+
+
+def test_every_event_of_a_run_leads_to_what_its_files_hold(folder: Path) -> None:
+    card = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    jobs = {row["job"]: row for row in pq.read_table(folder / "jobs.parquet").to_pylist()}
+    offers = pq.read_table(folder / "offers.parquet").to_pylist()
+    events = pq.read_table(folder / "events.parquet").to_pylist()
+    for row, event in enumerate(events):
+        thread = thread_of(folder, str(row))
+        assert (thread.event.kind, thread.event.time_s) == (event["kind"], event["time_s"])
+        assert thread.configuration["scenario_hash"] == card["scenario_hash"]
+        assert thread.code["hash"] == card["code_hash"] == code_hash()
+        if event["job"]:
+            assert thread.job == jobs[event["job"]]
+        if event["kind"] in ("finish", "home"):
+            assert thread.award is not None
+            assert thread.award.arm == event["arm"]
+            own = [o for o in offers if (o["time_s"], o["job"]) == (thread.award.time_s, event["job"])]
+            assert [asdict(offer) for offer in thread.offers] == own
+            (chosen,) = (offer for offer in thread.offers if offer.awarded)
+            assert (chosen.arm, chosen.difficulty) == (event["arm"], pytest.approx(thread.award.value))
+            assert chosen.plan in (0, 1)
+            assert thread.twin == {"arm": event["arm"], **card["twins"][event["arm"]]}
+
+
+def test_the_command_shows_one_screen_or_json(folder: Path, capsys, monkeypatch) -> None:
+    monkeypatch.chdir(folder.parent.parent)
+    assert last_folder(Path("runs")) == Path("runs/one")
+    for options in ([], ["--json"]):
+        with pytest.raises(SystemExit) as ended:
+            main(["trace", "finish", *options])
+        assert ended.value.code in (0, None)
+    screen, text = capsys.readouterr().out.split("{", 1)
+    assert len(screen.splitlines()) < 60
+    assert all(head in screen for head in ("event", "job", "award", "plan", "offers", "twin", "configuration", "code"))
+    thread = thread_of(Path("runs/one"), "finish")
+    odd = replace(thread, event=replace(thread.event, reason="[bold]a[/b] of others"))
+    out_console.print(thread_table(odd))
+    assert "[bold]a[/b] of others" in capsys.readouterr().out
+    shown = json.loads("{" + text)
+    assert (shown["event"]["kind"], shown["award"]["kind"]) == ("finish", "award")
+    assert code_hash() in screen
+
+
+def test_a_folder_without_a_run_is_said(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FleetError, match="There is no run in 'runs'; name the folder"):
+        last_folder(Path("runs"))
+    with pytest.raises(FleetError, match="is neither a folder of `thermofleet run` nor of `thermofleet bus record`"):
+        thread_of(tmp_path, "fault")
+
+
+def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: Path) -> None:
+    recorder = Recorder.open(tmp_path, "f")
+    log = (
+        ("award", ", twin old"),
+        ("return", ""),
+        ("award", "plan 1, twin d:0123"),
+        ("warning", "hot"),
+        ("finish", ""),
+    )
+    for number, (kind, reason) in enumerate(log):
+        recorder.add("a", ArmEvent(arm="a", number=number, time_s=10.0 * number, kind=kind, job="j", reason=reason))
+    status = JobStatus(job="j", state="awarded", arm="a", value=2.0)
+    for number, time_s in enumerate((1.0, 21.0)):
+        quoted = PlanQuote(difficulty=time_s, p_saturation=0.1, duration_s=60.0)
+        offers = (ArmOffer("a", "idle", True, quoted), ArmOffer("b", "working", False))
+        recorder.add("boss", Result(auctioneer="boss", number=number, time_s=time_s, status=status, offers=offers))
+    recorder.write(status="finished")
+    recorder.close()
+    thread = thread_of(tmp_path, "warning")
+    assert thread.award is not None
+    assert (thread.award.time_s, thread.twin) == (20.0, {"arm": "a", "version": "d:0123"})
+    assert [event.kind for event in thread.history] == [kind for kind, _ in log]
+    assert [(o.arm, o.awarded, o.feasible, o.difficulty) for o in thread.offers] == [
+        ("a", True, True, 21.0),
+        ("b", False, False, None),
+    ]
+    assert (thread.job["value"], thread.code["hash"]) == (2.0, NOT_RECORDED)
+    assert json.dumps(thread.as_json(), allow_nan=False)
+
+
+ARMS = ("hot", "cool")
+MIN = 60.0
+
+
+def event(minute, kind, arm, job, **more):
+    return Event(time_s=minute * MIN, kind=kind, arm=arm, job=job, **more)
+
+
+EVENTS = (
+    event(0, "award", "hot", "hold-1"),
+    event(20, "finish", "hot", "hold-1", value=0.0),
+    event(20, "home", "hot", "hold-1"),
+    event(20.5, "award", "hot", "hold-2"),
+    event(25, "award", "cool", "sort-1"),
+    event(30, "fault", "hot", "hold-2", joint=2, value=75.0, reason="motor 2 passed 75 °C"),
+    event(30, "return", "hot", "hold-2", value=1.0),
+    event(50, "recover", "hot", ""),
+    event(55, "finish", "cool", "sort-1", value=0.0),
+    event(55, "home", "cool", "sort-1"),
+)
+
+
+def offer(arm, peak_c, *, at=20.5, **more):
+    of = {"state": "idle", "feasible": True, "free": True, "difficulty": 5.0, "duration_s": 600.0, "p_saturation": 1.0}
+    return Offer(time_s=at * MIN, job="hold-2", arm=arm, awarded=arm == "hot", peak_c=peak_c, **{**of, **more})
+
+
+def sentences(*offers, events=EVENTS, end=60):
+    return told({"status": "finished", "time_s": end * MIN}, events, offers)
+
+
+def told(card, events=(), offers=()):
+    readings = Telemetry.empty(len(ARMS))
+    log = ShiftLog(card=card, arms=ARMS, limits=ThermalLimits(), readings=readings, events=events, offers=offers)
+    return verdict(log).sentences
+
+
+def test_a_fault_is_told_with_its_arm_joint_time_and_cause():
+    fault, why, _, remedy = sentences(offer("hot", 78.2), offer("cool", 50.0))
+    assert fault == "0:30:00: hot stopped during hold-2, out for 20 min: the motor of joint 2 passed 75 °C."
+    assert why.startswith("Why: at work without a pause since 0:00:00; at the award, 0:20:30, predicted peak 78 °C ")
+    assert remedy.startswith("The fault was predicted")
+    assert len(sentences(offer("hot", 74.0), offer("cool", 50.0))) == 3
+
+
+@pytest.mark.parametrize(
+    ("own_c", "other", "end", "told"),
+    [
+        (78.0, {"peak_c": 50.0}, 60, "giving the job to cool, predicted peak 50 °C: it was free."),
+        (78.0, {"peak_c": 72.0, "free": False}, 60, "predicted peak 72 °C, but its place or space was taken."),
+        (78.0, {"peak_c": 73.0}, 60, "until hot had cooled: no other arm could do the job cooler."),
+        (78.0, {"peak_c": None, "feasible": False}, 60, "had cooled: no other arm could do the job."),
+        (70.0, {"peak_c": 68.0}, 60, "below the limit, and no other arm could do the job cooler."),
+    ],
+)  # fmt: skip
+def test_the_choice_that_would_have_avoided_a_fault(own_c, other, end, told):
+    assert sentences(offer("hot", own_c), offer("cool", **other), end=end)[2].endswith(told)
+
+
+@pytest.mark.parametrize(("end", "told"), [(60, "once it was free, at 0:55:00."), (55, "which was busy to the end.")])
+def test_a_cooler_arm_at_work_is_named_with_the_end_of_its_job(end, told):
+    events = (EVENTS[0], event(10, "award", "cool", "sort-1"), *EVENTS[1:4], *EVENTS[5:])
+    busy = offer("cool", 50.0, free=False, state="working")
+    assert sentences(offer("hot", 78.0), busy, events=events, end=end)[2].endswith(told)
+
+
+def test_without_offers_only_the_work_is_told_and_without_a_fault_the_hottest_motor():
+    assert sentences()[1:] == ("Why: at work without a pause since 0:00:00; no prediction was recorded.",)
+    assert told({"metrics": {"peak_c": {"hot": 68.2, "cool": float("nan")}}}) == (
+        "No motor reached its fault limit; the hottest, in hot, reached 68 °C.",
+    )

@@ -1,11 +1,15 @@
-"""The suite: its splits never change, and its cells are as they are described."""
+"""The suite: its splits never change; and stored results are those of its code."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fleet.errors import ScenarioError
+from scenarios.evaluate.leaderboard import read_all
+from scenarios.evaluate.runner import run_study
+from scenarios.evaluate.study import Study, suite_of
 from scenarios.prepare.fleet import prepare
 from scenarios.prepare.load_factor import load_factor
 from scenarios.spec.jobs import all_works
@@ -116,3 +120,18 @@ def test_three_quarters_of_the_arms_of_a_cell_can_work_at_once(cell) -> None:
     report = layout_report(scenario_of("x", cell, PLAIN, 0))
     assert report.problems == ()
     assert len(report.at_once) >= 0.75 * cell.arms
+
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results" / "leaderboard"
+
+
+def test_stored_results_of_built_in_policies_repeat():
+    """One shift of each, with the present code: a change of a policy needs new results."""
+    found = [each for each in read_all(RESULTS, "test") if not each.card.policy_hash]
+    for difficulty in {each.card.difficulty for each in found}:
+        stored = {each.card.policy: each for each in found if each.card.difficulty == difficulty}
+        study = Study(policies=list(stored), cases=suite_of("test/0000", 1), difficulties=[difficulty])
+        for row in run_study(study, workers=1):
+            (before,) = [own.figures for own in stored[row.key.policy].rows if own.instance == "test/0000"]
+            assert row.outcome is not None
+            assert list(asdict(row.outcome).values()) == pytest.approx(before, rel=1e-6, abs=1e-6), row.key

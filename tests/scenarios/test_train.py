@@ -1,19 +1,30 @@
-"""`thermofleet train`: the folder it leaves, going on, and what it refuses."""
+"""`thermofleet train`: rewards of batches, the folder it leaves, going on, and what it refuses."""
 
 import json
+from dataclasses import replace
+from itertools import chain, repeat
 
+import numpy as np
 import pytest
 
-from agents.learned.evolution import LOG
+from agents.learned.config import TrainingLength
+from agents.learned.evolution import LOG, EvolutionConfig
 from agents.learned.policy import load_policy
 from agents.learned.ppo import PpoConfig
+from agents.pairs import PAIRS_CARD, PARAMETERS, Worth, first_parameters
 from fleet.errors import FleetError
 from scenarios.cli.main import main
-from scenarios.policy_loader import label, policy_of
+from scenarios.evaluate.rollout import outcomes
+from scenarios.policy_loader import label, policy_of, scope_of
+from scenarios.prepare.fleet import prepare
 from scenarios.spec.load import load
 from scenarios.spec.parse import override
-from scenarios.train.instances import NETWORK_STATE
-from scenarios.train.networks import CURVE, VALIDATION_SEED, TrainingPlan, train
+from scenarios.suite.splits import Instance, instance
+from scenarios.train import instances as suite_batches
+from scenarios.train import networks, pairs
+from scenarios.train.instances import NETWORK_STATE, PAIRS_STATE, TRAINING, holds_training, rewards, training_instance
+from scenarios.train.networks import VALIDATION_SEED, TrainingPlan, Validation, train, train_on_split
+from scenarios.train.pairs import CURVE, PairPlan, train_pairs, validation
 
 SMALL = {"horizon_s": 300.0}
 
@@ -46,7 +57,7 @@ def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> N
     judged = [row["validation_reward"] for row in rows if "validation_reward" in row]
     assert done.best == max(judged)
     assert [(row["number"], row["env_steps"]) for row in rows if "number" in row] == [(1, 4 * 16), (2, 2 * 4 * 16)]
-    assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
+    assert (out / networks.CURVE).read_bytes().startswith(b"\x89PNG")
     assert type(policy_of(str(out))) is type(load_policy(out))
     assert label(str(out)) == "learned"
     with pytest.raises(FleetError, match="holds a training already"):
@@ -65,17 +76,211 @@ def test_validation_seeds_are_nobody_elses() -> None:
     assert VALIDATION_SEED > 1_000_000
 
 
-def test_what_cannot_be_is_refused(tmp_path, capsys) -> None:
-    for words, reason in (
-        (["--algo", "dqn"], "No algorithm 'dqn'. Allowed: ippo, mappo, pairs."),
-        (["--minutes", "0"], "minutes must be > 0"),
-        (["--envs", "0"], "--envs must be 1 to 65536 (got 0)."),
-        (["--threads", "0"], "--threads must be 1 to 1024 (got 0)."),
-        (["--decisions", "event"], "No kind of step 'event'; did you mean 'events'? Allowed: events, interval."),
-        (["--discount-hours", "0"], "--discount-hours must be 0.01 to 1000 (got 0)."),
-        (["--resume"], "holds no training to resume"),
-    ):
+WRONG = {
+    "quickstart --out none --algo dqn": "No algorithm 'dqn'. Allowed: ippo, mappo, pairs.",
+    "quickstart --out none --minutes 0": "minutes must be > 0",
+    "quickstart --out none --envs 0": "--envs must be 1 to 65536 (got 0).",
+    "quickstart --out none --threads 0": "--threads must be 1 to 1024 (got 0).",
+    "quickstart --out none --decisions event": "No kind of step 'event'; did you mean 'events'? Allowed: events, inter",
+    "quickstart --out none --discount-hours 0": "--discount-hours must be 0.01 to 1000 (got 0).",
+    "quickstart --out none --resume": "holds no training to resume",
+    "": "Give either a scenario or --suite SPLIT.",
+    "quickstart --suite train": "Give either a scenario or --suite SPLIT.",
+    "--suite trian": "No training split 'trian'; did you mean 'train'?",
+    "--suite validation": "No training split 'validation'. Allowed: train.",
+    "--suite test --algo mappo": "No training split 'test'. Allowed: train.",
+    "test/0017": "No training split 'test'. Allowed: train.",
+    "quickstart --algo pairs": "give --suite, not a scenario",
+    "quickstart --seeds 2 --out x": "leave --out away",
+    "quickstart --lr 0": "--lr must be > 0 and at most 10 (got 0).",
+    "--suite train --minutes 0": "minutes must be > 0",
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_cannot_be_trained_is_refused(thermofleet, tmp_path, monkeypatch, words) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = thermofleet("train", *words.split(), *(["--difficulty", "blind"] if "none" in words else []))
+    assert said.code == 2
+    assert WRONG[words] in " ".join(said.err.split())
+
+
+@pytest.fixture(scope="module")
+def ground():
+    scenario = override(load("quickstart"), horizon_s=1200.0)
+    return training_instance(Instance("train/9999", scenario, 3), difficulty="oracle")
+
+
+def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
+    """In the same shift, decision by decision, with perfect messages; and other parameters give another reward."""
+    fleet = prepare(override(load("quickstart"), horizon_s=1200.0), difficulty="oracle")
+    expected = [outcome.reward for outcome in outcomes(fleet, "wsept", [3, 4])]
+    found = rewards(ground, np.zeros((2, PARAMETERS)), [3, 4])
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    refuses_all = first_parameters()
+    refuses_all[Worth._fields.index("spread")] = (
+        5.0  # true peaks that deviate by 740 K: each claim is as likely to fault as not
+    )
+    assert rewards(ground, refuses_all[None], [3])[0] < expected[0] - 1.0
+
+
+def test_validation_is_the_normalised_score_of_the_shift_of_the_benchmark(ground) -> None:
+    (reward,) = rewards(ground, np.zeros((1, PARAMETERS)), [ground.seed])
+    half = replace(ground, random=reward - 5.0, span=10.0)
+    none = replace(ground, random=reward, span=20.0)
+    assert validation([half, none], np.zeros(PARAMETERS)) == pytest.approx(0.25)
+    assert validation([ground], np.zeros(PARAMETERS)) == pytest.approx(reward / ground.value(ground.seed))
+    own = replace(instance("train/0005"), name="x", seed=3)
+    made = training_instance(own, known={("x", 3): (40.0, 60.0), ("x", 4): (0.0, 1.0)})
+    assert (made.random, made.unit) == (40.0, 20.0)
+
+
+def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path, ground) -> None:
+    out, told = tmp_path / "pairs", list[str]()
+
+    def trained(iterations: int, *, resume: bool = False, samples: int = 4):
+        plan = PairPlan(minutes=5.0, iterations=iterations, validate_every=1)
+        config = EvolutionConfig(samples=samples)
+        card: dict[str, object] = {"suite": "train"}
+        return train_pairs([ground], [ground], config, out, plan, card=card, resume=resume, tell=told.append)
+
+    done = trained(2)
+    assert done.iterations == 2
+    rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
+    judged = [row["validation"] for row in rows if "validation" in row]
+    assert len(told) == len(judged) == 3
+    teacher = rows[0]["teacher"]
+    assert done.best == max(judged)
+    assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
+    assert scope_of(str(out)) == "central"
+    with pytest.raises(FleetError, match="holds a training already"):
+        trained(3)
+    with np.load(out / PAIRS_STATE) as saved:
+        assert saved["teacher"] == teacher
+        assert 0.0 < saved["seconds"] <= done.seconds
+        np.savez(out / PAIRS_STATE, **{**saved, "seconds": np.array(100.0)})
+    again = trained(3, resume=True)
+    assert again.iterations == 3
+    assert again.best >= done.best
+    assert again.seconds > 100.0
+    with pytest.raises(FleetError, match=r"has samples = 4 \(got 6\)"):
+        trained(4, resume=True, samples=6)
+    with pytest.raises(FleetError, match="has 3 iterations: --iterations must be more"):
+        trained(3, resume=True)
+    (out / PAIRS_STATE).unlink()
+    for resume, reason in ((False, "holds a policy without a training to resume"), (True, "holds no training to")):
+        with pytest.raises(FleetError, match=reason):
+            trained(4, resume=resume)
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize("calls", range(6))
+def test_a_killed_training_blocks_nothing(tmp_path, ground, monkeypatch, calls) -> None:
+    """After each of its first steps it either has not begun, or can be resumed."""
+    out, left = tmp_path / "pairs", chain(range(calls, 0, -1), repeat(0))
+
+    def mortal(function):
+        def call(*args, **options):
+            if next(left) == 0:
+                raise Killed
+            return function(*args, **options)
+
+        return call
+
+    def trained(*, resume: bool):
+        plan = PairPlan(minutes=5.0, iterations=1)
+        return train_pairs([ground], [ground], EvolutionConfig(samples=2), out, plan, card={}, resume=resume)
+
+    with monkeypatch.context() as patch:
+        for name in ("validation", "write_card", "save_pairs", "_fitness"):
+            patch.setattr(pairs, name, mortal(getattr(pairs, name)))
+        with pytest.raises(Killed):
+            trained(resume=False)
+    assert holds_training(out) == (calls >= 3)
+    with pytest.raises(FleetError, match="holds a training already" if calls >= 3 else "holds no training to resume"):
+        trained(resume=calls < 3)
+    assert trained(resume=calls >= 3).iterations == 1
+    assert (out / PAIRS_CARD).exists()
+    rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
+    assert [row["iteration"] for row in rows if "iteration" in row] == [0, 1]
+
+
+def test_a_split_is_trained_by_ppo_in_turns_of_its_cells(tmp_path, ground) -> None:
+    small = replace(ground, name="train/9998", seed=5)
+    config = PpoConfig(envs=2, steps=8, epochs=1)
+    plan = TrainingPlan(minutes=5.0, iterations=2, validate_every=2)
+    card: dict[str, object] = {"suite": "train"}
+    done = train_on_split([ground, small], [ground], config, tmp_path / "ppo", plan, card=card)
+    assert done.iterations == 2
+    rows = [json.loads(line) for line in (tmp_path / "ppo" / LOG).read_text().splitlines()]
+    assert [row["env_steps"] for row in rows if "env_steps" in row] == [16, 32]
+    judged = {row["iteration"]: row["validation_reward"] for row in rows if "validation_reward" in row}
+    assert list(judged) == [0, 2]
+    assert done.best == max(judged.values())
+    assert 0.0 < max(judged.values()) < 1.0, "shares of the value of all jobs"
+    with pytest.raises(FleetError, match="has 2 iterations: --iterations must be more"):
+        train_on_split([ground, small], [ground], config, tmp_path / "ppo", plan, card=card, resume=True)
+    told: list[str] = []
+    series, out = replace(plan, in_total=True), tmp_path / "ppo"
+    again = train_on_split([ground, small], [ground], config, out, series, card=card, resume=True, tell=told.append)
+    assert (again.iterations, again.best) == (2, done.best)
+    assert told == [f"Skipped the training in '{out}', because it is complete."]
+
+
+def test_ctrl_c_before_the_first_state_of_ppo_leaves_no_training(tmp_path, ground, monkeypatch) -> None:
+    out, plan = tmp_path / "ppo", TrainingPlan(minutes=5.0, iterations=1)
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    def trained(*, resume: bool = False):
+        config = PpoConfig(envs=2, steps=8, epochs=1, warm_start="wspt")
+        return train_on_split([ground], [ground], config, out, plan, card={}, resume=resume)
+
+    monkeypatch.setattr("scenarios.train.networks.imitate_rule", lambda *args: None)
+    with monkeypatch.context() as patch:
+        rewards_of = iter([0.5])  # of the teacher, and then an interruption
+        patch.setattr(Validation, "reward", lambda *args: next(rewards_of, None) or interrupt())
+        with pytest.raises(KeyboardInterrupt):
+            trained()
+    assert not (out / TRAINING).exists()
+    with pytest.raises(FleetError, match="holds no training to resume"):
+        trained(resume=True)
+    with monkeypatch.context() as patch:
+        patch.setattr("scenarios.train.networks.Trainer.iterate", interrupt)
+        done = trained()
+    assert (done.iterations, done.interrupted) == (0, True)
+    assert trained(resume=True).iterations == 1
+    assert sum("teacher" in row for row in map(json.loads, (out / LOG).read_text().splitlines())) == 1
+
+
+def test_time_of_a_session_or_in_total() -> None:
+    each, total = (TrainingLength(minutes=1.0, iterations=10, in_total=in_total) for in_total in (False, True))
+    assert each.share(3, 75.0, 45.0) == pytest.approx(0.5)
+    assert total.share(3, 75.0, 45.0) == pytest.approx(1.25)
+    assert each.share(9, 75.0, 45.0) == pytest.approx(0.9)
+
+
+def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(suite_batches, "training_instances", lambda *args, **options: [ground])
+    monkeypatch.setattr("scenarios.evaluate.scores.references_of", lambda cases: {})
+    words = ["--suite", "train", "--difficulty", "oracle", "--instances", "1", "--validation-instances", "1"]
+
+    def trained(*more: str) -> tuple[list[int], int]:
+        """Iterations of each training, and trainings that were skipped."""
         with pytest.raises(SystemExit) as stop:
-            main(["train", "quickstart", "--out", str(tmp_path / "none"), "--difficulty", "blind", *words])
-        assert stop.value.code == 2
-        assert reason in " ".join(capsys.readouterr().err.split())
+            main(["train", *words, *more])
+        assert stop.value.code == 0, capsys.readouterr().err
+        folders = sorted((tmp_path / "runs").iterdir())
+        rows = [[json.loads(line) for line in (folder / LOG).read_text().splitlines()] for folder in folders]
+        skipped = " ".join(capsys.readouterr().err.split()).count("because it is complete.")
+        return [max(row["iteration"] for row in each if "iteration" in row) for each in rows], skipped
+
+    assert trained("--iterations", "1") == ([1], 0)
+    assert trained("--iterations", "2", "--seed", "1") == ([1, 2], 0)
+    assert trained("--iterations", "2", "--seeds", "3", "--resume") == ([2, 2, 2], 1)
+    assert trained("--minutes", "0.0001", "--seeds", "3", "--resume") == ([2, 2, 2], 3)

@@ -1,19 +1,33 @@
-"""Twins trained by hand: the very ones with which a fleet works, whoever is trained beside them."""
+"""Twins of a scenario: rehearsed, calibrated, and trained on what stays cool."""
 
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
+from fleet.difficulty import Blind
+from fleet.errors import FleetError
+from fleet.motion import drive
+from fleet.robot import ThermalLimits
+from scenarios.evaluate.sources import PlannedFleet
+from scenarios.motion.generate import peak_of
 from scenarios.motion.recover import known_arm
-from scenarios.prepare.arms import plan_arms
+from scenarios.prepare.arms import PlannedArm, air_offsets, hardware_of, plan_arms
+from scenarios.prepare.calibrate import calibrate_networks, simulate_past
 from scenarios.prepare.twins import quality, train_arms, train_twin, train_twins
 from scenarios.progress import quiet
+from scenarios.run.log import provenance
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.load import load
 from scenarios.spec.parse import override
 from scenarios.spec.schema import Scenario
+from twin.thermal.identify import nominal_heat_model
 from twin.vae.config import TwinConfig
+from twin.vae.measures import PARTS, Features
 from twin.vae.twin import Twin
 
 TINY = TwinConfig(max_windows=64, epochs=2, restarts=1, hidden=4, allow_collapse=True)
@@ -92,3 +106,129 @@ def test_who_is_trained_beside_it_does_not_matter_and_another_seed_does(scenario
 def test_an_arm_that_generates_and_recovers_knows_itself_by_the_twin_of_the_fleet(scenario, fleet, plans, tmp_path):
     shutil.copytree(plans / "plans", tmp_path / "plans")  # and no twins: it has to train its own
     assert known_arm(scenario, "right", cache=tmp_path).twin.version == fleet[1].version
+
+
+@dataclass(frozen=True)
+class Seer:
+    """Stands in for a twin: reports the squared current of each joint."""
+
+    motors: object
+    version: str = "seer"
+    joints: int = 7
+
+    def features(self, plans, repetitions) -> Features:
+        heat = np.array([drive(plan.cycle.profile, self.motors).current_sq for plan in plans])
+        return Features(np.repeat(heat[..., None], PARTS, axis=-1))
+
+
+def calibrate(scenario, hardware, twin, folder: Path, *, jobs=60):
+    planned = PlannedFleet(scenario, folder)
+    vars(planned)["arms"] = [PlannedArm(0, hardware, {})]
+    (learned,) = planned.with_regressions([twin], jobs=jobs)
+    return learned
+
+
+@pytest.fixture(scope="module")
+def quickstart():
+    return load("quickstart")
+
+
+def test_a_rehearsal_holds_both_outcomes_and_repeats(quickstart) -> None:
+    def rehearse(index: int):
+        arm = PlannedArm(index, hardware_of(quickstart, index), {})
+        return simulate_past(quickstart, arm, nominal_heat_model(), jobs=60)
+
+    past = rehearse(0)
+    assert 5 <= past.passed.sum() <= 40
+    assert len(past) == 60
+    assert past.known_c.min() > 10.0
+    assert past.known_c.max() < 80.0
+    np.testing.assert_array_equal(rehearse(0).known_c, past.known_c)
+    assert not np.array_equal(rehearse(1).known_c, past.known_c)
+
+
+def test_a_rehearsal_has_the_air_of_the_hall() -> None:
+    heat_wave = load("heat_wave")
+    arm = PlannedArm(0, hardware_of(heat_wave, 0), {})
+    air_c = simulate_past(heat_wave, arm, nominal_heat_model(), jobs=60).known_c[:, -1]
+    offset_k = float(air_offsets(heat_wave)[0])
+    assert 17.0 < air_c.min() - offset_k < 22.0 < 36.0 < air_c.max() - offset_k < 41.0
+
+
+def test_a_regression_is_kept_for_the_same_arm_only(quickstart, tmp_path: Path, caplog) -> None:
+    hardware = hardware_of(quickstart, 0)
+    seer = Seer(hardware.motors)
+    first = calibrate(quickstart, hardware, seer, tmp_path)
+    (home,) = (tmp_path / "saturation").iterdir()
+    (home / "saturation.json").touch()
+    stamp = (home / "saturation.json").stat().st_mtime_ns
+    assert calibrate(quickstart, hardware, seer, tmp_path).regression == first.regression
+    assert (home / "saturation.json").stat().st_mtime_ns == stamp
+    other = hardware_of(quickstart, 1)
+    calibrate(quickstart, other, Seer(other.motors), tmp_path)
+    assert len(list((tmp_path / "saturation").iterdir())) == 2
+    (home / "saturation.json").write_text("{")
+    assert calibrate(quickstart, hardware, seer, tmp_path).regression == first.regression
+    assert "making it again" in caplog.text
+
+
+def test_an_arm_that_nothing_heats_keeps_its_twin_and_says_why(quickstart, tmp_path: Path, caplog) -> None:
+    hardware, twin = hardware_of(quickstart, 0), Seer(hardware_of(quickstart, 0).motors)
+    lax = replace(quickstart, limits=ThermalLimits(warning_c=500.0, error_c=600.0))
+    kept = calibrate(lax, hardware, twin, tmp_path, jobs=40)
+    assert kept.twin is twin
+    assert kept.regression is None
+    assert f"quickstart: arm '{hardware.robot.name}' gets no probability of saturation" in caplog.text
+    assert "(got 40; passed in 0)" in caplog.text
+    assert not (tmp_path / "saturation").exists()
+
+
+def test_a_curve_is_kept_for_the_same_arm_only(quickstart, tmp_path: Path) -> None:
+    def network(index: int):
+        arm = PlannedArm(index, hardware_of(quickstart, index), {})
+        return calibrate_networks(quickstart, [arm], tmp_path, quiet, risk="rc-nominal", jobs=60)[0]
+
+    first = network(0)
+    assert first.curve is not None
+    assert network(0).version == first.version
+    assert network(1).version != first.version
+    assert len(list((tmp_path / "saturation").iterdir())) == 2
+
+
+LEFT: Any = SimpleNamespace(arm="left")
+
+
+def test_an_arm_begins_from_what_it_found_to_stay_cool(small_toml, plans):
+    known = known_arm(load(small_toml), twin=LEFT, cache=plans)
+    assert known.arm.robot.name == "left"
+    assert len(known.sources) > 2
+    asked = known.verification
+    assert (asked.ambient_c, asked.cool_c, asked.horizon_s) == (22.0, 40.0, 1800.0)
+    for plan in known.sources:
+        assert plan.arm == "left"
+        peak_c = peak_of(plan, known.arm.motors, known.arm.thermal, asked.ambient_c, asked.horizon_s)
+        assert np.all(peak_c <= 40.0)
+
+
+def test_an_unknown_arm_anothers_twin_and_no_cool_motion_are_refused(small_toml, plans):
+    scenario = load(small_toml)
+    hot = override(scenario, twin={"cool_c": 22.5})
+    for known, arm, said in (
+        (scenario, "lefd", r"No arm 'lefd' in heat; did you mean 'left'\? Allowed: left, right"),
+        (scenario, "right", "twin of arm 'left', not of 'right'"),
+        (hot, "left", r"no motion that stays below 22.5 °C.*Raise twin.cool_c"),
+    ):
+        with pytest.raises(FleetError, match=said):
+            known_arm(known, arm, twin=LEFT, cache=plans)
+
+
+TWIN = SimpleNamespace(version="ab12", data_hash="cd34", seed="[0, 1]/")
+
+
+def test_a_model_names_its_data_and_seed_and_a_calibrated_one_both_sources():
+    assert provenance(Blind()) == {"version": "blind"}
+    twin = {"version": "ab12", "data_hash": "cd34", "seed": "[0, 1]/"}
+    assert provenance(TWIN) == {"version": "ab12", "twin": twin}
+    saturation = {"version": "ef56", "data_hash": "9988", "jobs": 300, "passed": 40}
+    model = SimpleNamespace(version="ab12+ef56", twin=TWIN, saturation=SimpleNamespace(**saturation))
+    assert provenance(model) == {"version": "ab12+ef56", "twin": twin, "saturation": saturation}

@@ -1,19 +1,401 @@
-"""The two plants against each other, and what a fault must do in both."""
+"""The simulated plants against each other, the laws of motion and all pairs of links."""
 
+from dataclasses import replace
+from itertools import product
+
+import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.arm.plant import MujocoPlant
+from fleet.arm.cell import APART_S, ContactFinder
+from fleet.arm.model import ArmModel, build_cell, gen3_xml, links_of, set_payload_balls
+from fleet.arm.planner import Planner
+from fleet.arm.plant import STRIDE, TIMESTEP_S, MujocoPlant, control, load_hands, reference, still
 from fleet.arrivals import Arrivals
 from fleet.engine.profile_plant import sample, sample_row
+from fleet.engine.shift import step
+from fleet.engine.state import initial
+from fleet.errors import FleetError
 from fleet.heat.motor import gen3_motors
-from fleet.job import KINDS
-from fleet.motion import RATE_HZ
-from fleet.telemetry import FAULTED, IDLE
+from fleet.job import KINDS, Fixture, Place, Work, payload_radius_m
+from fleet.motion import RATE_HZ, Phase, Plan
+from fleet.offered_plans import PLANS
+from fleet.robot import GEN3, POSTURES, Mount, Robot
+from fleet.telemetry import FAULTED, IDLE, WORKING
 from scenarios.prepare.fleet import make_env
 from scenarios.spec.schema import ArmSpec, JobStream, Planning, Scenario
+
+SAMPLE_S = STRIDE * TIMESTEP_S
+
+# The scene
+
+
+@settings(max_examples=20)
+@given(payload_kg=st.floats(0.01, 6.0), seed=st.integers(0, 2**31))
+def test_a_loaded_hand_is_a_model_compiled_with_the_load(payload_kg, seed):
+    spec = mujoco.MjSpec.from_string(gen3_xml().decode())
+    loaded = spec.compile()
+    load_hands(loaded, mujoco.MjData(loaded), np.array([loaded.body("payload").id]), np.array([payload_kg]))
+    spec.body("payload").mass = payload_kg
+    fresh = spec.compile()
+    rng = np.random.default_rng(seed)
+    q, qd, ctrl = rng.uniform(-2.0, 2.0, (3, 7))
+    results = []
+    for model in (loaded, fresh):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = q, qd, ctrl
+        mujoco.mj_step(model, data, 10)
+        results.append(data.qpos.copy())
+    np.testing.assert_allclose(*results, rtol=1e-12, atol=1e-12)
+    for name in dir(fresh):
+        value = getattr(fresh, name)
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            np.testing.assert_allclose(getattr(loaded, name), value, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_a_load_taken_off_leaves_no_trace(cell):
+    model = build_cell(cell.robots)
+    before = {name: np.copy(getattr(model, name)) for name in ("body_subtreemass", "dof_invweight0", "dof_M0")}
+    bodies = np.array([model.body(f"{robot.name}/payload").id for robot in cell.robots])
+    for payload_kg in ((2.0, 0.5), (0.0, 0.0)):
+        load_hands(model, mujoco.MjData(model), bodies, np.array(payload_kg))
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(model, name), value, err_msg=name)
+
+
+# Motion in the scene
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+@pytest.mark.parametrize("kind", KINDS)
+def test_arms_follow_their_plan_and_need_its_torque(cell, kind, arm):
+    """Tracking in joint space; the torque of the plan is inverse dynamics of the arm alone, with Jᵀf of a press."""
+    repetitions = 2
+    world, plants = cell.shift(cell.job(kind, repetitions=repetitions))
+    plan = cell.plans[arm][cell.works[kind]][0]
+    offsets = np.arange(1, 501) / RATE_HZ
+    parts, _ = cell.recorded(world, plants["mujoco"], offsets, first=(1, 0) if arm == 0 else (0, 1))
+    count = round(plan.duration_s(repetitions) * RATE_HZ) - 1
+    motion = np.stack([np.concatenate([getattr(p, n)[:, arm] for p in parts]) for n in ("q", "qd", "tau")], axis=1)
+    planned = sample(plan, np.arange(1, count + 1) / RATE_HZ, repetitions)
+    error = motion[:count] - planned
+    told, _ = cell.recorded(world, plants["profile"], offsets, first=(1, 0) if arm == 0 else (0, 1))
+    np.testing.assert_array_equal(np.concatenate([p.q[:, arm] for p in told])[:count], planned[:, 0])
+    np.testing.assert_array_equal(np.concatenate([p.tau[:, arm] for p in told])[:count], planned[:, 2])
+    rms = np.sqrt((error**2).mean(axis=0))
+    assert rms[0].max() < 1e-4
+    assert rms[1].max() < 0.01
+    # A switch of the load shows one sample early or late.
+    steady = np.abs(np.diff(planned[:, 2], axis=0, prepend=planned[:1, 2])).max(axis=1) < 2.0
+    assert np.mean(steady) > 0.9
+    assert np.sqrt((error[steady, 2] ** 2).mean(axis=0)).max() < 0.2
+    np.testing.assert_allclose(
+        motion[count + 1 :, 0], np.tile(cell.robots[arm].home_q(), (3000 - count - 1, 1)), atol=1e-3
+    )
+
+
+def heavy_plan(cell, payload_kg):
+    """A made-up hold at home whose payload the plan's torque knows nothing of."""
+    robot = cell.robots[0]
+    q, tau = robot.home_q(), ArmModel(robot).gravity_torque(robot.home_q())
+    profile = np.broadcast_to(np.stack([q, np.zeros(7), tau]), (100, 3, 7)).astype(np.float32)
+    none = Phase(np.zeros((0, 3, 7), np.float32), np.zeros(0, np.float32))
+    cycle = Phase(profile, np.full(100, payload_kg, np.float32))
+    return Plan(robot.name, cell.works["hold"], 0, 1.0, none, cycle, none)
+
+
+@pytest.mark.parametrize("clips", [False, True])
+def test_torque_is_what_changes_the_momentum(cell, clips):
+    """Second method: a plain loop of `mj_step`, and M (v⁺ − v)/h + c − Jᵀf from its states."""
+    plan = heavy_plan(cell, 60.0) if clips else cell.plans[0][cell.works["press"]][0]
+    world, _ = cell.shift(cell.job("press"), robots=cell.robots[:1], dt_s=2.0)
+    rest_tau = ArmModel(cell.robots[0]).gravity_torque(cell.robots[0].home_q())
+    plant = MujocoPlant(cell.robots[:1], [plan], rest_tau[None])
+    state = initial(world)
+    state.mode[:], state.job[:], state.plan[:], state.todo[:] = WORKING, 0, 0, 5
+    states = [state]
+    for _ in range(2):  # The second tick is looked at: the press begins in it.
+        done = step(world, states[-1], np.zeros((1, 1), int), plant)
+        read = cell.read(world, plant, done, np.arange(1, 201) * SAMPLE_S)
+        states.append(done.state)
+    model = build_cell(cell.robots[:1])
+    data, scratch = mujoco.MjData(model), mujoco.MjData(model)
+    kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+    body = np.array([model.body("floor/payload").id])
+    data.qpos[:] = cell.robots[0].home_q()
+    tau, q, inertia, jacobian = [], [], np.empty((7, 7)), np.empty((3, 7))
+    for tick in range(2):
+        home = still(cell.robots[0].home_q(), rest_tau, 100)
+        told = reference(plan, 5, 2.0 * tick, 100, home)
+        for i, ctrl in enumerate(control([told], 10, kp, kv)):
+            set_payload_balls(model, body, told.payload_kg[[i // 10]])
+            load_hands(model, scratch, body, told.payload_kg[[i // 10]])
+            data.ctrl[:] = ctrl
+            data.xfrc_applied[body, :3] = told.force_n[i // 10]
+            mujoco.mj_forward(model, data)
+            mujoco.mj_fullM(model, data, inertia)
+            mujoco.mj_jacBody(model, data, jacobian, None, body[0])
+            before, bias = data.qvel.copy(), data.qfrc_bias - jacobian.T @ told.force_n[i // 10]
+            mujoco.mj_step(model, data)
+            if tick == 1 and i % STRIDE == STRIDE - 1:
+                tau.append(inertia @ (data.qvel - before) / TIMESTEP_S + bias - data.qfrc_constraint)
+                q.append(data.qpos.copy())
+    np.testing.assert_allclose(read.q[:, 0], q, atol=1e-9)
+    np.testing.assert_allclose(read.tau[:, 0], tau, atol=1e-6)
+    limit = np.array(GEN3.torque_clip)
+    # Damping taken at the end of a step may add a little to a force just below the clip.
+    assert np.all(np.abs(read.tau[:, 0]) <= 1.1 * limit)
+    assert np.any(np.isclose(np.abs(read.tau[:, 0]), limit)) == clips
+
+
+def test_torque_goes_straight_but_jumps_with_the_load():
+    """At rest with no stiffness to speak of, ctrl · kp − kp · q is the torque alone."""
+    home = still(np.zeros(7), np.zeros(7), 3)
+    motion = home.motion.copy()
+    motion[2:, 2] = 6.0  # from sample 2 on
+    kp, kv = np.full(7, 1000.0), np.full(7, 10.0)
+    straight = control([replace(home, motion=motion)], 3, kp, kv) * kp
+    np.testing.assert_allclose(straight[:, 0], [0, 0, 0, 0, 2, 4, 6, 6, 6], atol=1e-12)
+    jumps = [0, 0, 0, 0, 0, 0, 6, 6, 6]
+    payload_kg, force_n = np.array([0.0, 0.0, 1.0, 1.0]), np.zeros((4, 3))
+    grasped = control([replace(home, motion=motion, payload_kg=payload_kg)], 3, kp, kv) * kp
+    np.testing.assert_allclose(grasped[:, 0], jumps, atol=1e-12)
+    force_n[2:, 1] = -3.0
+    pressed = control([replace(home, motion=motion, force_n=force_n)], 3, kp, kv) * kp
+    np.testing.assert_allclose(pressed[:, 0], jumps, atol=1e-12)
+
+
+# Faults and readings
+
+
+def test_only_faulted_arms_heat_nothing(cell):
+    world, plants = cell.shift(cell.job("hold", repetitions=20), ticks=40, limits=cell.HOT)
+    drives = []
+    plant = plants["mujoco"]
+    inner = plant.drive
+
+    def spy(world, state):
+        drives.append((state.mode[0].copy(), inner(world, state)))
+        return drives[-1][1]
+
+    plant.drive = spy
+    cell.work_through(world, plant)
+    modes = np.array([mode for mode, _ in drives])
+    heats = np.array([drive.current_sq[0].any(axis=-1) for _, drive in drives])
+    rubs = np.array([drive.friction_w[0].any(axis=-1) for _, drive in drives])
+    assert (modes == FAULTED).any()
+    np.testing.assert_array_equal(heats, modes != FAULTED)
+    assert not rubs[modes == FAULTED].any()
+
+
+def test_looking_at_the_sensors_changes_nothing(cell):
+    seen, unseen = [], []
+    for states, watched in ((seen, True), (unseen, False)):
+        world, plants = cell.shift(cell.job("hold", repetitions=20), ticks=40, limits=cell.HOT)
+        plant = plants["mujoco"]
+
+        def watch(done, world=world, plant=plant):
+            cell.read(world, plant, done, np.array([5.0]))
+
+        states += cell.work_through(world, plant, watch=watch if watched else None)
+        states.append(plant.data.qpos.copy())
+    np.testing.assert_array_equal(seen[-1], unseen[-1])
+    np.testing.assert_array_equal(seen[-2].temp_c, unseen[-2].temp_c)
+
+
+def test_tick_zero_starts_afresh(cell):
+    world, plants = cell.shift(cell.job("sort", repetitions=90), cell.job("hold"), ticks=4)
+    first, second = (cell.work_through(world, plants["mujoco"])[-1].temp_c for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+# Errors
+
+
+def test_many_envs_and_parts_of_samples_are_refused_and_ticks_come_in_order(cell):
+    for changes, nobody, said in (
+        ({"shifts": 2}, np.zeros((2, 2), int), r"simulates one env \(got 2\)"),
+        ({"dt_s": 1.01}, np.zeros((1, 2), int), r"whole 0.02 s \(got 1.01 s\)"),
+    ):
+        world, plants = cell.shift(cell.job("sort"), **changes)
+        with pytest.raises(ValueError, match=said):
+            step(world, initial(world), nobody, plants["mujoco"])
+    world, plants = cell.shift(cell.job("sort"))
+    done = step(world, initial(world), np.zeros((1, 2), int), plants["mujoco"])
+    later = done.state._replace(tick=done.state.tick + 1)
+    with pytest.raises(ValueError, match=r"1 is next \(got 2\)"):
+        step(world, later, np.zeros((1, 2), int), plants["mujoco"])
+    step(world, done.state, np.zeros((1, 2), int), plants["mujoco"])
+    with pytest.raises(ValueError, match=r"tick 1 only \(got 0\)"):
+        plants["mujoco"].motion(world, done.record, np.array([1.0]))
+
+
+def test_a_simulation_that_diverges_is_an_error(cell, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning into a file.
+    plan = cell.plans[0][cell.works["press"]][0]
+    world, _ = cell.shift(cell.job("press"), robots=cell.robots[:1])
+    work = replace(plan.work)
+    object.__setattr__(work, "force_n", 1e12)  # beyond the bounds of a work
+    plant = MujocoPlant(cell.robots[:1], [replace(plan, work=work)], np.zeros((1, 7)))
+    with pytest.raises(FleetError, match="diverged in tick 0"):
+        step(world, initial(world), np.ones((1, 1), int), plant)
+
+
+@pytest.mark.parametrize("timestep_s", [0.003, 0.02, 0.005])
+def test_a_timestep_must_fit_into_a_sample(cell, timestep_s):
+    with pytest.raises(ValueError, match="must be 4, 2, 1"):
+        MujocoPlant(cell.robots, [], np.zeros((2, 7)), timestep_s=timestep_s)
+
+
+ONE = Robot(name="one")
+FACING = Robot(name="two", mount=Mount(position_m=(1.3, 0.0, 0.0), tilt_deg=(0.0, 0.0, 180.0)))
+
+
+def towards(robot, seconds=2.0):
+    """A path from home to outstretched and back, rad, [sample, joint]."""
+    share = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(0.0, seconds, SAMPLE_S) / seconds)
+    return robot.home_q() + share[:, None] * (np.array(POSTURES["outstretched"]) - robot.home_q())
+
+
+def found(robots, q, payload_kg=None, fixtures=()):
+    """Events of recorded postures [sample, arm, joint]."""
+    payload_kg = np.zeros(q.shape[:2]) if payload_kg is None else payload_kg
+    finder = ContactFinder(build_cell(robots, fixtures=fixtures), robots)
+    return finder.events(np.arange(len(q)) * SAMPLE_S, q, payload_kg)
+
+
+def distances_m(robots, q):
+    """Distance of every pair of links of the two arms, by reason of an event, [sample]."""
+    model = build_cell(robots)
+    data = mujoco.MjData(model)
+    pairs = {
+        f"{a} of {robots[0].name} and {b} of {robots[1].name}": [
+            model.geom(f"{robot.name}/{link}").id for robot, link in zip(robots, (a, b), strict=True)
+        ]
+        for a, b in product(*(links_of(model, robot.name) for robot in robots))
+    }
+    out = {names: np.empty(len(q)) for names in pairs}
+    for i, postures in enumerate(q):
+        data.qpos[:] = postures.ravel()
+        mujoco.mj_kinematics(model, data)
+        for names, geoms in pairs.items():
+            out[names][i] = mujoco.mj_geomDistance(model, data, *geoms, 5.0, None)
+    return out
+
+
+def check_against_distances(events, robots, q, tolerance_m=1e-4):
+    """Every pair is reported when its distance first becomes negative, with its greatest depth, and no other."""
+    reported = {event.reason.rpartition(",")[0]: event for event in events}
+    assert len(reported) == len(events)
+    assert {event.arm for event in events} <= {robots[0].name}
+    for names, apart_m in distances_m(robots, q).items():
+        inside = np.flatnonzero(apart_m < 0)
+        if apart_m.min() < -tolerance_m:
+            event = reported.pop(names)
+            assert event.kind == "contact"
+            assert event.time_s == pytest.approx(inside[0] * SAMPLE_S, abs=SAMPLE_S + 1e-9)
+            # The depth of boxes and cylinders is that of one of their contact points.
+            assert event.value == pytest.approx(-1e3 * apart_m.min(), rel=0.02, abs=0.5)
+            assert event.reason.endswith(f", {event.value:.1f} mm deep")
+        elif apart_m.min() > tolerance_m:
+            assert names not in reported
+
+
+def test_arms_that_reach_for_one_another_are_reported_link_by_link():
+    q = np.stack([towards(ONE), towards(FACING)], axis=1)
+    events = found([ONE, FACING], q)
+    assert 1 < len(events) < 30
+    assert [event.time_s for event in events] == sorted(event.time_s for event in events)
+    check_against_distances(events, [ONE, FACING], q, tolerance_m=2e-3)
+
+
+def test_arms_apart_an_arm_in_itself_and_bases_on_the_floor_give_none():
+    folded = np.tile([0.0, 2.1, 0.0, 2.5, 0.0, 0.0, 0.0], (10, 1))
+    high = Robot(name="high", mount=Mount(position_m=(3.0, 0.0, 1.0)))
+    assert found([ONE, FACING], np.tile(ONE.home_q(), (10, 2, 1))) == []
+    assert found([high], folded[:, None]) == []
+
+
+@pytest.mark.parametrize(("pause_s", "count"), [(APART_S / 2, 1), (2 * APART_S, 2)])
+@pytest.mark.parametrize("cut", [None, 30, 130])
+def test_a_contact_is_one_event_until_the_links_were_apart(pause_s, count, cut):
+    """The arm's hand is in the floor for a second, out of it, and in it again."""
+    low, pause = np.array([0.0, 1.9, 0.0, 0.0, 0.0, 0.0, 0.0]), round(pause_s / SAMPLE_S)
+    q = np.concatenate(
+        [np.tile(ONE.home_q(), (n, 1)) if n == pause else np.tile(low, (n, 1)) for n in (100, pause, 99)]
+    )
+    whole = found([ONE], q[:, None])
+    assert {event.reason.split(" and ")[1].split(",")[0] for event in whole} == {"the floor"}
+    hand = [event for event in whole if event.reason.startswith("bracelet of one and the floor")]
+    assert [event.time_s for event in hand] == pytest.approx([0.0, 1.0 + pause_s][:count])
+    if cut is not None:  # the same in two stretches
+        finder, times = ContactFinder(build_cell([ONE]), [ONE]), np.arange(len(q)) * SAMPLE_S
+        parts = [(slice(cut),), (slice(cut, None),)]
+        events = [
+            e for (part,) in parts for e in finder.events(times[part], q[part, None], np.zeros((len(q[part]), 1)))
+        ]
+        assert [(e.time_s, e.reason) for e in events] == [(e.time_s, e.reason) for e in whole]
+
+
+def test_a_payload_in_a_table_is_reported_while_it_is_carried():
+    """The plan does not know the table, whose top is 10 mm above the lower end of the payload."""
+    work = Work(kind="hold", places=(Place(name="at", position_m=(0.45, 0.0, 0.25)),), payload_kg=2.0, dwell_s=2.0)
+    plan = Planner(ONE, elbows=1, speeds=(1.0,)).plan(work)[0]
+    top_m = 0.25 - 2 * payload_radius_m(2.0) + 0.01
+    table = Fixture(name="table", position_m=(0.45, 0.0, top_m / 2), size_m=(0.3, 0.3, top_m))
+    q = np.concatenate([phase.profile[:, 0] for phase in plan.phases]).astype(float)[:, None]
+    payload_kg = np.concatenate([phase.payload_kg for phase in plan.phases])[:, None]
+    (event,) = found([ONE], q, payload_kg, [table])
+    assert event.reason == "payload of one and the fixture 'table', 10.0 mm deep"
+    assert event.time_s == pytest.approx(np.flatnonzero(payload_kg)[0] * SAMPLE_S)
+    assert found([ONE], q, fixtures=[table]) == []
+
+
+# In the plant
+
+
+def driven(cell, robots, *, contacts):
+    """Postures and events of ten seconds in which both arms of the small cell work, their mounts moved to `robots`."""
+    world, plants = cell.shift(cell.job("sort"), cell.job("hold"), ticks=2)
+    plant = MujocoPlant(robots, plants["mujoco"]._plans, plants["mujoco"]._home_tau)
+    if not contacts:
+        plant.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    state, motion, events = initial(world), [], []
+    for tick in range(world.ticks):
+        done = step(world, state, np.array([[1, 1 + PLANS]]) * (tick == 0), plant)
+        motion.append(plant.motion(world, done.record, np.arange(1, round(world.dt_s / SAMPLE_S) + 1) * SAMPLE_S)[0])
+        events += plant.contacts(world, done.record)
+        state = done.state
+    return np.concatenate(motion), events
+
+
+def test_arms_apart_move_bit_for_bit_as_without_contacts(cell):
+    robots = [cell.robots[0], Robot(name="wall", mount=Mount(position_m=(-2.0, 0.0, 0.7), tilt_deg=(0.0, 90.0, 0.0)))]
+    with_contacts, events = driven(cell, robots, contacts=True)
+    without, _ = driven(cell, robots, contacts=False)
+    assert events == []
+    assert np.abs(np.diff(with_contacts[:, :, 0], axis=0)).max(axis=(0, 2)).min() > 0.001  # both move
+    np.testing.assert_array_equal(with_contacts, without)
+
+
+def test_crossing_arms_push_one_another_and_are_reported(cell):
+    robots = [cell.robots[0], Robot(name="wall", mount=Mount(position_m=(-0.75, 0.0, 0.7), tilt_deg=(0.0, 90.0, 0.0)))]
+    motion, events = driven(cell, robots, contacts=True)
+    free, unpushed = driven(cell, robots, contacts=False)
+    assert events
+    first = events[0].time_s
+    before = round(first / SAMPLE_S) - 1
+    assert before > 10
+    np.testing.assert_array_equal(motion[:before], free[:before])
+    assert not np.array_equal(motion, free)
+    assert events[0].value < 0.1 * unpushed[0].value
+    inside = {names: m for names, m in distances_m(robots, motion[:, :, 0]).items() if m.min() < -1e-3}
+    apart = min((np.flatnonzero(m < 0)[0] + 1) * SAMPLE_S for m in inside.values())
+    assert first == pytest.approx(apart, abs=SAMPLE_S + 1e-9)
+    assert set(inside) <= {event.reason.rpartition(",")[0] for event in events}
+
 
 # The profile plant
 

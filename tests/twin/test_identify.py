@@ -1,9 +1,14 @@
+"""The thermal twin, and its parameters identified from recordings, with intervals."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from benchmarks.paper.real_logs import held_out_errors, rms
+from benchmarks.paper.real_logs import continued_peaks, filter_log, held_out_errors, planned_peaks, rms
+from benchmarks.paper.saturation import brier, reliability
+from fleet.difficulty import KNOWN, SETTLING_S, known_temperatures
 from fleet.errors import CheckpointError, IdentificationError
 from fleet.heat.motor import friction_heat, gen3_motors, reference_current
 from fleet.heat.thermal import (
@@ -13,10 +18,14 @@ from fleet.heat.thermal import (
     ThermalSpread,
     drive_heat,
     gen3_network,
+    simulate_temperatures,
     spread_motors,
+    steady_state,
     thermal_model,
 )
+from fleet.motion import RATE_HZ, drive, drives
 from fleet.robot import JOINTS
+from scenarios.prepare.arms import peaks
 from twin.logs.recording import Recording, heat_logs
 from twin.thermal.checkpoint import CARD, load, load_twin, save
 from twin.thermal.identify import (
@@ -31,9 +40,267 @@ from twin.thermal.identify import (
     noise_of,
     nominal_heat_model,
 )
-from twin.thermal.thermal_twin import RcTwin
+from twin.thermal.thermal_twin import CalibratedTwin, NotEnoughExperience, PeakCurve, RcTwin, fit_curve
 
 AIR_C = 22.0
+FULL_REACH_NM = np.array([0.0, 50.1, 0.0, 21.3, 0.0, 1.0, 0.0])
+"""3 kg held outstretched (gravity torques of the Gen3 model)."""
+
+
+def hold(tau, seconds: float = 4.0):
+    """Profile of a posture held, [time, 3, joint]."""
+    samples = round(seconds * RATE_HZ)
+    return np.stack([np.zeros((samples, JOINTS)), np.zeros((samples, JOINTS)), np.tile(tau, (samples, 1))], axis=1)
+
+
+@pytest.fixture
+def rng_5():
+    return np.random.default_rng(5)
+
+
+@pytest.fixture
+def holds(make_plan):
+    """Plan that holds joint torques."""
+
+    def make(tau, seconds: float = 4.0):
+        short = hold(tau, 0.5)
+        return make_plan(*(p.astype(np.float32) for p in (short, hold(tau, seconds), short)))
+
+    return make
+
+
+def test_three_kilograms_outstretched_pass_the_limit_when_the_project_says(holds):
+    # 12.6 min from a cold arm in 25 °C, DESIGN §3.
+    twin = RcTwin.nominal(ambient_c=25.0)
+    time_s, temp_c = twin.predict(holds(FULL_REACH_NM), 450, np.full(JOINTS, 25.0))
+    assert time_s[-1] == pytest.approx(1801.0)
+    passed_s = np.interp(60.0, temp_c[:, 1], time_s)
+    assert passed_s / 60.0 == pytest.approx(12.6, abs=0.2)
+
+
+def test_peaks_are_those_of_the_simulator_with_the_same_parameters(holds, rng_5):
+    twin = RcTwin.nominal()
+    plans = [holds(scale * FULL_REACH_NM) for scale in (0.3, 0.7, 1.1)]
+    repetitions = [20, 100, 300]
+    start = np.full(NODES, 30.0)
+    mine = twin.peaks(plans, repetitions, start_c=start)
+    lasts = [plan.duration_s(n) for plan, n in zip(plans, repetitions, strict=True)]
+    theirs = peaks(plans, lasts, motors=twin.motors, thermal=twin.thermal, start_c=start, ambient_c=AIR_C)
+    np.testing.assert_allclose(mine, theirs, atol=0.05)  # steps of unequal length
+
+
+def test_a_job_in_phases_ends_where_its_mean_ends(holds):
+    twin = RcTwin.nominal()
+    plan = holds(FULL_REACH_NM)
+    _, temp_c = twin.predict(plan, 50, np.full(JOINTS, 30.0))
+    peak = twin.peaks([plan], [50], start_c=np.full(NODES, 30.0))[0]
+    np.testing.assert_allclose(temp_c.max(axis=0), peak, atol=0.02)
+
+
+def test_difficulty_grows_with_load_and_repetitions_and_is_none_at_rest(holds):
+    twin = RcTwin.nominal()
+    rest = twin.score(holds(np.zeros(JOINTS)), 100)
+    np.testing.assert_allclose(rest.per_joint, 0.0, atol=1e-9)
+    d = [twin.score(holds(s * FULL_REACH_NM), n).per_joint[1] for s, n in ((0.5, 100), (1.0, 100), (1.0, 1000))]
+    assert 0 < d[0] < d[1] < d[2] < 1
+    # The limit is reached where the rise fills the room: d = 1 − 1/e.
+    idle = twin.idle_c[1]
+    at_limit = replace(twin, warning_c=float(twin.peaks([holds(FULL_REACH_NM)], [100], start_c=twin.idle_c)[0, 1]))
+    assert at_limit.warning_c > idle
+    assert at_limit.score(holds(FULL_REACH_NM), 100).per_joint[1] == pytest.approx(1 - np.exp(-1))
+
+
+def test_the_peak_is_that_of_the_step_by_step_simulation(holds):
+    """Hot and cold starts, short and long plans, copper and magnets that change with temperature."""
+    twin, rng = RcTwin.nominal(), np.random.default_rng(1)
+    errors = []
+    for _ in range(60):
+        plan, times = holds(rng.uniform(0.0, 1.3) * FULL_REACH_NM), int(rng.integers(10, 900))
+        ambient_c, warm_k = rng.uniform(15.0, 38.0), rng.uniform(0.0, 25.0)
+        housing_c = ambient_c + warm_k * rng.uniform(0.0, 1.0, JOINTS)
+        start_c = np.append(housing_c + warm_k * rng.uniform(0.0, 1.0, JOINTS), housing_c)
+        settled_s = min(SETTLING_S, plan.duration_s(times))
+        load = drives([plan.cycle.profile], twin.motors)
+        law = {"motors": twin.motors, "thermal": twin.thermal, "ambient_c": ambient_c}
+        settled = simulate_temperatures(load, [settled_s], start_c=start_c, **law)
+        after_s = plan.duration_s(times) - settled_s
+        wanted_c = simulate_temperatures(load, [after_s], start_c=settled.end_c[0], **law).highest_c.max()
+        known_c = known_temperatures(start_c[:JOINTS], housing_c, ambient_c)
+        if wanted_c < 90.0:  # beyond the error limit nothing needs to be right
+            errors.append(twin.score(plan, times).peak_at(known_c) - wanted_c)
+    assert len(errors) > 30
+    assert np.sqrt(np.mean(np.square(errors))) < 0.3
+    assert np.abs(errors).max() < 1.0
+
+
+def test_a_plan_that_cools_a_warm_motor_is_not_held_against_it(holds):
+    twin = replace(RcTwin.nominal(), curve=PeakCurve(knots=((59.0, 0.01), (61.0, 0.99)), jobs=30))
+    warm_c = known_temperatures(np.append(65.0, np.full(6, 30.0)), np.full(JOINTS, 30.0), 22.0)
+    light = twin.score(holds(0.0 * FULL_REACH_NM), 2000)
+    assert light.p_at(warm_c) == 0.01
+    hot_c = known_temperatures(np.full(JOINTS, 70.0), np.full(JOINTS, 68.0), 36.0)
+    assert light.p_at(hot_c) == 0.99
+
+
+def test_pieces_of_later_moments_say_so(holds):
+    peak = RcTwin.nominal().peak(holds(FULL_REACH_NM), 8000)
+    assert peak.time_s is not None
+    assert set(np.round(peak.time_s)) <= {0.0, 480.0, np.round(peak.time_s.max())}
+    assert (peak.time_s == 0.0).any()
+    assert len(peak.offset) <= 24
+
+
+def test_a_curve_is_the_chance_of_the_prediction_error(holds):
+    """Normal errors of 2 K with a bias of 1 K; P is then a normal distribution function."""
+    rng = np.random.default_rng(3)
+    predicted_c = rng.uniform(40.0, 80.0, 4000)
+    curve = fit_curve(predicted_c, predicted_c + rng.normal(1.0, 2.0, 4000), 60.0)
+    at, p = np.array(curve.knots).T
+    expected = norm.cdf((at + 1.0 - 60.0) / 2.0)
+    assert p == pytest.approx(expected, abs=0.04)
+    with pytest.raises(NotEnoughExperience, match="needs 30 past jobs"):
+        fit_curve(predicted_c[:29], predicted_c[:29], 60.0)
+
+
+def test_bad_plans_are_refused(holds, make_plan):
+    twin, empty = RcTwin.nominal(), np.zeros((0, 3, JOINTS), np.float32)
+    with pytest.raises(ValueError, match="at least one repetition"):
+        twin.score(holds(FULL_REACH_NM), 0)
+    with pytest.raises(ValueError, match="no motion"):
+        twin.score(make_plan(empty, empty, empty), 1)
+    six = np.zeros((50, 3, 6), np.float32)
+    with pytest.raises(ValueError, match="7 joints"):
+        twin.score(make_plan(six, six, six), 1)
+    with pytest.raises(ValueError, match="start_c"):
+        twin.predict(holds(FULL_REACH_NM), 1, np.zeros(3))
+
+
+def working(twin: RcTwin, minutes: float, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
+    """A log at 1 Hz of a hold and a rest from warm housings, and the true node temperatures."""
+    count = round(60 * minutes)
+    on = (np.arange(count + 1) < count // 2).astype(float)[:, None]
+    tau, still = on * FULL_REACH_NM, np.zeros((count + 1, JOINTS))
+    start = np.append(np.full(JOINTS, 35.0), np.full(JOINTS, 31.0))
+    phi, gamma = twin.thermal.step_matrices(1.0)
+    temp, amps = [start], []
+    for k in range(count):
+        square = reference_current(tau[k], still[k], twin.motors) ** 2
+        heat = drive_heat(temp[-1], square, friction_heat(still[k], twin.motors), twin.motors)
+        temp.append(phi @ temp[-1] + gamma @ (heat + twin.thermal.to_ambient * AIR_C))
+    for k in range(count + 1):
+        factor = 1.0 + twin.motors.alpha_kt_per_k * (temp[k][HOUSING] - twin.motors.reference_c)
+        amps.append(reference_current(tau[k], still[k], twin.motors) / factor)
+    temps = np.array(temp)
+    seen = temps[:, WINDING] + twin.motors.sensor_noise_k * rng.standard_normal((count + 1, JOINTS))
+    arrays = {"q": still, "qd": still, "tau": tau, "current_a": np.array(amps), "temp_c": seen}
+    return Recording(name="work", time_s=np.arange(count + 1.0), **arrays), temps
+
+
+def test_the_observer_finds_the_housings_and_says_how_well(rng_5):
+    twin = RcTwin.nominal()
+    recording, truth = working(twin, 40.0, rng_5)
+    (log,) = heat_logs(recording, twin.motors, "current")
+    error = np.abs(filter_log(twin, log)[:, HOUSING] - truth[log.time_s.astype(int), HOUSING])
+    assert (error[0] > 3.5).all()
+    assert error[-1].max() < 1.0
+
+
+def test_forecasts_know_the_coming_load_or_take_the_last_one_for_granted(rng_5):
+    twin = RcTwin.nominal()
+    recording, truth = working(twin, 40.0, rng_5)
+    (log,) = heat_logs(recording, twin.motors, "torque")
+    states = truth[log.time_s.astype(int)]
+    planned = planned_peaks(twin, log, states, 300.0)
+    continued = continued_peaks(twin, log, states, 300.0, past_s=30.0)
+    assert np.isnan(planned[-1]).all()
+    assert np.isnan(continued[0]).all()
+    for k in (30, 100, 125, 180):
+        coming = truth[int(log.time_s[k]) + 1 : int(log.time_s[k]) + 301, WINDING].max(axis=0)
+        np.testing.assert_allclose(planned[k], coming, atol=0.15)
+    # Just before the hold ends, a load that goes on is hotter than what comes; in the middle it is the same.
+    assert continued[115, 1] > planned[115, 1] + 0.5
+    np.testing.assert_allclose(continued[60], planned[60], atol=0.15)
+
+
+def own_arm(seed: int) -> tuple[RcTwin, HeatModel]:
+    rng, spread = np.random.default_rng(seed), ThermalSpread.gen3()
+    body = nominal_heat_model()
+    return RcTwin.nominal(), HeatModel(spread_motors(body.motors, spread, rng), gen3_network(spread=spread, rng=rng))
+
+
+def test_an_identified_arm_predicts_its_own_heat_better_than_the_nominal_one(holds, rng_5, tmp_path):
+    nominal, body = own_arm(11)
+    true = RcTwin(arm="own", heat_model=body, ambient_c=AIR_C, base="true")
+    recordings = [replace(working(true, 40.0, rng_5)[0], name=f"{i}") for i in range(2)]
+    got = identify(recordings, ambient_sd_k=0.0, step_s=20.0)
+    plans = [holds(s * FULL_REACH_NM) for s in (0.5, 0.8, 1.1)]
+    start = np.full(NODES, 30.0)
+    wanted = true.peaks(plans, [200] * 3, start_c=start)[:, 1]
+    error = [
+        np.abs(twin.peaks(plans, [200] * 3, start_c=start)[:, 1] - wanted).max() for twin in (nominal, RcTwin.of(got))
+    ]
+    assert error[1] < min(0.5 * error[0], 0.5)
+    save(got, tmp_path, saturation=PeakCurve(knots=((59.0, 0.1), (61.0, 0.9)), jobs=30))
+    back = load_twin(tmp_path)
+    assert back.curve is not None
+    np.testing.assert_array_equal(
+        back.peaks(plans, [200] * 3, start_c=start), RcTwin.of(got).peaks(plans, [200] * 3, start_c=start)
+    )
+
+
+def test_probability_from_past_jobs_of_an_arm_unlike_the_nominal_one(holds):
+    # Jobs of random loads and lengths from random starts; labels by the simulator's law with the arm's own numbers.
+    nominal, body = own_arm(2)
+    rng = np.random.default_rng(0)
+    count, taught = 700, 200
+    scale = rng.uniform(0.2, 1.3, count)
+    tau = scale[:, None] * FULL_REACH_NM * rng.uniform(0.5, 1.5, (count, JOINTS))
+    plans = [holds(row, 0.2) for row in tau]
+    repetitions = rng.integers(300, 12000, count)
+    winding = rng.uniform(22, 50, (count, 1)) + rng.normal(0, 2, (count, JOINTS))
+    housing = winding - rng.uniform(0, 5, (count, JOINTS))
+    loads = drives([plan.cycle.profile for plan in plans], body.motors)
+    lasts = np.array([plan.duration_s(int(n)) for plan, n in zip(plans, repetitions, strict=True)])
+    law = {"motors": body.motors, "thermal": body.thermal(), "ambient_c": np.full(count, 24.0)}
+    settled_s = np.minimum(SETTLING_S, lasts)
+    start = np.concatenate([winding, housing], axis=1)
+    settled = simulate_temperatures(loads, settled_s, start_c=start, **law)
+    peak = simulate_temperatures(loads, lasts - settled_s, start_c=settled.end_c, **law).highest_c.max(axis=1)
+    known = known_temperatures(winding, housing, np.full(count, 24.0))
+    part = slice(0, taught)
+    twin = nominal.with_past_jobs(plans[part], repetitions[part], known_c=known[part], peak_c=peak[part])
+    passed = peak >= 60.0
+    p = np.array(
+        [
+            float(twin.peak(plan, int(times)).at(at))
+            for plan, times, at in zip(plans[taught:], repetitions[taught:], known[taught:], strict=True)
+        ]
+    )
+    assert 0.1 < passed.mean() < 0.9
+    assert brier(p, passed[taught:]) <= 0.045
+    assert reliability(p, passed[taught:]).error <= 0.04
+
+
+def test_the_warm_end_is_where_newton_says_it_settles(holds):
+    twin = RcTwin.nominal()
+    plan = holds(0.5 * FULL_REACH_NM)
+    load = drive(plan.cycle.profile, twin.motors)
+    end = steady_state(twin.thermal, load.current_sq, load.friction_w, twin.motors, AIR_C)
+    _, temp_c = twin.predict(plan, 15000, np.full(JOINTS, 30.0))
+    np.testing.assert_allclose(temp_c[-1], end[WINDING], atol=0.05)
+
+
+def test_a_calibrated_twin_states_what_each_model_states(twin, plan) -> None:
+    known_c = np.linspace(20.0, 50.0, KNOWN)
+    heat = replace(RcTwin.nominal(), curve=PeakCurve(knots=((0.0, 0.25), (200.0, 0.25)), jobs=30))
+    calibrated = CalibratedTwin(twin, heat)
+    score = calibrated.score(plan, 40)
+    np.testing.assert_array_equal(score.per_joint, twin.score(plan, 40).per_joint)
+    assert score.peak_at(known_c) == heat.peak(plan, 40).value(known_c)
+    assert score.p_at(known_c) == 0.25
+    assert calibrated.version == f"d:{twin.version}+peak:{heat.version}"
+
+
 GRAVITY_NM = np.array([3.0, 25.0, 6.0, 12.0, 2.0, 5.0, 2.0])
 
 

@@ -1,3 +1,5 @@
+"""Windows, network, loss and training of a twin, against torch and closed forms."""
+
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -5,10 +7,236 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from torch.distributions import Independent, Normal, kl_divergence
 
 from fleet.errors import FleetError
-from twin.vae.config import TwinConfig, hash_records, seed_text, training_key
-from twin.vae.train import CollapsedPosterior, Diverged, Run, train
+from twin.logs.recording import NothingCool, Recording, cool_stretches
+from twin.vae.config import LOGVAR_RANGE, TwinConfig, hash_records, seed_text, training_key
+from twin.vae.inference import tanh
+from twin.vae.model import active_units, build, collapsed, kl, negative_elbo, one_thread, reconstruction
+from twin.vae.train import CollapsedPosterior, Diverged, Run, SideBySide, train
+from twin.vae.window import STD_FLOOR, Scaler, cover, cut, resample, starts, windows_of
+
+lengths = st.integers(1, 300)
+windows = st.integers(2, 60)
+rates = st.sampled_from([2.0, 10.0, 12.5, 33.0, 50.0, 120.0])
+
+
+@given(lengths, windows, st.data())
+def test_windows_cover_every_sample_and_nothing_beyond(length, window, data):
+    stride = data.draw(st.integers(1, window))
+    first = starts(length, window, stride)
+    seen = {i for s in first for i in range(s, s + window)}
+    assert set(range(length)) <= seen
+    assert len(set(first)) == len(first)
+    assert first[-1] == max(length - window, 0)
+
+
+@given(lengths, windows, st.data())
+def test_cover_makes_the_window_mean_the_plain_time_mean(length, window, data):
+    stride = data.draw(st.integers(1, window))
+    values = data.draw(arrays(float, (length, 3, 2), elements=st.floats(-9, 9)))
+    weights = cover(length, window, stride)
+    pieces = cut(values, window, stride)
+    mean = np.einsum("bt,btjc->cj", weights, pieces)
+    np.testing.assert_allclose(mean, values.mean(axis=0), atol=1e-9)
+
+
+def test_short_motion_is_padded_by_its_last_sample_none_gives_no_window_and_blocks_are_averaged():
+    (window,) = cut(np.arange(9.0).reshape(3, 3, 1), 5, 5)
+    np.testing.assert_array_equal(window[:, 0, 0], [0, 3, 6, 6, 6])
+    np.testing.assert_allclose(cover(3, 5, 5), [[1 / 3, 1 / 3, 1 / 3, 0, 0]])
+    assert cut(np.zeros((0, 3, 7)), 50, 10).shape == (0, 50, 7, 3)
+    assert cover(0, 50, 10).shape == (0, 50)
+    assert resample(np.zeros((0, 3, 7)), 50.0, 12.5).shape == (0, 3, 7)
+    profile = np.arange(8.0)[:, None, None] * np.ones((1, 3, 1)) * 0.1
+    np.testing.assert_allclose(resample(profile, 50.0, 12.5)[:, 0, 0], [0.15, 0.55])
+
+
+@given(st.integers(1, 200), rates, rates)
+def test_resampling_keeps_the_integral_over_time(length, from_hz, to_hz):
+    rng = np.random.default_rng(length)
+    profile = rng.uniform(-1, 1, (length, 3, 2))
+    new = resample(profile, from_hz, to_hz)
+    span = np.full(len(new), 1 / to_hz)
+    span[-1] = length / from_hz - (len(new) - 1) / to_hz
+    assert span[-1] > 0
+    np.testing.assert_allclose((new * span[:, None, None]).sum(0), profile.sum(0) / from_hz, atol=1e-9)
+
+
+def test_a_wrap_of_a_continuous_joint_never_shows(rng, motion):
+    spun = (0, 2, 4, 6)
+    profile = motion(rng, 12.0).astype(float)
+    profile[:, 0, spun] += 3.0
+    wrapped = profile.copy()
+    wrapped[:, 0, spun] = np.angle(np.exp(1j * profile[:, 0, spun]))
+    assert np.abs(np.diff(wrapped[:, 0, spun], axis=0)).max() > 6
+    turned = profile.copy()
+    turned[:, 0, spun] += 6 * np.pi
+    scaler = Scaler.fit(cut(resample(profile, 50, 12.5), 50, 10))
+    want = scaler.to_z(cut(resample(profile, 50, 12.5), 50, 10))
+    for other in (wrapped, turned):
+        np.testing.assert_allclose(scaler.to_z(cut(resample(other, 50, 12.5), 50, 10)), want, atol=1e-4)
+
+
+def test_a_limited_joint_is_not_moved_by_turns():
+    at = np.zeros((1, 5, 7, 3))
+    far = at.copy()
+    far[:, :, 1, 0] = 4.0
+    z = Scaler.fit(at).to_z(far)
+    assert z[0, 0, 1, 0] == pytest.approx(4.0 / STD_FLOOR[0])
+
+
+def test_z_scores_have_mean_zero_and_deviation_one_go_back_to_si_and_floor_a_still_joint(records):
+    cool = windows_of(records, TwinConfig())
+    z = Scaler.fit(cool).to_z(cool)
+    np.testing.assert_allclose(z.mean(axis=(0, 1)), 0, atol=1e-4)
+    np.testing.assert_allclose(z.std(axis=(0, 1)), 1, atol=1e-3)
+    cool = windows_of(records, TwinConfig())
+    scaler = Scaler.fit(cool)
+    heavy = cool.copy()
+    heavy[..., 2] *= 3
+    assert scaler.to_z(heavy)[..., 2].std() > 2.5
+    cool = windows_of(records, TwinConfig())
+    cool[:, :, 4] = 1.0
+    scaler = Scaler.fit(cool)
+    np.testing.assert_array_equal(scaler.std[4], STD_FLOOR)
+    np.testing.assert_array_equal(scaler.still, np.arange(7) == 4)
+    assert np.all(np.isfinite(scaler.to_z(cool)))
+    cool = windows_of(records[:3], TwinConfig())
+    scaler = Scaler.fit(cool)
+    np.testing.assert_allclose(scaler.to_si(scaler.to_z(cool)), cool, atol=1e-5)
+
+
+def test_records_that_cannot_teach_are_refused(rng, motion, tiny):
+    bad, whole = motion(rng, 2.0), np.zeros((100, 3, 7))
+    bad[4, 2, 1] = np.nan
+    for records, words in (
+        ([], "at least one record"),
+        ([np.zeros((0, 3, 7))], "at least one record"),
+        ([np.zeros((5, 7))], r"Record 0 must be \[time, 3, joint\]"),
+        ([np.zeros((5, 2, 7))], r"Record 0 must be \[time, 3, joint\]"),
+        ([whole.astype(np.float32), bad], "Record 1 is not finite: tau of joint 2 at sample 4"),
+        ([whole, np.zeros((100, 3, 6))], "same number of joints"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            train(records, tiny, SEED, arm="a")
+
+
+@pytest.mark.parametrize(("latent", "layers"), [(1, 2), (5, 1)])
+def test_shapes_and_the_range_of_the_log_variance(latent, layers):
+    net = build(TwinConfig(latent=latent, hidden=8, layers=layers), seed=0)
+    x_hat, mu, logvar = net(torch.zeros(4, 50, 3), torch.zeros(4, latent))
+    assert x_hat.shape == (4, 50, 3)
+    assert mu.shape == logvar.shape == (4, latent)
+    with torch.no_grad():
+        net.logvar.bias.copy_(100.0 * (-1.0) ** torch.arange(latent))
+        _, logvar = net.encode(torch.randn(3, 50, 3))
+    assert logvar.unique().tolist() == sorted(LOGVAR_RANGE)[-min(latent, 2) :]
+
+
+def test_building_leaves_the_global_random_state_alone():
+    before = torch.random.get_rng_state()
+    first, second, other = build(TwinConfig(), 5), build(TwinConfig(), 5), build(TwinConfig(), 6)
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert torch.equal(first.mu.weight, second.mu.weight)
+    assert not torch.equal(first.mu.weight, other.mu.weight)
+
+
+def test_one_thread_gives_the_threads_back_even_after_an_error():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    seen = []
+    try:
+        with pytest.raises(ZeroDivisionError), one_thread():
+            seen.append(torch.get_num_threads() / (torch.get_num_threads() - 1))
+        with one_thread():
+            seen.append(torch.get_num_threads())
+        seen.append(torch.get_num_threads())
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scope": "leg"}, "No scope 'leg'"),
+        ({"kind": "gan"}, "No kind 'gan'"),
+        ({"trial": 0.0}, r"trial must be in \(0, 1\]"),
+        ({"latent": 0}, "latent must be 1 to 64"),
+        ({"rate_hz": 0.0}, "rate_hz must be > 0 and at most 1000"),
+        ({"learning_rate": float("nan")}, "learning_rate must be > 0"),
+        ({"window": 1}, "window must be 2 to 10000"),
+        ({"window": 20, "stride": 30}, "never seen"),
+        ({"beta": -1.0}, "beta must be 0 to 1000"),
+        ({"noise": (0.1, -0.1, 0.1)}, "noise must be three"),
+        ({"noise": (0.1, 0.1)}, "noise must be three"),
+    ],
+)
+def test_a_configuration_that_cannot_be_is_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        TwinConfig(**change)
+
+
+def test_quick_trains_less_and_a_seed_reads_as_entropy_and_spawn_key():
+    quick, full = TwinConfig.quick(), TwinConfig()
+    assert quick.max_windows * quick.epochs * quick.restarts < full.max_windows * full.epochs * full.restarts / 4
+    assert seed_text(np.random.SeedSequence(5, spawn_key=(1, 2))) == "5/1.2"
+
+
+def test_an_autoencoder_is_certain_whatever_the_noise():
+    net = build(TwinConfig(kind="ae"), seed=0)
+    x = torch.randn(4, 50, 3, generator=torch.Generator().manual_seed(1))
+    quiet, mu, logvar = net(x, torch.zeros(4, 2))
+    loud, _, _ = net(x, torch.full((4, 2), 1e6))
+    assert torch.equal(quiet, loud)
+    assert torch.equal(logvar.exp(), torch.zeros_like(mu))
+
+
+@pytest.mark.parametrize(("scope", "networks", "channels"), [("joint", 7, 3), ("arm", 1, 21)])
+def test_a_scope_says_how_many_networks_read_how_much(scope, networks, channels):
+    config = TwinConfig(scope=scope)
+    assert (config.networks(7), config.channels(7)) == (networks, channels)
+
+
+DRAW = torch.Generator().manual_seed(0)
+
+
+def test_kl_is_that_of_torch_distributions():
+    mu, logvar = torch.randn(5, 3, generator=DRAW), torch.randn(5, 3, generator=DRAW)
+    posterior = Independent(Normal(mu, (0.5 * logvar).exp()), 1)
+    prior = Independent(Normal(torch.zeros(5, 3), torch.ones(5, 3)), 1)
+    torch.testing.assert_close(kl(mu, logvar), kl_divergence(posterior, prior))
+
+
+def test_kl_is_the_mean_log_ratio_over_samples():
+    mu, logvar = torch.tensor([[0.7, -1.2]]), torch.tensor([[-1.0, 0.5]])
+    q = Normal(mu, (0.5 * logvar).exp())
+    z = mu + (0.5 * logvar).exp() * torch.randn(200_000, 2, generator=DRAW)
+    ratio = (q.log_prob(z) - Normal(0.0, 1.0).log_prob(z)).sum(1)
+    np.testing.assert_allclose(kl(mu, logvar).item(), ratio.mean(), rtol=0.02)
+
+
+def test_beta_weighs_the_kl_and_that_of_the_prior_is_zero():
+    x, mu, logvar = torch.zeros(4, 1, 3, 2), torch.ones(1, 2, 2), torch.zeros(1, 2, 2)
+    assert [negative_elbo(x, x, mu, logvar, beta).item() for beta in (1.0, 4.0)] == [1.0, 4.0]
+    assert kl(torch.zeros(1, 2), torch.zeros(1, 2)).item() == 0.0
+
+
+def test_a_latent_that_never_moves_is_not_active_and_none_or_little_kl_counts_as_collapsed():
+    assert active_units(torch.stack([torch.linspace(-1, 1, 50), torch.full((50,), 0.4)])) == 1
+    assert [collapsed(0.4, 1), collapsed(3.0, 0), collapsed(0.6, 1)] == [True, True, False]
+
+
+def test_reconstruction_is_the_gaussian_log_likelihood_up_to_its_constant():
+    x, x_hat = torch.randn(6, 2, 3, 4, generator=DRAW), torch.randn(6, 2, 3, 4, generator=DRAW)
+    log_p = Normal(x_hat, 1.0).log_prob(x).sum((0, 2))
+    torch.testing.assert_close(-reconstruction(x, x_hat) - 18 * 0.5 * np.log(2 * np.pi), log_p)
+
 
 SEED = np.random.SeedSequence(11)
 
@@ -35,16 +263,13 @@ def test_the_twin_knows_its_training_better_than_their_mean(twin):
         assert fit.active_units >= 1
 
 
-def test_the_same_seed_gives_the_same_weights(records, tiny):
+def test_a_seed_gives_the_same_weights_and_leaves_global_states_alone(records, tiny):
     first = train(records, tiny, SEED, arm="a")
     again = train(records, tiny, SEED, arm="a")
     other = train(records, tiny, np.random.SeedSequence(12), arm="a")
     assert first.version == again.version != other.version
     for name, tensor in first.tensors().items():
         np.testing.assert_array_equal(tensor, again.tensors()[name])
-
-
-def test_training_leaves_global_random_states_and_threads_alone(records, tiny):
     before, threads = torch.random.get_rng_state(), torch.get_num_threads()
     train(records, tiny, SEED, arm="a")
     assert torch.equal(before, torch.random.get_rng_state())
@@ -141,10 +366,6 @@ def test_the_data_is_named_by_its_content_unless_told(records, tiny):
     assert train(records[:2], one, SEED, arm="a", data_hash="lot 7").data_hash == "lot 7"
 
 
-def test_a_seed_reads_as_entropy_and_spawn_key():
-    assert seed_text(np.random.SeedSequence(5, spawn_key=(1, 2))) == "5/1.2"
-
-
 def test_one_network_can_know_the_whole_arm(records, small):
     config = replace(small, scope="arm", latent=8, hidden=32)
     twin = train(records, config, SEED, arm="a")
@@ -175,19 +396,168 @@ def test_an_autoencoder_that_learned_nothing_is_collapsed(records, small):
         )
 
 
-@pytest.mark.parametrize(
-    ("bad", "words"),
-    [
-        ([], "at least one record"),
-        ([np.full((100, 3, 7), np.nan)], "Record 0 is not finite"),
-        ([np.zeros((100, 3, 7)), np.zeros((100, 3, 6))], "same number of joints"),
-    ],
-)
-def test_records_that_cannot_teach_are_refused(tiny, bad, words):
-    with pytest.raises(ValueError, match=words):
-        train(bad, tiny, SEED, arm="a")
-
-
 def test_a_record_shorter_than_a_window_teaches_what_it_shows(motion, tiny, rng):
     twin = train([motion(rng, 1.0) for _ in range(40)], tiny, SEED, arm="a")
     assert np.isfinite([fit.elbo for fit in twin.fits]).all()
+
+
+JOINTS = 7
+
+
+def warmed(temp_2_c: np.ndarray, others_c: float = 30.0, name: str = "a") -> Recording:
+    """A recording at 1 Hz in which only the temperature of joint 2 changes."""
+    time_s = np.arange(float(len(temp_2_c)))
+    still = np.zeros((len(time_s), JOINTS))
+    temp_c = np.full_like(still, others_c)
+    temp_c[:, 1] = temp_2_c
+    return Recording(name=name, time_s=time_s, q=still, qd=still, tau=still, temp_c=temp_c)
+
+
+def test_what_comes_later_counts():
+    temp_c = np.full(300, 35.0)
+    temp_c[150] = 41.0
+    recordings = [warmed(temp_c), warmed(temp_c + 10, name="b"), warmed(np.full(100, 39.0), name="c")]
+    found = cool_stretches(recordings, 1.0, cool_c=40.0, joints=range(JOINTS))
+    assert [s.recording for s in found] == ["a", "c"]
+    assert [(s.time_s[0], s.time_s[-1]) for s in found] == [(151.0, 299.0), (0.0, 99.0)]
+    long = cool_stretches(recordings, 1.0, cool_c=40.0, joints=range(JOINTS), least_s=140.0)
+    assert [s.recording for s in long] == ["a"]
+
+
+def test_motors_that_do_not_count_may_be_warm():
+    idle = warmed(np.full(100, 33.0), others_c=42.0)
+    with pytest.raises(NothingCool, match=r"Always above: 1 \(42.0 °C\), 3 .*Raise the limit"):
+        cool_stretches([idle], 1.0, cool_c=40.0, joints=range(JOINTS))
+    assert [len(s.time_s) for s in cool_stretches([idle], 1.0, cool_c=40.0, joints=[1])] == [100]
+
+
+def test_hot_recordings_are_refused_with_advice():
+    hot = [warmed(np.full(100, 50.0))]
+    words = r"^At no moment of 2 recording.*motors 2, 3 stay below 40 °C for the rest.*2 \(50.0 °C\).*Raise the limit"
+    with pytest.raises(NothingCool, match=words):
+        cool_stretches(hot * 2, 1.0, cool_c=40.0, joints=[1, 2])
+    with pytest.raises(ValueError, match="at least one recording"):
+        cool_stretches([], 1.0, cool_c=40.0, joints=[1])
+
+
+def test_a_short_recording_is_not_reported_as_hot():
+    with pytest.raises(NothingCool, match=r"^The recording is shorter .* 25 s are needed, the longest .* has 10 s\."):
+        cool_stretches([warmed(np.full(10, 30.0))] * 2, 1.0, cool_c=40.0, joints=[1], least_s=25.0)
+    temp_c = np.full(100, 35.0)
+    temp_c[87] = 50.0
+    words = r"^The part that stays cool is shorter .* 25 s are needed, the longest .* has 12 s\."
+    with pytest.raises(NothingCool, match=words):
+        cool_stretches([warmed(temp_c)], 1.0, cool_c=40.0, joints=[1], least_s=25.0)
+
+
+def test_bad_arguments_are_named():
+    recording = warmed(np.full(10, 30.0))
+    with pytest.raises(ValueError, match="some of 0 … 6"):
+        cool_stretches([recording], 1.0, cool_c=40.0, joints=[7])
+    still = recording.q
+    blind = Recording(name="blind", time_s=recording.time_s, q=still, qd=still, tau=still)
+    with pytest.raises(ValueError, match="'blind' has no motor temperatures"):
+        cool_stretches([blind], 1.0, cool_c=40.0, joints=[1])
+
+
+def drawn(seed: int, *shape: int) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def loss_of(x, x_hat, mu, logvar, config):
+    """As `negative_elbo` of one network in the layout of `LstmVae`, written out."""
+    squares = 0.5 * (x - x_hat) ** 2
+    error = squares.sum((1, 2)) if config.loss == "sum" else squares.mean((1, 2))
+    if config.kind == "ae":
+        return error.mean()
+    kl = -0.5 * (1 + logvar - mu**2 - logvar.exp()).sum(1)
+    return (error + config.beta * kl).mean()
+
+
+def test_the_tangent_is_that_of_numpy():
+    x = np.concatenate([np.linspace(-12, 12, 4001), [0.0, 1e-20, -1e-6, 1e6, -1e30]]).astype(np.float32)
+    np.testing.assert_allclose([tanh(value) for value in x], np.tanh(x.astype(float)), atol=4e-7)
+
+
+@pytest.mark.parametrize(("layers", "kind", "loss"), [(1, "vae", "sum"), (2, "vae", "mean"), (3, "ae", "sum")])
+@pytest.mark.parametrize("batch", [1, 17])
+def test_values_and_gradients_are_those_of_torch(layers, kind, loss, batch):
+    config = TwinConfig(hidden=9, layers=layers, kind=kind, loss=loss, beta=1.5)
+    nets = [build(config, seed) for seed in range(3)]
+    together = SideBySide.of(nets, config)
+    parameters = together.parameters
+    x, eps = drawn(0, 20, 3, 3, batch), drawn(1, 3, 2, batch)
+    x_hat, mu, logvar = together(x, eps)
+    negative_elbo(x, x_hat, mu, logvar, 1.5 if kind == "vae" else 0.0, config.loss).sum().backward()
+    assert all(parameter.grad is not None for parameter in parameters)
+    for n, net in enumerate(nets):
+        alone = x[:, n].permute(2, 0, 1)
+        want_x, want_mu, want_logvar = net(alone, eps[n].T)
+        torch.testing.assert_close(x_hat[:, n].permute(2, 0, 1), want_x, atol=2e-6, rtol=0)
+        torch.testing.assert_close(mu[n].T, want_mu, atol=2e-6, rtol=0)
+        torch.testing.assert_close(logvar[n].T, want_logvar, atol=2e-6, rtol=0)
+        loss_of(alone, want_x, want_mu, want_logvar, config).backward()
+        for name, parameter in net.named_parameters():
+            got, want = together.weights[name].grad, parameter.grad
+            assert got is not None
+            assert want is not None
+            torch.testing.assert_close(got[n], want, atol=2e-5 * float(want.abs().max()) + 1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "sgd"])
+def test_a_training_is_that_of_torch_with_the_same_draws(optimizer):
+    """Three epochs of three batches, the last one smaller, by torch.nn.LSTM, torch's clipping and its optimisers."""
+    config = TwinConfig(hidden=6, epochs=3, batch=16, optimizer=optimizer, learning_rate=2e-2, clip=3.0)
+    x, noise, seeds = [drawn(n, 12, 3, 40) for n in range(2)], torch.full((2, 3), 0.1), [5, 6]
+    run = Run(x, noise, config, seeds)
+    run.train(3)
+    for n, seed in enumerate(seeds):
+        net, draw = build(config, seed), torch.Generator().manual_seed(seed)
+        rate = config.learning_rate
+        if optimizer == "sgd":
+            steps, schedule = torch.optim.SGD(net.parameters(), rate), None
+        else:
+            steps = torch.optim.Adam(net.parameters(), rate)
+            schedule = torch.optim.lr_scheduler.OneCycleLR(steps, rate, total_steps=9)
+        for _ in range(3):
+            for some in torch.randperm(40, generator=draw).split(16):
+                eps = torch.randn(2, len(some), generator=draw)
+                batch = x[n][:, :, some] + 0.1 * torch.randn(12, 3, len(some), generator=draw)
+                steps.zero_grad()
+                batch = batch.permute(2, 0, 1)
+                x_hat, mu, logvar = net(batch, eps.T)
+                loss_of(batch, x_hat, mu, logvar, config).backward()
+                torch.nn.utils.clip_grad_norm_(net.parameters(), 3.0)
+                steps.step()
+                if schedule:
+                    schedule.step()
+        for name, weight in net.state_dict().items():
+            np.testing.assert_allclose(run.nets.weights_of(n)[name], weight.numpy(), atol=2e-4)
+
+
+def test_a_selection_goes_on_as_if_nothing_had_happened():
+    config = TwinConfig(hidden=6, epochs=4, batch=16)
+    x, noise = [drawn(n, 12, 3, 40) for n in range(3)], torch.full((3, 3), 0.1)
+    whole, half = Run(x, noise, config, [1, 2, 3]), Run(x, noise, config, [1, 2, 3])
+    whole.train(4)
+    half.train(2)
+    first, second = half.select([2, 0]), half.select([2])
+    first.train(4)
+    second.train(4)
+    assert len(half.elbo_by_epoch) == 2
+    for run, i, n in ((first, 0, 2), (first, 1, 0), (second, 0, 2)):
+        for name, weight in whole.nets.weights_of(n).items():
+            np.testing.assert_allclose(run.nets.weights_of(i)[name], weight, atol=1e-5)
+    torch.testing.assert_close(torch.stack(first.elbo_by_epoch), torch.stack(whole.elbo_by_epoch)[:, [2, 0]])
+
+
+def test_a_network_that_diverges_leaves_its_neighbours_alone():
+    config = TwinConfig(hidden=6, epochs=2, batch=16)
+    x, noise = [drawn(0, 12, 3, 32), drawn(1, 12, 3, 32)], torch.zeros(2, 3)
+    spoilt = [x[0], torch.full_like(x[1], torch.nan)]
+    alone, beside = Run(x, noise, config, [1, 2]), Run(spoilt, noise, config, [1, 2])
+    alone.train(2)
+    beside.train(2)
+    assert np.isfinite(beside.elbos()).tolist() == [True, False]
+    for name, weight in alone.nets.weights_of(0).items():
+        np.testing.assert_allclose(beside.nets.weights_of(0)[name], weight, atol=1e-6)

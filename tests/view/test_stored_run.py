@@ -1,20 +1,28 @@
-"""A run read from its folder, and what a page gets of it."""
+"""A run read from its folder, its films, and its files for other viewers."""
 
 import base64
 import gzip
 import json
+import os
 import shutil
+import subprocess
+import sys
+from collections import defaultdict
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from fleet.errors import FleetError
-from fleet.telemetry import Telemetry
+from fleet.ros2.cdr import read, read_diagnostics, read_joints
+from fleet.telemetry import MODES, Telemetry
 from scenarios.cli.main import main
-from scenarios.run.log import open_run, telemetry_table
+from scenarios.run.log import RunLog, open_run, telemetry_table
+from scenarios.show.film import Film, Shot, times
+from scenarios.show.moments import Moments
 from scenarios.show.page import packed
 
 
@@ -91,3 +99,226 @@ def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path) -
         main(["report", str(run_folder), "--out", str(tmp_path / "again.html")])
     assert ended.value.code in (0, None)
     assert (tmp_path / "again.html").read_bytes() == (run_folder / "report.html").read_bytes()
+
+
+FILM = "from scenarios.cli.main import main; main()"
+
+
+def film(run: Path, out: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", FILM, "film", str(run), "--out", str(out), *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=os.environ | {"MUJOCO_GL": "egl"})
+
+
+def has_egl() -> bool:
+    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).close()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=os.environ | {"MUJOCO_GL": "egl"})
+    return done.returncode == 0
+
+
+def test_the_cell_takes_the_recorded_postures_and_heat(run_folder: Path) -> None:
+    run = open_run(run_folder)
+    shown, readings = Film(run), run.readings
+    model, data = shown.player.model, shown.player.data
+    hottest = int(readings.temp_c.max(axis=(1, 2)).argmax())
+    temp_c, mode = shown.show(float(readings.time_s[hottest]))
+    assert data.qpos == pytest.approx(readings.q[hottest].ravel())
+    assert mode.tolist() == readings.mode[hottest].tolist()
+    motors = [model.site(f"{arm}/motor_{j + 1}").id for arm in run.arms for j in range(7)]
+    red = model.site_rgba[motors, 0] - model.site_rgba[motors, 1]
+    size = model.site_size[motors, 0]
+    for shows in (red, size):
+        assert shows[temp_c.argmax()] > shows[temp_c.argmin()]
+    shown.show(float(readings.time_s[hottest : hottest + 2].mean()))
+    assert data.qpos == pytest.approx(readings.q[hottest : hottest + 2].mean(axis=0).ravel())
+
+
+SEEN = """
+import sys, numpy as np
+from pathlib import Path
+from fleet.arm.cell import CellCamera
+from scenarios.run.log import open_run
+from scenarios.show.film import Film
+run = open_run(Path(sys.argv[1]))
+film, t = Film(run), run.readings
+row, arm, joint = np.unravel_index(t.temp_c.argmax(), t.temp_c.shape)
+points = film.player.extent(film.postures(t.time_s))
+film.show(float(t.time_s[row]))
+motors = film.player.data.site_xpos[[film.player.model.site(f"{run.arms[arm]}/motor_{j + 1}").id for j in range(7)]]
+with CellCamera(film.player, 640, 360, points, top=0.2, bottom=0.1) as camera:
+    picture, places, (x, y) = camera.picture(), camera.pixels(points), camera.pixels(motors)[joint]
+red, green, _ = picture[round(y), round(x)].astype(int)
+print(*places.min(axis=0), *places.max(axis=0), red - green, picture.max(axis=2).min())
+"""
+
+
+@pytest.mark.skipif(not has_egl(), reason="this machine has no EGL")
+def test_the_camera_holds_every_posture_and_sees_no_edge_of_the_floor(run_folder: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SEEN, str(run_folder)],
+        capture_output=True, text=True, timeout=300, env=os.environ | {"MUJOCO_GL": "egl"},
+    )  # fmt: skip
+    left, upper, right, lower, redness, darkest = map(float, done.stdout.split())
+    assert min(left, 640 - right) > 0
+    assert upper > 0.2 * 360
+    assert lower < 0.9 * 360
+    assert min(left, 640 - right) < 40 or min(upper - 72, 324 - lower) < 40  # and it is no farther than it must be
+    assert redness > 80  # the hottest motor is where `pixels` says
+    assert darkest > 10
+
+
+@pytest.mark.parametrize(("begin_s", "end_s"), [(0.0, 1e9), (600.0, 700.0)])
+def test_the_pictures_follow_the_clock(run_folder: Path, begin_s: float, end_s: float) -> None:
+    run = open_run(run_folder)
+    at_s = times(run, Shot(begin_s=begin_s, end_s=end_s, speed=60, fps=30))
+    assert np.diff(at_s) == pytest.approx(2.0)
+    assert at_s[0] >= begin_s
+    assert at_s[-1] <= end_s
+    with pytest.raises(FleetError, match="has readings from"):
+        times(run, Shot(begin_s=1e8))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "needed"),
+    [
+        ("shift.avi", [], "--out must end in .mp4, .webm, .gif"),
+        ("shift.mp4", ["--size", "641x480"], "--size must be WIDTHxHEIGHT, even numbers"),
+        ("shift.mp4", ["--speed", "0.1", "--fps", "60"], "Raise --speed"),
+    ],
+)
+def test_a_film_that_cannot_be_is_refused(run_folder: Path, tmp_path: Path, name, options, needed) -> None:
+    done = film(run_folder, tmp_path / name, *options)
+    assert done.returncode == 2
+    assert needed in " ".join(done.stderr.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["mp4", "webm", "gif"])
+def test_a_film_can_be_read_by_ffmpeg_and_shows_the_heat(run_folder: Path, tmp_path: Path, kind: str) -> None:
+    if not has_egl():
+        done = film(run_folder, tmp_path / f"shift.{kind}", "--size", "320x240")
+        assert "No OpenGL without a display" in done.stderr
+        pytest.skip("this machine has no EGL")
+    import av
+
+    run = open_run(run_folder)
+    hottest_s = float(run.readings.time_s[run.readings.temp_c.max(axis=(1, 2)).argmax()])
+    options = ["--size", "480x270", "--speed", "60", "--fps", "10"]
+    span = ["--begin", f"{hottest_s - 60}", "--end", f"{hottest_s}"]
+    done = film(run_folder, tmp_path / f"shift.{kind}", *options, *span)
+    assert done.returncode == 0, done.stderr
+    with av.open(str(tmp_path / f"shift.{kind}")) as container:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(pictures) == 11
+    assert pictures[0].shape == (270, 480, 3)
+    last = pictures[-1][60:220].astype(int)
+    orange = (last[..., 0] > 150) & (last[..., 2] < 90)  # warm motors, and nothing else in the cell
+    assert orange.sum() > 50
+
+
+EVERY_S = 20
+
+
+def written(run_folder: Path, path: Path) -> Path:
+    with pytest.raises(SystemExit) as ended:
+        main(["view", str(run_folder), "--mcap", str(path), "--every", "20"])
+    assert ended.value.code in (0, None)
+    return path
+
+
+@pytest.fixture(scope="module")
+def opened_run(run_folder: Path) -> RunLog:
+    return open_run(run_folder)
+
+
+def hottest_moment(run: RunLog) -> tuple[int, float]:
+    """A kept sample at which an arm works and is hot, and its time."""
+    kept = Moments(run, EVERY_S).heats
+    sample = int(kept[run.readings.temp_c[kept].max(axis=(1, 2)).argmax()])
+    return sample, float(run.readings.time_s[sample])
+
+
+def positions_in_mujoco(run: RunLog, time_s: float) -> np.ndarray:
+    """Motors in the world as MuJoCo has them, [arm, joint, 3]."""
+    film = Film(run)
+    film.show(time_s)
+    data, model = film.player.data, film.player.model
+    return np.array([[data.site_xpos[model.site(f"{arm}/motor_{j + 1}").id] for j in range(7)] for arm in run.arms])
+
+
+def along(parents: dict[str, str], poses: dict[str, tuple[list[float], list[float]]], frame: str) -> np.ndarray:
+    """Origin of a frame in the world; poses are positions and quaternions w, x, y, z."""
+    point = np.zeros(3)
+    while frame in parents:
+        position, quaternion = poses[frame]
+        turned = np.empty(3)
+        mujoco.mju_rotVecQuat(turned, point, np.array(quaternion))
+        point, frame = turned + position, parents[frame]
+    return point
+
+
+def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, opened_run: RunLog, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    path = written(run_folder, tmp_path / "shift.mcap")
+    messages: dict[str, list[tuple[float, object]]] = defaultdict(list)
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+            content = message.data if channel.topic.endswith("joint_states") else read(message.data, schema.name)
+            if channel.topic == "/diagnostics":
+                content = read_diagnostics(message.data)
+            messages[channel.topic].append((message.log_time / 1e9, content))
+    readings, moments = opened_run.readings, Moments(opened_run, EVERY_S)
+    for index, arm in enumerate(opened_run.arms):
+        joints = [read_joints(payload) for _, payload in messages[f"/quickstart/{arm}/joint_states"]]
+        assert np.array([each.q for each in joints]) == pytest.approx(readings.q[moments.poses, index])
+        assert np.array([each.tau for each in joints]) == pytest.approx(readings.tau[moments.poses, index])
+        for joint in range(7):
+            heat = messages[f"/quickstart/{arm}/joint_{joint + 1}/temperature"]
+            assert [time_s for time_s, _ in heat] == pytest.approx(readings.time_s[moments.heats])
+            assert [each.temperature for _, each in heat] == pytest.approx(readings.temp_c[moments.heats, index, joint])
+    sample, time_s = hottest_moment(opened_run)
+    parents, poses = {}, {}
+    for topic in ("/tf_static", "/tf"):
+        last = [content for at_s, content in messages[topic] if at_s <= time_s][-1]
+        for each in last.transforms:
+            move, turn = each.transform.translation, each.transform.rotation
+            parents[each.child_frame_id] = each.header.frame_id
+            poses[each.child_frame_id] = ([move.x, move.y, move.z], [turn.w, turn.x, turn.y, turn.z])
+    expected = positions_in_mujoco(opened_run, time_s)
+    spheres = next(content for at_s, content in messages["/motors"] if at_s == time_s).markers
+    found = np.array([along(parents, poses, sphere.header.frame_id) for sphere in spheres])
+    assert found == pytest.approx(expected.reshape(-1, 3), abs=1e-4)
+    hottest, coolest = readings.temp_c[sample].argmax(), readings.temp_c[sample].argmin()
+    assert spheres[hottest].scale.x > spheres[coolest].scale.x
+    assert spheres[hottest].color.r - spheres[hottest].color.g > spheres[coolest].color.r - spheres[coolest].color.g
+    statuses = {each.hardware: each for each in dict(messages["/diagnostics"])[time_s]}
+    for index, arm in enumerate(opened_run.arms):
+        assert dict(statuses[f"quickstart/{arm}"].values)["mode"] == MODES[readings.mode[sample, index]]
+    log = [(at_s, line.name, line.msg) for at_s, line in messages["/rosout"]]
+    for kind in ("award", "fault"):
+        assert [(at_s, arm) for at_s, arm, text in log if text.startswith(kind)] == [
+            (pytest.approx(event.time_s), event.arm) for event in opened_run.events if event.kind == kind
+        ]
+    awards = sum(event.kind == "award" for event in opened_run.events)
+    assert sum(text.startswith("offers for ") for *_, text in log) == awards > 0
+    assert [each.temperature for _, each in messages["/limits/error"]] == [opened_run.scenario.limits.error_c] * 2
+
+
+@pytest.mark.parametrize(
+    ("options", "needed"),
+    [
+        (["--mcap", "shift.bag"], "--mcap must end in .mcap (got 'shift.bag')"),
+        (["--mcap", "there.mcap"], "'there.mcap' exists; give another --mcap"),
+        (["--every", "5"], "--every is for --mcap and --gltf"),
+    ],
+)
+def test_a_file_that_cannot_be_is_refused(
+    run_folder: Path, tmp_path: Path, monkeypatch, capsys, options, needed
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.mcap").touch()
+    with pytest.raises(SystemExit) as ended:
+        main(["view", str(run_folder), *options])
+    assert ended.value.code == 2
+    assert needed in " ".join(capsys.readouterr().err.split())

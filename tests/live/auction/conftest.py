@@ -81,7 +81,8 @@ class Arm:
     def _query(self, topic, request, kind, done):
         self._asked = True
         key = keys.asked_by(self.link.fleet, self._current.auctioneer, topic, self.name)
-        self.link.query(key, request, kind, done, timeout_s=1.0)
+        # A request for a lease is repeated, also to the next auctioneer; a report is sent once.
+        self.link.query(key, request, kind, done, timeout_s=1.0 if topic == "lease" else PATIENCE_S)
 
     def apply_lease(self, replies):
         self._asked = False

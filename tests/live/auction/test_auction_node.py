@@ -1,7 +1,13 @@
-"""An auctioneer over a real router: jobs are accepted, awarded and finished, also across its restart."""
+"""An auctioneer over a real router: awards, requests of people, restarts, rivals and lost journals."""
 
 import errno
+import json
 import os
+import re
+import threading
+import time
+import zlib
+from contextlib import ExitStack
 
 import pytest
 
@@ -10,6 +16,7 @@ from fleet.bus.protocol.auction import (
     Announcement,
     Clock,
     ClockRequest,
+    JobSpec,
     JobStatus,
     Result,
     Status,
@@ -17,12 +24,24 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.messages import State, encode
+from fleet.bus.protocol.messages import State, decode, encode
+from fleet.bus.protocol.operator import Cancel, Change, Controlled, ControlRequest, Operation, Pause, Resume, Settle
+from fleet.bus.protocol.registry import HISTORY
 from fleet.bus.router import open_client, other_versions
-from fleet.errors import JournalFull
+from fleet.errors import BusError, JournalFull, Refused
 from fleet.live import journal
+from fleet.live.auction import node as auction_node
 from fleet.live.auction.job_rules import status_reply
-from fleet.live.journal import Journal
+from fleet.live.auction.knowledge import LiveFleet
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import Operated
+from fleet.live.auction.rounds import LedgerWriter
+from fleet.live.journal import EpochBegun, JobsAccepted, Journal
+from fleet.live.monitor.snapshot import FleetListener
+from fleet.live.policy_client import PolicyClient
+from scenarios.live.auctioneer import ON_BUS_S, CentralAllocation
+from tests.bus.test_policy_client import Server
 from tests.waiting import PATIENCE_S
 
 TWICE = ("Started", "Started")
@@ -191,3 +210,356 @@ def test_a_state_without_a_token_takes_no_space_unless_the_arm_is_of_the_cell(bu
     bus.until(lambda: "nobody" in node._tokens)
     outsider.publish(keys.of_arm("f", "nobody", "state"), said)
     bus.until(lambda: "nobody" in node.auctioneer.ledger.taken_space())
+
+
+def control(bus, name, action):
+    """Return the reply to a request and the reason of a refusal."""
+    replies = bus.ask(keys.of_jobs("f", "control"), ControlRequest(name, action, "ann"), Controlled)
+    return next(iter(replies.messages.values()), None), next(iter(replies.refused.values()), "")
+
+
+def test_every_request_is_answered_published_and_kept_over_a_restart(bus):
+    node, arm = bus.auctioneer(), bus.arm("arm_0")
+    operations, results = [], []
+    watcher = bus.link()
+    watcher.subscribe(keys.of_every_auction("f", "operation"), Operation, lambda _, each: operations.append(each))
+    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, each: results.append(each))
+    arm.commits = False
+    bus.until(lambda: node.present)
+    assert control(bus, "1", Pause())[0].paused == {"*": "ann"}
+    node.submit(Submission((*bus.jobs("a"), *bus.jobs("b", place="bin")), "bob"))
+    reply, _ = control(bus, "2", Cancel("a"))
+    assert (reply.changed, reply.job.state) == (True, "cancelled")
+    reply, _ = control(bus, "3", Change("b", due_s=900.0, value=2.0))
+    assert (reply.changed, reply.job.state) == (True, "waiting")
+    bus.kill(node)
+    node = bus.auctioneer()
+    assert node.auctioneer.ledger.jobs["b"].spec.due_s == 900.0
+    assert not control(bus, "2", Cancel("a"))[0].changed
+    bus.serve_for(1.0)
+    assert bus.states(node) == ["cancelled", "waiting"]
+    assert control(bus, "4", Resume("*"))[0].paused == {}
+    bus.until(lambda: bus.states(node) == ["cancelled", "awarded"])
+    assert control(bus, "5", Settle("b", "done")) == (None, "'b' is awarded; only an unfinished job can be settled.")
+    assert control(bus, "6", Cancel("unknown")) == (None, "There is no job 'unknown'.")
+    bus.until(lambda: any(each.number == 3 for each in operations))  # the first ones come again after the restart
+    numbered = {(each.epoch, each.number): each.request.request for each in operations}
+    assert numbered == {(node.epoch, number): str(number + 1) for number in range(4)}
+    assert {each.request.by for each in operations} == {"ann"}
+    assert {each.by for each in results if each.status.state == "cancelled"} == {"ann"}
+    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).messages.values()
+    assert [job.repetitions for job in status.jobs] == [1, 1]
+
+
+def test_an_unfinished_job_is_settled(bus):
+    node, arm = bus.auctioneer(), bus.arm("arm_0")
+    node.submit(Submission(bus.jobs("a")))
+    arm.apply_lease = lambda _: None  # it may commit, and says nothing more
+    bus.until(lambda: bus.states(node) == ["finishing"])
+    node.end()
+    assert bus.states(node) == ["unfinished"]
+    assert "over" in control(bus, "1", Settle("a", "redo"))[1]
+    assert control(bus, "2", Settle("a", "done"))[0].job.state == "finished"
+    bus.kill(node)
+    assert bus.states(bus.auctioneer()) == ["finished"]
+
+
+def test_an_auctioneer_with_a_poisonous_job_goes_on_reports_it_and_has_it_settled(bus):
+    """Its journal has a number that was allowed in an earlier version; the job is awarded and finished elsewhere."""
+    node = bus.auctioneer()
+    node.submit(Submission((*bus.jobs("good"), *bus.jobs("poison", place="bin")), "bob"))
+    path = node.journal.path
+    bus.kill(node)
+    lines = []
+    for line in path.read_bytes().splitlines():
+        content = json.loads(line)
+        for record in content["records"]:
+            for job in record.get("jobs", ()) if record["type"] == "jobs_accepted" else ():
+                job |= {"dwell_s": 60_000.0} if job["name"] == "poison" else {}
+        body = json.dumps(content["records"], separators=(",", ":")).encode()
+        lines.append(b'{"crc":"%08x","records":%s}\n' % (zlib.crc32(body), body))
+    path.write_bytes(b"".join(lines))
+    results = []
+    watcher = bus.link()
+    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, each: results.append(each.status))
+    arm = bus.arm("arm_0")
+    for _ in range(2):  # the second start reads the compacted journal
+        node = bus.auctioneer()
+        bus.until(lambda: arm.done == ["good"])
+        (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(("poison",)), Status).messages.values()
+        assert [(job.state, job.reason.startswith("Put aside")) for job in status.jobs] == [("unfinished", True)]
+        assert not node.submit(Submission(bus.jobs("poison", place="bin"))).jobs[0].accepted
+        bus.kill(node)
+    assert "60000" in path.with_suffix(".aside").read_text()
+    node = bus.auctioneer()
+    bus.until(lambda: any(each.job == "poison" and each.state == "unfinished" for each in results))
+    assert control(bus, "1", Settle("poison", "redo"))[0].changed
+    assert node.submit(Submission(bus.jobs("poison", place="bin"))).jobs[0].accepted
+    bus.until(lambda: arm.done == ["good", "poison"])
+
+
+@pytest.mark.parametrize("action", [Cancel("a"), Settle("a", "redo"), Change("a", due_s=None), Pause(), Resume("x")])
+def test_every_action_travels_as_json(action):
+    request = ControlRequest("1", action)
+    assert decode(ControlRequest, encode(request)) == request
+
+
+def writer(ledger: Ledger) -> LedgerWriter:
+    return LedgerWriter("boss", ledger, lambda *records: None, 0.0)
+
+
+def test_a_restart_publishes_as_much_again_as_was_cached():
+    """Or what a recorder had not yet received when the auctioneer ended is lost."""
+    ledger = Ledger().replay([EpochBegun("e")])
+    before = writer(ledger)
+    for start in range(0, 2 * HISTORY, 128):
+        jobs = tuple(JobSpec(name=str(start + i), kind="hold", places=("rack",)) for i in range(128))
+        before.record(JobsAccepted(jobs, "bob", 1.0))
+    before.record(*(Operated(ControlRequest(str(number), Pause("arm_0"), "ann"), 2.0) for number in range(3)))
+    after = writer(Ledger().replay(ledger.compact()))
+    for kind in (Result, Operation):
+        sent, again = ([message for message in each.out if isinstance(message, kind)] for each in (before, after))
+        assert [message.number for message in sent] == list(range(len(sent)))
+        assert {message.epoch for message in sent} == {"e"}
+        assert again == sent[-HISTORY:]
+
+
+def submit(bus, *names):
+    (reply,) = bus.ask(keys.of_jobs("f", "submit"), Submission(bus.jobs(*names)), SubmissionReply).messages.values()
+    return reply
+
+
+def lose(bus, node):
+    """Stop an auctioneer and delete its journal."""
+    bus.kill(node)
+    node.journal.path.unlink()
+
+
+def test_an_empty_journal_is_refused_beside_arms_that_know_an_epoch(bus):
+    first = bus.auctioneer()
+    arm = bus.arm("arm_0")
+    before = submit(bus, "a", "b")
+    bus.until(lambda: bus.states(first) == ["finished", "finished"])
+    lose(bus, first)
+    with pytest.raises(BusError, match=r"'arm_0' knows the epoch '\w+', 2 finished job\(s\), the last ones a, b"):
+        served(bus, bus.auctioneer)
+    again = served(bus, lambda: bus.auctioneer(new_epoch=True))
+    bus.until(lambda: again.present and len(again.auctioneer.ledger.past) == 2)
+    after = submit(bus, "a", "b", "c")
+    assert [job.accepted for job in after.jobs] == [True] * 3
+    assert before.epoch != after.epoch == again.epoch
+    bus.until(lambda: bus.states(again) == ["finished"])
+    assert arm.done == ["a", "b", "c"]
+    replies = (
+        *bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages.values(),
+        *bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).messages.values(),
+    )
+    assert {reply.epoch for reply in replies} == {after.epoch}
+    bus.kill(again)
+    assert served(bus, bus.auctioneer).epoch == after.epoch
+
+
+def test_jobs_are_refused_when_arms_of_an_older_epoch_come_later(bus):
+    first = bus.auctioneer()
+    arm = bus.arm("arm_0")
+    submit(bus, "a")
+    bus.until(lambda: bus.states(first) == ["finished"])
+    lose(bus, first)
+    bus.arms.clear()
+    arm.link.close()
+    second = bus.auctioneer()
+    back = bus.arm("arm_0")
+    back.awards, back.done = arm.awards, arm.done
+    key = keys.of_jobs("f", "submit")
+    bus.until(lambda: second._epochs.objection)
+    (reason,) = bus.ask(key, Submission(bus.jobs("a")), SubmissionReply).refused.values()
+    assert "the journal has the epoch" in reason
+    assert "--new-epoch" in reason
+    assert second._epochs.admitted(["arm_0"]) == frozenset()
+
+
+def test_an_award_that_an_arm_still_has_is_adopted(bus):
+    first = bus.auctioneer()
+    arm = bus.arm("arm_0")
+    arm.commits = False
+    submit(bus, "a")
+    bus.until(lambda: bus.states(first) == ["awarded"] and arm._current)
+    lose(bus, first)
+    again = served(bus, lambda: bus.auctioneer(new_epoch=True))
+    bus.until(lambda: bus.states(again) == ["awarded"])
+    arm.commits = True
+    bus.until(lambda: bus.states(again) == ["finished"])
+    assert submit(bus, "a").jobs[0].accepted
+    bus.serve_for(1.0)
+    assert (arm.done, len(arm.awards)) == (["a"], 1)
+
+
+def test_an_older_copy_of_the_journal_learns_what_is_finished(bus):
+    first = bus.auctioneer()
+    arm = bus.arm("arm_0")
+    arm.commits = False
+    submit(bus, "a")
+    bus.until(lambda: bus.states(first) == ["awarded"] and arm._current)
+    submit(bus, "b")
+    copy = first.journal.path.read_bytes()
+    arm.commits = True
+    bus.until(lambda: bus.states(first) == ["finished"] * 2)
+    bus.kill(first)
+    first.journal.path.write_bytes(copy)
+    again = served(bus, bus.auctioneer)
+    bus.until(lambda: bus.states(again).count("finished") == 1)
+    bus.serve_for(1.0)
+    assert arm.done == ["a", "b"]
+
+
+def served(bus, start):
+    """Start an auctioneer while the arms are served by another thread."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(1) as pool:
+        started = pool.submit(start)
+        bus.until(started.done)
+        return started.result()
+
+
+def test_a_fleet_has_one_auctioneer(bus, token_reaches):
+    node = bus.auctioneer("one")
+    token_reaches(bus.link(), keys.of_auction("f", "one", "alive"))
+    # While the second one starts, the first is not served, as if it were stopped: only its token is present.
+    with pytest.raises(BusError, match=r"has an auctioneer already: 'one'. A fleet has one"):
+        bus.auctioneer("two")
+    with pytest.raises(BusError, match=r"has an auctioneer 'one' already: its token is present. Stop that one first"):
+        bus.auctioneer("one", folder="elsewhere")
+    bus.kill(node)
+    assert bus.states(bus.auctioneer("one")) == []
+
+
+def test_a_participant_that_replies_without_a_token_counts_as_an_auctioneer(bus, token_reaches):
+    early = bus.link()
+    early.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))
+    early.watch_tokens(keys.of_every_arm("f", "alive"), lambda *_: None)
+    with pytest.raises(BusError, match="has an auctioneer already, which does not reply"):
+        bus.auctioneer("two")
+    stop = threading.Event()
+
+    def serve():
+        while not stop.is_set():
+            early.serve(time.monotonic() + 0.05)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        with pytest.raises(BusError, match="has an auctioneer already: 'one'"):
+            bus.auctioneer("two")
+        with bus.link() as arm:
+            arm.declare_token(keys.of_arm("f", "one", "alive"))
+            token_reaches(early, keys.of_arm("f", "one", "alive"))
+            with pytest.raises(BusError, match=r"allocate the jobs themselves; 'one' replies .* Stop them first"):
+                bus.auctioneer("two")
+    finally:
+        stop.set()
+        thread.join(PATIENCE_S)
+
+
+def test_two_auctioneers_detect_each_other_and_accept_no_jobs(bus, monkeypatch):
+    """Both start while the network is cut, and meet after it."""
+    monkeypatch.setattr(AuctionNode, "_check_no_auctioneer", lambda self: None)
+    one, two = bus.auctioneer("one"), bus.auctioneer("two")
+    arm = bus.arm("arm_0")
+    bus.until(lambda: one.rivals == {"two"} and two.rivals == {"one"} and one.present == {"arm_0"})
+    replies = bus.ask(keys.of_jobs("f", "submit"), Submission(bus.jobs("a")), SubmissionReply)
+    assert not replies.messages
+    assert (
+        sorted(replies.refused.values())
+        == ["Fleet 'f' has more than one auctioneer (one, two): no jobs are accepted until one is stopped."] * 2
+    )
+    with pytest.raises(Refused, match="more than one auctioneer"):
+        one.submit(Submission(bus.jobs("a")))
+    status = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status)
+    assert sorted(reply.auctioneer for reply in status.messages.values()) == ["one", "two"]
+    assert len(bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages) == 2
+    bus.kill(two)
+    bus.until(lambda: not one.rivals)
+    one.submit(Submission(bus.jobs("a")))
+    bus.until(lambda: bus.states(one) == ["finished"])
+    assert arm.done == ["a"]
+
+
+def test_two_auctioneers_of_one_name_detect_each_other_and_award_nothing(bus, monkeypatch):
+    """Both start at the same moment, and share one token."""
+    monkeypatch.setattr(AuctionNode, "_check_no_auctioneer", lambda self: None)
+    one, two = bus.auctioneer("one"), bus.auctioneer("one", folder="elsewhere")
+    for node in (one, two):  # before either is served
+        node.submit(Submission(bus.jobs("a")))
+    arm = bus.arm("arm_0")
+    bus.until(lambda: one.rivals == two.rivals == {"one"} and one.present == two.present == {"arm_0"})
+    error = "Fleet 'f' has more than one auctioneer (one, one): no jobs are accepted until one is stopped."
+    with pytest.raises(Refused, match=re.escape(error)):
+        one.submit(Submission(bus.jobs("b")))
+    bus.serve_for(0.5)
+    assert bus.states(one) == bus.states(two) == ["waiting"]
+    assert not arm.awards
+    bus.kill(two)
+    bus.until(lambda: bus.states(one) == ["finished"])
+    assert arm.done == ["a"]
+
+
+def test_an_auctioneer_without_a_recent_check_for_others_awards_nothing(bus, monkeypatch):
+    """It awards nothing before its first check, nor long after its last."""
+    alone = bus.auctioneer("one")
+    arm = bus.arm("arm_0")
+    monkeypatch.setattr(AuctionNode, "_check_rivals", lambda self, real_s: None)
+    alone.submit(Submission(bus.jobs("a")))
+    bus.until(lambda: alone.present == {"arm_0"})
+    bus.serve_for(0.3)
+    assert not arm.awards
+    monkeypatch.undo()
+    bus.until(lambda: bus.states(alone) == ["finished"])
+    monkeypatch.setattr(auction_node, "ALONE_S", 0.0)  # as if it had been stopped for longer than that
+    alone.submit(Submission(bus.jobs("b")))
+    bus.serve_for(0.3)
+    assert arm.done == ["a"]
+
+
+def test_jobs_accepted_before_a_second_auctioneer_started_are_awarded_after_it_stopped(bus, monkeypatch):
+    monkeypatch.setattr(AuctionNode, "_check_no_auctioneer", lambda self: None)
+    one = bus.auctioneer("one")
+    one.submit(Submission(bus.jobs("a")))
+    two = bus.auctioneer("two")
+    bus.until(lambda: one.rivals == {"two"})
+    arm = bus.arm("arm_0")
+    bus.until(lambda: one.present == {"arm_0"})
+    listener = FleetListener(bus.link())
+    bus.until(
+        lambda: {each.auctioneer for each in listener.view.snapshot(0.0).auctioneers if each.token} == {"one", "two"}
+    )
+    bus.serve_for(0.5)
+    assert bus.states(one) == ["waiting"]
+    assert not arm.awards
+    bus.kill(two)
+    bus.until(lambda: bus.states(one) == ["finished"])
+
+
+ARMS = ("arm_0", "arm_1")
+
+
+def test_nothing_is_awarded_and_the_arms_stay_present_until_the_policy_replies(bus, caplog):
+    policy = PolicyClient("mine", fleet="f", endpoint=bus.endpoint, limit_s=ON_BUS_S)
+    node = bus.auctioneer(allocate=CentralAllocation(policy, LiveFleet(arms=ARMS)))
+    for arm in ARMS:
+        bus.arm(arm)
+    bus.until(lambda: node.present == set(ARMS))
+    with ExitStack() as stack:
+        hung = Server(stack.enter_context(open_client(bus.endpoint, timeout_s=PATIENCE_S)), None)
+        node.submit(Submission(bus.jobs("a")))
+        for asked in range(1, 4):
+            bus.until(lambda asked=asked: hung.requests.qsize() >= asked)
+            assert bus.states(node) == ["waiting"]
+            assert node.present == set(ARMS)
+        node.submit(Submission(bus.jobs("b")))  # it still replies
+        assert caplog.text.count("Nothing is awarded until the policy replies") == 1
+        assert "did not reply and finish the query" in caplog.text
+    Server(bus.stack.enter_context(open_client(bus.endpoint, timeout_s=PATIENCE_S)), '{"actions": {"arm_0": 1}}')
+    bus.until(lambda: bus.states(node) == ["finished", "finished"])
+    assert caplog.text.count("The policy replies again.") == 1
+    assert not any(arm.done for arm in bus.arms[1:])

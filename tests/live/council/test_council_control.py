@@ -1,10 +1,21 @@
-"""Requests of people to arms without an auctioneer: what each does in each state of a job, also after restarts."""
+"""Requests of people to arms without an auctioneer, abandoned and settled jobs, also after restarts."""
+
+import random
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobEstimate, JobSpec
+from fleet.bus.protocol.consensus import Claim, ClaimEntry, JobOutcome
+from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Cancel, Change, Pause, Resume, Settle
 from fleet.errors import Refused
+from fleet.live.consensus import jobs
+from fleet.live.consensus.grants import Granter
+from fleet.live.consensus.jobs import JobSettled, Register
+from fleet.live.journal import JobsAccepted
+from tests.live.disk import Disk
 
 
 def job(name: str, repetitions: int = 100, **more) -> JobSpec:
@@ -244,3 +255,140 @@ def test_a_status_says_why_no_arm_can_do_a_job(council):
     expected = "No arm can do it: arm_0: too far for arm_0; arm_1: too far for arm_1; arm_2: too far for arm_2."
     reasons = [s.reason for arm in fleet.arms.values() for s in arm.participant.status([], arm.real_s)]
     assert reasons == [expected] * 3
+
+
+JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=50)
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 5), st.lists(st.booleans(), max_size=5), st.data())
+def test_a_job_that_always_faults_is_given_up_by_all_and_others_go_on(council, arms, restarts, data):
+    other = JobSpec(name="other", kind="hold", places=("y",), repetitions=3)
+    fleet = council.Fleet([1.0] * arms, [JOB, other])
+    restarts = iter(restarts)
+    for _ in range(400):
+        at_work = [a for a in fleet.arms.values() if a.executor.active and a.executor.active[0].job == "j"]
+        if at_work:
+            fleet.run(0.3)
+            at_work[0].fault()
+            fleet.run(0.3)  # the majority has its report
+            if next(restarts, False):
+                data.draw(st.sampled_from(list(fleet.arms.values()))).crash()
+        fleet.run(0.3)
+        if "given_up" in fleet.settled().values():
+            break
+    fleet.run(8.0)
+    faults = fleet.faults["j"]
+    assert len(faults) == 3 or len(faults) > len(set(faults))
+    assert len(faults[:-1]) == len(set(faults[:-1])) < 3, "not one attempt more"
+    for arm in fleet.arms.values():
+        register = arm.participant.granter.register
+        assert register.settled["j"].outcome == "given_up"
+        assert register.settled["other"].outcome in ("finished", "unfinished")  # a crash in its last cycle
+        (status,) = [each for each in arm.participant.status([], arm.real_s) if each.job == "j"]
+        assert status.state == "given_up"
+        assert all(f"'{name}' {faults.count(name)} time" in status.reason for name in faults)
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_an_arm_that_was_away_learns_that_a_job_is_given_up(council, lost):
+    successor = JobSpec(name="k", kind="hold", places=("y",), after=("j",))
+    fleet = council.Fleet([1.0] * 4, [JOB, successor])
+    away = fleet.names[lost]
+    fleet.cut = {away}
+    for _ in range(200):
+        fleet.run(0.3)
+        at_work = [a for a in fleet.arms.values() if a.executor.active and a.name != away]
+        if at_work:
+            at_work[0].fault()
+        if "given_up" in fleet.settled().values():
+            break
+    assert "j" not in fleet.arms[away].participant.granter.register.settled
+    fleet.cut = set()
+    fleet.run(5.0)
+    for arm in fleet.arms.values():
+        assert {status.job: status.state for status in arm.participant.status([], arm.real_s)} == {
+            "j": "given_up",
+            "k": "given_up",
+        }
+        assert arm.participant.all_settled(arm.real_s)
+
+
+def numbered(number: int) -> JobSpec:
+    return JobSpec(name=f"job {number}", kind="hold", places=("x",), repetitions=3)
+
+
+def outcome(number: int, kind: str = "finished", time_s: float | None = None) -> JobOutcome:
+    return JobOutcome(f"job {number}", f"a-{number}", "a", kind, 3, float(number) if time_s is None else time_s)
+
+
+def entry(number: int) -> ClaimEntry:
+    return ClaimEntry(f"b-{number}", f"job {number}", ("x",), 0, "requested", "home")
+
+
+kinds = st.sampled_from(["finished", "given_up", "cancelled"])
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), kinds)), st.randoms())
+def test_arms_with_the_same_outcomes_keep_the_same_ones_in_any_order(several, rng):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "MAX_SETTLED", 3)
+        digests, kept = set(), set()
+        for _ in range(3):
+            register = Register().replay([JobsAccepted(tuple(map(numbered, range(10))))])
+            for _ in range(2):  # peers send their outcomes again until all agree
+                rng.shuffle(several)
+                for each in several:
+                    if register.is_news(outcome(*each)):
+                        register.apply(JobSettled(outcome(*each)))
+            again = Register().replay(register.compact())
+            assert (again.digest, dict(again.settled), again.past) == (
+                register.digest,
+                dict(register.settled),
+                register.past,
+            )
+            digests.add(register.digest)
+            kept.add(tuple(sorted((name, each.outcome) for name, each in register.settled.items())))
+        assert (len(digests), len(kept)) == (1, 1)
+
+
+def test_a_long_run_takes_bounded_memory_and_disk_and_no_job_is_granted_again():
+    disk, register = Disk(), Register()
+    granter = Granter("a", ("a", "b"), register, disk.keep, real_s=0.0)
+    sizes = []
+    for number in range(6000):
+        granter.add_jobs((numbered(number),))
+        granter.answer_claim(Claim("b", number, (), (outcome(number),), space=()), 0.0)
+        register.take_gone()
+        if number in (2999, 5999):
+            records = register.compact()
+            sizes.append(sum(len(encode(record)) for record in records) - len(register.past.packed()) * 4 / 3)
+    assert sizes[1] < 1.1 * sizes[0]
+    for content in (register.settled, register.jobs, register.cycles, register.faults, register.returned_s):
+        assert len(content) <= jobs.MAX_SETTLED
+    assert (len(register.past), register.settled.left) == (4000, {"finished": 4000})
+    again = Register().replay(register.compact())
+    for number in random.Random(0).sample(range(6000), 50):
+        reply = Granter("a", ("a", "b"), again, disk.keep, real_s=0.0).answer_claim(
+            Claim("b", 10_000 + number, (entry(number),), space=()), 0.0
+        )
+        again.numbers.clear()
+        assert reply.denied[0].outcome.outcome == "finished"
+    granter.add_jobs((numbered(3),))
+    assert "job 3" not in register.jobs
+
+
+def test_an_arm_that_was_away_learns_that_a_job_has_left(council, monkeypatch):
+    monkeypatch.setattr(jobs, "MAX_SETTLED", 2)
+    fleet = council.Fleet([1.0] * 3, [JobSpec(f"job {n}", "hold", (f"p{n}",), 2) for n in range(8)])
+    fleet.cut = {"arm_2"}
+    for _ in range(100):
+        fleet.run(0.2, stopped="arm_2")
+        if fleet.arms["arm_0"].participant.all_settled(fleet.arms["arm_0"].real_s):
+            break
+    assert len(fleet.arms["arm_0"].participant.granter.register.past) == 6
+    assert len(fleet.arms["arm_0"].participant.known.current) == 2
+    fleet.cut = set()
+    fleet.run(8.0)
+    assert fleet.arms["arm_2"].participant.open_jobs(fleet.arms["arm_2"].real_s) == []
+    assert set(fleet.last_cycles.values()) == {1}

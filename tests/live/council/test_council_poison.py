@@ -10,14 +10,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agents.auction import Consensus
-from fleet.bus.protocol.auction import (
-    ClockRequest,
-    JobEstimate,
-    JobSpec,
-    PlanQuote,
-    StatusRequest,
-    Submission,
-)
+from fleet.bus.protocol.auction import ClockRequest, JobEstimate, JobSpec, PlanQuote, StatusRequest, Submission
 from fleet.bus.protocol.cell import CellRequest
 from fleet.bus.protocol.consensus import (
     Bid,

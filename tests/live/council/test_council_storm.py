@@ -18,7 +18,7 @@ from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.operator import Cancel, Change, Pause, Resume, Settle
 from fleet.errors import JournalFull, Refused
 from fleet.live.consensus import jobs
-from tests.live.conflicts import random_conflicts
+from tests.live.disk import random_conflicts
 
 START_S = 100.0
 """Fleet time at the start."""

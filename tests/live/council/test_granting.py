@@ -1,14 +1,31 @@
-"""Grants and claims, step by step; random faults are in `test_council_storm`."""
+"""Grants, claims and space, step by step; random faults are in `test_council_storm`."""
+
+import random
+import re
+from contextlib import nullcontext
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import Award, JobSpec
-from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
-from fleet.errors import Refused
+from agents.registry import RULES
+from fleet.bus.protocol.auction import Award, JobEstimate, JobSpec, PlanQuote
+from fleet.bus.protocol.consensus import (
+    Bid,
+    Claim,
+    ClaimEntry,
+    ClaimReply,
+    DeniedEntry,
+    GrantedEntry,
+    History,
+    JobOutcome,
+)
+from fleet.errors import BusError, Refused
 from fleet.live.arm.awards import ArmHistory, AwardExecutor
 from fleet.live.auction.rounds import Timing
-from fleet.live.consensus.grants import Claimant, Granter
+from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
 from fleet.live.consensus.jobs import Register
+from fleet.live.consensus.node import check_journals
 from tests.live.disk import Disk
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05)
@@ -225,7 +242,7 @@ def test_the_first_claim_after_a_crash_reports_an_unsure_job():
     assert claimed.number > 1_000_000_000
 
 
-def test_a_finished_job_is_claimed_until_its_report_is_on_disk():
+def test_a_finished_job_is_claimed_until_its_report_is_on_disk_with_and_without_an_own_grant():
     one = One()
     obtain_permission(one)
     one.disk.full = True
@@ -241,10 +258,7 @@ def test_a_finished_job_is_claimed_until_its_report_is_on_disk():
     assert one.executor.has_pending_reports
     one.receive(claimed, 0.8, "c")
     assert not one.executor.has_pending_reports, "a majority has it on disk"
-
-
-def test_a_finished_job_is_claimed_until_its_report_is_on_disk_without_an_own_grant():
-    """Its own grant was not written either; else its peers would take the job as released."""
+    # Its own grant was not written either; else its peers would take the job as released.
     one = One()
     obtain_permission(one)
     one.claimant.granter.register.grants.clear()
@@ -255,7 +269,7 @@ def test_a_finished_job_is_claimed_until_its_report_is_on_disk_without_an_own_gr
     assert (entry.job, entry.places, entry.phase) == ("j", ("x",), "finishing")
 
 
-def test_a_request_that_a_majority_denies_is_withdrawn():
+def test_a_request_that_a_majority_denies_or_nobody_answers_is_withdrawn():
     one = One()
     one.claimant.request(JOB, 0, 0.0)
     claimed = one.send_claim(0.0)
@@ -266,18 +280,15 @@ def test_a_request_that_a_majority_denies_is_withdrawn():
     assert not one.send_claim(0.2).entries
     late = Award("x", "x", "a", "q", JOB)
     assert not one.executor.answer_award(late, 0.2).accepted
-
-
-def denial(claimed: Claim) -> DeniedEntry:
-    return DeniedEntry(claimed.entries[0].award, "'d' has 'j'")
-
-
-def test_a_request_without_replies_is_withdrawn():
     one = One()
     one.claimant.request(JOB, 0, 0.0)
     one.send_claim(0.0)
     assert one.send_claim(0.6).entries, "repeated for peers that have not replied"
     assert not one.send_claim(2.1).entries
+
+
+def denial(claimed: Claim) -> DeniedEntry:
+    return DeniedEntry(claimed.entries[0].award, "'d' has 'j'")
 
 
 def receive_faults(one: One, **faults: dict[str, str]) -> None:
@@ -309,3 +320,251 @@ def test_a_request_is_withdrawn_if_the_granters_together_know_too_many_faults():
     assert one.claimant.rejected == ["j"]
     assert not one.send_claim(0.2).entries
     assert one.granter.status("j", 0.2).state == "given_up"
+
+
+THREE = ("a", "b", "c")
+LATER_S = 1e6
+
+
+def same_name(arm: str, space: str, other: str, other_space: str) -> bool:
+    """Two plans exclude each other if their names begin with the same letter; an arm that may be anywhere, all."""
+    return "*" in (space, other_space) or space[0] == other_space[0]
+
+
+class Granting:
+    """Arm `c`, its disk, and claims of its peers."""
+
+    def __init__(self):
+        self.records, self.number = [], 0
+        self.start(0.0)
+        for arm in THREE:
+            self.claim(arm)
+
+    def start(self, real_s: float) -> None:
+        register = Register().replay(self.records)
+        self.records[:] = register.compact()
+        self.granter = Granter(
+            "c",
+            THREE,
+            register,
+            lambda *records: self.records.extend(records),
+            real_s=real_s,
+            timing=TIMING,
+            excludes=same_name,
+        )
+
+    def claim(self, arm: str, *jobs: str, space=(), at_s: float = 0.0, phase="requested", outcomes=()) -> list[str]:
+        """Claim jobs, each with a plan of its name; return the reasons for which they are denied."""
+        self.number += 1
+        entries = tuple(ClaimEntry(f"{arm}: {job}", job, (f"at {job}",), 0, phase, job) for job in jobs)
+        claim = Claim(arm, self.number, entries, tuple(outcomes), space=space)
+        return [denied.reason for denied in self.granter.answer_claim(claim, at_s).denied]
+
+
+@pytest.fixture
+def granting():
+    return Granting()
+
+
+def test_of_two_plans_that_exclude_each_other_one_is_granted(granting):
+    assert granting.claim("a", "p1", "q1") == []
+    assert granting.claim("b", "p2", "r1") == ["'a' is in the way"]
+    assert granting.claim("a", "q1") == []
+    assert granting.claim("b", "p2", "r1") == []
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_space_stays_taken_after_the_lease_and_after_a_restart(granting, restart):
+    assert granting.claim("a", "p1", phase="working") == []
+    if restart:
+        granting.start(LATER_S)
+    assert granting.claim("b", "p2", at_s=LATER_S) == ["'a' is in the way"]
+    assert granting.claim("a", space=("p1",), at_s=LATER_S) == []  # it is on its way home
+    assert granting.claim("b", "p2", at_s=LATER_S) == ["'a' is in the way"]
+    granting.claim("a", at_s=LATER_S)
+    assert granting.claim("b", "p2", at_s=LATER_S) == []
+
+
+def test_space_of_a_finished_job_stays_taken_until_the_arm_is_home(granting):
+    granting.claim("a", "p1", phase="finishing")
+    outcome = JobOutcome("p1", "a: p1", "a", "finished", 1, 9.0)
+    granting.claim("a", space=("p1",), outcomes=[outcome])
+    assert granting.claim("b", "p2") == ["'a' is in the way"]
+    granting.claim("a")
+    assert granting.claim("b", "p2") == []
+
+
+def test_an_arm_without_a_claim_or_that_does_not_say_where_it_is_may_be_anywhere():
+    granting = Granting()
+    granting.records.clear()
+    granting.start(0.0)
+    assert granting.claim("b", "p2") == ["'a' is in the way"]
+    granting.claim("c")
+    granting.claim("a", space=None)
+    assert granting.claim("b", "p2") == ["'a' is in the way"]
+    granting.claim("a")
+    assert granting.claim("b", "p2") == []
+
+
+def test_a_person_frees_the_space_of_an_arm_that_is_not_heard(granting):
+    granting.claim("a", "p1", phase="finishing")
+    for present, at_s, reason in (({"a"}, LATER_S, "present"), (set(), 0.0, "lease of 'a' has not ended")):
+        with pytest.raises(Refused, match=reason):
+            granting.granter.clear("a", "me", frozenset(present), at_s, 0.0)
+    with pytest.raises(Refused, match=r"no arm of this fleet. Arms: a, b, c."):
+        granting.granter.clear("z", "me", frozenset(), LATER_S, 0.0)
+    granting.granter.clear("a", "me", frozenset(), LATER_S, 0.0)
+    count = len(granting.records)
+    granting.granter.clear("a", "me", frozenset(), LATER_S, 0.0)
+    assert len(granting.records) == count  # the same request again changes nothing
+    granting.start(LATER_S)
+    assert granting.claim("b", "p2", at_s=LATER_S + TIMING.lease_s + 1) == []
+    granting.claim("b", at_s=LATER_S + TIMING.lease_s + 1)
+    for restart in (False, True):  # it is heard again, away from home
+        if restart:
+            granting.start(LATER_S)
+        again = granting.claim("a", "p1", space=("p1",), at_s=2 * LATER_S, phase="finishing")
+        assert again == ["the space of 'a' was cleared"]
+    assert granting.claim("c", "p3", at_s=2 * LATER_S) == ["'a' is in the way"]
+
+
+class Second:
+    """Every arm chooses the second plan for the job of the slot with its own number."""
+
+    scope = "arm"
+
+    def reset(self, rng):
+        """Nothing to reset."""
+
+    def choose(self, observation, place):
+        option = 2 * place + 1
+        legal = observation.action_mask[1:-1]
+        return option + 1 if option < len(legal) and legal[option] else 0
+
+
+def test_a_claim_covers_the_space_of_the_plan_that_was_chosen(council):
+    """No arm receives the choice of another: the grants alone keep two second plans apart, which exclude each other."""
+    jobs = [JobSpec(name=f"job {i}", kind="hold", places=(f"p{i}",), repetitions=3) for i in range(3)]
+    fleet = council.Fleet([1.0] * 3, jobs, Second, lambda a, one, b, other: one.endswith("1") and other.endswith("1"))
+
+    def offer(arm, job):
+        return JobEstimate(job.name, tuple(PlanQuote(n, space=fleet.arms[arm].space_of(job, n)) for n in range(2)))
+
+    fleet.offer, most = offer, 0
+    for _ in range(200):
+        for arm in fleet.arms.values():
+            arm.step()
+        while fleet.packets:
+            call = fleet.packets[0][2]
+            if isinstance(call.args[2], Bid) and call.args[2].choice:
+                del fleet.packets[0]
+            else:
+                fleet.deliver(0)
+        fleet.true_s += 0.1
+        fleet.check()
+        most = max(most, sum(bool(arm.out) for arm in fleet.arms.values()))
+    assert most == 1
+    assert fleet.settled()
+
+
+ARM_POLICIES = [name for name, rule in RULES.items() if rule.scope == "arm"]
+
+
+def greedy(difficulty: dict[str, dict[str, float]], cool: list[str]) -> dict[str, str | None]:
+    """Assign the pair with the least difficulty relative to the average of the job first, to cool arms only."""
+    jobs = sorted({job for row in difficulty.values() for job in row})
+    pairs = []
+    for job in jobs:
+        scores = {arm: row[job] for arm, row in difficulty.items() if job in row}
+        average = sum(scores.values()) / len(scores)
+        pairs += [(score - average, job, arm) for arm, score in scores.items() if arm in cool]
+    out: dict[str, str | None] = {}
+    for _, job, arm in sorted(pairs):
+        if arm not in out and job not in out.values():
+            out[arm] = job
+    return {arm: out.get(arm) for arm in cool}
+
+
+@given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 7))
+def test_without_message_loss_the_allocation_is_that_of_a_central_policy(council, seed, arms, jobs):
+    """The first job of every arm, where every job has a separate station."""
+    rng = random.Random(seed)
+    jobs = [JobSpec(name=f"job {i}", kind="hold", places=(f"p{i}",), repetitions=50) for i in range(jobs)]
+    fleet = council.Fleet([1.0] * arms, jobs)
+    for name in rng.sample(fleet.names, rng.randrange(arms)):
+        fleet.arms[name].hot = True
+    fleet.run(0.8)
+    cool = [name for name, arm in fleet.arms.items() if not arm.hot]
+    offers = {name: [fleet.offer(name, job) for job in jobs] for name in fleet.names}
+    wanted = greedy(
+        {arm: {offer.job: offer.least.difficulty for offer in row if offer.feasible} for arm, row in offers.items()},
+        cool,
+    )
+    has = {name: next((h.award.job.name for h in fleet.arms[name].executor.active), None) for name in cool}
+    assert has == wanted
+    assert all(fleet.arms[name].participant.rounds <= 2 for name in cool)
+
+
+@pytest.mark.parametrize("name", ARM_POLICIES)
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32), jobs=st.integers(1, 6))
+def test_every_arm_policy_completes_all_jobs(council, name, seed, jobs):
+    rng = random.Random(seed)
+    jobs = [JobSpec(name=f"job {i}", kind="hold", places=(rng.choice("xyz"),), repetitions=2) for i in range(jobs)]
+    fleet = council.Fleet([1.0] * 3, jobs, RULES[name].kind)
+    for _ in range(60):
+        fleet.run(1.0)
+        if len(fleet.settled()) == jobs:
+            break
+    assert fleet.settled() == {job.name: "finished" for job in jobs}
+
+
+class First:
+    """Every arm chooses the same job: the first legal one."""
+
+    scope = "arm"
+
+    def reset(self, rng):
+        """Nothing to reset."""
+
+    def choose(self, observation, place):
+        options = observation.action_mask[1:-1]
+        return int(options.argmax()) + 1 if options.any() else 0
+
+
+def test_of_two_that_choose_one_job_the_one_with_the_lower_difficulty_gets_it(council):
+    fleet = council.Fleet([1.0] * 3, [JobSpec(name="j", kind="hold", places=("p",), repetitions=50)], First)
+    fleet.run(0.8)
+    (holder,) = [arm.name for arm in fleet.arms.values() if arm.executor.active]
+    offers = {name: fleet.offer(name, fleet.jobs[0]) for name in fleet.names}
+    assert holder == min((offer.plans[0].difficulty, name) for name, offer in offers.items() if offer.feasible)[1]
+
+
+def test_an_isolated_arm_does_not_report_that_all_jobs_are_settled(council):
+    """Not even if the only open job is one that another arm was permitted to commit."""
+    fleet = council.Fleet([1.0] * 3, [JobSpec(name="j", kind="hold", places=("p",))])
+    holder = fleet.busy_arm(random.Random(0), may_commit=True)
+    fleet.cut = {next(name for name in fleet.names if name != holder.name)}
+    fleet.run(8.0, stopped=holder.name)
+    isolated = fleet.arms[min(fleet.cut)]
+    assert isolated.participant.open_jobs(isolated.real_s) == []
+    assert not isolated.participant.all_settled(isolated.real_s)
+
+
+@pytest.mark.parametrize(
+    ("boot", "epoch", "peer", "reason"),
+    [
+        (1, "", History("b"), ""),  # nobody has begun
+        (1, "", History("b", "x", claims={"b": 1000000003}), ""),  # the arm is new in a fleet that has
+        (2, "x", History("b", "x", claims={"a": 1000000003}), ""),  # it was restarted
+        (2, "", History("b", "", claims={"a": 1000000003}), ""),  # neither has heard of epochs
+        (1, "", History("b", "x", claims={"a": 1000000003}), "'b' knows claims of 'a' that its journals do not"),
+        (2, "", History("b", "x", claims={"a": 1000000003}), "'b' knows claims of 'a' that its journals do not"),
+        (2, "x", History("b", "x", claims={"a": 2000000001}), "'b' knows claims of 'a' that its journals do not"),
+        (2, "y", History("b", "x"), "The journals of 'a' are of the epoch 'y', but 'b' knows the epoch 'x'"),
+    ],
+)
+def test_an_arm_with_other_journals_than_its_peers_know_does_not_start(boot, epoch, peer, reason):
+    own = History("a", "z", claims={"a": 9000000000})  # its own reply says nothing
+    with pytest.raises(BusError, match=re.escape(reason)) if reason else nullcontext():
+        check_journals("a", boot * NUMBERS_PER_BOOT, epoch, [own, peer])

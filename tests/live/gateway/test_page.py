@@ -1,48 +1,58 @@
-"""The live page without a browser: what is served to whom, and under which policy."""
+"""A gateway without a browser: the live page, requests, errors, rights, streams and the command."""
 
 import asyncio
 import gzip
 import http.client
 import json
+import os
 import re
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import pytest
 
 from fleet.bus.protocol.auction import Status
-from fleet.bus.protocol.operator import ControlRequest, Operation, Pause, ResetRequest, Resume
+from fleet.bus.protocol.operator import Cancel, ControlRequest, Operation, Pause, ResetRequest, Resume
 from fleet.bus.router import Router
 from fleet.live.monitor.snapshot import FleetView
 from scenarios.live.fleet_processes import page_of
-from scenarios.live.gateway import FILES, PAGE, LivePage, scene_of
+from scenarios.live.gateway import FILES, MAX_BYTES, PAGE, LivePage, scene_of
 from scenarios.spec.load import load
+from tests import commands
 from tests.live.gateway.moving_fleet import MovingFleet, until
-from tests.live.gateway.served import PATIENCE_S, Served
+from tests.live.gateway.served import CRATE_JSON, Served, events, numbers_of, of
+from tests.waiting import PATIENCE_S, wait_until
 
 BROWSER = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
 WATCHER, BOSS = "watcher-watcher-watcher", "operator-operator-operator"
 
 
 @pytest.fixture(scope="module")
-def router():
+def page_router():
     with Router() as opened:
         yield opened.endpoint
 
 
 @pytest.fixture(scope="module")
-def fleet(router):
-    with MovingFleet(router, ("arm_0", "arm_1"), fleet="f") as moving:
+def moving(page_router):
+    with MovingFleet(page_router, ("arm_0", "arm_1"), fleet="f") as moving:
         yield moving
 
 
 @pytest.fixture(scope="module")
-def served(router, fleet):
-    with Served(router, page=LivePage()) as opened:
+def served(page_router, moving):
+    with Served(page_router, page=LivePage()) as opened:
         yield opened
 
 
 @pytest.fixture(scope="module")
-def guarded(router, fleet):
-    with Served(router, page=LivePage(), tokens={WATCHER: "monitor", BOSS: "operator"}) as opened:
+def guarded(page_router, moving):
+    with Served(page_router, page=LivePage(), tokens={WATCHER: "monitor", BOSS: "operator"}) as opened:
         yield opened
 
 
@@ -84,8 +94,8 @@ def test_the_page_may_load_nothing_from_elsewhere_and_run_no_inline_script(serve
         assert "innerHTML" not in text or name == "three.js"
 
 
-def test_without_the_page_the_gateway_serves_no_html(router, fleet):
-    with Served(router) as plain:
+def test_without_the_page_the_gateway_serves_no_html(page_router, moving):
+    with Served(page_router) as plain:
         assert get(plain, "/", BROWSER)[1].get_content_type() == "application/json"
         assert get(plain, "/page/cell.js")[0] == 404
 
@@ -110,9 +120,9 @@ def test_a_page_of_another_name_gets_nothing_without_tokens(served):
     assert get(served, "/page/cell.js", {"Host": "evil.example"})[0] == 421
 
 
-def test_the_scene_is_the_cell_that_the_auctioneer_describes(served, fleet):
+def test_the_scene_is_the_cell_that_the_auctioneer_describes(served, moving):
     _, _, text = get(served, "/v4/scene")
-    scene, cell = json.loads(text), fleet.cell()
+    scene, cell = json.loads(text), moving.cell()
     assert [(arm["name"], tuple(arm["position"])) for arm in scene["arms"]] == [
         (arm.name, arm.position_m) for arm in cell.arms
     ]
@@ -148,18 +158,18 @@ def test_a_pause_is_seen_when_it_is_requested_and_not_when_it_is_history():
     assert paused(Resume("*"), 8.0) == {}
 
 
-def test_a_fault_is_reset_over_http(served, fleet):
-    fleet.mode["arm_1"] = "faulted"
+def test_a_fault_is_reset_over_http(served, moving):
+    moving.mode["arm_1"] = "faulted"
     token = ("POST", "/v4/reset")
     assert served.ask(*token, {"arm": "arm_1", "by": "ann"})[2] == {"arm": "arm_1", "changed": True}
-    assert fleet.requests[-1] == ResetRequest("ann")
+    assert moving.requests[-1] == ResetRequest("ann")
     assert served.ask(*token, {"arm": "arm_1"})[2]["changed"] is False
     status, _, told = served.ask(*token, {"arm": "nobody"})
     assert (status, told["detail"]) == (503, "There is no arm 'nobody' in this fleet.")
     assert served.ask(*token, {"arm": "a/b"})[0] == 422
 
 
-def test_the_snapshot_names_the_paused_arms_and_as_many_jobs_as_asked_for(served, fleet):
+def test_the_snapshot_names_the_paused_arms_and_as_many_jobs_as_asked_for(served, moving):
     jobs = [
         {"name": f"crate {number}", "kind": "hold", "places": ["clamp"], "repetitions": 1000} for number in (1, 2, 3)
     ]
@@ -182,3 +192,295 @@ def test_the_page_is_small():
     contents = LivePage().contents
     assert len(contents[PAGE]) < 5_000
     assert sum(map(len, contents.values())) < 250_000
+
+
+def test_the_fleet_is_shown_with_ages(gateway, arm):
+    def fleet():
+        _, kind, told = gateway.ask("GET", "/v4/fleet")
+        assert kind == "application/json"
+        return told if told["arms"] and told["arms"][0]["present"] and told["jobs"] else None
+
+    told = wait_until(fleet, lambda: arm.state(3))
+    assert told["fleet"] == "f"
+    (seen,) = told["arms"]
+    assert (seen["arm"], seen["hottest_c"], seen["joint"], seen["headroom_k"]) == ("a+1", 41.5, 2, 18.5)
+    assert 0 <= seen["state_age_s"] < 3.0
+    assert told["counts"] == {"waiting": 1}
+
+
+def test_jobs_are_submitted_and_quoted(gateway, arm):
+    status, _, told = gateway.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "me"})
+    assert (status, told["jobs"][0]["accepted"]) == (200, True)
+    assert arm.asked[-1].jobs[0].name == "crate 1"
+    status, _, told = gateway.ask("GET", "/v4/jobs?job=crate%201")
+    assert (status, told["jobs"][0]["state"]) == (200, "waiting")
+    status, _, told = gateway.ask("POST", "/v4/ask", {"jobs": [CRATE_JSON]})
+    assert (status, told["quotes"][0]["estimates"][0]["plans"][0]["difficulty"]) == (200, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "headers", "status", "says"),
+    [
+        ("POST", "/v4/jobs", "{", {}, 422, "Not a thermofleet.Submission"),
+        ("POST", "/v4/jobs", {"jobs": []}, {}, 422, "length >= 1"),
+        ("POST", "/v4/jobs", {"jobs": [{**CRATE_JSON, "places": ["a", "b"]}]}, {}, 422, "place"),
+        ("POST", "/v4/jobs", b"\xff", {}, 422, "Not a"),
+        ("POST", "/v4/jobs", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}, 415, "application/json"),
+        ("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
+        ("POST", "/v4/ask", {"jobs": []}, {}, 422, "length >= 1"),
+        ("POST", "/v4/jobs", b" " * (MAX_BYTES + 1), {}, 413, "at most"),
+        ("GET", "/v4/nothing", None, {}, 404, "Not Found"),
+        ("DELETE", "/v4/jobs", None, {}, 405, "Not Allowed"),
+        ("GET", "/v4/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
+        ("GET", "/v4/fleet", None, {"Host": "evil.example:80"}, 421, "evil.example"),
+    ],
+)
+def test_an_error_is_a_problem_document(gateway, method, path, body, headers, status, says):
+    got, kind, told = gateway.ask(method, path, body, headers)
+    assert (got, kind) == (status, "application/problem+json")
+    assert told["status"] == status
+    assert says in told["detail"]
+
+
+def test_a_body_of_unknown_length_is_limited_too(gateway):
+    line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
+    parts = (b" " * 10_000 for _ in range(7))
+    line.request("POST", "/v4/jobs", parts, {"Content-Type": "application/json"}, encode_chunked=True)
+    assert line.getresponse().status == 413
+    line.close()
+
+
+def test_a_slow_body_is_a_timeout(router):
+    with Served(router, body_s=0.2) as served, socket.create_connection(("127.0.0.1", served.port)) as line:
+        line.settimeout(PATIENCE_S)
+        head = (
+            "POST /v4/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
+        )
+        line.sendall(f"{head}{{".encode())
+        assert b" 408 " in line.recv(1000)
+
+
+def test_without_an_auctioneer_the_gateway_says_so():
+    with Router() as empty, Served(empty.endpoint) as served:
+        status, _, told = served.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
+        assert (status, told["detail"]) == (503, "There is no auctioneer in this fleet.")
+        status, _, told = served.ask("GET", "/v4/fleet")
+        assert (status, told["arms"]) == (200, [])
+
+
+def test_only_requests_with_the_token_are_served(router):
+    token = "sixteen-or-more-characters"
+    with Served(router, tokens={token: "operator"}) as served:
+        for wrong in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {token}"},
+                      {"Authorization": f"Bearer {token}x"}, {"Authorization": f"Bearer {token[:-1]}"}):  # fmt: skip
+            status, kind, _ = served.ask("GET", "/v4/fleet", headers=wrong)
+            assert (status, kind) == (401, "application/problem+json")
+        with served.stream() as (_, file):
+            assert " 401 " in file.readline()
+        status, _, _ = served.ask("GET", "/v4/fleet", headers={"Authorization": f"bearer {token}", "Host": "any"})
+        assert status == 200
+
+
+def test_a_token_may_do_what_its_role_may(router, arm):
+    watcher, sender = "watcher-watcher-watcher", "sender-sender-sender"
+    with Served(router, tokens={watcher: "monitor", sender: "submitter"}) as served:
+
+        def ask(token, method, path, body=None):
+            return served.ask(method, path, body, {"Authorization": f"Bearer {token}"})
+
+        assert ask(watcher, "GET", "/v4/jobs")[0] == 200
+        status, _, told = ask(watcher, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
+        assert (status, told["detail"]) == (403, "This token has the role monitor; this request needs submitter.")
+        assert ask(sender, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})[0] == 200
+        status, _, told = ask(sender, "POST", "/v4/control", {"request": "1", "action": {"action": "pause"}})
+        assert (status, told["detail"]) == (403, "This token has the role submitter; this request needs operator.")
+
+
+def test_an_operator_cancels_over_http(gateway, arm):
+    cancel = {"request": "1", "action": {"action": "cancel", "job": "crate 1"}, "by": "ann"}
+    status, _, told = gateway.ask("POST", "/v4/control", cancel)
+    assert (status, told["changed"]) == (200, True)
+    assert arm.asked[-1] == ControlRequest("1", Cancel("crate 1"), "ann")
+    assert gateway.ask("POST", "/v4/control", {"request": "1", "action": {"action": "fly"}})[0] == 422
+
+
+def test_the_first_page_lists_all_requests(gateway):
+    status, _, told = gateway.ask("GET", "/")
+    assert (status, told["role"]) == (200, "operator")
+    offered = {(entry["method"], entry["path"]) for entry in told["requests"]}
+    assert {("GET", "/v4/fleet"), ("POST", "/v4/jobs")} <= offered
+    for method, path in offered - {("GET", "/v4/events")}:
+        assert gateway.ask(method, path, {} if method == "POST" else None)[0] in (200, 422)
+
+
+def test_no_other_origin_is_ever_allowed(gateway):
+    line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
+    line.request("GET", "/v4/fleet", headers={"Origin": "http://evil.example"})
+    assert not [name for name in line.getresponse().headers if name.lower().startswith("access-control")]
+    line.close()
+
+
+def test_the_stream_has_all_messages(gateway, arm):
+    with gateway.stream() as (_, file):
+        arm.state(1)
+        arm.difficulty()
+        arm.happens(0)
+        found = events(file, lambda found: {"state", "difficulty", "event"} <= {name for _, name, _ in found})
+    assert of("presence", found)[0]["message"] == {"role": "arm", "name": "a+1", "there": True}
+    assert of("state", found)[0]["name"] == "a+1"
+    assert of("state", found)[0]["message"]["temp_c"] == [30.0, 41.5]
+    assert of("event", found)[0]["message"]["kind"] == "warning"
+    numbers = [int(number.partition("-")[2]) for number, _, _ in found]
+    assert numbers == sorted(set(numbers))
+
+
+def test_a_reader_that_reconnects_misses_no_event(gateway, arm):
+    with gateway.stream() as (_, file):
+        arm.happens(100)
+        last = events(file, lambda found: 100 in numbers_of(found))[-1][0]
+    for number in range(101, 104):
+        arm.happens(number)
+    with gateway.stream({"Last-Event-ID": last}) as (_, file):
+        found = events(file, lambda found: len(of("event", found)) == 3)
+    assert numbers_of(found) == [101, 102, 103]
+    assert not of("gap", found)
+    with gateway.stream({"Last-Event-ID": "otherlife-99999999"}) as (_, file):  # before a restart: all again
+        assert events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
+
+
+def test_a_silent_stream_sends_heartbeats():
+    with Router() as empty, Served(empty.endpoint, heartbeat_s=0.05) as served, served.stream() as (_, file):
+        assert any(": heartbeat" in file.readline() for _ in range(30))
+
+
+def test_a_stuck_reader_is_dropped_and_delays_no_other(router, arm):
+    big = "x" * 4000
+    with Served(router, stuck_s=0.5) as served, served.stream(receive_bytes=4096), served.stream() as (_, file):
+        wait_until(lambda: len(served.readers.connected) == 2)
+        slowest_s = 0.0
+        for number in range(600):  # far more than socket buffers hold
+            said_s = time.monotonic()
+            arm.happens(number, big)
+            if number % 100 == 99:
+                events(file, lambda found, n=number: n in numbers_of(found))
+                slowest_s = max(slowest_s, time.monotonic() - said_s)
+        assert slowest_s < PATIENCE_S
+        wait_until(lambda: len(served.readers.connected) == 1)  # the stuck one is gone, the other still reads
+        arm.happens(600)
+        assert events(file, lambda found: 600 in numbers_of(found))
+        wait_until(lambda: len(served.server.server_state.connections) == 1)  # and so is its connection
+
+
+def test_a_reader_that_disconnects_is_removed(gateway, arm):
+    for _ in range(3):
+        with gateway.stream() as (_, file):
+            file.readline()
+            wait_until(lambda: gateway.readers.connected)
+        wait_until(lambda: not gateway.readers.connected, lambda: arm.state(1))
+
+
+def test_the_number_of_readers_is_limited(gateway):
+    with ExitStack() as stack:
+        for _ in range(64):
+            stack.enter_context(gateway.stream())
+        wait_until(lambda: len(gateway.readers.connected) == 64)
+        assert gateway.ask("GET", "/v4/events")[0] == 503
+        assert gateway.ask("GET", "/v4/fleet")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "begun",
+    [
+        "POST /v4/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{",
+        "POST /v4/jobs HTTP/1.1\r\nHost: loc",
+        "",
+    ],
+    ids=["bodies", "headers", "connections"],
+)
+def test_300_unfinished_requests_hold_nobody_up(router, arm, begun, monkeypatch):
+    monkeypatch.setattr("scenarios.cli.live.gateway.HEADER_S", 3 * PATIENCE_S)
+    with Served(router, body_s=3 * PATIENCE_S) as served, ExitStack() as lines:
+        for _ in range(300):
+            line = lines.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+            line.sendall(begun.encode())
+        for request in (("GET", "/v4/fleet"), ("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})):
+            wait_until(lambda request=request: served.ask(*request)[0] == 200)  # the rate is limited, too
+
+
+def test_requests_beyond_the_rate_are_refused_until_a_pause(router, monkeypatch):
+    with Served(router) as served:
+        with monkeypatch.context() as patch:
+            patch.setattr("scenarios.live.http_access.RATE_HZ", 1.0)  # which a slow machine also exceeds
+            answers = [served.ask("GET", "/")[0] for _ in range(400)]
+        assert answers[:100] == [200] * 100
+        assert 429 in answers
+        wait_until(lambda: served.ask("GET", "/")[0] == 200)
+
+
+ROOT = Path(__file__).parents[3]
+
+
+@contextmanager
+def process(endpoint, *options):
+    """The command in a process of its own, from when it says that it is ready, and its address."""
+    started = commands.start("bus", "gateway", "--fleet", "f", "--endpoint", endpoint, "--port", 0, *options)
+    try:
+        line = started.stdout.readline()
+        assert line.startswith("ready gateway http://127.0.0.1:"), line + started.stderr.read()
+        yield started, line.split()[2]
+    finally:
+        started.kill()
+        started.communicate(timeout=PATIENCE_S)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_the_command_exits_on_a_signal_even_while_a_reader_is_connected(router, number, code):
+    with process(router) as (started, address):
+        port = int(address.split(":")[2].split("/")[0])
+        line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+        line.request("GET", "/v4/events")
+        assert line.getresponse().status == 200
+        started.send_signal(number)
+        assert started.wait(PATIENCE_S) == code
+        line.close()
+        assert "Traceback" not in started.stderr.read()
+
+
+def test_the_command_waits_for_a_router():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with Router(port):
+        pass  # now the port is free, and was a router's
+    started = commands.start("bus", "gateway", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}", "--port", 0)
+    try:
+        assert "Waiting for a router." in started.stderr.readline()
+        assert started.poll() is None
+        with Router(port):
+            assert started.stdout.readline().startswith("ready gateway http://127.0.0.1:")
+            started.terminate()
+            assert started.wait(PATIENCE_S) == 0
+    finally:
+        started.kill()
+        started.communicate(timeout=PATIENCE_S)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no Node")
+def test_the_monitor_in_javascript_shows_the_fleet(router, arm, tmp_path):
+    log = tmp_path / "log"  # a pipe that nobody reads would stop it
+    with process(router) as (_, address), log.open("w") as out:
+        arm.state(1)
+        arm.difficulty()
+        arm.happens(7)
+        command = ["node", str(ROOT / "examples" / "monitor.mjs"), address, "3"]
+        node = subprocess.Popen(command, stdout=out, env=os.environ | {"NO_COLOR": "1"})
+        try:
+            wait_until(lambda: node.poll() is not None, lambda: (arm.state(1), arm.difficulty(), arm.happens(7)))
+        finally:
+            node.kill()
+            node.wait(timeout=PATIENCE_S)
+    told = log.read_text(encoding="utf-8")
+    assert node.returncode == 0
+    assert re.search(r"a\+1 .*idle.*41\.5.*2 .*18\.5", told)
+    assert "warning" in told
+    assert "crate 1 0.50" in told

@@ -1,14 +1,22 @@
-"""View of a fleet, from its messages, in bounded memory."""
+"""View of a fleet, from its messages, in bounded memory, and its events for slow readers."""
+
+import time
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import JobStatus, Status
+from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import ArmEvent, JobStatus, Status, StatusRequest
 from fleet.bus.protocol.messages import DifficultyScores
+from fleet.bus.router import Router
+from fleet.live.monitor import snapshot as listener_module
 from fleet.live.monitor import snapshot as snapshot_module
-from fleet.live.monitor.snapshot import FRESH_S, FleetView, JobScore
+from fleet.live.monitor.async_bridge import HISTORY, MAX_WAITING, NEWEST_ONLY, EventFeed, ReaderBuffer
+from fleet.live.monitor.snapshot import FRESH_S, FleetListener, FleetView, JobScore
 from tests.live.monitor.messages import result, stands, state
+from tests.waiting import serve_until, wait_until
 
 
 @given(token=st.booleans(), age_s=st.floats(0.0, 10.0), spoke=st.booleans())
@@ -95,14 +103,11 @@ def test_an_incomplete_status_reply_drops_no_job(jobs, letters):
     assert sum(seen.snapshot(3.0).counts.values()) == jobs
 
 
-def test_an_older_result_changes_nothing():
+def test_an_older_result_changes_nothing_and_a_status_adds_jobs_without_one():
     seen = FleetView("f")
     for word in (result(2, to="finished"), result(1, to="awarded")):
         seen.update("au", word, 0.0)
     assert seen.snapshot(0.0).counts == {"finished": 1}
-
-
-def test_the_auctioneers_status_adds_jobs_without_a_result():
     seen = FleetView("f")
     seen.update_jobs(Status("au", 1.0, (JobStatus("x", "waiting"), JobStatus("y", "finished"))), 0.0)
     assert seen.snapshot(4.0).counts == {"waiting": 1, "finished": 1}
@@ -119,3 +124,88 @@ def test_too_many_names_drop_the_oldest(monkeypatch):
     now = seen.snapshot(0.0)
     assert [arm.arm for arm in now.arms] == ["a7", "a8", "a9"]
     assert [job.job for job in now.jobs] == ["j7", "j8", "j9"]
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["state", "difficulty", "event", "result"]), st.sampled_from("ab")), max_size=60
+    ),
+    st.integers(0, 60),
+)
+def test_a_reader_gets_every_event_once_and_the_newest_state(said, after):
+    """Taken in two helpings or one, in order: the letter box and the feed tell the same."""
+    feed, box, got = EventFeed(), ReaderBuffer(), []
+    for count, (topic, name) in enumerate(said):
+        box.put(feed.add(topic, name, str(count)))
+        if count == after:
+            got += box.take()
+    got += box.take()
+    numbers = [entry.number for entry in got]
+    assert numbers == sorted(set(numbers))
+    events = [number for number, (topic, _) in enumerate(said, 1) if topic not in NEWEST_ONLY]
+    assert [entry.number for entry in got if entry.topic not in NEWEST_ONLY] == events
+    last = {where: number for number, where in enumerate(said, 1) if where[0] in NEWEST_ONLY}
+    assert {(entry.topic, entry.name): entry.number for entry in got if entry.topic in NEWEST_ONLY} == last
+    missed, gap = feed.since(0)
+    assert not gap
+    assert {entry.number for entry in missed} == {*events, *last.values()}
+
+
+def test_bids_drop_no_event():
+    feed, box = EventFeed(), ReaderBuffer()
+    for topic in ("event", *["bid"] * (HISTORY + 1), "event"):
+        box.put(feed.add(topic, "a", "{}"))
+    missed, gap = feed.since(0)
+    assert not gap
+    assert [entry.topic for entry in missed] == [entry.topic for entry in box.take()] == ["event", "bid", "event"]
+
+
+def test_a_full_reader_buffer_is_empty_and_telemetry_never_fills_it():
+    feed, box = EventFeed(), ReaderBuffer()
+    for _ in range(MAX_WAITING + 1):
+        box.put(feed.add("event", "a", "{}"))
+    assert box.full
+    assert box.take() == []
+    feed, box = EventFeed(), ReaderBuffer()
+    for number in range(10 * MAX_WAITING):
+        box.put(feed.add("state", f"arm {number % 5}", "{}"))
+    assert not box.full
+    assert len(box.take()) == 5
+
+
+def test_dropped_events_leave_a_gap():
+    feed = EventFeed()
+    for _ in range(1100):
+        feed.add("event", "a", "{}")
+    assert feed.since(10)[1]
+    assert not feed.since(1000)[1]
+    assert len(feed.since(1000)[0]) == 100
+
+
+def test_a_listener_counts_only_the_jobs_of_the_present_fleet(monkeypatch):
+    monkeypatch.setattr(listener_module, "STATUS_EVERY_S", 0.05)
+    fleets = [stands(900.0, "a", "b"), stands(5.0, "c", state="waiting")]
+    with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as auctioneer:
+        auctioneer.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: fleets[0])
+        seen = FleetListener(link)
+        for fleet in ({"finished": 2}, {"waiting": 1}):
+            serve_until(lambda fleet=fleet: seen.view.snapshot(0.0).counts == fleet, seen, auctioneer)
+            del fleets[:-1]
+
+
+def test_a_listener_receives_a_whole_fleet(fleet):
+    heard, came = [], []
+    fleet.event(ArmEvent(arm="a", number=0, time_s=1.0, kind="warning", joint=2))
+    with BusClient(fleet.endpoint, "f") as link:
+        listener = FleetListener(
+            link, on_message=lambda *said: heard.append(said[:2]), on_presence=lambda *who: came.append(who)
+        )
+        wait_until(
+            lambda: len({topic for topic, _ in heard}) >= 3,
+            lambda: (fleet.say(), listener.serve(time.monotonic() + 0.05)),
+        )
+        (arm,) = listener.view.snapshot(time.monotonic()).arms
+    assert {topic for topic, _ in heard} == {"state", "difficulty", "event"}  # the event was said before
+    assert came == [("arm", "a", True)]
+    assert arm.present
+    assert arm.event == "warning joint 2"

@@ -142,15 +142,12 @@ def test_the_key_j_shows_all_joints_and_q_ends(fleet):
         os.close(ours)
 
 
-def test_a_small_screen_shows_the_arms_with_least_headroom():
+def test_a_small_screen_shows_the_arms_with_least_headroom_and_an_empty_fleet_says_so():
     names = [arm_now(f"arm_{number}", headroom_k=float(number)) for number in range(30)]
     told = shown(fleet_of(names), height=12)
     assert "arm_0 " in told
     assert "arm_29" not in told
     assert "more with more headroom" in told
-
-
-def test_an_empty_fleet_is_shown_as_empty():
     told = shown(FleetSnapshot("f", (), (), {}, ()))
     assert "no auctioneer" in told
     assert "jobs: none" in told

@@ -1,0 +1,306 @@
+"""A client of the bus over a real router, and its queue: what is said arrives, what is asked is answered."""
+
+import json
+import math
+import signal
+import socket
+import threading
+import time
+from contextlib import ExitStack
+from queue import Empty
+
+import pytest
+
+from fleet.bus.client import MOST_REPLIES, BusClient, Refused, Replies
+from fleet.bus.mailbox import Mailbox
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Admission, ArmEvent, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
+from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, decode, encode, encoding
+from fleet.bus.router import Router
+from fleet.errors import BusError
+from fleet.live.supervisor import Supervisor
+from tests.waiting import PATIENCE_S, serve_until
+
+WAIT_S = 0.05
+
+
+def get(mailbox, until_s):
+    with pytest.raises(Empty):
+        mailbox.get(until_s)
+
+
+@pytest.fixture
+def late_signal():
+    """A signal amid a wait, whose handler returns when the time of the wait is over; the next one ends it."""
+    rung = []
+
+    def ring(*_):
+        rung.append(time.monotonic())
+        assert len(rung) == 1, "still waiting ten seconds after the time was up"
+        until_s = rung[0] + WAIT_S
+        while time.monotonic() < until_s:
+            pass
+
+    before = signal.signal(signal.SIGALRM, ring)
+    yield lambda: signal.setitimer(signal.ITIMER_REAL, WAIT_S / 2, 10.0)
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize(
+    "wait",
+    [
+        lambda until_s, _: get(Mailbox(), until_s),
+        lambda until_s, _: Mailbox().wait(4, until_s),
+        lambda until_s, _: BusClient("tcp/127.0.0.1:1", "f").serve(until_s),
+        lambda until_s, folder: Supervisor(folder).poll(until_s - time.monotonic()),
+    ],
+    ids=["Mailbox.get", "Mailbox.wait", "BusClient.serve", "Supervisor.look"],
+)
+def test_a_signal_that_takes_as_long_as_the_wait_does_not_make_it_endless(late_signal, wait, tmp_path):
+    until_s = time.monotonic() + WAIT_S
+    late_signal()
+    wait(until_s, tmp_path)
+    assert WAIT_S / 2 <= time.monotonic() - until_s + WAIT_S < 10.0
+
+
+def test_what_several_threads_put_in_comes_out_once_and_in_the_order_of_each():
+    mailbox, threads, each = Mailbox(), 4, 2000
+
+    def talk(name):
+        for number in range(each):
+            mailbox.put((name, number))
+
+    talkers = [threading.Thread(target=talk, args=(name,)) for name in range(threads)]
+    for talker in talkers:
+        talker.start()
+    until_s = time.monotonic() + PATIENCE_S
+    got = [mailbox.get(until_s) for _ in range(threads * each)]
+    for talker in talkers:
+        talker.join()
+    assert len(mailbox) == 0
+    assert [[number for name, number in got if name == one] for one in range(threads)] == [list(range(each))] * threads
+
+
+def test_one_that_waits_is_woken_and_a_bell_left_over_is_not_taken_for_a_word():
+    mailbox = Mailbox()
+    mailbox.put("first")
+    assert mailbox.get() == "first"  # without waiting: its bell still rings
+    begun_s = time.monotonic()
+    get(mailbox, begun_s + WAIT_S)
+    assert time.monotonic() - begun_s >= WAIT_S
+    threading.Timer(WAIT_S, lambda: mailbox.put("second")).start()
+    assert mailbox.get(math.inf) == "second"
+    get(mailbox, -math.inf)
+
+
+@pytest.fixture
+def bus():
+    """A router, and what makes lines to it."""
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        yield lambda **options: stack.enter_context(BusClient(router.endpoint, "f", **options))
+
+
+def meet(*links):
+    """What each has declared is known to all: a token is declared last, and seen after the rest."""
+    seen = [set() for _ in links]
+    for number, (link, names) in enumerate(zip(links, seen, strict=True)):
+        link.declare_token(keys.of_arm("f", f"guest_{number}", "alive"))
+        link.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, _, names=names: names.add(arm))
+    serve_until(lambda: all(len(names) >= len(links) for names in seen), *links)
+
+
+def raw(link):
+    """The session beneath, to speak rubbish with."""
+    return link._session
+
+
+def test_an_answer_reaches_the_one_who_asked(bus):
+    asker, teller = bus(), bus()
+    teller.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=12.5, speed=60.0))
+    meet(asker, teller)
+    got = []
+    asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=PATIENCE_S)
+    serve_until(lambda: got, asker, teller)
+    assert list(got[0].messages.values()) == [Clock(time_s=12.5, speed=60.0)]
+    assert not got[0].refused
+    assert got[0].took_s < PATIENCE_S
+
+
+def test_a_question_to_nobody_is_over_at_once(bus):
+    asker = bus()
+    answers = asker.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENCE_S)
+    assert not answers.messages
+    assert answers.took_s < PATIENCE_S
+
+
+def test_a_refusal_is_told_in_words(bus):
+    asker, teller = bus(), bus()
+
+    def refuse(_):
+        raise Refused("No clock here.")
+
+    teller.reply_to(keys.of_clock("f"), ClockRequest, refuse)
+    meet(asker, teller)
+    got = []
+    asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=PATIENCE_S)
+    serve_until(lambda: got, asker, teller)
+    assert got[0].refused == {keys.of_clock("f"): "No clock here."}
+
+
+@pytest.mark.parametrize("part", ["payload", "attachment", "parameters"])
+def test_a_large_question_is_refused_before_it_waits(bus, part):
+    """To a key with a wildcard, as the router lets it through; nobody serves the one who is asked."""
+    asker, teller = bus(), bus()
+    asked = []
+    teller.reply_to(keys.of_clock("f"), ClockRequest, asked.append)
+    meet(asker, teller)
+    key, large = "thermofleet/v4/f/*/now", "x" * (MOST_BYTES + 1)
+    options = {} if part == "parameters" else {part: large}
+    (reply,) = raw(asker).get(f"{key}?{large}" if part == "parameters" else key, **options, timeout=PATIENCE_S)
+    assert str(reply.ok.encoding) == encoding(Refusal)
+    assert decode(Refusal, reply.ok.payload.to_bytes()).reason == (
+        "The request has 65,537 bytes, and at most 65,536 are allowed."
+    )
+    teller.serve()
+    assert (teller.malformed, asked) == (1, [])
+
+
+@pytest.mark.parametrize("most", [2, MOST_REPLIES])
+def test_a_flood_of_answers_ends_the_question(bus, most):
+    asker, flooder = bus(), bus()
+    held = []
+
+    def flood(query):
+        held.append(query)  # so that it does not end
+        for _ in range(most + 1):
+            query.reply(keys.of_clock("f"), encode(Clock(1.0, 1.0)), encoding=encoding(Clock))
+
+    raw(flooder).declare_queryable(keys.of_clock("f"), flood, complete=True)
+    meet(asker, flooder)
+    got = asker.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENCE_S, most=most)
+    assert len(got.messages) == most
+    assert got.refused == {"?": f"More than {most} replies to one query; no more are read."}
+
+
+def test_a_large_answer_is_not_decoded():
+    with pytest.raises(MalformedMessage, match="It has 65,537 bytes, and at most 65,536 are allowed"):
+        Replies().take(keys.of_clock("f"), encoding(Clock), encode(Clock(1.0, 1.0)).ljust(MOST_BYTES + 1), Clock)
+
+
+def test_two_that_ask_each_other_do_not_block(bus):
+    one, other = bus(), bus()
+    job = JobSpec(name="j", kind="hold", places=("rack",))
+    got = []
+
+    def answered(jobs):
+        other.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=PATIENCE_S)
+        return SubmissionReply(auctioneer="a", jobs=tuple(Admission(j.name, True) for j in jobs.jobs))
+
+    other.reply_to(keys.of_jobs("f", "submit"), Submission, answered)
+    one.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
+    meet(one, other)
+    one.query(keys.of_jobs("f", "submit"), Submission((job,)), SubmissionReply, got.append, timeout_s=PATIENCE_S)
+    serve_until(lambda: len(got) == 2, one, other)
+    assert all(len(answers.messages) == 1 for answers in got)
+
+
+@pytest.mark.parametrize(
+    ("payload", "said", "complaint"),
+    [
+        (b"{", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v4"),
+        (b"\xff\xfe", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v4"),
+        (b"{}", "application/json;thermofleet.ClockRequest.v9", "encoded as"),
+        (b"{}", "text/plain", "encoded as"),
+    ],
+)
+def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said, complaint):
+    asker, teller = bus(), bus()
+    teller.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
+    meet(asker, teller)
+    replies = []
+    raw(asker).get(keys.of_clock("f"), replies.append, payload=payload, encoding=said, timeout=PATIENCE_S)
+    serve_until(lambda: replies, teller)
+    assert str(replies[0].ok.encoding) == encoding(Refusal)
+    assert complaint in json.loads(replies[0].ok.payload.to_bytes())["reason"]
+    assert teller.malformed == 1
+
+
+def test_a_late_joiner_hears_the_last_words(bus):
+    arm = bus()
+    say = arm.publisher(keys.of_arm("f", "arm_0", "event"), ArmEvent)
+    for number in range(3):
+        say(ArmEvent(arm="arm_0", number=number, time_s=1.0, kind="finish"))
+    late, heard = bus(), []
+    late.subscribe(
+        keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append((arm, word.number)), history=True
+    )
+    serve_until(lambda: len(heard) == 3, late)
+    assert heard == [("arm_0", 0), ("arm_0", 1), ("arm_0", 2)]
+
+
+def test_words_that_speak_for_another_are_left_out(bus):
+    listener, stranger, heard = bus(), bus(), []
+    listener.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(arm))
+    meet(listener, stranger)
+    lie = ArmEvent(arm="arm_1", number=0, time_s=1.0, kind="finish")
+    truth = ArmEvent(arm="arm_2", number=0, time_s=1.0, kind="finish")
+    stranger.publish(keys.of_arm("f", "arm_0", "event"), lie)
+    raw(stranger).put("thermofleet/v4/f/arm/*/event", json.dumps({"arm": "arm_0"}), encoding=encoding(ArmEvent))
+    stranger.publish(keys.of_arm("f", "arm_2", "event"), truth)
+    serve_until(lambda: heard, listener)
+    assert heard == ["arm_2"]
+    assert listener.malformed == 2
+
+
+def test_who_comes_and_goes_is_seen(bus):
+    watcher, seen = bus(), []
+    watcher.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, there: seen.append((arm, there)))
+    arm = bus()
+    arm.declare_token(keys.of_arm("f", "arm_0", "alive"))
+    serve_until(lambda: ("arm_0", True) in seen, watcher)
+    arm.close()
+    serve_until(lambda: ("arm_0", False) in seen, watcher)
+    assert seen.index(("arm_0", True)) < seen.index(("arm_0", False))
+
+
+def test_what_nobody_handles_pushes_out_the_oldest(bus):
+    listener, sender, heard = bus(backlog=10), bus(), []
+    listener.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(word.number))
+    meet(listener, sender)
+    for number in range(50):
+        sender.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=number, time_s=0.0, kind="finish"))
+    sender.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=50, time_s=0.0, kind="finish"))
+    deadline_s = time.monotonic() + PATIENCE_S
+    patience = threading.Event()
+    while listener.overrun < 41 and time.monotonic() < deadline_s:
+        patience.wait(0.01)
+    listener.serve()
+    assert heard == list(range(41, 51))
+    assert listener.overrun == 41
+
+
+def test_a_closed_line_says_so(bus):
+    link = bus()
+    link.close()
+    with pytest.raises(BusError, match="not open"):
+        link.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=0, time_s=0.0, kind="finish"))
+
+
+def test_a_line_closes_soon_though_a_router_that_stands_still_has_taken_its_call():
+    """In place of the router is somebody who accepts and never says a word; Zenoh itself would wait for ten seconds."""
+
+    def seconds_to_close() -> float:
+        router = Router().open()
+        port = int(router.endpoint.rpartition(":")[2])
+        line = BusClient(router.endpoint, "f").open()
+        router.close()
+        with socket.create_server(("127.0.0.1", port)) as silent:
+            silent.settimeout(PATIENCE_S)
+            with silent.accept()[0]:
+                begun_s = time.monotonic()
+                line.close()
+                return time.monotonic() - begun_s
+
+    assert any(seconds_to_close() < 9.0 for _ in range(3))  # a busy machine delays one attempt, a defect all

@@ -1,0 +1,745 @@
+"""The exchange in memory and on the bus: who hears whom through which channel, when, and what is then known."""
+
+import json
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import fields, replace
+from itertools import pairwise
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import HealthCheck, given
+from hypothesis import strategies as st
+
+from agents.registry import make_policy
+from fleet.bus.exchange.channel import PERFECT, TOPOLOGIES, Channel, Partition
+from fleet.bus.exchange.memory import UNHEARD, Delivery, Exchange, MemoryExchange, PeerView
+from fleet.bus.exchange.zenoh import ZenohExchange
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import DifficultyScores, Info, State, check_name, decode, encode, encoding
+from fleet.bus.router import Router, open_client
+from fleet.env.allocation_v1 import parallel_env
+from fleet.errors import BusError
+from tests.profiles import examples
+from tests.waiting import PATIENCE_S
+
+FIVE = ("a", "b", "c", "d", "e")
+
+
+def named(count: int) -> tuple[str, ...]:
+    return tuple(f"arm_{i}" for i in range(count))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+@pytest.mark.parametrize(
+    ("topology", "same"),
+    [
+        ("complete", nx.complete_graph),
+        ("star", lambda n: nx.star_graph(n - 1)),
+        ("ring", nx.cycle_graph),
+        ("line", nx.path_graph),
+    ],
+)
+def test_a_topology_by_name_is_that_of_networkx(topology, same, count):
+    expected = nx.to_numpy_array(same(count), dtype=bool)
+    np.fill_diagonal(expected, False)  # networkx's ring of one is a loop
+    np.testing.assert_array_equal(Channel(topology=topology).links(named(count)), expected)
+
+
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+def test_a_topology_by_name_carries_both_ways_and_never_to_oneself(topology):
+    hears = Channel(topology=topology).links(FIVE)
+    np.testing.assert_array_equal(hears, hears.T)
+    assert not hears.diagonal().any()
+    assert Channel(topology=topology).graph(FIVE).number_of_nodes() == len(FIVE)
+
+
+@given(st.floats(0, 1.5), st.floats(0, 1.5), st.integers(0, 1000))
+def test_whoever_reaches_farther_hears_all_the_same_and_more(one, other, seed):
+    near, far = (
+        Channel(topology="random_geometric", radius=radius, topology_seed=seed).links(FIVE)
+        for radius in sorted((one, other))
+    )
+    assert (near <= far).all()
+
+
+def test_random_places_are_uniform_in_the_unit_square():
+    """Two points of the unit square are not farther apart than r < 1 with πr² − 8r³/3 + r⁴/2 (square line picking)."""
+    r, arms = 0.4, named(2)
+    hits = [Channel(topology="random_geometric", radius=r, topology_seed=s).links(arms)[0, 1] for s in range(3000)]
+    expected = np.pi * r**2 - 8 / 3 * r**3 + r**4 / 2
+    assert abs(np.mean(hits) - expected) < 4 * np.sqrt(expected * (1 - expected) / 3000)
+
+
+def test_a_graph_of_names_is_taken_as_it_is_and_strangers_are_refused():
+    graph = nx.DiGraph([("a", "b"), ("c", "c")])
+    hears = Channel(topology=graph).links(FIVE)
+    assert np.argwhere(hears).tolist() == [[1, 0]]
+    with pytest.raises(ValueError, match="The graph has an unknown arm 'z'"):
+        Channel(topology=nx.path_graph(["a", "z"])).check(FIVE)
+    channel = Channel(partitions=(Partition(0.0, 1.0, (("arm_a",),)),))
+    with pytest.raises(ValueError, match=r"A partition names an unknown arm 'arm_a'.*Allowed: a, b"):
+        channel.check(FIVE)
+
+
+def test_a_partition_cuts_what_lies_between_groups_and_those_of_no_group_keep_together():
+    cut = Partition(0.0, 1.0, (("a", "b"), ("c",))).cuts(FIVE)
+    together = [{"a", "b"}, {"c"}, {"d", "e"}]
+    for r, receiver in enumerate(FIVE):
+        for s, sender in enumerate(FIVE):
+            assert cut[r, s] == (not any({receiver, sender} <= group for group in together))
+
+
+def test_only_the_default_is_perfect():
+    assert PERFECT.perfect
+    assert Channel() == PERFECT
+    partition = Partition(0.0, 1.0, (("a",),))
+    for changes in (
+        {"topology": "ring"},
+        {"delay_s": 1.0},
+        {"jitter_s": 1.0},
+        {"loss": 0.1},
+        {"partitions": [partition]},
+    ):
+        assert not Channel(**changes).perfect
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"topology": "rign"}, "No topology 'rign'; did you mean 'ring'"),
+        ({"delay_s": -1.0}, "delay_s must be 0 to 86400"),
+        ({"delay_s": np.inf}, "delay_s must be 0 to 86400"),
+        ({"delay_s": np.nan}, "delay_s must be 0 to 86400"),
+        ({"jitter_s": -0.1}, "jitter_s must be 0 to 86400"),
+        ({"loss": 1.5}, "loss must be 0 to 1"),
+        ({"loss": np.nan}, "loss must be 0 to 1"),
+        ({"radius": -1.0}, "radius must be 0 to 2"),
+        ({"topology_seed": -1}, "topology_seed must be 0 to 4294967295"),
+    ],
+)
+def test_a_channel_that_cannot_be_is_refused(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        Channel(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((5.0, 5.0, (("a",),)), "must end after it begins"),
+        ((np.nan, 5.0, (("a",),)), "must end after it begins"),
+        ((0.0, 5.0, ()), "needs groups"),
+        ((0.0, 5.0, (("a",), ())), "needs groups"),
+        ((0.0, 5.0, (("a", "b"), ("a",))), "names 'a' twice"),
+    ],
+)
+def test_a_partition_that_cannot_be_is_refused(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        Partition(*arguments)
+
+
+def test_a_channel_is_told_in_plain_values_and_travels_to_other_processes():
+    partition = Partition(600.0, 1200.0, (("a", "b"), ("c",)))
+    channel = Channel(topology="random_geometric", radius=0.3, topology_seed=4, loss=0.1, partitions=(partition,))
+    assert json.loads(json.dumps(channel.described())) == {
+        "topology": "random_geometric",
+        "radius": 0.3,
+        "topology_seed": 4,
+        "delay_s": 0.0,
+        "jitter_s": 0.0,
+        "loss": 0.1,
+        "partitions": [{"from_s": 600.0, "to_s": 1200.0, "groups": [["a", "b"], ["c"]]}],
+    }
+    assert pickle.loads(pickle.dumps(channel)) == channel
+    told = json.loads(json.dumps(Channel(topology=nx.path_graph(["b", "a"])).described()))
+    assert told["topology"] == {"directed": False, "edges": [["b", "a"]]}
+
+
+THREE = ("a", "b", "c")
+DT_S = 10.0
+
+
+def carry(delivery: Delivery, now_s: float, said_s: list[float]) -> np.ndarray:
+    """The times at which the words that every arm now has were said, [receiver, sender]; −inf for none."""
+    said_s.append(now_s)
+    return np.array([*said_s, -np.inf])[delivery.carry(now_s)]
+
+
+def shift(channel: Channel, ticks: int, seed: int = 0, arms: tuple[str, ...] = THREE) -> tuple[Delivery, np.ndarray]:
+    """A delivery after so many ticks, and the times of the words known after each, [tick, receiver, sender]."""
+    delivery = Delivery(arms, channel, np.random.default_rng(seed))
+    said_s: list[float] = []
+    return delivery, np.array([carry(delivery, DT_S * tick, said_s) for tick in range(ticks)])
+
+
+channels = st.builds(
+    Channel,
+    topology=st.sampled_from(["complete", "ring", "star", "line"]),
+    delay_s=st.sampled_from([0.0, 3.0, 10.0, 25.0]),
+    jitter_s=st.sampled_from([0.0, 4.0, 35.0]),
+    loss=st.sampled_from([0.0, 0.3]),
+    partitions=st.sampled_from([(), (Partition(30.0, 60.0, (("a",),)),)]),
+)
+
+
+@given(channels, st.integers(0, 100))
+def test_what_is_known_never_grows_older_by_a_word_and_never_comes_before_its_time(channel, seed):
+    delivery, known = shift(channel, 15, seed)
+    now_s = DT_S * np.arange(15)[:, None, None]
+    others = ~np.eye(3, dtype=bool)
+    for earlier, later in pairwise(known):
+        assert (later >= earlier).all()
+    assert ((now_s - known)[:, others] >= channel.delay_s).all()
+    assert (known[:, ~others] == now_s[:, 0]).all()  # one's own word is known at once
+    assert np.isneginf(known[:, ~channel.links(THREE) & others]).all()
+    assert delivery.delivered + delivery.late <= 15 * channel.links(THREE).sum()
+
+
+@given(st.sampled_from([0.0, 3.0, 10.0, 25.0]), st.sampled_from([1.0, 10.0, 35.0]), st.integers(0, 100))
+def test_without_loss_a_word_is_there_after_delay_and_jitter_at_the_latest(delay_s, jitter_s, seed):
+    _, known = shift(Channel(delay_s=delay_s, jitter_s=jitter_s), 20, seed)
+    for tick in range(20):
+        surely = DT_S * np.arange(20)
+        surely = surely[surely + delay_s + jitter_s <= DT_S * tick]
+        if len(surely):
+            assert (known[tick] >= surely[-1]).all()
+
+
+def test_jitter_is_uniform():
+    """A word that takes 0 to m ticks is there after n of them with probability n/m."""
+    m, links = 20, 90
+    delivery, _ = shift(Channel(jitter_s=m * DT_S), m // 2 + 1, arms=tuple("abcdefghij"))
+    shares = [n / m for n in range(m // 2 + 1)]
+    spread = np.sqrt(links * sum(p * (1 - p) for p in shares))
+    assert abs(delivery.delivered - links * sum(shares)) < 5 * spread
+
+
+def test_words_overtake_each_other_and_the_older_is_no_news():
+    delivery, known = shift(Channel(jitter_s=60.0), 60)
+    others = ~np.eye(3, dtype=bool)
+    changes = int((known[1:] > known[:-1])[:, others].sum()) + int(np.isfinite(known[0][others]).sum())
+    assert delivery.delivered > changes > 0
+    assert delivery.late == 0
+
+
+def test_more_loss_loses_the_same_words_and_more_and_jitter_loses_no_others():
+    def heard(**changes) -> np.ndarray:
+        _, known = shift(Channel(**changes), 100, seed=3)
+        return known == DT_S * np.arange(100)[:, None, None]
+
+    little, much = heard(loss=0.2), heard(loss=0.5)
+    assert (much <= little).all()
+    assert much.sum() < little.sum()
+    few, _ = shift(Channel(loss=0.2), 100, seed=3)
+    delayed, _ = shift(Channel(loss=0.2, jitter_s=5.0), 100, seed=3)
+    assert few.late == delayed.late
+    pairs = 100 * 6
+    assert abs(few.late - 0.2 * pairs) < 5 * np.sqrt(0.2 * 0.8 * pairs)
+
+
+def test_each_link_draws_for_itself():
+    _, known = shift(Channel(loss=0.5), 40)
+    came = known == DT_S * np.arange(40)[:, None, None]
+    rows = [tuple(came[:, r, s]) for r in range(3) for s in range(3) if r != s]
+    assert len(set(rows)) == 6
+
+
+def test_partitions_cut_for_their_time_and_may_overlap():
+    _, known = shift(Channel(partitions=(Partition(20.0, 50.0, (("a", "b"), ("c",))),)), 7)
+    for tick in range(7):
+        now_s = DT_S * tick
+        across = 10.0 if 20.0 <= now_s < 50.0 else now_s
+        np.testing.assert_array_equal(
+            known[tick], [[now_s, now_s, across], [now_s, now_s, across], [across, across, now_s]]
+        )
+    both = (Partition(0.0, 30.0, (("a",),)), Partition(20.0, 40.0, (("b",),)))
+    _, known = shift(Channel(partitions=both), 6)
+    assert known[3].tolist() == [[30.0, -np.inf, 30.0], [-np.inf, 30.0, 10.0], [30.0, 10.0, 30.0]]
+    assert (known[4] == 40.0).all()
+
+
+def test_a_word_under_way_when_the_link_is_cut_is_lost_and_one_said_just_before_it_heals_too():
+    """Delay 20 s, cut from 30 to 50 s: what is said in [10, 50) would travel while it is cut."""
+    delivery, known = shift(Channel(delay_s=20.0, partitions=(Partition(30.0, 50.0, (("a",),)),)), 9, arms=("a", "b"))
+    assert known[:, 0, 1].tolist() == [-np.inf, -np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 50.0, 60.0]
+    assert delivery.late == 2 * 4
+
+
+def test_a_new_episode_forgets_what_was_known_and_what_was_on_its_way():
+    delivery = Delivery(THREE, Channel(delay_s=20.0))
+    for time_s in (-20.0, -10.0, 0.0):
+        delivery.carry(time_s)
+    delivery.begin()
+    others, said_s = ~np.eye(3, dtype=bool), list[float]()
+    for time_s in (0.0, 10.0):
+        assert np.isneginf(carry(delivery, time_s, said_s)[others]).all()
+    assert (carry(delivery, 20.0, said_s)[others] == 0.0).all()
+
+
+def test_chance_must_be_given():
+    with pytest.raises(ValueError, match="needs an rng"):
+        Delivery(THREE, Channel(jitter_s=1.0)).carry(0.0)
+    Delivery(THREE, Channel(delay_s=1.0)).carry(0.0)
+
+
+FOUR = ("a", "b", "c", "d")
+
+
+def test_everybody_hears_everybody_at_once_and_nothing_of_an_empty_slot(make_words):
+    words = replace(make_words(np.random.default_rng(0), 4, 5.0), jobs=("w", "x", "y", "z"))
+    heard = MemoryExchange(FOUR).share(words)
+    for receiver in range(4):
+        np.testing.assert_array_equal(heard.mode[receiver], words.mode)
+        np.testing.assert_array_equal(heard.headroom_k[receiver], words.headroom_k)
+        np.testing.assert_array_equal(heard.difficulty[receiver], words.difficulty)
+        np.testing.assert_array_equal(heard.p_saturation[receiver], words.p_saturation)
+    np.testing.assert_array_equal(heard.age_s, np.zeros((4, 4)))
+    words = replace(make_words(np.random.default_rng(0), 4, 0.0), jobs=("w", "", "y", ""), difficulty=np.ones((4, 4)))
+    heard = MemoryExchange(FOUR).share(words)
+    assert np.isnan(heard.difficulty[:, :, [1, 3]]).all()
+    assert (heard.difficulty[:, :, [0, 2]] == 1.0).all()
+
+
+def test_scores_go_to_the_slot_of_their_job(make_words):
+    exchange = MemoryExchange(("s", "t"), Channel(delay_s=10.0))
+    words = replace(
+        make_words(np.random.default_rng(0), 2, 0.0, slots=3),
+        jobs=("a", "b", "c"),
+        difficulty=np.array([[1.0, 2.0, 3.0]] * 2),
+        p_saturation=np.array([[0.1, 0.2, 0.3]] * 2),
+    )
+    exchange.share(words)
+    later = make_words(np.random.default_rng(1), 2, 10.0, slots=4)
+    heard = exchange.share(replace(later, jobs=("c", "", "x", "a")))
+    np.testing.assert_array_equal(heard.difficulty[0, 1], [3.0, np.nan, np.nan, 1.0])
+    np.testing.assert_array_equal(heard.p_saturation[0, 1], [0.3, np.nan, np.nan, 0.1])
+
+
+def test_on_a_ring_only_neighbours_are_heard(make_words):
+    exchange = MemoryExchange(FOUR, Channel(topology=nx.cycle_graph(FOUR)))
+    rng = np.random.default_rng(1)
+    heard = [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(3)][-1]
+    across = np.array([[(r - s) % 4 == 2 for s in range(4)] for r in range(4)])
+    assert np.isinf(heard.age_s[across]).all()
+    assert (heard.mode[across] == UNHEARD).all()
+    assert np.isnan(heard.headroom_k[across]).all()
+    assert np.isnan(heard.difficulty[across]).all()
+    assert (heard.age_s[~across] == 0.0).all()
+    assert exchange.delivered == 3 * 8
+
+
+def test_a_directed_edge_carries_one_way_and_loss_one_nothing(make_words):
+    exchange = MemoryExchange(("a", "b"), Channel(topology=nx.DiGraph([("a", "b")])))
+    age_s = exchange.share(make_words(np.random.default_rng(0), 2, 0.0)).age_s
+    np.testing.assert_array_equal(age_s, [[0.0, np.inf], [0.0, 0.0]])
+    exchange = MemoryExchange(FOUR, Channel(loss=1.0), rng=np.random.default_rng(0))
+    age_s = exchange.share(make_words(np.random.default_rng(0), 4, 0.0)).age_s
+    np.testing.assert_array_equal(np.isinf(age_s), ~np.eye(4, dtype=bool))
+
+
+@examples(40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(ticks=st.integers(0, 4), dt_s=st.sampled_from([0.1, 1.0, 10.0]), seed=st.integers(0, 99))
+def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, ticks, dt_s, seed):
+    """Against a second method: look the word of t − delay up by hand."""
+    rng = np.random.default_rng(seed)
+    exchange = MemoryExchange(FOUR, Channel(delay_s=ticks * dt_s))
+    said = []
+    for tick in range(8):
+        words = make_words(rng, 4, tick * dt_s)
+        said.append(words)
+        heard = exchange.share(words)
+        for receiver in range(4):
+            for sender in range(4):
+                then = tick if receiver == sender else tick - ticks
+                if then < 0:
+                    assert heard.age_s[receiver, sender] == np.inf
+                    assert np.isnan(heard.difficulty[receiver, sender]).all()
+                    continue
+                old = said[then]
+                assert heard.age_s[receiver, sender] == words.time_s - old.time_s
+                assert heard.mode[receiver, sender] == old.mode[sender]
+                assert heard.headroom_k[receiver, sender] == old.headroom_k[sender]
+                for slot, job in enumerate(words.jobs):
+                    expected = old.difficulty[sender, old.jobs.index(job)] if job and job in old.jobs else np.nan
+                    np.testing.assert_equal(heard.difficulty[receiver, sender, slot], expected)
+
+
+def test_lost_words_leave_the_last_known_and_its_age(make_words):
+    exchange = MemoryExchange(FOUR, Channel(loss=0.5), rng=np.random.default_rng(3))
+    rng, age_s = np.random.default_rng(4), np.full((4, 4), np.inf)
+    np.fill_diagonal(age_s, 0.0)
+    grown = 0
+    for tick in range(30):
+        heard = exchange.share(make_words(rng, 4, 10.0 * tick))
+        older = heard.age_s == age_s + 10.0
+        assert (older | (heard.age_s == 0.0) | np.isinf(heard.age_s)).all()
+        grown += int(older[np.isfinite(age_s)].sum())
+        age_s = heard.age_s
+    assert grown > 0
+    assert exchange.late > 0
+    assert exchange.delivered + exchange.late == 30 * 12
+    # Binomial(360, 1/2): five standard deviations either side.
+    assert abs(exchange.late - 180) < 5 * np.sqrt(360 / 4)
+
+
+def test_the_same_seed_loses_the_same_words(make_words, assert_same):
+    def episode(seed: int) -> list[PeerView]:
+        rng = np.random.default_rng(0)
+        exchange = MemoryExchange(FOUR, Channel(loss=0.3), rng=np.random.default_rng(seed))
+        return [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(10)]
+
+    for one, other in zip(episode(7), episode(7), strict=True):
+        assert_same(one, other)
+    assert any((a.age_s != b.age_s).any() for a, b in zip(episode(7), episode(8), strict=True))
+
+
+def test_relabelling_the_arms_relabels_what_is_heard(make_words, assert_same):
+    order = [2, 0, 3, 1]
+    rng = np.random.default_rng(5)
+    channel = Channel(topology=nx.path_graph(FOUR), delay_s=10.0)
+    plain, turned = MemoryExchange(FOUR, channel), MemoryExchange([FOUR[i] for i in order], channel)
+    for tick in range(5):
+        words = make_words(rng, 4, 10.0 * tick)
+        per_arm = ("mode", "temp_c", "headroom_k", "busy_s", "difficulty", "p_saturation")
+        moved = replace(
+            words, **{f: getattr(words, f)[order] for f in per_arm}, twin=tuple(words.twin[i] for i in order)
+        )
+        one, other = plain.share(words), turned.share(moved)
+        assert_same(PeerView(**{f.name: getattr(one, f.name)[np.ix_(order, order)] for f in fields(PeerView)}), other)
+
+
+def test_a_new_episode_knows_nothing_of_the_last(make_words):
+    exchange = MemoryExchange(FOUR, Channel(delay_s=10.0))
+    rng = np.random.default_rng(0)
+    heard = [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(3)][-1]
+    assert np.isfinite(heard.age_s).all()
+    exchange.begin()
+    heard = exchange.share(make_words(rng, 4, 0.0))
+    np.testing.assert_array_equal(np.isinf(heard.age_s), ~np.eye(4, dtype=bool))
+
+
+def test_a_new_episode_may_bring_its_own_chance(make_words, assert_same):
+    exchange = MemoryExchange(FOUR, Channel(loss=0.5), rng=np.random.default_rng(0))
+
+    def episode() -> list[PeerView]:
+        exchange.begin(np.random.default_rng(3))
+        rng = np.random.default_rng(1)
+        return [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(10)]
+
+    for one, other in zip(episode(), episode(), strict=True):
+        assert_same(one, other)
+
+
+def test_what_was_said_does_not_change_with_the_callers_arrays(make_words):
+    exchange = MemoryExchange(FOUR, Channel(delay_s=10.0))
+    rng = np.random.default_rng(0)
+    words = replace(make_words(rng, 4, 0.0), jobs=("w", "x", "y", "z"), difficulty=np.full((4, 4), 0.5))
+    exchange.share(words)
+    words.difficulty[:] = 9.0
+    heard = exchange.share(replace(words, time_s=10.0))
+    assert heard.difficulty[0, 1, 0] == 0.5
+    assert heard.difficulty[0, 0, 0] == 9.0
+
+
+def test_a_delay_is_not_a_tick_longer_for_a_rounding(make_words):
+    """0.1 + 0.2 > 0.3 in binary."""
+    exchange = MemoryExchange(FOUR, Channel(delay_s=0.2))
+    rng = np.random.default_rng(0)
+    exchange.share(make_words(rng, 4, 0.1))
+    assert np.isfinite(exchange.share(make_words(rng, 4, 0.3)).age_s).all()
+
+
+def test_one_arm_alone_knows_itself(make_words):
+    heard = MemoryExchange(["solo"]).share(make_words(np.random.default_rng(0), 1, 0.0))
+    assert heard.difficulty.shape == (1, 1, 4)
+    assert heard.age_s.tolist() == [[0.0]]
+
+
+def test_no_slot_is_fine(make_words):
+    heard = MemoryExchange(FOUR).share(make_words(np.random.default_rng(0), 4, 0.0, slots=0))
+    assert heard.difficulty.shape == (4, 4, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"time_s": np.nan}, "time_s"),
+        ({"mode": np.array([0, 1, 3, 0])}, "mode"),
+        ({"mode": np.zeros(3, dtype=int)}, "mode"),
+        ({"headroom_k": np.array([1.0, np.nan, 1.0, 1.0])}, "headroom_k"),
+        ({"temp_c": np.full((4, 7), np.inf)}, "temp_c"),
+        ({"temp_c": np.zeros(4)}, "temp_c"),
+        ({"difficulty": np.full((4, 4), np.inf)}, "difficulty"),
+        ({"p_saturation": np.zeros((4, 5))}, "p_saturation"),
+        ({"jobs": ("x", "x", "", "y")}, "jobs"),
+        ({"twin": ("v1",)}, "twin"),
+    ],
+)
+def test_words_that_cannot_be_said_are_refused(make_words, changes, named):
+    exchange = MemoryExchange(FOUR)
+    with pytest.raises(ValueError, match=f"Broadcast.{named}"):
+        exchange.share(replace(make_words(np.random.default_rng(0), 4, 0.0), **changes))
+
+
+def test_an_exchange_that_cannot_be_is_refused(make_words):
+    with pytest.raises(ValueError, match="unknown arm 'z'"):
+        MemoryExchange(FOUR, Channel(topology=nx.path_graph(["a", "z"])))
+    with pytest.raises(ValueError, match="names"):
+        MemoryExchange(["a", "a"])
+    with pytest.raises(ValueError, match="needs an rng"):
+        MemoryExchange(FOUR, Channel(loss=0.5)).share(make_words(np.random.default_rng(0), 4, 0.0))
+
+
+def test_a_closed_exchange_says_so(make_words):
+    with MemoryExchange(FOUR) as exchange:
+        pass
+    exchange.close()
+    with pytest.raises(BusError, match="closed"):
+        exchange.share(make_words(np.random.default_rng(0), 4, 0.0))
+
+
+ARMS = ("arm_0", "arm_1", "arm 2+*@")
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("channel", [Channel(), Channel(topology="ring", delay_s=10.0, loss=0.5)], ids=["all", "some"])
+def test_the_bus_carries_every_message_and_the_arms_know_what_the_memory_delivers(make_words, assert_same, channel):
+    arms, rng, samples = tuple(f"arm {i}+*@" for i in range(12)), np.random.default_rng(2), queue.Queue()
+    with ZenohExchange(arms, "same", channel=channel, timeout_s=PATIENCE_S) as bus:
+        memory, said = MemoryExchange(arms, channel), []
+        with open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as observer:
+            ears = [
+                observer.declare_subscriber(keys.of_every_arm("same", topic), samples.put)
+                for topic in ("state", "difficulty")
+            ]
+            barrier(observer)
+            for exchange in (bus, memory):
+                exchange.begin(np.random.default_rng(7))
+            for tick in range(10):
+                words = make_words(rng, 12, 10.0 * tick, slots=3 + tick % 3)
+                said.append(words)
+                assert_same(bus.share(words), memory.share(words))
+            heard = [samples.get(timeout=PATIENCE_S) for _ in range(2 * 12 * 10)]
+            for ear in ears:
+                ear.undeclare()
+        assert (bus.delivered, bus.late) == (memory.delivered, memory.late)
+    for sample in heard:
+        key = keys.parse(str(sample.key_expr))
+        kind = State if key.topic == "state" else DifficultyScores
+        message = check_name(decode(kind, sample.payload.to_bytes()), key.name, "arm")
+        words, arm = said[message.tick], arms.index(key.name)
+        assert message.time_s == words.time_s
+        if isinstance(message, State):
+            assert (message.headroom_k, message.busy_s) == (words.headroom_k[arm], words.busy_s[arm])
+            assert message.temp_c == tuple(words.temp_c[arm])
+        else:
+            known = [job for job in words.jobs if job]
+            columns = [words.jobs.index(job) for job in known]
+            assert message.jobs == tuple(known)
+            np.testing.assert_array_equal(np.array(message.difficulty, float), words.difficulty[arm, columns])
+            np.testing.assert_array_equal(np.array(message.p_saturation, float), words.p_saturation[arm, columns])
+
+
+def test_a_new_episode_knows_nothing_of_the_last_but_what_is_said_anew(make_words, assert_same):
+    rng = np.random.default_rng(1)
+    with ZenohExchange(ARMS, "again", timeout_s=PATIENCE_S) as bus, MemoryExchange(ARMS) as memory:
+        for time_s in (0.0, 10.0, 20.0, 0.0, 10.0, 0.0):
+            if time_s == 0.0:
+                bus.begin()
+                memory.begin()
+            words = make_words(rng, 3, time_s)
+            assert_same(bus.share(words), memory.share(words))
+
+
+@pytest.mark.parametrize("make", [lambda: MemoryExchange(ARMS), lambda: ZenohExchange(ARMS, "f")])
+def test_an_exchange_is_an_exchange(make: Callable[[], Exchange], make_words):
+    """The contract that the environment relies on, for both."""
+    with make() as exchange:
+        exchange.begin(np.random.default_rng(0))
+        heard = exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
+        with pytest.raises(ValueError, match=r"-1 s after that of 0 s; begin\(\)"):
+            exchange.share(make_words(np.random.default_rng(0), 3, -1.0))
+        assert exchange.arms == ARMS
+        assert (exchange.delivered, exchange.late) == (6, 0)
+        assert heard.mode.dtype.kind == "i"
+        assert heard.difficulty.dtype == heard.p_saturation.dtype == heard.age_s.dtype == np.float64
+    exchange.close()
+
+
+def test_one_arm_alone_needs_nobody(make_words):
+    with ZenohExchange(["solo"], "f") as bus:
+        assert bus.share(make_words(np.random.default_rng(0), 1, 0.0)).age_s.tolist() == [[0.0]]
+
+
+def test_an_arm_is_on_the_bus_once():
+    with Router() as router, ZenohExchange(ARMS, "f", router.endpoint, timeout_s=PATIENCE_S):
+        with pytest.raises(BusError, match="already has arm_1 "):
+            ZenohExchange(["arm_1", "arm_9"], "f", router.endpoint, timeout_s=PATIENCE_S).open()
+        ZenohExchange(["arm_9"], "f", router.endpoint, timeout_s=PATIENCE_S).open().close()
+
+
+def test_what_a_stranger_says_is_never_believed(make_words, assert_same):
+    rng = np.random.default_rng(3)
+    with (
+        ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus,
+        MemoryExchange(ARMS) as memory,
+        open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as stranger,
+    ):
+        for tick in range(3):
+            words = make_words(rng, 3, 10.0 * tick)
+            assert_same(bus.share(words), memory.share(words))
+            foreign = encode(State("arm_0", 10**9, 1e9, "idle", (20.0,), 40.0))
+            stranger.put(keys.of_arm("f", "arm_0", "state"), foreign, encoding=encoding(State))
+            stranger.put(keys.of_arm("f", "arm_0", "difficulty"), b"garbage")
+            barrier(stranger)
+
+
+def barrier(session: zenoh.Session) -> None:
+    """Wait until the router has taken all that the session said: it answers in order."""
+    assert list(session.liveliness().get("thermofleet/v4/*/arm/*/alive", timeout=PATIENCE_S))
+
+
+def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
+    """With nothing but Zenoh: the caches answer a subscriber that was not there."""
+    samples: queue.Queue[zenoh.Sample] = queue.Queue()
+    with ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus:
+        words = make_words(np.random.default_rng(5), 3, 0.0)
+        bus.share(words)
+        with open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as joiner:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+            for topic in ("info", "difficulty"):
+                zenoh.ext.declare_advanced_subscriber(
+                    joiner, keys.of_every_arm("f", topic), samples.put, history=history
+                )
+            tokens = joiner.liveliness().get(keys.of_every_arm("f", "alive"), timeout=PATIENCE_S)
+            present = {keys.parse(str(reply.ok.key_expr)).name for reply in tokens if reply.ok}
+            said = [samples.get(timeout=PATIENCE_S) for _ in range(6)]
+    assert present == set(ARMS)
+    for sample in said:
+        key = keys.parse(str(sample.key_expr))
+        index = ARMS.index(key.name)
+        kind = Info if key.topic == "info" else DifficultyScores
+        assert str(sample.encoding) == encoding(kind)
+        word = check_name(decode(kind, sample.payload.to_bytes()), key.name, "arm")
+        assert word.twin == words.twin[index]
+        if isinstance(word, Info):
+            assert word.joints == 7
+        else:
+            assert word.jobs == tuple(job for job in words.jobs if job)
+    assert len({str(sample.key_expr) for sample in said}) == 6
+
+
+def test_closing_leaves_no_thread_and_no_port(make_words):
+    threads = set(threading.enumerate())
+    bus = ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S).open()
+    endpoint = bus.endpoint or ""
+    bus.share(make_words(np.random.default_rng(0), 3, 0.0))
+    bus.close()
+    bus.close()
+    assert set(threading.enumerate()) == threads
+    with Router(int(endpoint.rsplit(":", 1)[1])):
+        pass
+    with pytest.raises(BusError, match="closed"):
+        bus.share(make_words(np.random.default_rng(0), 3, 0.0))
+    with pytest.raises(BusError, match="closed"):
+        bus.open()
+
+
+def test_an_error_inside_the_block_is_the_one_that_is_seen():
+    with pytest.raises(ZeroDivisionError), ZenohExchange(ARMS, "f"):
+        _ = 1 / 0
+
+
+@pytest.mark.parametrize("ending", ["bus.close()", "pass", "del bus", "raise SystemExit(0)"])
+def test_a_process_ends_however_it_leaves_the_exchange(ending):
+    """A Zenoh session that is not closed keeps a process from ending."""
+    program = f"""
+import numpy as np
+from fleet.bus.exchange.memory import Broadcast
+from fleet.bus.exchange.zenoh import ZenohExchange
+bus = ZenohExchange(["a", "b"], "f", timeout_s=120.0)
+one = np.ones((2, 1))
+heard = bus.share(Broadcast(0.0, np.zeros(2, int), one, one[:, 0], one[:, 0], ("j",), one, one, ("", "")))
+print(heard.difficulty.sum(), flush=True)
+{ending}
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "4.0", "")
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/10.0.0.1:7447", "tcp/0.0.0.0:7447"])
+def test_an_arm_connects_to_this_machine_alone(endpoint):
+    with pytest.raises(BusError, match="not on loopback"):
+        ZenohExchange(ARMS, "f", endpoint)
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="timeout_s"):
+        ZenohExchange(ARMS, "f", timeout_s=0.0)
+    with pytest.raises(ValueError, match="name"):
+        ZenohExchange(ARMS, "")
+    with pytest.raises(ValueError, match="names"):
+        ZenohExchange(["a", "a"], "f")
+
+
+def test_no_router_is_an_error_and_leaves_nothing_open():
+    with Router() as router:
+        endpoint = router.endpoint
+    threads = set(threading.enumerate())
+    with pytest.raises(BusError, match="No router answered"):
+        ZenohExchange(ARMS, "f", endpoint, timeout_s=0.2).open()
+    assert set(threading.enumerate()) == threads
+
+
+def test_words_that_cannot_be_said_open_nothing(make_words):
+    bus = ZenohExchange(ARMS, "f")
+    with pytest.raises(ValueError, match=r"Broadcast\.mode"):
+        bus.share(make_words(np.random.default_rng(0), 2, 0.0))
+    assert bus.endpoint is None
+
+
+BUS_FOUR = ("arm_0", "arm_1", "arm_2", "arm_3")
+CHANNELS = {
+    "perfect": Channel(),
+    "ring": Channel(
+        topology="ring",
+        delay_s=10.0,
+        jitter_s=15.0,
+        loss=0.2,
+        partitions=(Partition(60.0, 120.0, (("arm_0", "arm_1"), ("arm_2", "arm_3"))),),
+    ),
+    "directed": Channel(topology=nx.DiGraph([("arm_0", "arm_1"), ("arm_1", "arm_2")]), loss=0.5),
+    "silent": Channel(loss=1.0),
+}
+
+
+@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
+def test_the_same_seed_gives_the_same_awards_over_either(small, channel):
+    def shift(exchange: ZenohExchange | MemoryExchange) -> tuple[list[str], int]:
+        env = parallel_env(small.Shifts(arms=4, jobs=20, ticks=60), exchange=exchange, keep_events=True)
+        policy = make_policy("least_difficulty")
+        env.reset(seed=3)
+        while env.agents:
+            env.step(policy.act(env.knowledge()))
+        return [repr(event) for event in env.events], env.messages
+
+    with ZenohExchange(BUS_FOUR, "trace", channel=channel, timeout_s=PATIENCE_S) as bus:
+        over_zenoh = shift(bus)
+    assert over_zenoh == shift(MemoryExchange(BUS_FOUR, channel))
+    assert sum("award" in event for event in over_zenoh[0]) > 5

@@ -1,0 +1,384 @@
+"""`thermofleet bus keys`, `bus router` and `bus ros2`, in this process and as processes."""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import State
+from fleet.bus.router import Router, open_client
+from fleet.bus.security.access_control import Participant
+from fleet.bus.security.certificates import issue
+from fleet.bus.security.tls import Tls, identified
+from fleet.errors import FleetError
+from fleet.live.arm.awards import ArmRecord, Closed
+from fleet.live.journal import Journal
+from scenarios.cli.main import main
+from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
+from scenarios.live.gateway import check, check_token, read_tokens
+from scenarios.spec.options import LiveSpec
+from tests import commands
+from tests.waiting import PATIENCE_S, wait_until
+
+
+@contextmanager
+def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The router as a process, and the line that it prints when it listens."""
+    with commands.start("bus", "router", *words) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def made_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("made") / "keys"
+    with pytest.raises(SystemExit) as left:
+        main(["bus", "keys", str(place), "quickstart", "--extra", "gateway:submitter"])
+    assert left.value.code == 0
+    return place
+
+
+@pytest.fixture
+def folder(tmp_path: Path, made_keys: Path) -> Path:
+    """A copy of one's own."""
+    return shutil.copytree(made_keys, tmp_path / "keys")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_router_prints_its_endpoint_and_exits_on_a_signal(number, code):
+    with started("--port", 0) as (process, endpoint):
+        assert endpoint.startswith("tcp/127.0.0.1:")
+        with open_client(endpoint, timeout_s=PATIENCE_S):
+            process.send_signal(number)
+            out, err = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == code
+        assert out == ""
+        assert ("The router was interrupted" in err) == (code == 130)
+        assert "Traceback" not in err
+
+
+def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
+    with started("--port", 0, "--tls", folder, "--scenario", "quickstart", "--state-hz", 5) as (process, endpoint):
+        assert endpoint.startswith("tls/127.0.0.1:")
+        with (
+            open_client(endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "arm_0")) as arm,
+            open_client(endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "monitor")) as monitor,
+        ):
+            heard: list[str] = []
+            listener = monitor.declare_subscriber(
+                "thermofleet/v4/quickstart/**", lambda s: heard.append(str(s.key_expr))
+            )
+            cache = keys.caches_of("thermofleet/v4/quickstart/arm/nobody")
+            assert list(monitor.get(cache, timeout=PATIENCE_S)) == []
+            state, sent = keys.of_arm("quickstart", "arm_0", "state"), 0
+
+            def publish() -> None:
+                nonlocal sent
+                for _ in range(100):
+                    arm.put(state, b"")
+                    arm.put(keys.of_arm("quickstart", "arm_1", "event"), b"not mine")
+                sent += 100
+                for session in (arm, monitor):
+                    assert list(session.get(cache, timeout=PATIENCE_S)) == []
+
+            publish()
+            wait_until(lambda: heard.count(state), publish)  # the first ones may come too soon after the connection
+            assert heard.count(state) < sent / 2
+            assert keys.of_arm("quickstart", "arm_1", "event") not in heard
+            listener.undeclare()
+        process.terminate()
+        assert process.wait(PATIENCE_S) == 0
+
+
+def test_a_port_in_use_is_one_sentence(thermofleet):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        code, out, err = thermofleet("bus", "router", "--port", port)
+    assert (code, out) == (2, "")
+    assert f"could not listen on port {port} of 127.0.0.1; is it in use?" in err
+
+
+KEYS = {
+    "{keys} quickstart": "holds the keys of a fleet",
+    "{keys} --add gateway:submitter": "has a certificate",
+    "{keys} --add x:router --host ''": "is not a host name or address",
+    "{keys} --add x:router --host 'a b'": "is not a host name or address",
+    "{keys} --add x:king": "no role 'king'. Allowed: arm",
+    "{keys} --add x:submiter": "did you mean 'submitter'?",
+    "{keys} --add x": "is not NAME:ROLE",
+    "{keys} --add ca:monitor": "cannot be named 'ca'",
+    "{keys} --extra y:arm": "SCENARIO is needed",
+    "{keys} --no-auctioneer": "SCENARIO is needed",
+    "{keys} quickstart --add y:arm": "leave SCENARIO and --extra out",
+    "{keys} quickstart --extra arm_0:arm --overwrite": "'arm_0' is taken",
+    "{keys} nowhere": "No scenario 'nowhere'",
+}
+ROUTER = {
+    "--host 0.0.0.0": "Plain TCP does not authenticate",
+    "--host 192.0.2.1": "is not on loopback",
+    "--port 70000": "--port must be 0 to 65535",
+    "--scenario quickstart": "--scenario needs --tls",
+    "--tls {keys} --scenario heat_wave": "are for the fleet 'quickstart', not for 'heat_wave'",
+    "--tls {keys}/none": "There is no '",
+    "--tls {keys} --name arm_0": "a router needs that of a router",
+}
+SEVERAL_MACHINES = {
+    "--arms arm_7": "the scenario has no arm 'arm_7'",
+    "--router tls/cell-1:7447": "name the arms to start here: --arms",
+    "--arms arm_0 --router tls/cell-1:7447": "needs a certificate",
+    "--arms arm_0 --router tcp/10.0.0.1:7447": "is not on loopback",
+    "--host 0.0.0.0": "needs --tls",
+}
+ROS2 = {
+    "listen /joint_states": "has no motor temperatures",
+    "listen /j --temperatures /d --joints a,a": "different names",
+    "listen /j --temperatures /d --rate-hz 0": "--rate-hz must be",
+    "jobs": "needs the Python module 'rclpy' of ROS 2",
+    "bridge --domain 233": "--domain must be 0 to 232",
+    "bridge --fleet f --warning-c 80": "--warning-c must be less than --error-c",
+    "bridge --endpoint tls/127.0.0.1:7447#keys/arm_0": "name the router of ROS 2 with --router",
+}
+WRONG = {
+    f"{command} {words}": complaint
+    for command, rows in {
+        "bus keys": KEYS,
+        "bus router": ROUTER,
+        "up quickstart --out {keys}/../run": SEVERAL_MACHINES,
+        "bus ros2": ROS2,
+    }.items()
+    for words, complaint in rows.items()
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_an_error_of_a_command_is_one_sentence_and_changes_no_key(thermofleet, folder, monkeypatch, words):
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    code, out, err = thermofleet(*shlex.split(words.format(keys=folder), comments=False))
+    assert (code, out) == (2, "")
+    assert err.startswith("Error: ")
+    assert WRONG[words] in " ".join(err.split())
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_an_arm_without_a_certificate_is_named_before_the_router_starts(thermofleet, folder):
+    told = json.loads((folder / "roster.json").read_text())
+    told["participants"] = [one for one in told["participants"] if one["name"] != "arm_1"]
+    (folder / "roster.json").write_text(json.dumps(told))
+    code, _, err = thermofleet("bus", "router", "--tls", folder, "--scenario", "quickstart")
+    assert code == 2
+    assert "--add arm_1:arm." in " ".join(err.split())
+
+
+def test_keys_are_made_shown_and_extended(thermofleet, folder):
+    code, out, err = thermofleet("bus", "keys", folder, "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert told["fleet"] == "quickstart"
+    roles = {one["name"]: one["role"] for one in told["participants"]}
+    assert roles == {
+        **{role: role for role in ("router", "auctioneer", "submitter", "operator", "monitor", "recorder")},
+        **{f"arm_{i}": "arm" for i in range(4)},
+        "gateway": "submitter",
+    }
+    assert thermofleet("bus", "keys", folder, "--add", "a:b:monitor", "--days", 5)[0] == 0
+    code, out, _ = thermofleet("bus", "keys", folder)
+    assert "a:b" in out
+    assert "expired" not in out
+    assert "(authority)" in out
+
+
+def test_up_gives_every_process_its_own_certificate(folder):
+    spec = LiveSpec(fleet="quickstart", speed=60.0, jobs="none", difficulty="blind")
+    options = {"port": 7447, "folder": Path("run"), "tls": folder}
+    router, arms, record, auction = parts_of("quickstart", ("arm_0", "arm_1"), spec, **options)
+    assert router.argv[router.argv.index("--tls") + 1] == str(folder)
+    assert router.ready == "tls/127.0.0.1:7447"
+    who = [identified(part.argv[part.argv.index("--endpoint") + 1]) for part in (*arms, record, auction)]
+    names = ("arm_0", "arm_1", "recorder", "auctioneer")
+    assert who == [(router.ready, Tls(folder, name)) for name in names]
+    for tls in who:
+        assert tls[1] is not None
+        tls[1].check(serves=False)
+
+
+def test_a_part_of_a_fleet_connects_to_a_router_elsewhere(folder):
+    spec = LiveSpec(fleet="quickstart", speed=60.0, jobs="none", difficulty="blind")
+    options = {"port": 7447, "folder": Path("run"), "tls": folder}
+    names = chosen_arms("arm_3, arm_1", ("arm_0", "arm_1", "arm_2", "arm_3"))
+    assert names == ("arm_1", "arm_3")
+    _, arms, *_ = parts_of("quickstart", names, spec, at="tls/cell-1:7447", **options)
+    ends = [identified(part.argv[part.argv.index("--endpoint") + 1]) for part in arms]
+    assert ends == [("tls/cell-1:7447", Tls(folder, name)) for name in names]
+    router, *_ = parts_of("quickstart", names, spec, host="0.0.0.0", **options)
+    assert router.argv[router.argv.index("--host") + 1] == "0.0.0.0"
+    assert router.ready == "tls/127.0.0.1:7447"
+    assert parts_of("quickstart", names, spec, host="fd00::1", **options)[0].ready == "tls/[fd00::1]:7447"
+
+
+def reports(folder):
+    """What the arms have noted of the ends of their jobs."""
+    for path in folder.glob("*.journal"):
+        if path.stem != "auctioneer":
+            with Journal(path, ArmRecord) as book:
+                yield from (each for each in book.records() if isinstance(each, Closed))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["matching", "consensus"])
+def test_a_whole_fleet_works_with_tls_and_access_control(thermofleet, small_toml, plans, tmp_path, policy):
+    """Processes of their own for router, arms, auctioneer and recorder: what they need of each other is allowed."""
+    place, out = tmp_path / "keys", tmp_path / "live"
+    assert (
+        thermofleet("bus", "keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
+    )
+    words = ("up", small_toml, "--tls", place, "--speed", 20, "--difficulty", "blind", "--out", out, "--policy", policy)
+    done = commands.run(*words, env={**os.environ, "THERMOFLEET_CACHE": str(plans)})
+    assert done.returncode == 0, done.stderr
+    finished = [one for one in reports(out / "journals") if one.outcome == "finished"]
+    assert len({one.job for one in finished}) == len(finished) >= 4
+    assert {one.arm for one in finished} == {"left", "right"}
+    assert re.search(rf"{len(finished)} of \d+ jobs finished", done.stdout)
+    results = [row for path in (out / "recording").glob("results-*") for row in pq.read_table(path).to_pylist()]
+    if policy == "matching":
+        assert {row["job"] for row in results if row["state"] == "finished"} == {one.job for one in finished}
+    else:
+        assert not (out / "logs" / "auction.log").exists()
+    logs = {path.name: path.read_text(encoding="utf-8") for path in (out / "logs").iterdir()}
+    assert logs["router.log"].startswith("tls/")
+    assert not [name for name, said in logs.items() if "Traceback" in said or "No router answered" in said]
+
+
+def test_the_list_of_keys_shows_which_are_invalid_now(tmp_path, thermofleet):
+    place, now = tmp_path / "keys", datetime.now(UTC)
+    assert thermofleet("bus", "keys", place, "quickstart")[0] == 0
+    issue(place, Participant("arm_0", "arm"), days=1, now=now - timedelta(days=3))
+    issue(place, Participant("arm_1", "arm"), days=1, now=now + timedelta(days=3))
+    rows = dict(line.split(maxsplit=1) for line in thermofleet("bus", "keys", place)[1].splitlines()[2:])
+    assert rows["arm_0"].rstrip().endswith(f"{now - timedelta(days=2):%Y-%m-%d %H:%M} UTC, expired")
+    assert rows["arm_1"].rstrip().endswith(f"{now + timedelta(days=4):%Y-%m-%d %H:%M} UTC, not yet valid")
+    assert rows["arm_2"].rstrip().endswith("UTC")
+
+
+def test_the_default_port_is_used_if_it_is_free():
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        held.listen()
+        taken = held.getsockname()[1]
+        assert free_port(taken) not in (0, taken)
+    assert free_port(taken) == taken
+
+
+TEMP_C = (30.0, 31.0, 32.5, 33.0, 34.0, 35.0, 36.0)
+
+
+def ros2_started(stack, *words):
+    """A command that says it is ready."""
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    environment.pop("ROS_DOMAIN_ID", None)
+    process = stack.enter_context(commands.start("bus", "ros2", *words, env=environment))
+    stack.callback(process.kill)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("ready ")
+    return process
+
+
+def ended(process, number):
+    process.send_signal(number)
+    _, said = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, said
+
+
+def test_an_arm_is_published_in_ros_and_followed_again():
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        link = stack.enter_context(BusClient(router.endpoint, "shop"))
+        heard: list[State] = []
+        link.subscribe(keys.of_arm("shop", "mirror", "state"), State, lambda _, word: heard.append(word))
+        here = ["--endpoint", router.endpoint, "--fleet", "shop"]
+        bridge = ros2_started(stack, "bridge", *here)
+        listen = ros2_started(stack, "listen", "/shop/arm_0/joint_states", "--temperatures", "/diagnostics",
+                         "--hardware", "shop/arm_0", "--arm", "mirror", *here)  # fmt: skip
+        deadline_s = time.monotonic() + PATIENCE_S
+        tick = 0
+        while not heard:
+            assert time.monotonic() < deadline_s, "waited in vain"
+            tick += 1
+            said = State("arm_0", tick, 0.1 * tick, "working", TEMP_C, 24.0, q=(0.1,) * 7, qd=(0.2,) * 7)
+            link.publish(keys.of_arm("shop", "arm_0", "state"), said)
+            link.serve(time.monotonic() + 0.1)
+        assert (heard[0].temp_c, heard[0].q, heard[0].qd, heard[0].tau) == (TEMP_C, (0.1,) * 7, (0.2,) * 7, ())
+        assert heard[0].mode == "working"
+        assert ended(listen, signal.SIGTERM) == (0, "")
+        assert ended(bridge, signal.SIGINT) == (130, "The bridge was interrupted.\n")
+
+
+def test_a_missing_extra_is_named(thermofleet, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    code, _, err = thermofleet("bus", "ros2", "bridge", "--fleet", "f", "--domain", "0")
+    assert code == 2
+    assert "pip install -e '.[ros2]'" in err
+
+
+PLAIN, SECURE = "tcp/127.0.0.1:7447", "tls/127.0.0.1:7447"
+
+
+@pytest.mark.parametrize(
+    ("host", "endpoint", "says"),
+    [
+        ("0.0.0.0", PLAIN, "THERMOFLEET_TOKEN"),
+        ("192.0.2.1", PLAIN, "reachable from other machines"),
+        ("127.0.0.1", SECURE, "every user of this machine"),
+        ("localhost", PLAIN, "IP address"),
+    ],
+)
+def test_other_machines_and_users_need_a_token(host, endpoint, says):
+    with pytest.raises(FleetError, match=re.escape(says)):
+        check(host, endpoint, has_tokens=False)
+
+
+def test_with_a_token_any_address_is_allowed_with_a_warning(caplog):
+    check("0.0.0.0", SECURE, has_tokens=True)
+    assert "not encrypted" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("content", "mode", "says"),
+    [
+        ("operator sixteen-or-more-characters", 0o644, "chmod 600"),
+        ("operater sixteen-or-more-characters", 0o600, "line 1: no role 'operater'; did you mean 'operator'?"),
+        ("operator short", 0o600, "16 or more"),
+        ("# nothing", 0o600, "holds no tokens"),
+    ],
+)
+def test_a_file_of_tokens_says_what_is_wrong_with_it(tmp_path, content, mode, says):
+    path = tmp_path / "tokens"
+    path.write_text(content)
+    path.chmod(mode)
+    with pytest.raises(FleetError, match=re.escape(says)):
+        read_tokens(path)
+
+
+def test_a_token_is_long_and_ascii():
+    assert check_token("sixteen-or-more-characters")
+    for bad in ("short", "sixteen-or-more-\n", "sixteen-or-more-ä"):
+        with pytest.raises(FleetError, match="16 or more printable ASCII"):
+            check_token(bad)

@@ -1,0 +1,605 @@
+"""`thermofleet arm run`, `bus auctioneer`, `job submit` and `job list`."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fleet.arm.model import ArmModel
+from fleet.arm.plan_cache import rest_torque
+from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
+    Admission,
+    JobEstimate,
+    JobSpec,
+    JobStatus,
+    PlanQuote,
+    Quote,
+    QuoteRequest,
+    Status,
+    StatusRequest,
+    Submission,
+    SubmissionReply,
+)
+from fleet.bus.protocol.messages import Info, State
+from fleet.bus.router import Router
+from fleet.errors import BusError, FleetError, LogError
+from fleet.job import Job, Place, Work
+from fleet.live.job_client import batches
+from scenarios.live import auctioneer as live_auction
+from scenarios.live.arm import ambient_of, replayed_arm, simulated_arm, wait_for_name
+from scenarios.live.auctioneer import job_spec, own_jobs
+from scenarios.live.journals import refuse_other_way
+from scenarios.live.requests import read_jobs
+from scenarios.prepare.fleet import make_env, prepare, prepare_arm
+from scenarios.progress import quiet
+from scenarios.spec.load import load
+from scenarios.spec.schema import Ambient
+from tests import commands
+from tests.waiting import PATIENCE_S
+from twin.logs.reader import read
+from twin.logs.recording import READINGS
+
+LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
+TIME_S = np.arange(0.0, 4.0, 0.1)
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A plain log in which every channel of joint k rises by k a second from its own start."""
+    starts = dict(zip(READINGS, (0.0, 1.0, 2.0, 3.0, 30.0), strict=True))
+    rise = TIME_S[:, None] * np.arange(1, 8) / 100
+    columns = np.hstack([TIME_S[:, None] + 50.0, *(start + rise for start in starts.values())])
+    header = ",".join(["time_s", *(f"{channel}_{k}" for channel in READINGS for k in range(1, 8))])
+    path = tmp_path / "real.csv"
+    np.savetxt(path, columns, delimiter=",", header=header, comments="", fmt="%.12g")
+    return path
+
+
+class Process:
+    """`thermofleet arm …` until the end of the block."""
+
+    def __init__(self, *args, cache, cwd):
+        self.process = commands.start("arm", "run", *args, cwd=cwd, env={**os.environ, "THERMOFLEET_CACHE": str(cache)})
+        self.killer = threading.Timer(PATIENCE_S, self.process.kill)
+        self.killer.start()
+        self.ready = self.process.stdout.readline()
+
+    def end(self, number):
+        self.process.send_signal(number)
+        _, said = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, said
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self.killer.cancel()
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate()
+
+
+def heard_from(link, fleet, enough):
+    """State words and the info of an arm, once there are enough."""
+    states, infos = [], []
+    link.subscribe(keys.of_every_arm(fleet, "state"), State, lambda _, word: states.append(word))
+    link.subscribe(keys.of_every_arm(fleet, "info"), Info, lambda _, word: infos.append(word), history=True)
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not (infos and enough(states)):
+        assert time.monotonic() < deadline_s, "waited in vain"
+        link.serve(time.monotonic() + 0.1)
+    return states, infos[-1]
+
+
+ARM = {
+    "ghost": "No arm 'ghost'",
+    "left --source log": "log with a FILE",
+    "left some.csv": "log with a FILE",
+    "left --source video": "'video' is not one of 'sim', 'log'",
+    "left --difficulty oracle": "No difficulty 'oracle'. Allowed: blind, twin.",
+    "left --speed 0": "--speed must be 0.001 to 10000",
+    "left --rate-hz 1000": "--rate-hz must be > 0 and at most 100 (got 1000).",
+    "left --capacity 0": "--capacity must be 1 to 256 (got 0).",
+    "left --seed -1": "--seed must be 0 to 4294967295 (got -1).",
+    "left --speed inf": "--speed must be 0.001 to 10000 (got inf).",
+    "left none.csv --source log": "none.csv",
+    "left --difficulty blind --endpoint udp/127.0.0.1:1": "is no endpoint of this bus",
+    "left --policy wspt": "'wspt' needs an auctioneer: start it with thermofleet bus auctioneer",
+    "left --policy ssi": "'ssi' needs an auctioneer: start it with thermofleet bus auctioneer",
+    "arm_9 --policy random": "No arm 'arm_9' in heat",
+    "left --policy random --jobs all": "No source of jobs 'all'. Allowed: none, scenario.",
+}
+POLICIES = {
+    "bus auctioneer quickstart --policy match": "No policy 'match'; did you mean 'matching'?",
+    "up quickstart --policy sssi": "did you mean 'ssi'?",
+    "bus auctioneer quickstart --policy consensus": "'consensus' of scope arm runs without an auctioneer. Start",
+    "bus auctioneer quickstart --policy random": "'random' of scope arm runs without an auctioneer. Start",
+}
+WRONG = {f"arm run heat.toml {words}": complaint for words, complaint in ARM.items()} | POLICIES
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_an_error_of_a_command_is_one_sentence(thermofleet, small_toml, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    said = thermofleet(*words.split())
+    assert said.code == 2
+    assert WRONG[words] in " ".join(said.err.split())
+
+
+def test_a_single_arm_equals_the_arm_of_the_fleet(small_toml, plans):
+    scenario = load(small_toml)
+    fleet = prepare(scenario, difficulty="blind", cache=plans)
+    alone, same = prepare_arm(scenario, "right", difficulty="blind", cache=plans), fleet.arms[1]
+    assert alone.robot == same.robot
+    for name in ("motors", "thermal"):
+        for one, other in zip(vars(getattr(alone, name)).values(), vars(getattr(same, name)).values(), strict=True):
+            np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(alone.rest_tau, same.rest_tau)
+    assert alone.plans.keys() == same.plans.keys()
+    for work, variants in alone.plans.items():
+        for one, other in zip(variants, same.plans[work], strict=True):
+            np.testing.assert_array_equal(one.cycle.profile, other.cycle.profile)
+
+
+@pytest.mark.slow
+def test_a_single_arm_has_the_twin_of_the_arm_of_the_fleet(small_toml, tmp_path):
+    text = small_toml.read_text(encoding="utf-8") + '\n[twin]\nsize = "quick"\nexploration = 0\n'
+    small_toml.write_text(text, encoding="utf-8")
+    scenario = load(small_toml)
+    alone = prepare_arm(scenario, "right", cache=tmp_path / "one")
+    assert alone.model.version == prepare(scenario, cache=tmp_path / "all").arms[1].model.version
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_an_arm_runs_as_a_process_and_exits_on_a_signal(small_toml, plans, tmp_path, number, code):
+    with Router() as router, BusClient(router.endpoint, "heat") as link:
+        options = ["--endpoint", router.endpoint, "--difficulty", "blind", "--rate-hz", 20]
+        with Process(small_toml, "left", *options, cache=plans, cwd=tmp_path) as arm:
+            assert arm.ready.split() == ["ready", "left", router.endpoint, str(arm.process.pid)]
+            states, info = heard_from(link, "heat", lambda states: len(states) > 5)
+            assert "torch" not in Path(f"/proc/{arm.process.pid}/maps").read_text()
+            returned, said = arm.end(number)
+    assert returned == code, said
+    assert (info.twin, states[-1].mode) == ("blind", "idle")
+    assert (tmp_path / "runs/live-heat/left.journal").is_file()
+    if number == signal.SIGINT:
+        assert "the same command continues" in said.replace("\n", " ")
+
+
+def test_a_log_is_replayed_as_an_arm(small_toml, plans, log, tmp_path):
+    with Router() as router, BusClient(router.endpoint, "heat") as link:
+        options = ["--source", "log", "--endpoint", router.endpoint, "--speed", 4, "--rate-hz", 20]
+        with Process(small_toml, "museum", log, *options, cache=plans, cwd=tmp_path) as arm:
+            assert arm.ready.startswith("ready museum")
+            states, info = heard_from(link, "heat", lambda states: states and states[-1].mode == "idle")
+            job = JobSpec(name="j", kind="hold", places=("bench",))
+            answers = link.query_and_wait(
+                keys.of_every_arm("heat", "quote"), QuoteRequest("q", (job,), dry_run=True), Quote, timeout_s=PATIENCE_S
+            )
+            assert arm.end(signal.SIGTERM)[0] == 0
+    assert info.twin == "log real.csv"
+    (quote,) = answers.messages.values()
+    assert "replays the log 'real.csv'" in quote.estimates[0].reason
+    rise = np.arange(1, 8) / 100
+    for state in states:
+        into_s = (state.temp_c[0] - 30.0) * 100  # what the first joint says of the time, the others must say too
+        np.testing.assert_allclose(state.temp_c, 30.0 + into_s * rise, atol=1e-9)
+        np.testing.assert_allclose(state.q, into_s * rise, atol=1e-9)
+        np.testing.assert_allclose(state.tau, 2.0 + into_s * rise, atol=1e-9)
+        np.testing.assert_allclose(state.current_a, 3.0 + into_s * rise, atol=1e-9)
+    seen = [round((state.temp_c[0] - 30.0) * 100, 6) for state in states]
+    assert seen == sorted(seen)
+    assert seen[-1] == pytest.approx(TIME_S[-1])
+    began_s = states[0].time_s - seen[0]
+    for state, into_s in zip(states, seen, strict=True):
+        if state.mode == "working":
+            assert state.time_s - began_s == pytest.approx(into_s, abs=0.1 + 1e-6)
+
+
+def test_no_second_arm_of_a_name_starts(token_reaches):
+    with Router(0) as router, BusClient(router.endpoint, "f") as first, BusClient(router.endpoint, "f") as second:
+        first.declare_token(keys.of_arm("f", "a", "alive"))
+        token_reaches(second, keys.of_arm("f", "a", "alive"))
+        wait_for_name(second, "b", patience_s=PATIENCE_S)
+        with pytest.raises(BusError, match="Arm 'a' of fleet 'f' is already running"):
+            wait_for_name(second, "a", patience_s=0.3)
+
+
+def test_an_arm_waits_until_the_token_of_its_last_process_expires(token_reaches):
+    with Router(0) as router, BusClient(router.endpoint, "f") as second:
+        with BusClient(router.endpoint, "f") as first:
+            first.declare_token(keys.of_arm("f", "a", "alive"))
+            token_reaches(second, keys.of_arm("f", "a", "alive"))
+            leaves = threading.Timer(0.3, first.close)
+            leaves.start()
+            wait_for_name(second, "a", patience_s=PATIENCE_S)
+            leaves.join()
+        assert not second.tokens(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
+
+
+def test_a_log_without_temperatures_is_refused(log, tmp_path):
+    bare = tmp_path / "bare.csv"
+    lines = log.read_text().splitlines()
+    bare.write_text("\n".join(",".join(line.split(",")[:22]) for line in lines))
+    with pytest.raises(LogError, match="no motor temperatures"):
+        replayed_arm("arm", bare)
+
+
+def test_an_arm_that_the_scenario_lacks_is_refused(small_toml, plans):
+    with pytest.raises(FleetError, match="No arm 'museum'"):
+        simulated_arm(load(small_toml), "museum", "blind", 0, quiet, plans)
+
+
+@pytest.mark.skipif(not LOGS.is_dir(), reason="the real logs are not here")
+def test_a_real_arm_is_replayed_as_it_was_logged():
+    file = sorted(LOGS.glob("*.csv.gz"))[0]
+    (recording,) = read(file, damaged="skip")
+    body = replayed_arm("kinova", file).body(1000.0, 0.1)
+    for row in np.linspace(0, len(recording.time_s) - 2, 50).astype(int).tolist():
+        body.advance(1000.0 + recording.time_s[row] - recording.time_s[0] + 1e-6)
+        reading = body.read_sensors()
+        np.testing.assert_array_equal(reading.temp_c, recording.temp_c[row])
+        np.testing.assert_array_equal(reading.q, recording.q[row])
+        np.testing.assert_array_equal(reading.current_a, recording.current_a[row])
+
+
+@pytest.mark.parametrize("points", [((0.0, 28.0),), ((0.0, 28.0), (600.0, 28.0)), ((0.0, 20.0), (600.0, 40.0))])
+def test_the_ambient_temperature_is_that_of_the_scenario(points):
+    scenario = replace(load("quickstart"), ambient=Ambient(points=points))
+    for time_s in (-1.0, 0.0, 150.0, 600.0, 1e6):
+        assert ambient_of(scenario)(time_s) == np.interp(time_s, *zip(*points, strict=True))
+
+
+def test_a_blind_arm_whose_plans_are_known_loads_no_physics(tmp_path):
+    """64 of them on one machine would each take 50 MB more."""
+    prepare(load("quickstart"), difficulty="blind", cache=tmp_path)
+    program = f"""
+import sys
+from pathlib import Path
+from scenarios.progress import quiet
+from scenarios.live.arm import simulated_arm
+from scenarios.spec.load import load
+made = simulated_arm(load("quickstart"), "arm_0", "blind", 0, quiet, Path({str(tmp_path)!r}))
+made.body(0.0, 0.1).advance(1.0)
+print(*sys.modules)
+"""
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
+    heavy = {"mujoco", "mink", "ruckig", "scipy", "torch", "pettingzoo", "gymnasium", "numba", "pyarrow", "plotly"}
+    assert set(said.stdout.split()) & heavy == set()
+
+
+def test_the_torque_at_home_is_the_same_from_the_cache(tmp_path):
+    fresh, kept = (prepare_arm(load("quickstart"), "arm_2", difficulty="blind", cache=tmp_path) for _ in range(2))
+    assert fresh.rest_tau.tolist() == kept.rest_tau.tolist()
+    assert fresh.rest_tau.tolist() == ArmModel(fresh.robot).gravity_torque(fresh.robot.home_q()).tolist()
+    tilted = replace(fresh.robot, mount=replace(fresh.robot.mount, tilt_deg=(30.0, 0.0, 0.0)))
+    heavier = replace(fresh.robot, tool_kg=fresh.robot.tool_kg + 1.0)
+    for other in (tilted, heavier):
+        assert rest_torque(other, tmp_path / "plans").tolist() != fresh.rest_tau.tolist()
+
+
+ROOT = Path(__file__).parents[2]
+HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}
+
+
+def test_the_stream_is_the_one_of_a_run(small_toml, plans):
+    """Against the world that a run lays out for the same seed."""
+    scenario = load(small_toml)
+    env = make_env(scenario, difficulty="blind", cache=plans)
+    for seed in (0, 3):
+        env.reset(seed=seed)
+        table, drawn = env.world.jobs, own_jobs(scenario, seed)
+        assert {word.name for _, word in drawn} == set(table.names[0])
+        for name, release_s, repetitions in zip(table.names[0], table.release_s[0], table.repetitions[0], strict=True):
+            (word,) = (word for _, word in drawn if word.name == name)
+            assert (word.release_s, word.repetitions) == (release_s, repetitions)
+
+
+def test_a_job_is_submitted_after_those_it_waits_for(small_toml):
+    drawn = own_jobs(load(small_toml), 0)
+    assert [at_s for at_s, _ in drawn] == sorted(at_s for at_s, _ in drawn)
+    seen: set[str] = set()
+    for at_s, word in drawn:
+        assert at_s >= word.release_s
+        assert set(word.after) <= seen
+        seen.add(word.name)
+
+
+class Stage:
+    """Stands in for a node: an hour passes with every turn, and a job is done in the turn after it was handed in."""
+
+    def __init__(self) -> None:
+        self.time_s, self.handed_in, self.open, self.ended = 0.0, [], [], False
+        self.alone_s = 0.0
+        ledger = SimpleNamespace(unsettled=lambda: self.open, ended=False)
+        self.auctioneer = SimpleNamespace(ledger=ledger, finishing=lambda: False)
+
+    @property
+    def rivals(self) -> set[str]:
+        return {"other"} if self.time_s < self.alone_s else set()
+
+    def serve(self, _until_s: float) -> None:
+        self.time_s += 3600.0
+        self.open = []
+
+    def submit(self, word: Submission) -> SubmissionReply:
+        self.handed_in.append((self.time_s, [job.name for job in word.jobs]))
+        self.open = list(word.jobs)
+        return SubmissionReply("auctioneer", tuple(Admission(job.name, True) for job in word.jobs))
+
+    def end(self) -> None:
+        self.ended = True
+
+
+@pytest.mark.parametrize(("horizon_s", "ended"), [(1e6, False), (7200.0, True)])
+def test_a_stream_is_submitted_as_released_until_all_is_done_or_the_shift_is_over(monkeypatch, horizon_s, ended):
+    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
+    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
+    names = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
+    stream = [(at_s, JobSpec(name, "hold", ("x",))) for name, at_s in names.items()]
+    live_auction.submit_stream(stage, stream, horizon_s, never)
+    all_of_it = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
+    assert stage.handed_in == (all_of_it[:2] if ended else all_of_it)
+    assert stage.ended is ended
+
+
+def test_a_finished_shift_submits_no_job_again(monkeypatch):
+    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
+    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
+    stage.auctioneer.ledger.ended = True
+    live_auction.submit_stream(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1.0, never)
+    assert stage.handed_in == []
+
+
+def test_no_job_is_submitted_while_another_auctioneer_is_present(monkeypatch):
+    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
+    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
+    stage.alone_s = 7200.0
+    live_auction.submit_stream(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1e6, never)
+    assert stage.handed_in == [(7200.0, ["a"])]
+
+
+def test_a_job_message_has_all_fields():
+    place = Place(name="rack", position_m=(0.0, 0.0, 0.0))
+    work = Work(kind="press", places=(place,), force_n=30.0, dwell_s=20.0)
+    job = Job(name="p", work=work, repetitions=6, release_s=1.0, due_s=9.0, value=3.0, after=("q",))
+    assert job_spec(job) == JobSpec("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
+
+
+OTHER_KIND = {
+    "up quickstart --policy consensus --out": (["arm_2.journal"], "the shift had an auctioneer"),
+    "up quickstart --out": (["arm_2.journal", "arm_2.grants"], "belongs to a shift without an auctioneer"),
+    "bus auctioneer quickstart --journal": (["arm_2.grants"], "belongs to a shift without an auctioneer"),
+    "arm run quickstart arm_2 --journal": (["arm_2.grants"], "belongs to a shift without an auctioneer"),
+    "arm run quickstart arm_2 --policy consensus --journal": (["arm_2.journal"], "has no 'arm_2.grants'"),
+}
+
+
+@pytest.mark.parametrize("words", OTHER_KIND)
+def test_a_shift_is_not_continued_with_the_other_kind_of_allocation(thermofleet, tmp_path, words):
+    """Who goes on from the journals of the other way does not know what is done, and would have it done again."""
+    files, complaint = OTHER_KIND[words]
+    folder = tmp_path / "journals" if words.startswith("up") else tmp_path
+    folder.mkdir(exist_ok=True)
+    for file in files:
+        (folder / file).write_text("{}\n")
+    code, _, err = thermofleet(*words.split(), tmp_path)
+    assert code == 2
+    assert complaint in " ".join(err.split())
+
+
+def test_a_shift_is_continued_with_its_own_kind_of_allocation(tmp_path):
+    for alone in (True, False):
+        refuse_other_way(tmp_path / "none", ("a",), alone=alone)
+    for file in ("alone.journal", "alone.grants", "led.journal"):
+        (tmp_path / file).write_text("{}\n")
+    for file in ("new.journal", "new.grants"):
+        (tmp_path / file).touch()
+    refuse_other_way(tmp_path, ("alone", "new"), alone=True)
+    refuse_other_way(tmp_path, ("led", "new"), alone=False)
+
+
+@contextmanager
+def auctioneer(endpoint: str, folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
+    """The command as a process that has said that it is ready."""
+    with commands.start("bus", "auctioneer", "--endpoint", endpoint, "--journal", folder, *words) as process:
+        assert process.stdout is not None
+        try:
+            said = process.stdout.readline()
+            assert said == f"ready auctioneer {endpoint} {process.pid}\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
+    file = tmp_path / "jobs.jsonl"
+    file.write_text("\n".join(json.dumps(HOLD | {"name": n, "places": [p]}) for n, p in (("a", "belt"), ("b", "moon"))))
+    at = ("--endpoint", endpoint, "--fleet", "quickstart")
+    with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
+        code, out, _ = thermofleet("job", "submit", file, *at)
+        assert code == 1
+        assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
+        code, _, err = thermofleet(
+            "bus", "auctioneer", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other"
+        )
+        assert code == 2
+        assert "Fleet 'quickstart' has an auctioneer 'auctioneer' already: its token is present." in err
+        other = ("--name", "other", "--journal", tmp_path / "other")
+        code, _, err = thermofleet("bus", "auctioneer", "quickstart", "--endpoint", endpoint, *other)
+        assert code == 2
+        assert "Fleet 'quickstart' has an auctioneer already: 'auctioneer'." in err
+        process.send_signal(signal.SIGKILL)
+        process.wait(PATIENCE_S)
+    with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
+        file.write_text(json.dumps(HOLD | {"places": ["belt"]}))
+        assert thermofleet("job", "submit", file, *at)[:2] == (0, "a: accepted\n")
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0
+        assert "0 of 1 jobs finished" in out
+        assert "Continuing from" in err
+
+
+def test_the_end_of_a_shift_lists_unfinished_jobs(endpoint, tmp_path):
+    short = tmp_path / "short.toml"
+    text = (ROOT / "scenarios" / "library" / "quickstart.toml").read_text(encoding="utf-8")
+    short.write_text(text.replace("horizon_s = 7200", "horizon_s = 600"), encoding="utf-8")
+    with auctioneer(endpoint, tmp_path / "journal", short, "--speed", "1000") as process:
+        out, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0
+    assert "unfinished, The shift ended before it was done." in out
+
+
+def test_jobs_are_read_from_lines_or_a_list(tmp_path):
+    other = {**HOLD, "name": "b"}
+    lines, listed = tmp_path / "jobs.jsonl", tmp_path / "jobs.json"
+    lines.write_text(f"{json.dumps(HOLD)}\n\n{json.dumps(other)}\n", encoding="utf-8")
+    listed.write_text(json.dumps([HOLD, other], indent=1), encoding="utf-8")
+    assert [word.name for word in read_jobs(str(lines))] == ["a", "b"]
+    assert read_jobs(str(lines)) == read_jobs(str(listed))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (f"{json.dumps(HOLD)}\n{{}}", "line 2: Object missing required field `name`."),
+        (json.dumps(HOLD | {"repetitions": 0}), "line 1: JobSpec.repetitions must be between 1 and 100000 (got 0)."),
+        (
+            json.dumps([HOLD, HOLD | {"kind": "dance"}]),
+            "No kind of job 'dance'. Allowed: hold, pick_place, press, sort (at [1].kind).",
+        ),
+        (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: JobSpec.places must be one place for a hold (got a, b)."),
+        ("{", "line 1: Input data was truncated."),
+        ("\n", "contains no jobs."),
+        ("[]", "contains no jobs."),
+        ("\xff", "line 1: "),
+    ],
+)
+def test_an_invalid_job_is_reported_with_its_line(tmp_path, text, complaint):
+    file = tmp_path / "jobs"
+    file.write_bytes(text.encode("latin-1"))
+    with pytest.raises(FleetError) as refusal:
+        read_jobs(str(file))
+    assert str(refusal.value).startswith(f"{file}")
+    assert complaint in str(refusal.value)
+
+
+def test_jobs_in_several_messages_follow_those_they_wait_for():
+    words = [JobSpec(f"j{i:03d}", "hold", ("x",), after=(f"j{i + 1:03d}",) if i < 199 else ()) for i in range(200)]
+    handed_in = list(batches(words))
+    assert [len(part) for part in handed_in] == [64, 64, 64, 8]
+    assert [word.name for part in handed_in for word in part] == [word.name for word in reversed(words)]
+    ring = [JobSpec("a", "hold", ("x",), after=("b",)), JobSpec("b", "hold", ("x",), after=("a",))]
+    assert list(batches(ring)) == [tuple(ring)]
+
+
+def test_a_missing_file_or_auctioneer_is_one_sentence(endpoint, tmp_path, thermofleet):
+    file = tmp_path / "jobs"
+    file.write_text(json.dumps(HOLD))
+    for name, sentence in (
+        ("no-such-file", "Cannot read 'no-such-file': No such file or directory."),
+        (file, "No auctioneer of fleet 'f' replied"),
+    ):
+        code, _, err = thermofleet("job", "submit", name, "--endpoint", endpoint, "--fleet", "f")
+        assert code == 2
+        assert sentence in err
+
+
+@contextmanager
+def served(endpoint: str, declare: Callable[[BusClient], None]) -> Iterator[None]:
+    """A participant of fleet f on a thread of its own."""
+    stop = threading.Event()
+    with BusClient(endpoint, "f") as link:
+        declare(link)
+
+        def serve() -> None:
+            while not stop.is_set():
+                link.serve(time.monotonic() + 0.05)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join(PATIENCE_S)
+
+
+@contextmanager
+def arm(endpoint: str, *, feasible: bool = True) -> Iterator[list[QuoteRequest]]:
+    """An arm that only quotes; gives what it was asked."""
+    asked: list[QuoteRequest] = []
+
+    def answer(request: QuoteRequest) -> Quote:
+        asked.append(request)
+        fastest = PlanQuote(0, 52.34, 12.34, 0.125, (0.5,) * 7, 3.5, 100.0, 160.0)
+        offers = (JobEstimate(request.jobs[0].name, (fastest, PlanQuote(1, 49.5)) if feasible else ()),)
+        return Quote("arm_0", request.auction, "", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
+
+    with served(endpoint, lambda link: link.reply_to(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)):
+        yield asked
+
+
+@pytest.mark.parametrize(("end", "link", "code"), [("finished", "by", 0), ("unfinished", "last at", 1)])
+def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, thermofleet, end, link, code):
+    states = iter([JobStatus("a", "waiting"), JobStatus("a", "awarded", "arm_0"), JobStatus("a", end, "arm_0")])
+
+    def declare(bus: BusClient) -> None:
+        taken = SubmissionReply("auctioneer", (Admission("a", True),))
+        bus.reply_to(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
+        bus.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("auctioneer", 0.0, (next(states),)))
+
+    file = tmp_path / "jobs"
+    file.write_text(json.dumps(HOLD))
+    with served(endpoint, declare):
+        said = thermofleet("job", "submit", file, "--wait", "--endpoint", endpoint, "--fleet", "f")
+    assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} {link} arm_0\n")
+
+
+def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, thermofleet):
+    job = ("--kind", "hold", "--place", "rack", "--payload", "2")
+    with arm(endpoint) as asked:
+        code, out, _ = thermofleet("job", "submit", "--quote", *job, "--endpoint", endpoint, "--fleet", "f")
+        assert code == 0
+        assert "hold  arm_0     0     52.3     +12.3  0.12  3.50         100          160" in out
+        assert "1     49.5         –     –     –           –            –" in out
+        code, out, _ = thermofleet("job", "submit", "--quote", *job, "--endpoint", endpoint, "--fleet", "f", "--json")
+        assert json.loads(out)[0]["estimates"][0]["plans"][0]["difficulty"] == 3.5
+    assert [request.dry_run for request in asked] == [True, True]
+    assert asked[0].jobs[0].payload_kg == 2.0
+
+
+def test_ask_exits_with_1_where_no_arm_can_do_a_job(endpoint, thermofleet):
+    with arm(endpoint, feasible=False):
+        at = ("--endpoint", endpoint, "--fleet", "f")
+        code, out, _ = thermofleet("job", "submit", "--quote", "--kind", "hold", "--place", "rack", *at)
+        assert (code, "arm_0" in out) == (1, True)
+        assert thermofleet("job", "submit", "--quote", "--kind", "hold", "--place", "rack", "--json", *at)[0] == 1
+
+
+def test_ask_reports_missing_arguments(endpoint, thermofleet):
+    at = ("--endpoint", endpoint, "--fleet", "f")
+    assert "either a FILE of jobs or one job" in thermofleet("job", "submit", "--quote", *at)[2]
+    assert r"must be UTF-8 text (got '\udcff')" in thermofleet("job", "submit", "--quote", "--kind", "\udcff", *at)[2]
+    heavy = thermofleet("job", "submit", "--quote", "--kind", "hold", "--place", "rack", "--payload", "11", *at)
+    assert "--payload must be 0 to 10 (got 11)" in heavy[2]
+    told = thermofleet("job", "submit", "--quote", "--kind", "pick_and_place", *at)[2]
+    told_kinds = "did you mean 'pick_place'? Allowed: hold, pick_place, press, sort (at kind)."
+    assert f"Invalid job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())
+    code, _, err = thermofleet("job", "submit", "--quote", "--kind", "hold", "--place", "rack", *at)
+    assert code == 2
+    assert "No arm of fleet 'f' replied" in err
