@@ -18,7 +18,7 @@ from typing import Any  # defaults of options, and values of JSON
 
 from fleet.files import atomic_path
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 """Longest wait for a process to start or to end."""
 CHROMIUM = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Options of a browser without a graphics card."""
