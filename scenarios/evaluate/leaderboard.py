@@ -362,13 +362,13 @@ def read_all(folder: Path, split: str) -> list[Submission]:
     """
     if (folder / CARD).exists():
         raise FleetError(
-            f"'{folder}' is a folder of `thermofleet compare`; run `thermofleet submit-result` with it first."
+            f"'{folder}' is a folder of `thermofleet compare`; run `thermofleet leaderboard --submit` with it first."
         )
     references, found = split_references(split), list[Submission]()
     for path in sorted(folder.glob("*.jsonl")):
         if (named := path.stem.partition("-")[0]) not in JUDGED:
             raise FleetError(
-                f"'{path}' must have the name that `thermofleet submit-result` gives, SPLIT-POLICY-PREDICTIONS.jsonl "
+                f"'{path}' must have the name that `thermofleet leaderboard --submit` gives, SPLIT-POLICY-PREDICTIONS.jsonl "
                 f"with SPLIT {', '.join(JUDGED)}."
             )
         if named != split:
