@@ -368,8 +368,8 @@ def read_all(folder: Path, split: str) -> list[Submission]:
     for path in sorted(folder.glob("*.jsonl")):
         if (named := path.stem.partition("-")[0]) not in JUDGED:
             raise FleetError(
-                f"'{path}' must have the name that `thermofleet leaderboard --submit` gives, SPLIT-POLICY-PREDICTIONS.jsonl "
-                f"with SPLIT {', '.join(JUDGED)}."
+                f"'{path}' must have the name that `thermofleet leaderboard --submit` gives, "
+                f"SPLIT-POLICY-PREDICTIONS.jsonl with SPLIT {', '.join(JUDGED)}."
             )
         if named != split:
             continue
