@@ -291,7 +291,9 @@ def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, plans) -> N
     for make in (make_env, lambda scenario: make_batch(scenario, 2)):
         with pytest.raises(ScenarioError, match=r"scenario must be a library name, .+ \(got 0\.3\)"):
             make(wrong)
-    with pytest.raises(ScenarioError, match=r"randomise must be a scenarios\.prepare\.fleet\.Randomisation \(got 0\.3\)"):
+    with pytest.raises(
+        ScenarioError, match=r"randomise must be a scenarios\.prepare\.fleet\.Randomisation \(got 0\.3\)"
+    ):
         make_batch(cell, 2, difficulty="blind", cache=plans, randomise=wrong)
 
 
