@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scenarios.prepare.fleet import make_batch as make_batch
     from scenarios.prepare.fleet import make_env as make_env
     from scenarios.prepare.fleet import prepare as prepare
-    from scenarios.prepare.twins import train_twin as train_twin
+    from scenarios.prepare.twins import train_log as train_twin
     from scenarios.run.log import open_run as open_run
     from scenarios.run.shift import run as run
     from scenarios.spec.load import load as load
@@ -40,8 +40,9 @@ _HOMES = {
     "open_run": "scenarios.run.log",
     "prepare": "scenarios.prepare.fleet",
     "run": "scenarios.run.shift",
-    "train_twin": "scenarios.prepare.twins",
+    "train_twin": "scenarios.prepare.twins:train_log",
 }
+"""Module of each public name, with `:NAME` if it has another name there."""
 __all__ = [*_HOMES]
 _PACKAGES = ("fleet", "agents", "twin", "scenarios")
 
@@ -54,7 +55,8 @@ def __getattr__(name: str) -> Any:  # functions and classes
     if name not in _HOMES:
         raise AttributeError(f"module 'thermofleet' has no attribute '{name}'; it has {', '.join(sorted(_HOMES))}.")
     _check_packages()
-    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    module, _, attribute = _HOMES[name].partition(":")
+    value = globals()[name] = getattr(import_module(module), attribute or name)
     return value
 
 
