@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet.env.render.floor_plan import Cell, mount_kind
+from fleet.env.render.scene import Cell, mount_kind
 from fleet.errors import ScenarioError
 from scenarios.spec.schema import Scenario
 

@@ -1,29 +1,20 @@
 """MuJoCo models: the cell with all its arms, with primitives or Kinova's shells, and the dynamics of a single arm."""
 
 from collections.abc import Sequence
-from importlib import import_module, resources
+from importlib import import_module
 from itertools import combinations
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from fleet.arm.gen3 import GRAVITY_M_S2, gen3_xml
 from fleet.errors import FleetError, install
 from fleet.job import MOST_PAYLOAD_M, Fixture, Place, payload_radius_m
 from fleet.robot import GEN3, JOINTS, Robot, rotation
 
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
-
-GRAVITY_M_S2 = 9.81
-ELBOW_ANGLES_DEG = (0.0, 60.0, -60.0, 120.0, -120.0, 180.0, 30.0, -30.0, 90.0, -90.0, 150.0, -150.0)
-"""Angles of the elbow about the line from shoulder to wrist, in the order in which the planner tries them; at 0 the
-elbow is furthest along the base axis."""
-
-
-def gen3_xml() -> bytes:
-    """MJCF model of one Gen3."""
-    return resources.files("fleet").joinpath("arm/assets/gen3.xml").read_bytes()
 
 
 MESH_OF_GEOM = {

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fleet.arm.gen3 import ELBOW_ANGLES_DEG
 from fleet.arm.kinematics import InverseKinematics, Pose, Unreachable
-from fleet.arm.model import ELBOW_ANGLES_DEG, ArmModel
+from fleet.arm.model import ArmModel
 from fleet.arm.trajectory import CollisionChecker, LoadedMotion, build_phase, check_time, move, rest
 from fleet.errors import InfeasibleJob
 from fleet.job import Fixture, Place, Work

@@ -25,8 +25,8 @@ from fleet.engine.shift import EpisodeFactory as EpisodeFactory
 from fleet.engine.shift import ShiftRunner, Watch
 from fleet.engine.state import State, World
 from fleet.env.lookahead import CellSimulator, Lookahead
-from fleet.env.render.floor_plan import Cell
-from fleet.env.render.picture import Renderer
+from fleet.env.render.renderer import Renderer
+from fleet.env.render.scene import Cell
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
 from fleet.observation import Layout, Observation

@@ -53,7 +53,7 @@ from fleet.bus.protocol.operator import (
     ResetReply,
     ResetRequest,
 )
-from fleet.env.render.picture import heat_scale
+from fleet.env.render.heat import heat_scale
 from fleet.errors import NAME_RULE, BusError, FleetError, Refused, is_name, nearest
 from fleet.live.monitor.async_bridge import AsyncBridge, Entry, EventFeed, ReaderBuffer
 from fleet.live.monitor.snapshot import MAX_JOBS

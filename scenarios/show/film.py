@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from fleet.arm.cell import CellCamera, CellPlayer
-from fleet.env.render.picture import heat_colour, heat_marks
+from fleet.env.render.heat import heat_colour, heat_marks
 from fleet.errors import FleetError, install, visible
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES

@@ -16,7 +16,7 @@ from typing import Any  # plain values of JSON
 
 import numpy as np
 
-from fleet.env.render.picture import heat_marks
+from fleet.env.render.heat import heat_marks
 from fleet.robot import JOINTS
 from scenarios.progress import Progress, quiet
 from scenarios.show.moments import Moments, motor_spheres

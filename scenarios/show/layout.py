@@ -25,7 +25,7 @@ from scenarios.spec.jobs import all_works, fault_price, works_of
 from scenarios.spec.schema import ArmSpec, JobStream, Scenario
 
 if TYPE_CHECKING:
-    from fleet.env.render.floor_plan import Scene
+    from fleet.env.render.scene import Scene
 
 
 Array = np.ndarray
@@ -112,7 +112,7 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
 
 def layout_scene(scenario: Scenario, report: LayoutReport) -> "Scene":
     """The cell with the arms that can work at once at their stations, for `fleet.env.render.picture.Picture`."""
-    from fleet.env.render.floor_plan import Scene
+    from fleet.env.render.scene import Scene
     from fleet.telemetry import IDLE, WORKING
 
     cell = cell_of(scenario)

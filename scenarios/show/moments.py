@@ -8,7 +8,7 @@ from typing import Any  # plain values of a cell model
 
 import numpy as np
 
-from fleet.env.render.picture import heat_colour, heat_marks
+from fleet.env.render.heat import heat_colour, heat_marks
 from fleet.job import payload_radius_m
 from fleet.robot import ThermalLimits
 from scenarios.run.log import RunLog

@@ -11,7 +11,7 @@ from itertools import groupby
 from typing import Any  # values of a card
 from urllib.parse import quote
 
-from fleet.env.render.picture import heat_scale
+from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import Assignment, Outage, Schedule

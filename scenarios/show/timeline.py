@@ -9,7 +9,7 @@ from typing import Any, TypeVar  # Any: values of Plotly's schema
 
 import numpy as np
 
-from fleet.env.render.picture import HEAT, heat_marks
+from fleet.env.render.heat import HEAT, heat_marks
 from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry

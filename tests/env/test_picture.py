@@ -14,24 +14,11 @@ from hypothesis import strategies as st
 
 from fleet.engine.shift import step
 from fleet.engine.state import initial
-from fleet.env.render.floor_plan import (
-    LARGEST,
-    NORMAL,
-    SMALLEST,
-    Cell,
-    FloorPlan,
-    MountKind,
-    Pixel,
-    QueuedJob,
-    Scene,
-    floor_plan,
-    grid_cell,
-    mount_kind,
-    scene_of,
-    shortened,
-    text_width,
-)
-from fleet.env.render.picture import Picture, Renderer, heat_colour, legend_ends, legend_row, time_left
+from fleet.env.render.floor_plan import LARGEST, NORMAL, SMALLEST, FloorPlan, Pixel, floor_plan, shortened, text_width
+from fleet.env.render.heat import heat_colour
+from fleet.env.render.picture import Picture, legend_ends, legend_row, time_left
+from fleet.env.render.renderer import Renderer
+from fleet.env.render.scene import Cell, MountKind, QueuedJob, Scene, grid_cell, mount_kind, scene_of
 from fleet.errors import FleetError
 from fleet.job import Fixture
 from fleet.robot import JOINTS, Mount, rotation

@@ -17,8 +17,9 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from fleet.arm.gen3 import ELBOW_ANGLES_DEG
 from fleet.arm.kinematics import InverseKinematics, Pose, Unreachable, angle_between, nearest_turn
-from fleet.arm.model import ELBOW_ANGLES_DEG, ArmModel
+from fleet.arm.model import ArmModel
 from fleet.arm.plan_cache import CachedPlanner, LoadedPlans
 from fleet.arm.planner import Planner
 from fleet.arm.trajectory import CollisionChecker, PlanningTimeout, check_time, time_limit

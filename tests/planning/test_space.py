@@ -11,18 +11,11 @@ from scipy.optimize import minimize
 
 from fleet.arm import space
 from fleet.arm.cell import ContactFinder
+from fleet.arm.clearance import Capsules, clearance, conflict, segment_distance
 from fleet.arm.kinematics import InverseKinematics, Pose
 from fleet.arm.model import ArmModel, build_cell, links_of
 from fleet.arm.planner import Planner
-from fleet.arm.space import (
-    Capsules,
-    clearance,
-    collisions_of_homes,
-    conflict,
-    conflicts_with_homes,
-    segment_distance,
-    space_table,
-)
+from fleet.arm.space import collisions_of_homes, conflicts_with_homes, space_table
 from fleet.arm.trajectory import GAP_M, CollisionChecker, straight_line
 from fleet.errors import InfeasibleJob
 from fleet.job import KINDS, Fixture, Place, Work, payload_radius_m

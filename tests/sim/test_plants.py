@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.arm.cell import APART_S, ContactFinder
-from fleet.arm.model import ArmModel, build_cell, gen3_xml, links_of, set_payload_balls
+from fleet.arm.gen3 import gen3_xml
+from fleet.arm.model import ArmModel, build_cell, links_of, set_payload_balls
 from fleet.arm.planner import Planner
 from fleet.arm.plant import STRIDE, TIMESTEP_S, MujocoPlant, control, load_hands, reference, still
 from fleet.arrivals import Arrivals

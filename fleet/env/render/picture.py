@@ -1,15 +1,10 @@
 """The fleet as a picture: the cell from above, each arm a ring of seven motors coloured by their temperature.
 
-Frames are arrays, or shown in a window. They are drawn on matplotlib's Agg canvas, so no display is needed; matplotlib
-is loaded with the first frame. The unchanged parts of a cell are drawn once and restored for every frame. All pictures
-and pages share the colour scale.
+Frames are drawn on matplotlib's Agg canvas, so no display is needed. The unchanged parts of a cell are drawn once and
+restored for every frame.
 """
 
-import logging
 from collections.abc import Sequence
-from typing import (
-    Any,  # plain values of JSON
-)
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,146 +15,12 @@ from matplotlib.path import Path
 from matplotlib.transforms import IdentityTransform
 from numpy.typing import ArrayLike
 
-from fleet.engine.state import State, World
-from fleet.env.render.floor_plan import (
-    NORMAL,
-    Cell,
-    FloorPlan,
-    MountKind,
-    Pixel,
-    QueuedJob,
-    Scene,
-    floor_plan,
-    scene_of,
-    shortened,
-    text_path,
-    text_width,
-)
-from fleet.errors import FleetError, install
+from fleet.env.render.floor_plan import NORMAL, FloorPlan, Pixel, floor_plan, shortened, text_path, text_width
+from fleet.env.render.heat import heat_colour, heat_marks
+from fleet.env.render.scene import MountKind, QueuedJob, Scene
 from fleet.telemetry import FAULTED, WORKING
 
-log = logging.getLogger(__name__)
-
-DPI = 100
-NO_WINDOW = (
-    "There is no display to show the fleet on (%s). Use render_mode='rgb_array' for the frames, or "
-    "`thermofleet run SCENARIO` and `thermofleet film RUN` for a film."
-)
-
-
-class Renderer:
-    """Renders states of one environment.
-
-    A copy or pickle draws the same and has a window of its own, not yet open.
-
-    Args:
-        cell: Positions of arms and stations; a grid if not given.
-        title: Of the window.
-    """
-
-    def __init__(self, cell: Cell | None = None, title: str = "thermofleet") -> None:
-        self._cell, self._title = cell, title
-        self._picture: Picture | None = None
-        self._figure: Figure | None = None
-        self._closed = False
-        """Whether the user closed the window, or there is no display."""
-
-    def frame(self, world: World, state: State) -> np.ndarray:
-        """Env 0 as uint8 [height, width, 3].
-
-        Raises:
-            FleetError: matplotlib is not installed.
-        """
-        if self._picture is None:
-            try:
-                pass
-            except ImportError as error:
-                raise FleetError(f"Rendering needs matplotlib: {install('report')}.") from error
-            self._picture = Picture()
-        return self._picture.frame(scene_of(world, state, self._cell))
-
-    def show(self, frame: np.ndarray) -> bool:
-        """Show a frame, uint8 [height, width, 3], in the window; return whether there is a window.
-
-        The first frame opens the window. A window that the user closed stays closed. Without a display a warning is
-        logged once.
-        """
-        import matplotlib.pyplot as plt
-
-        if self._figure is not None and not plt.fignum_exists(self._figure.number):  # pyright: ignore
-            self._closed = True
-        if not self._closed and self._figure is None:
-            self._figure = self._open(frame)
-            self._closed = self._figure is None
-        if self._closed or self._figure is None:
-            return False
-        self._figure.axes[0].images[0].set_data(frame)
-        self._figure.canvas.draw_idle()
-        self._figure.canvas.flush_events()
-        return True
-
-    def close(self) -> None:
-        """Close the window; the next frame opens a new one."""
-        if self._figure is not None:
-            import matplotlib.pyplot as plt
-
-            plt.close(self._figure)
-        self._figure, self._closed = None, False
-
-    def __reduce__(self) -> tuple[type["Renderer"], tuple[Cell | None, str]]:
-        return Renderer, (self._cell, self._title)
-
-    def _open(self, frame: np.ndarray) -> "Figure | None":
-        """A matplotlib window, or None without a display."""
-        import matplotlib
-        import matplotlib.pyplot as plt
-        from matplotlib.backends.registry import BackendFilter, backend_registry
-
-        try:
-            backend = matplotlib.get_backend()  # if none was chosen, the first one with a display, else agg
-            if backend.lower() not in map(str.lower, backend_registry.list_builtin(BackendFilter.INTERACTIVE)):
-                log.warning(NO_WINDOW, f"matplotlib's backend is {backend}")
-                return None
-            height, width = frame.shape[:2]
-            figure = plt.figure(num=self._title, figsize=(width / DPI, height / DPI), dpi=DPI)
-        except ImportError as error:  # a chosen backend whose toolkit or display is missing
-            log.warning(NO_WINDOW, str(error))
-            return None
-        axes = figure.add_axes((0, 0, 1, 1))
-        axes.set_axis_off()
-        axes.imshow(frame)
-        if figure.canvas.manager is not None:
-            figure.canvas.manager.show()
-        return figure
-
-
 Array = np.ndarray
-
-HEAT = ("#aef2a6", "#ecd070", "#e08a00", "#cc2222", "#4d0a2a")
-"""Cool, halfway to the warning limit, warning, error, beyond: green to red and always darker, so that they differ
-without colour vision."""
-COOL_C, BEYOND_K = 20.0, 10.0
-"""The scale begins at `COOL_C` and ends `BEYOND_K` above the error limit."""
-
-
-def heat_marks(warning_c: float, error_c: float) -> Array:
-    """Temperatures of the colours in `HEAT`, °C, rising."""
-    cool_c = min(COOL_C, warning_c - COOL_C)
-    return np.array([cool_c, (cool_c + warning_c) / 2, warning_c, error_c, error_c + BEYOND_K])
-
-
-def heat_colour(temp_c: Array, warning_c: float, error_c: float) -> Array:
-    """RGB from 0 to 1, [..., 3], of motor temperatures [...], °C; constant outside the scale."""
-    marks = heat_marks(warning_c, error_c)
-    rgb = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in HEAT])
-    return np.stack([np.interp(temp_c, marks, rgb[:, i]) for i in range(3)], axis=-1)
-
-
-def heat_scale(warning_c: float, error_c: float) -> dict[str, Any]:
-    """The scale as plain values, for a page."""
-    marks = [round(float(mark), 2) for mark in heat_marks(warning_c, error_c)]
-    return {"colours": list(HEAT), "marks_c": marks, "warning_c": warning_c, "error_c": error_c}
-
 
 INK, FAINT, LINE, PAPER, GROUND, BOX = "#222222", "#666666", "#c9c9c9", "#ffffff", "#f6f6f4", "#e4e0d8"
 WORK, FAULT = "#4477aa", "#cc2222"
