@@ -34,23 +34,29 @@ class Work(Protocol[Result]):
     @property
     def name(self) -> str:
         """What it does, in a sentence about a process that died."""
+        ...
 
     @property
     def group(self) -> object:
         """Work of one group shares what a process keeps, such as a prepared fleet."""
+        ...
 
     @property
     def deaths(self) -> int:
         """How many processes died while they did it."""
+        ...
 
     def __call__(self) -> Result:
         """Do it, in whichever process this is."""
+        ...
 
     def after_death(self) -> "Sequence[Work[Result]]":
         """The same work, perhaps in smaller parts, each with one death more."""
+        ...
 
     def given_up(self) -> Result:
         """Its result after `MOST_DEATHS`."""
+        ...
 
 
 class Worker(Protocol):
@@ -58,15 +64,19 @@ class Worker(Protocol):
 
     def submit(self, work: Work[Result]) -> "Future[Result]":
         """Begin a piece of work."""
+        ...
 
     def died(self, error: BaseException) -> bool:
         """Whether an error of its work says that the process died."""
+        ...
 
     def renew(self) -> bool:
         """Replace a process that died; False if there is no place for another."""
+        ...
 
     def close(self) -> None:
         """End the process."""
+        ...
 
 
 class LocalWorker:
