@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from agents.policy import Policy as Policy
     from fleet.bus.client import BusClient as BusClient
     from scenarios.evaluate.comparison import compare as compare
-    from scenarios.prepare.fleet import make_batch as make_batch
+    from scenarios.prepare.batch import make_batch as make_batch
     from scenarios.prepare.fleet import make_env as make_env
     from scenarios.prepare.fleet import prepare as prepare
     from scenarios.run.log import open_run as open_run
@@ -34,7 +34,7 @@ _HOMES = {
     "compare": "scenarios.evaluate.comparison",
     "identify": "twin.thermal.identify",
     "load": "scenarios.spec.load",
-    "make_batch": "scenarios.prepare.fleet",
+    "make_batch": "scenarios.prepare.batch",
     "make_env": "scenarios.prepare.fleet",
     "open_run": "scenarios.run.log",
     "prepare": "scenarios.prepare.fleet",

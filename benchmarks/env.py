@@ -26,7 +26,8 @@ from benchmarks.harness import median_rate, rss_mb
 from fleet.engine.tables import Tables
 from fleet.env.random_actions import random_legal
 from fleet.env.vector import BatchEnv, Library, keep_pages
-from scenarios.prepare.fleet import Randomisation, env_of, library_of, prepare
+from scenarios.prepare.batch import library_of
+from scenarios.prepare.fleet import Randomisation, env_of, prepare
 from scenarios.spec.load import load
 from scenarios.spec.options import DifficultyName
 

@@ -38,7 +38,8 @@ from fleet.engine.batch import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs, random_legal
 from scenarios.evaluate.rollout import Act, rollout
 from scenarios.json_rows import Rows
-from scenarios.prepare.fleet import Fleet, env_of, library_of, prepare
+from scenarios.prepare.batch import library_of
+from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.log import code_hash
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.load import load

@@ -39,8 +39,9 @@ from scenarios.evaluate.sources import drawn
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.calibrate import PastJobs, past_jobs
-from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
+from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
+from scenarios.prepare.known_cell import let_plan
 from scenarios.show.table import Table
 from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.parse import choose

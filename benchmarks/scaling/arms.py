@@ -51,7 +51,8 @@ def measure(arms: int, most_in_hall: int) -> dict[str, object]:
     from benchmarks.scaling.hall import hall
     from fleet.arm.space import space_table
     from fleet.env.vector import BatchEnv
-    from scenarios.prepare.fleet import Randomisation, library_of, prepare
+    from scenarios.prepare.batch import library_of
+    from scenarios.prepare.fleet import Randomisation, prepare
     from scenarios.spec.load import load
 
     halls = -(-arms // most_in_hall)

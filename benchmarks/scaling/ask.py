@@ -11,7 +11,8 @@ from fleet.env.allocation_v1 import actions_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.observation import Observation
 from scenarios.evaluate.statistics import interval
-from scenarios.prepare.fleet import Randomisation, library_of, prepare
+from scenarios.prepare.batch import library_of
+from scenarios.prepare.fleet import Randomisation, prepare
 from scenarios.run.metrics import common_figures
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.load import load

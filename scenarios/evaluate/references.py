@@ -32,7 +32,8 @@ from scenarios.evaluate.study import suite_of
 from scenarios.evaluate.upper_bound import Relaxation, upper_bound
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import blaming, policy_at, policy_of
-from scenarios.prepare.fleet import Fleet, ShiftFactory, simulator_of_shift
+from scenarios.prepare.fleet import Fleet, ShiftFactory
+from scenarios.prepare.known_cell import simulator_of_shift
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.log import code_hash

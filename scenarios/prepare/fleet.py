@@ -9,32 +9,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.policy import Planner, Policy
 from fleet.arm.plan_cache import rest_torque
 from fleet.arm.space import SpaceTable, space_table
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import Exchange, MemoryExchange
 from fleet.difficulty import Blind
-from fleet.engine.batch import Shift
 from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.state import World
-from fleet.engine.tables import Tables, stack_tables, tables_of
 from fleet.engine.world import Arm, build_world, warm_start
-from fleet.env.lookahead import CellSimulator
-from fleet.env.vector import BatchEnv, Library
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError
 from fleet.files import cache_folder
 from fleet.jit import cache_of_this_code
 from fleet.job import Job, Work
 from fleet.motion import Plan
 from fleet.robot import Robot
-from fleet.seeding import key_of, shift_seeds
+from fleet.seeding import shift_seeds
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms, problems_of
 from scenarios.prepare.randomisation import Randomisation, Variation, randomisation_of
 from scenarios.progress import Count, Progress, check_progress, quiet
-from scenarios.spec.jobs import JobSampler, all_works, rehearsal_works, weights_of, works_of
+from scenarios.spec.jobs import JobSampler, all_works, rehearsal_works, weights_of
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, BusName, DifficultyName, PlantName, RiskName
 from scenarios.spec.parse import choose
@@ -390,131 +385,4 @@ def env_of(
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, **options)
 
 
-def as_known(fleet: Fleet) -> Fleet:
-    """The fleet with the thermal networks and motors that its arms know, and without scores."""
-    variants = tuple(as_known(each) for each in fleet.variants)
-    arms = tuple(
-        replace(arm, thermal=arm.beliefs[0], motors=arm.beliefs[1], model=Blind(), known=arm.beliefs)
-        for arm in fleet.arms
-    )
-    return replace(fleet, arms=arms, variants=variants)
-
-
-def simulator_of(fleet: Fleet, tables: Tables) -> CellSimulator:
-    """The simulator of a cell.
-
-    Args:
-        tables: Of `as_known(fleet)`.
-    """
-    return CellSimulator(tables, len(fleet.arms), fleet.scenario.slots, weights_of(fleet.scenario))
-
-
-def let_plan(policy: Policy, fleet: Fleet, env: "AllocationEnv", seed: int) -> None:
-    """Give a policy that plans a simulator of the shift that an env has just begun, of a prepared fleet and a seed."""
-    if isinstance(policy, Planner):
-        policy.plan_in(env.lookahead(simulator_of_shift(fleet, seed)))
-
-
-def simulator_of_shift(fleet: Fleet, seed: int) -> CellSimulator:
-    """The simulator of a cell for the shift of one seed, in which every job is a kind of its own."""
-    world = ShiftFactory(as_known(fleet))(np.random.SeedSequence(seed)).world
-    return simulator_of(fleet, tables_of(world)[0])
-
-
 Array = np.ndarray
-_SINGLE = frozenset({"plant", "bus", "channel", "render_mode", "mask_in"})
-"""Options of `make_env` that a batch does not have."""
-
-
-def make_batch(
-    scenario: str | Path | Scenario,
-    num_envs: int,
-    seed: int | Sequence[int] | None = None,
-    *,
-    difficulty: DifficultyName = "twin",
-    risk: RiskName = RISK,
-    randomise: Randomisation | None = None,
-    cache: str | Path | None = None,
-    max_cycles: int | None = None,
-    autoreset: bool = True,
-    stagger: bool = False,
-    peers: int | None = None,
-    threads: int = 1,
-    progress: Progress = quiet,
-    **overrides: Any,  # one type per field
-) -> BatchEnv:
-    """The batched environment of a scenario: `num_envs` shifts side by side in one process.
-
-    Args:
-        scenario, difficulty, risk, cache, peers, overrides: As in `make_env`.
-        seed: Env e begins the shift of `seed + e` (or of `seed[e]`): that of `make_env(…).reset(seed=…)`.
-        randomise: Beyond what a scenario draws: ambient temperature, arrivals, fleets.
-        max_cycles, autoreset, stagger, threads: As in `fleet.env.vector.BatchEnv`.
-
-    Raises:
-        ScenarioError: a variant that is no fleet of the same arms and jobs, or an option that only `make_env` has.
-    """
-    if single := sorted(_SINGLE & set(overrides)):
-        raise ScenarioError(f"make_batch() takes no {single[0]}; only make_env() does.")
-    check_progress(progress)
-    chosen = scenario_with(scenario, overrides, make_batch)
-    near = near_of(chosen, peers)
-    fleet = prepare(chosen, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
-    library = replace(library_of(fleet), near=near)
-    options = {"max_cycles": max_cycles, "autoreset": autoreset, "stagger": stagger, "threads": threads}
-    return BatchEnv(library, num_envs, seed=seed, weights=weights_of(chosen), decisions=chosen.decisions, **options)
-
-
-def library_of(fleet: Fleet) -> Library:
-    """A fleet with its variants, and a sampler of their shifts.
-
-    Raises:
-        ScenarioError: the tables of a variant do not fit those of the fleet.
-    """
-    tables = [tables_of(world_of(each, _kinds(each.scenario))[0])[0] for each in fleet.all]
-    try:
-        table = stack_tables(tables)
-    except ValueError as error:
-        raise ScenarioError(str(error)) from error
-    names = tuple(arm.name for arm in fleet.scenario.arms)
-    return Library(names, fleet.scenario.slots, table, _ShiftSampler(fleet))
-
-
-def _kinds(scenario: Scenario) -> list[Job]:
-    """One job of every kind in a scenario's streams: each work, each number of repetitions."""
-    return [
-        Job(name=f"{stream.name}/{p}/{repetitions}", work=work, repetitions=repetitions, release_s=0.0, due_s=0.0,
-            value=stream.value)
-        for stream in scenario.jobs
-        for p, work in enumerate(works_of(scenario, stream))
-        for repetitions in range(stream.repetitions[0], stream.repetitions[1] + 1)
-    ]  # fmt: skip
-
-
-class _ShiftSampler:
-    """Draws the shift of a seed as arrays: the shift that `ShiftFactory` makes of it."""
-
-    def __init__(self, fleet: Fleet) -> None:
-        scenario, self._fleet = fleet.scenario, fleet
-        self._jobs = JobSampler(scenario)
-        self._first_kind = np.cumsum([0, *self._jobs.choices.prod(axis=1)])[:-1]
-        """Where the kinds of each stream begin; see `_kinds`."""
-        self._expires = np.array([stream.due == "hard" for stream in scenario.jobs])
-        self._due_s = np.array([stream.due_s for stream in scenario.jobs], dtype=float)
-
-    def __call__(self, seed: np.random.SeedSequence) -> Shift:
-        varied = self._fleet.variation(seed)
-        jobs_seed, sensor_seed = shift_seeds(seed)
-        sampler, jobs = self._jobs, self._jobs.sample(jobs_seed, varied.arrivals)
-        stream = jobs.stream
-        return Shift(
-            fleet=varied.fleet,
-            ambient_offset_k=varied.ambient_k,
-            kind=self._first_kind[stream] + jobs.payload * sampler.choices[stream, 1] + jobs.extra,
-            release_s=jobs.release_s,
-            due_s=jobs.release_s + self._due_s[stream],
-            repetitions=sampler.fewest[stream] + jobs.extra,
-            expires=self._expires[stream],
-            after=jobs.after,
-            noise_key=key_of(sensor_seed),
-        )

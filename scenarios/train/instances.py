@@ -20,7 +20,8 @@ from fleet.env.vector import BatchEnv, Library, Obs
 from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.evaluate.rollout import rollout
-from scenarios.prepare.fleet import library_of, prepare
+from scenarios.prepare.batch import library_of
+from scenarios.prepare.fleet import prepare
 from scenarios.progress import Count, Progress, quiet
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import RISK, DifficultyName, RiskName

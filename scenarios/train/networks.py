@@ -20,7 +20,8 @@ from fleet.env.vector import BatchEnv, Library
 from fleet.files import atomic_path
 from scenarios.evaluate.rollout import Act, acts_of, known_in, rollout
 from scenarios.policy_loader import policy_at, policy_of
-from scenarios.prepare.fleet import library_of, prepare
+from scenarios.prepare.batch import library_of
+from scenarios.prepare.fleet import prepare
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Count, Progress, quiet
 from scenarios.spec.jobs import weights_of

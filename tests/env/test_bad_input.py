@@ -8,7 +8,8 @@ import pytest
 
 from fleet.env import allocation_v1
 from fleet.errors import ScenarioError
-from scenarios.prepare.fleet import Randomisation, make_batch, make_env
+from scenarios.prepare.batch import make_batch
+from scenarios.prepare.fleet import Randomisation, make_env
 
 NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array([1, 2]), np.array(3.0))
 

@@ -22,7 +22,8 @@ from fleet.heat.thermal import WINDING
 from fleet.offered_plans import PLANS
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.policy_loader import policy_of
-from scenarios.prepare.fleet import Fleet, env_of, library_of, prepare
+from scenarios.prepare.batch import library_of
+from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.shift import RunLog, run
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import RunSpec

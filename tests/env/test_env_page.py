@@ -9,7 +9,8 @@ import pytest
 from docs.tables import fill_tables, main
 from fleet.engine.batch import TERMS
 from fleet.observation import FIELDS, Layout
-from scenarios.prepare.fleet import make_batch, make_env
+from scenarios.prepare.batch import make_batch
+from scenarios.prepare.fleet import make_env
 from scenarios.spec.parse import override
 from scenarios.spec.schema import RewardSpec
 

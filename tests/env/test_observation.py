@@ -26,7 +26,8 @@ from fleet.observation import FIELDS, LONG_S, Layout, Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 from scenarios.cell_layout import cell_of, near_of
-from scenarios.prepare.fleet import make_batch, make_env
+from scenarios.prepare.batch import make_batch
+from scenarios.prepare.fleet import make_env
 from scenarios.spec.load import load
 from tests.profiles import examples
 

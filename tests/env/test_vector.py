@@ -21,7 +21,8 @@ from fleet.engine.world import Space
 from fleet.env.vector import BatchEnv, Library, Shelf
 from fleet.motion import Plan
 from scenarios.evaluate.rollout import outcomes
-from scenarios.prepare.fleet import Fleet, Randomisation, library_of, make_batch, make_env, prepare
+from scenarios.prepare.batch import library_of, make_batch
+from scenarios.prepare.fleet import Fleet, Randomisation, make_env, prepare
 from scenarios.run.shift import run
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.options import RunSpec
