@@ -19,7 +19,7 @@ from fleet.bus.protocol import auction as trade
 from fleet.bus.protocol import keys, messages
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.contract import EXAMPLES, asyncapi, descriptions, schema_document
-from fleet.bus.protocol.keys import ASKED, NAMELESS, TOPICS, Key
+from fleet.bus.protocol.keys import ASKED, CHANNELS, NAMELESS, TOPICS, Key, channel_of
 from fleet.bus.protocol.messages import (
     DifficultyScores,
     Info,
@@ -32,7 +32,6 @@ from fleet.bus.protocol.messages import (
     schema,
 )
 from fleet.bus.protocol.operator import ControlRequest
-from fleet.bus.protocol.registry import CHANNELS, channel_of
 from fleet.errors import BusError, is_name
 from fleet.events import EVENT_KINDS, MEANINGS
 from fleet.live.arm.body import _REPORTED

@@ -24,9 +24,9 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.messages import State, decode, encode
 from fleet.bus.protocol.operator import Cancel, Change, Controlled, ControlRequest, Operation, Pause, Resume, Settle
-from fleet.bus.protocol.registry import HISTORY
 from fleet.bus.router import open_client, other_versions
 from fleet.errors import BusError, JournalFull, Refused
 from fleet.live import journal
