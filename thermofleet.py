@@ -42,7 +42,7 @@ _HOMES = {
     "train_twin": "scenarios.prepare.twins:train_log",
 }
 """Module of each public name, with `:NAME` if it has another name there."""
-__all__ = [*_HOMES]
+__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll] the names are those of the table
 _PACKAGES = ("fleet", "agents", "twin", "scenarios")
 
 

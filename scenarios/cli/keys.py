@@ -5,13 +5,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import get_args
 
-from rich.table import Table
-
 from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, of_arms, read_roster, rights
 from fleet.errors import FleetError, nearest
 from fleet.fields import argument, option
 from scenarios.cli import options
 from scenarios.cli.terminal import out_console, print_json, say
+from scenarios.show.table import Table
 
 DAYS, MAX_DAYS = 365, 3650
 _ROLES = ", ".join(ROLES)

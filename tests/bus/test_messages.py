@@ -19,7 +19,7 @@ from fleet.bus.protocol import auction as trade
 from fleet.bus.protocol import keys, messages
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.contract import EXAMPLES, asyncapi, descriptions, schema_document
-from fleet.bus.protocol.keys import ASKED, CHANNELS, NAMELESS, TOPICS, Key, channel_of
+from fleet.bus.protocol.keys import ASKED, CHANNELS, MESSAGES, NAMELESS, TOPICS, Key, channel_of
 from fleet.bus.protocol.messages import (
     DifficultyScores,
     Info,
@@ -35,7 +35,6 @@ from fleet.bus.protocol.operator import ControlRequest
 from fleet.errors import BusError, is_name
 from fleet.events import EVENT_KINDS, MEANINGS
 from fleet.live.arm.body import _REPORTED
-from scenarios.live.recording import MESSAGES
 
 chunks = st.text(st.characters(exclude_categories=["Cs", "Cc", "Cf"]), min_size=1, max_size=30).filter(is_name)
 wild = st.sampled_from(["*", "**", "@", "@v1", "a b", "$*", "?", "#", "%", "%2F", "ä", "机", "a.b", "a.."])
