@@ -13,7 +13,7 @@ import numpy as np
 from scenarios.evaluate.rollout import KINDS as FIGURE_KINDS
 from scenarios.evaluate.statistics import Figure, Interval, figures_of, interval, paired, paired_counts
 from scenarios.json_rows import Row, Rows
-from scenarios.show.table import markdown_table as table
+from scenarios.table import markdown_table as table
 
 
 def difference(mean: float, low: float | None, high: float | None, digits: int = 1) -> str:

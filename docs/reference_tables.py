@@ -23,8 +23,8 @@ from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 from scenarios.cli.main import COMMANDS, load_command
-from scenarios.show.table import markdown_table as table
 from scenarios.spec.schema import RewardSpec
+from scenarios.table import markdown_table as table
 
 
 def _key_table() -> str:

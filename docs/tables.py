@@ -60,10 +60,10 @@ from scenarios.evaluate.scores import Normalised, Scores, normalised, ranked, sc
 from scenarios.evaluate.statistics import Interval, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
-from scenarios.show.table import markdown_table as table
 from scenarios.spec.schema import SPLITS
 from scenarios.suite.instances import CELLS, JUDGED
 from scenarios.suite.splits import instance, manifest
+from scenarios.table import markdown_table as table
 
 Array = np.ndarray
 Tables = Mapping[str, Callable[[], str]]

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fleet", "twin", "agents", "scenarios")
 SOURCES = sorted(path.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-LAWS = ("motor", "thermal", "motion")
+LAWS = ("heat.motor", "heat.thermal", "motion")
 NOUNS_OF_LAWS = ("robot", "job", "errors", "jit")
 """What laws need besides: the number of joints, the kinds of work, the errors, and compilation."""
 
@@ -34,7 +34,6 @@ def name_of(path: Path) -> str:
 MODULES = {name_of(path) for path in SOURCES}
 NOUN_FOLDERS = (Path("fleet"), Path("fleet/heat"))
 NOUNS = {name_of(path) for path in SOURCES if path.parent in NOUN_FOLDERS and path.name != "__init__.py"}
-"""Most files in a folder, without `__init__.py`."""
 LONGEST_FILE = 900
 """Lines."""
 
@@ -75,15 +74,14 @@ def below(name: str, *parents: str) -> bool:
     return any(name == parent or name.startswith(f"{parent}.") for parent in parents)
 
 
-IN_MEMORY = tuple(f"fleet.bus.exchange.{name}" for name in ("protocol", "memory"))
+IN_MEMORY = ("fleet.bus.exchange.memory",)
 BELOW = {
     "fleet.heat": (),
-    "fleet.planning": ("fleet.physics",),
-    "fleet.physics": ("fleet.planning", "fleet.engine"),
+    "fleet.arm": ("fleet.engine",),
     "fleet.engine": IN_MEMORY,
     "fleet.bus": (),
     "fleet.env": ("fleet.engine", *IN_MEMORY),
-    "fleet.live": ("fleet.bus", "fleet.engine", "fleet.planning", "fleet.physics"),
+    "fleet.live": ("fleet.bus", "fleet.engine", "fleet.arm"),
     "fleet.ros2": ("fleet.bus", "fleet.live"),
 }
 """Which folders of fleet a folder of fleet may import, besides itself and the nouns."""
@@ -108,7 +106,7 @@ def allowed(importer: str, imported: str) -> bool:
 def library_allowed(importer: str, library: str) -> bool:
     """Whether a module of ours may import a library that is kept in one place."""
     if library in SIM_LIBRARIES:
-        return below(importer, "fleet.planning", "fleet.physics")
+        return below(importer, "fleet.arm")
     if library == "zenoh":
         # ros2: other keys, bytes and attachments than ours, which `BusClient` knows nothing of.
         return importer in ("fleet.bus.exchange.zenoh", "fleet.bus.router", "fleet.bus.client", "fleet.ros2.node")
@@ -252,6 +250,9 @@ def of_benchmarks() -> list[tuple[str, str]]:
 
 
 def folder_of(module: str) -> str:
+    """Folder of a module; laws of heat and plain values, which use one another, are one."""
+    if module in NOUNS:
+        return "fleet"
     return module if module in PACKAGE_FILES else module.rpartition(".")[0]
 
 

@@ -16,9 +16,9 @@ from scipy.optimize import minimize
 
 from fleet.difficulty import KNOWN, Forecast
 from fleet.motion import CHANNELS, Plan
-from twin.json_file import check_version, read_card, write_card
 from twin.thermal.thermal_twin import LEAST_JOBS, NotEnoughExperience
 from twin.vae.config import TwinConfig
+from twin.vae.json_file import check_version, read_card, write_card
 from twin.vae.measures import Features
 from twin.vae.window import STD_FLOOR, check_jobs
 

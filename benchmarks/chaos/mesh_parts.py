@@ -23,11 +23,11 @@ from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Timing
 from fleet.live.journal import Journal
-from scenarios.cli.signals import Stop, until_stopped
 from scenarios.live.arm import PreparedArm, make_node, simulated_arm
 from scenarios.live.auctioneer import CentralAllocation
 from scenarios.policy_loader import policy_at
 from scenarios.progress import quiet
+from scenarios.signals import Stop, until_stopped
 from scenarios.spec.load import load
 
 SCENARIO, FLEET = "quickstart", "mesh"

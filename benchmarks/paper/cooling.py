@@ -36,10 +36,10 @@ from scenarios.evaluate.rollout import Outcome, outcomes
 from scenarios.json_rows import Row
 from scenarios.motion.hold import hold
 from scenarios.prepare.fleet import prepare
-from scenarios.show.table import Table
 from scenarios.spec.options import DifficultyName
 from scenarios.spec.parse import choose
 from scenarios.spec.schema import Scenario
+from scenarios.table import Table
 
 Array = np.ndarray
 

@@ -31,7 +31,7 @@ from scenarios.json_rows import Row
 from scenarios.prepare.arms import ArmHardware
 from scenarios.prepare.identify import own_logs
 from scenarios.prepare.twins import cold_peaks, records
-from scenarios.show.table import Table
+from scenarios.table import Table
 from twin.thermal.identify import HeatModel, identify
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Measures

@@ -41,7 +41,7 @@ from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.motion.generate import MOST_DRAWS, GenerationError, Rejected, Verification, planned
 from scenarios.prepare.twins import cold_peaks, records
-from scenarios.show.table import Table
+from scenarios.table import Table
 from twin.baselines import untrained_config
 from twin.vae.config import TwinConfig
 from twin.vae.generate import vary

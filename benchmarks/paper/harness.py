@@ -25,9 +25,9 @@ from scenarios.evaluate.statistics import Interval, interval
 from scenarios.json_rows import Row, Rows
 from scenarios.processes import worker_processes
 from scenarios.progress import brief
-from scenarios.show.table import Table
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
+from scenarios.table import Table
 
 WIDEST = 240
 """Characters of a printed line."""

@@ -16,7 +16,7 @@ from benchmarks.paper.subjects import CARRIER, LABELS, Jobs, Study, cached_twin,
 from fleet.motion import CHANNELS, Plan
 from scenarios.json_rows import Row
 from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
-from scenarios.show.table import Table
+from scenarios.table import Table
 from twin.baselines import torque_over_known, untrained_config
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.config import TwinConfig

@@ -45,8 +45,8 @@ from scenarios.evaluate.statistics import Interval
 from scenarios.json_rows import Row
 from scenarios.motion.generate import Rejected, planned
 from scenarios.prepare.twins import cold_peaks
-from scenarios.show.table import Table
 from scenarios.spec.schema import Scenario
+from scenarios.table import Table
 from twin.vae.config import TwinConfig
 from twin.vae.generate import Variation, vary
 from twin.vae.measures import TAU, Calibration, Features, largest_p_value, p_value

@@ -33,7 +33,7 @@ from fleet.robot import JOINTS
 from scenarios.evaluate.statistics import Interval, percentile_interval
 from scenarios.json_rows import Row
 from scenarios.prepare.twins import LOG_INPUT, train_or_load
-from scenarios.show.table import Table
+from scenarios.table import Table
 from twin.logs.reader import read_folder
 from twin.logs.recording import READINGS, HeatLog, Recording, Stretch, cool_stretches, heat_logs, stretches
 from twin.thermal.identify import HeatModel, Identified, Noise, ParameterVector, Problem, identify

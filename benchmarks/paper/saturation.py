@@ -42,10 +42,10 @@ from scenarios.prepare.calibrate import PastJobs, past_jobs
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
 from scenarios.prepare.known_cell import let_plan
-from scenarios.show.table import Table
 from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.parse import choose
 from scenarios.spec.schema import Scenario
+from scenarios.table import Table
 from twin.baselines import EVIDENCE, fit_regression
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.measures import Features

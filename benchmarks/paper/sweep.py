@@ -51,7 +51,7 @@ from fleet.motion import RATE_HZ, Plan
 from scenarios.evaluate.statistics import Interval
 from scenarios.json_rows import Row
 from scenarios.prepare.twins import records
-from scenarios.show.table import Table
+from scenarios.table import Table
 from twin.vae.config import RECIPE, TwinConfig
 from twin.vae.model import one_thread
 from twin.vae.train import train

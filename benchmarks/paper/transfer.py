@@ -51,7 +51,7 @@ from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.prepare.identify import own_logs
 from scenarios.prepare.twins import records
-from scenarios.show.table import Table
+from scenarios.table import Table
 from twin.logs.recording import Recording, cool_stretches, stretches
 from twin.vae.config import TwinConfig, hash_records, seed_text
 from twin.vae.model import one_thread

@@ -1,8 +1,6 @@
-"""The beginning of a shift in a row of the engine.
+"""The engine: any number of shifts side by side in arrays, stepped by the same loops for one env or a thousand.
 
-Reward terms: named, weighted in the scenario, summed in one place, reported apart.
-
-The engine: any number of shifts side by side in arrays, stepped by the same loops for one env or a thousand.
+Rows are reset here, and reward terms, named and weighted in the scenario, are summed here and reported apart.
 """
 
 from collections.abc import Sequence
@@ -244,7 +242,7 @@ class Engine:
         self._step, self._reset = step_rows.chosen(compiled), reset_rows.chosen(compiled)
         self._bundle: Any = self._simulation  # numba's where the loops are compiled
         if self._step is not step_rows.interpreted:
-            from fleet.engine.tables import bundle_of
+            from fleet.engine.bundle import bundle_of
 
             self._bundle = bundle_of(self._simulation)
         self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None

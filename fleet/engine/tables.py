@@ -1,29 +1,21 @@
-"""Events of a step: recorded by the kernels as numbers, turned into `Event`s for reports.
-
-The arrays that the engine's kernels read and write, by name.
+"""The arrays that the engine's kernels read and write, by name, and the events that they record.
 
 Axis `fleet`: one fleet as it is built; all envs of one fleet have the same arms. Axis `kind`: one kind of job, its work
 and its number of repetitions. Last axes `lane` and `wide` are joints and nodes padded with zeros to what a processor
-takes at once. Every array is contiguous and owned, so one compilation serves all scenarios.
-
-All arrays of a simulation as one argument of a compiled kernel.
-
-Unpacking 80 arrays takes longer than a step of one environment; a bundle is unpacked once. Its arrays stay shared with
-the caller. Loads numba.
+takes at once. Every array is contiguous and owned, so one compilation serves all scenarios. Kernels record events as
+numbers, which are turned into `Event`s for reports.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numba import types
-from numba.experimental import structref
 
 from fleet.difficulty import extend_curve, forecast_arrays
 from fleet.engine.state import State, World
 from fleet.events import Event, EventKind
-from fleet.jit import compile_cached, jit
+from fleet.jit import jit
 from fleet.observation import Layout, Offsets
 from fleet.robot import JOINTS
 
@@ -510,35 +502,3 @@ def _same_words(fleets: Sequence[Array]) -> Array:
     """Bits of several fleets, [fleet or plan, ..., word], one after the other."""
     words = max(each.shape[-1] for each in fleets)
     return np.concatenate([pad(each, size=words) for each in fleets])
-
-
-# Numba ships no type stubs for its experimental part.
-# pyright: reportArgumentType=false
-
-
-@structref.register
-class BundleType(types.StructRef):
-    """The numba type of a bundle."""
-
-    def preprocess_fields(self, fields: Any) -> Any:  # numba's types
-        """Take literal types for the types of their values."""
-        return tuple((name, types.unliteral(kind)) for name, kind in fields)
-
-
-class Bundle(structref.StructRefProxy):
-    """A `Simulation` that compiled kernels take as one argument."""
-
-
-structref.define_proxy(Bundle, BundleType, list(Simulation._fields))
-
-
-def _make(tables, jobs, state, offers, events, trace, drive, form):  # pyright: ignore
-    return Bundle(tables, jobs, state, offers, events, trace, drive, form)
-
-
-_compiled_make = compile_cached(_make)
-
-
-def bundle_of(simulation: Simulation) -> Any:  # an opaque object of numba's
-    """The arrays of a simulation as one argument for compiled kernels."""
-    return _compiled_make(*simulation)

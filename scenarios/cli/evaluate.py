@@ -17,10 +17,10 @@ from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, argument, option
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.terminal import KEPT, echo, out_console, print_json, progress_bar, say
 from scenarios.result_folder import disk_errors
-from scenarios.show.table import Table
 from scenarios.spec.options import Budget, RunSpec, StudySpec
+from scenarios.table import Table
+from scenarios.terminal import KEPT, echo, out_console, print_json, progress_bar, say
 
 if TYPE_CHECKING:
     from scenarios.evaluate.leaderboard import Submission

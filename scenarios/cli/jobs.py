@@ -8,8 +8,8 @@ from fleet.errors import FleetError
 from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
-from scenarios.cli.terminal import out_console, print_json
-from scenarios.show.table import Table
+from scenarios.table import Table
+from scenarios.terminal import out_console, print_json
 
 if TYPE_CHECKING:  # slow to import
     from fleet.bus.protocol.operator import Action

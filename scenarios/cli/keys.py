@@ -9,8 +9,8 @@ from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, 
 from fleet.errors import FleetError, nearest
 from fleet.fields import argument, option
 from scenarios.cli import options
-from scenarios.cli.terminal import out_console, print_json, say
-from scenarios.show.table import Table
+from scenarios.table import Table
+from scenarios.terminal import out_console, print_json, say
 
 DAYS, MAX_DAYS = 365, 3650
 _ROLES = ", ".join(ROLES)

@@ -11,8 +11,8 @@ from fleet.errors import FleetError
 from fleet.fields import MAX_SPEED, MIN_SPEED, argument, option
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.terminal import echo, out_console, say
 from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
+from scenarios.terminal import echo, out_console, say
 
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
@@ -121,7 +121,7 @@ def router_command(
     """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; it prints its endpoint once it listens."""
     from fleet.bus.router import Limits, Router
     from fleet.bus.security.tls import Tls
-    from scenarios.cli.signals import until_stopped
+    from scenarios.signals import until_stopped
 
     if scenario is not None:
         from scenarios.live.fleet_processes import check_roster
@@ -184,8 +184,8 @@ def record_command(
     """Record what arms and auctioneer publish: a journal, then Parquet parts; readable at once."""
     from fleet.bus.client import BusClient
     from fleet.live.policy_client import CONNECT_S
-    from scenarios.cli.signals import until_stopped
     from scenarios.live.recorder import BACKLOG, record
+    from scenarios.signals import until_stopped
 
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
         echo(f"ready record {endpoint}")
@@ -208,8 +208,8 @@ def replay_command(
 ) -> None:
     """Publish a run or a recording on the bus, in real time or at --speed."""
     from fleet.bus.client import BusClient
-    from scenarios.cli.signals import until_stopped
     from scenarios.live.replayer import Replay
+    from scenarios.signals import until_stopped
 
     replay = Replay.of(path)
     if not len(replay):

@@ -16,9 +16,9 @@ from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING, Cooling
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.terminal import out_console, print_json, progress_bar, say
-from scenarios.show.table import Table
 from scenarios.spec.options import Shot
+from scenarios.table import Table
+from scenarios.terminal import out_console, print_json, progress_bar, say
 
 SMALLEST, LARGEST = 160, 3840
 """Width and height of a film, px."""
@@ -359,7 +359,7 @@ def trace_command(
     as_json: bool = options.JSON,
 ) -> None:
     """Follow an event to its job, plan, offers, twin, training data, configuration and code."""
-    from scenarios.show.trace import thread_of, thread_table
+    from scenarios.live.trace import thread_of, thread_table
 
     found = thread_of(folder or last_folder(Path("runs")), event)
     if as_json:

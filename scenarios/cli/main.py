@@ -18,8 +18,8 @@ from typer.core import TyperCommand, TyperGroup
 from fleet.errors import FleetError, JournalFull, NoRouter, printable, visible
 from fleet.live.supervisor import SUPERVISED, WAITS
 from scenarios.cli.from_fields import with_fields
-from scenarios.cli.terminal import INTERRUPTED, Interrupted, echo, err_console, say
 from scenarios.extras import missing_extra
+from scenarios.terminal import INTERRUPTED, Interrupted, echo, err_console, say
 
 USAGE = 2
 """Exit code of an error that the user can correct."""

@@ -15,9 +15,9 @@ from fleet.errors import FleetError
 from fleet.fields import option
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, print_json, progress_bar, say
-from scenarios.show.table import Table
 from scenarios.spec.options import RunSpec
+from scenarios.table import Table
+from scenarios.terminal import INTERRUPTED, Interrupted, out_console, print_json, progress_bar, say
 
 if TYPE_CHECKING:  # slow to import
     from fleet.events import Event

@@ -16,9 +16,9 @@ from fleet.job import BOUNDS
 from fleet.robot import POSTURES
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.cli.terminal import echo, out_console, print_json, print_wide, progress_bar, say
 from scenarios.result_folder import check_file, check_free, check_overwrite, new_file, new_folder
-from scenarios.show.table import Table
+from scenarios.table import Table
+from scenarios.terminal import echo, out_console, print_json, print_wide, progress_bar, say
 from twin.vae.config import TwinConfig
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ from scenarios.evaluate.study import Row, Study, suite_label
 from scenarios.policy_loader import has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
-from scenarios.show.table import Table
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, DifficultyName, RiskName
 from scenarios.spec.schema import Scenario
+from scenarios.table import Table
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.evaluate.references import Reference

@@ -25,11 +25,11 @@ from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
 from scenarios.result_folder import disk_errors
-from scenarios.show.table import markdown_table as table
 from scenarios.spec.options import DECISION_LIMIT_S, RiskName
 from scenarios.spec.schema import SplitName
 from scenarios.suite.instances import JUDGED
 from scenarios.suite.splits import ManifestLine, cell_of_instance, instance, line_of, manifest
+from scenarios.table import markdown_table as table
 
 FORMAT = 1
 DIGITS = 10

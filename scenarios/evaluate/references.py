@@ -324,7 +324,7 @@ def cells(each: Reference) -> tuple[str, ...]:
 
 def reference_table(references: Sequence[Reference]) -> str:
     """The table for a page, as Markdown: every instance, and the mean of each scenario."""
-    from scenarios.show.table import markdown_table as table
+    from scenarios.table import markdown_table as table
 
     lines: list[tuple[str, ...]] = []
     for scenario in dict.fromkeys(each.instance.rpartition("/")[0] for each in references):

@@ -30,15 +30,15 @@ from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal, own_records, put_aside
 from fleet.motion import Plan
-from scenarios.cli.signals import Stop, until_stopped
-from scenarios.cli.terminal import echo, progress_bar
 from scenarios.live.auctioneer import live_fleet, own_jobs, summary
 from scenarios.live.cell import cell_message, cell_space
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import arm_policy_of, scope_of
 from scenarios.progress import Progress
+from scenarios.signals import Stop, until_stopped
 from scenarios.spec.options import LiveModel, LiveSpec, RiskName
 from scenarios.spec.schema import Scenario
+from scenarios.terminal import echo, progress_bar
 
 log = logging.getLogger(__name__)
 

@@ -20,14 +20,14 @@ from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.rounds import Allocate, Assignment, Bidding, Timing, resolve_claims
 from fleet.live.journal import Journal, put_aside
-from scenarios.cli.signals import Stop, until_stopped
-from scenarios.cli.terminal import echo, progress_bar
 from scenarios.live.cell import cell_message, cell_space
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
+from scenarios.signals import Stop, until_stopped
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.options import LiveSpec
 from scenarios.spec.schema import Scenario
+from scenarios.terminal import echo, progress_bar
 
 _LOG = logging.getLogger(__name__)
 

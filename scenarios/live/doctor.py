@@ -15,8 +15,8 @@ from fleet.bus.security.tls import identified, why_not
 from fleet.errors import BusError
 from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
-from scenarios.cli.terminal import echo, out_console, say
 from scenarios.show.watch import arm_table, format_time, jobs_line, space_line
+from scenarios.terminal import echo, out_console, say
 
 PROBE_EVERY_S, REPLY_S = 0.3, 1.0
 _COLORS = {"fault": "red", "warning": "yellow"}

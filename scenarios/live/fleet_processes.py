@@ -12,13 +12,13 @@ from fleet.errors import FleetError, nearest
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.cli.from_fields import flags_of
 from scenarios.cli.options import split_names
-from scenarios.cli.signals import until_stopped
-from scenarios.cli.terminal import err_console, out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import plans, scope_of
+from scenarios.signals import until_stopped
 from scenarios.spec.load import load
 from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
+from scenarios.terminal import err_console, out_console, progress_bar, say
 
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""

@@ -58,9 +58,9 @@ from fleet.errors import NAME_RULE, BusError, FleetError, Refused, is_name, near
 from fleet.live.monitor.async_bridge import AsyncBridge, Entry, EventFeed, ReaderBuffer
 from fleet.live.monitor.snapshot import MAX_JOBS
 from scenarios.cli.options import the_fleet
-from scenarios.cli.signals import until_stopped
-from scenarios.cli.terminal import Interrupted, echo
+from scenarios.signals import until_stopped
 from scenarios.spec.schema import Scenario
+from scenarios.terminal import Interrupted, echo
 
 _LOG = logging.getLogger(__name__)
 
@@ -136,7 +136,7 @@ class LivePage:
     def contents(self) -> Mapping[str, bytes]:
         """The page and its files by name, compressed."""
         from scenarios.show.page import three_js
-        from scenarios.show.table import static
+        from scenarios.table import static
 
         texts = {name: static(name) for name in (PAGE, *FILES)}
         texts["three.js"] = three_js()

@@ -41,9 +41,9 @@ from fleet.job import BOUNDS, KINDS
 from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import the_fleet
-from scenarios.cli.signals import Stop, until_stopped
-from scenarios.cli.terminal import echo, out_console, say
-from scenarios.show.table import Column, Table
+from scenarios.signals import Stop, until_stopped
+from scenarios.table import Column, Table
+from scenarios.terminal import echo, out_console, say
 
 REPLY_S, ATTEMPTS = 5.0, 3
 """Real seconds to wait for a reply, and number of attempts: the same request again is carried out once."""

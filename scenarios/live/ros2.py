@@ -9,9 +9,9 @@ from fleet.bus.client import BusClient
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.cli.options import split_names, the_fleet
-from scenarios.cli.signals import Stop, until_stopped
-from scenarios.cli.terminal import echo
 from scenarios.extras import require_extra
+from scenarios.signals import Stop, until_stopped
+from scenarios.terminal import echo
 
 if TYPE_CHECKING:
     from fleet.ros2.node import Node

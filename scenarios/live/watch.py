@@ -18,8 +18,6 @@ from fleet.bus.router import fleets_at
 from fleet.errors import NoRouter
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot, describe_status
 from scenarios.cli.options import the_fleet
-from scenarios.cli.signals import Stop, until_stopped
-from scenarios.cli.terminal import echo, err_console, out_console, say
 from scenarios.show.watch import (
     JobBars,
     arm_line,
@@ -30,6 +28,8 @@ from scenarios.show.watch import (
     space_line,
     time_line,
 )
+from scenarios.signals import Stop, until_stopped
+from scenarios.terminal import echo, err_console, out_console, say
 
 WAIT_S, GONE_S = 0.5, 3.0
 """Real seconds: between two looks for a fleet; without any participant, after which a settled shift has ended."""

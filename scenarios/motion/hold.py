@@ -28,7 +28,7 @@ from fleet.job import BOUNDS
 from fleet.motion import static_drive
 from fleet.robot import GEN3, JOINTS, RATING, Cooling, Robot, ThermalLimits
 from scenarios.motion.recover import parse_posture
-from scenarios.show.table import Table
+from scenarios.table import Table
 
 Array = np.ndarray
 PerJoint = tuple[float, ...]

@@ -16,8 +16,8 @@ from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, Scores, ranked,
 from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, plain
-from scenarios.show.table import Column, Table
 from scenarios.show.words import value_text
+from scenarios.table import Column, Table
 
 Array = np.ndarray
 Range = tuple[float, float, float]

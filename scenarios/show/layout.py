@@ -20,9 +20,9 @@ from scenarios.prepare.arms import PlannedArm, plan_arms, problems_of
 from scenarios.prepare.fleet import ShiftFactory, prepare, space_of
 from scenarios.prepare.load_factor import load_factor
 from scenarios.progress import Progress, quiet
-from scenarios.show.table import Table
 from scenarios.spec.jobs import all_works, fault_price, works_of
 from scenarios.spec.schema import ArmSpec, JobStream, Scenario
+from scenarios.table import Table
 
 if TYPE_CHECKING:
     from fleet.env.render.scene import Scene

@@ -20,7 +20,7 @@ from markupsafe import Markup
 
 from fleet.errors import FleetError, install, visible
 from fleet.telemetry import Telemetry
-from scenarios.show.table import Table, render, static
+from scenarios.table import Table, render, static
 
 Array = np.ndarray
 Figure = Mapping[str, Any]

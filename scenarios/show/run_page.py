@@ -16,9 +16,9 @@ from fleet.events import Event
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import Assignment, Outage, Schedule
 from scenarios.show.page import Chart, Page, Replay, packed
-from scenarios.show.table import Moment, Table, render
 from scenarios.show.timeline import figure, time_unit
 from scenarios.show.words import CANNOT, by_joint, clock, duration, kind_text, scores_text, value_text
+from scenarios.table import Moment, Table, render
 
 MOST_FAULTS = 2
 """Faults with a sentence of their own."""

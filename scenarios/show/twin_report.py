@@ -36,9 +36,9 @@ from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.show.page import AXIS, LAYOUT, Chart, Page, Section
-from scenarios.show.table import Table
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario
+from scenarios.table import Table
 from twin.baselines import untrained_config
 from twin.logs.recording import Recording, cool_stretches, stretches
 from twin.vae.config import TwinConfig

@@ -9,9 +9,9 @@ from fleet.files import cache_folder
 from fleet.motion import Plan
 from scenarios.prepare.arms import plan_arms
 from scenarios.progress import Progress, quiet
-from scenarios.show.table import Column, Table
 from scenarios.spec.jobs import all_works
 from scenarios.spec.schema import Scenario
+from scenarios.table import Column, Table
 from twin.logs.recording import Recording, Stretch
 from twin.vae.measures import Features, Measures
 from twin.vae.twin import Twin

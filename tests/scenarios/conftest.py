@@ -19,10 +19,10 @@ from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.robot import Robot
 from scenarios.cli.main import main
-from scenarios.cli.terminal import progress_bar
 from scenarios.motion.generate import bare_arm
 from scenarios.prepare.arms import peaks
 from scenarios.prepare.twins import records
+from scenarios.terminal import progress_bar
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 

@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from joblib import delayed
 
 from fleet.errors import FleetError
-from scenarios.cli.signals import until_stopped
-from scenarios.cli.terminal import Interrupted, SafeConsole, echo, progress_bar
 from scenarios.processes import worker_processes
 from scenarios.progress import HINTS, Count, StageClock
 from scenarios.result_folder import check_free, new_folder
 from scenarios.run.log import FILES, RUN
-from scenarios.show.table import Table
+from scenarios.signals import until_stopped
+from scenarios.table import Table
+from scenarios.terminal import Interrupted, SafeConsole, echo, progress_bar
 from tests.waiting import PATIENCE_S, wait_until
 
 

@@ -18,17 +18,17 @@ from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.cli.look import last_folder
 from scenarios.cli.main import main
-from scenarios.cli.terminal import out_console
 from scenarios.live.recorder import Recorder
+from scenarios.live.trace import NOT_RECORDED, rows_of, thread_of, thread_table
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.log import FILES, code_hash, event_table, telemetry_table
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.shift import RunLog, run
 from scenarios.show.run_page import verdict
-from scenarios.show.trace import NOT_RECORDED, rows_of, thread_of, thread_table
 from scenarios.spec.load import load
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import scenario_hash
+from scenarios.terminal import out_console
 
 
 @pytest.fixture(scope="module")

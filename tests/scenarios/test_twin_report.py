@@ -15,8 +15,8 @@ from fleet.robot import Robot
 from scenarios.prepare.arms import hardware_of
 from scenarios.prepare.identify import own_logs
 from scenarios.show import twin_report as report
-from scenarios.show.table import Table
 from scenarios.spec.load import load
+from scenarios.table import Table
 from twin.logs.recording import Recording
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU

@@ -16,6 +16,7 @@ from scenarios.evaluate.statistics import (
     EQUAL,
     FARTHEST,
     SKEW_BIAS,
+    FigureKind,
     aggregates,
     by_group,
     count_interval,
@@ -81,13 +82,11 @@ def test_bad_values_and_scores_are_refused() -> None:
             interval(values)
     with pytest.raises(ValueError, match="equal shapes"):
         paired([1.0, 2.0], [1.0])
-    for bad, axis in (([[1.0, np.nan]], "instances"), ([1.0], "instances")):
+    for bad in ([[1.0, np.nan]], [1.0]):
         with pytest.raises(ValueError, match="Scores must be"):
-            aggregates({"x": bad}, axis)
-    with pytest.raises(ValueError, match="'within' needs two runs"):
-        aggregates({"x": [[1.0, 2.0]]}, "within")
-    with pytest.raises(ValueError, match="'both' needs two instances"):
-        aggregates({"x": [[1.0], [2.0]]}, "both")
+            aggregates({"x": bad})
+    with pytest.raises(ValueError, match="Scores need two instances"):
+        aggregates({"x": [[1.0], [2.0]]})
     with pytest.raises(ValueError, match="same instances"):
         improvement([[1.0, 2.0]], [[1.0]])
 
@@ -256,7 +255,7 @@ def paired_values() -> dict[str, dict[str, np.ndarray]]:
 
 
 def test_differences_are_paired_and_corrected_over_the_table(paired_values):
-    found = figures_of(paired_values, "base", counts=("faults",))
+    found = figures_of(paired_values, "base", {"faults": FigureKind("faults", is_count=True)})
     better, luck = found["better"]["value"], found["luck"]["value"]
     expected = paired(paired_values["better"]["value"], paired_values["base"]["value"])
     assert (better.difference, better.difference_low) == (expected.mean, expected.low)
@@ -271,7 +270,7 @@ def test_differences_are_paired_and_corrected_over_the_table(paired_values):
 
 
 def test_a_policy_differs_from_itself_by_nothing_and_two_without_faults_by_a_bound(paired_values):
-    found = figures_of(paired_values, "base", counts=("faults",))
+    found = figures_of(paired_values, "base", {"faults": FigureKind("faults", is_count=True)})
     base, other = found["base"]["faults"], found["better"]["faults"]
     assert (base.difference_low, base.difference_high) == (0.0, 0.0)
     assert (other.low, other.high) == (0.0, pytest.approx(0.369, abs=0.001))
@@ -279,7 +278,7 @@ def test_a_policy_differs_from_itself_by_nothing_and_two_without_faults_by_a_bou
 
 
 def test_cells_without_variation_say_so(paired_values):
-    found = figures_of(paired_values, "base", counts=("faults",))
+    found = figures_of(paired_values, "base", {"faults": FigureKind("faults", is_count=True)})
     shown = figure_rows({policy: each["value"] for policy, each in found.items()}, "base", str)
     rows = {name: cells for name, *cells in shown}
     assert rows["same"][-3:] == ["+2.0", EQUAL, ""]

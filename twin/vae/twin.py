@@ -21,10 +21,10 @@ from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.motion import CHANNELS, Plan
 from fleet.robot import JOINTS
-from twin.json_file import check_version, read_card, write_card
 from twin.vae import inference
 from twin.vae.config import TwinConfig
 from twin.vae.inference import shapes
+from twin.vae.json_file import check_version, read_card, write_card
 from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, latent_moments, measures_of, moments
 from twin.vae.window import PHASES, Scaler, check_jobs, cut_phases
 

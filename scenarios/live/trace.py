@@ -14,8 +14,8 @@ from scenarios.live.recording import CARD, read_card, read_parts
 from scenarios.live.recording_report import arm_events, offers_of
 from scenarios.run.log import RunLog, open_run
 from scenarios.run.records import JobRecord, Offer
-from scenarios.show.table import Table
 from scenarios.show.words import CANNOT, by_joint, clock, value_text
+from scenarios.table import Table
 
 CONFIGURATION = ("scenario_hash", "policy", "seed", "plant", "bus", "difficulty", "risk", "environment", "channel")
 NOT_RECORDED = "not recorded"

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from fleet.live.supervisor import exit_with_supervisor
-from scenarios.cli.terminal import Interrupted
+from scenarios.terminal import Interrupted
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
