@@ -235,7 +235,7 @@ def _folder(cache: str | Path | None) -> Path:
 
 
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
-    from scenarios.prepare.arms import Oracle
+    from scenarios.prepare.oracle import Oracle
 
     cell_c = float(np.mean(scenario.ambient.at(np.linspace(0, scenario.horizon_s, 100))))
     ambient_c = cell_c + arm.robot.ambient_offset_k

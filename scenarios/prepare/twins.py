@@ -26,7 +26,8 @@ from fleet.files import cache_folder
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import NODES, ThermalModel
 from fleet.motion import RATE_HZ, Plan
-from scenarios.prepare.arms import ArmHardware, PlannedArm, peaks, plan_arms
+from scenarios.prepare.arms import ArmHardware, PlannedArm, plan_arms
+from scenarios.prepare.oracle import peaks
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind

@@ -24,7 +24,7 @@ from fleet.job import Place, Work
 from fleet.motion import RATE_HZ
 from fleet.robot import GEN3, JOINTS, POSTURES, RATING, Mount, Robot, angles_deg, rotation
 from scenarios.motion.hold import hold
-from scenarios.prepare.arms import peaks
+from scenarios.prepare.oracle import peaks
 
 NEAR = np.array([0.3, 0.1, np.pi, -2.1, 0.1, 0.9, 1.5])
 FAR = np.array([-0.3, 1.0, np.pi, -0.7, 0.0, 0.9, 1.5])

@@ -20,7 +20,7 @@ from fleet.heat.thermal import NODES, ThermalSpread, gen3_network, spread_motors
 from fleet.robot import Robot
 from scenarios.cli.main import main
 from scenarios.motion.generate import bare_arm
-from scenarios.prepare.arms import peaks
+from scenarios.prepare.oracle import peaks
 from scenarios.prepare.twins import records
 from scenarios.terminal import progress_bar
 from twin.vae.config import TwinConfig

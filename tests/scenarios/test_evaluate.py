@@ -26,8 +26,8 @@ from scenarios.evaluate.scores import normalised, references_of, scores_of
 from scenarios.evaluate.statistics import interval
 from scenarios.evaluate.study import Case, Key, Row
 from scenarios.policy_loader import PolicyFailed, policy_of
-from scenarios.prepare.arms import Oracle, peaks
 from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.prepare.oracle import Oracle, peaks
 from scenarios.run.shift import run
 from scenarios.spec.jobs import JobSampler, downtime_s, fault_price, weights_of
 from scenarios.spec.load import load

@@ -20,7 +20,7 @@ from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3, Robot
 from scenarios.motion.generate import GenerationError, Verification, bare_arm, generate, perform
 from scenarios.motion.recover import Recovery, save_generated, save_recovery
-from scenarios.prepare.arms import peaks
+from scenarios.prepare.oracle import peaks
 from twin.vae.generate import vary
 
 

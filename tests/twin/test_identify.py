@@ -25,7 +25,7 @@ from fleet.heat.thermal import (
 )
 from fleet.motion import RATE_HZ, drive, drives
 from fleet.robot import JOINTS
-from scenarios.prepare.arms import peaks
+from scenarios.prepare.oracle import peaks
 from twin.logs.recording import Recording, heat_logs
 from twin.thermal.checkpoint import CARD, load, load_twin, save
 from twin.thermal.identify import (

@@ -20,8 +20,10 @@ from fleet.heat.thermal import NODES, STEP_S, WINDING, ThermalModel, node_heat, 
 from fleet.motion import Drive, Plan, drives
 from fleet.robot import JOINTS, Cooling, ThermalLimits
 from twin.thermal.identify import AMBIENT_C, HeatModel, Identified, nominal_heat_model
-from twin.vae.twin import PlanCache, Twin
+from twin.vae.twin import Twin
 from twin.vae.window import check_jobs
+
+from .tmp.pc import PlanCache
 
 Array = np.ndarray
 
@@ -346,7 +348,7 @@ class RcTwin:
 class CalibratedTwin:
     """A learned twin with a thermal network; implements `fleet.difficulty.DifficultyModel`."""
 
-    twin: Twin
+    twin: "Twin"
     """Gives the difficulty d."""
     heat: RcTwin
     """Gives the predicted peak and, if it has a curve, P(saturation)."""

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
-from weakref import WeakKeyDictionary
 
 import msgspec
 import numpy as np
@@ -26,21 +24,12 @@ from twin.vae.config import TwinConfig
 from twin.vae.inference import shapes
 from twin.vae.json_file import check_version, read_card, write_card
 from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, latent_moments, measures_of, moments
-from twin.vae.window import PHASES, Scaler, check_jobs, cut_phases
+from twin.vae.window import PHASES, PlanCache, Scaler, check_jobs, cut_phases
 
 Array = np.ndarray
 
 _CHUNK = 128
 """Plans per pass: bounds the memory for their windows and keeps it in cache."""
-
-Value = TypeVar("Value")
-
-
-class PlanCache(WeakKeyDictionary[Plan, Value]):
-    """Values by plan, kept while the plan is alive; empty in a copy and in another process."""
-
-    def __reduce__(self) -> tuple[type, tuple[()]]:
-        return PlanCache, ()
 
 
 @dataclass(frozen=True, kw_only=True)

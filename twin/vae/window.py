@@ -6,6 +6,8 @@ each window is shifted by whole turns until its mean lies nearest the training d
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -14,6 +16,16 @@ from twin.logs.recording import CONTINUOUS
 from twin.vae.config import TwinConfig
 
 Array = np.ndarray
+
+Value = TypeVar("Value")
+
+
+class PlanCache(WeakKeyDictionary[Plan, Value]):
+    """Values by plan, kept while the plan is alive; empty in a copy and in another process."""
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return PlanCache, ()
+
 
 Q = CHANNELS.index("q")
 PHASES = ("approach", "cycle", "retreat")
