@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import repeat
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtr
@@ -20,10 +21,11 @@ from fleet.heat.thermal import NODES, STEP_S, WINDING, ThermalModel, node_heat, 
 from fleet.motion import Drive, Plan, drives
 from fleet.robot import JOINTS, Cooling, ThermalLimits
 from twin.thermal.identify import AMBIENT_C, HeatModel, Identified, nominal_heat_model
-from twin.vae.twin import Twin
-from twin.vae.window import check_jobs
+from twin.vae.window import PlanCache, check_jobs
 
-from .tmp.pc import PlanCache
+if TYPE_CHECKING:  # needs the extra `twin`
+    from twin.vae.twin import Twin
+
 
 Array = np.ndarray
 
