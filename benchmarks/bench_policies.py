@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from agents.registry import RULES
 from benchmarks.harness import options, write_text
 from benchmarks.result_tables import live_table, steps_table
-from fleet.env.allocation_v1 import Decisions
+from fleet.env.validation import Decisions
 from scenarios.live.fleet_processes import PROGRAM
 from scenarios.policy_loader import label, policy_at, scope_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare

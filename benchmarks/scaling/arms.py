@@ -95,7 +95,7 @@ def _shift(env: Any, policy: Any, seed: int) -> tuple[float, float]:  # modules 
     import numpy as np
 
     from agents.policy import only_choices
-    from fleet.env.allocation_v1 import actions_of
+    from fleet.env.validation import actions_of
 
     obs, _ = env.reset(seed=[seed])
     over, engine_s, matching_s, lazy = False, 0.0, 0.0, only_choices(policy)

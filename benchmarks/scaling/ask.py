@@ -7,7 +7,7 @@ import numpy as np
 
 from agents.policy import WAIT, plans_of
 from agents.rules import Matching
-from fleet.env.allocation_v1 import actions_of
+from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.observation import Observation
 from scenarios.evaluate.statistics import interval

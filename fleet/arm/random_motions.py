@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fleet.arm.model import ArmModel
-from fleet.arm.planner import GRASP_S
+from fleet.arm.task_phases import GRASP_S
 from fleet.arm.trajectory import CollisionChecker, LoadedMotion, Motion, build_phase, move, rest
 from fleet.errors import FleetError, InfeasibleJob
 from fleet.job import LONGEST_GRASP_S, Place, Work

@@ -18,7 +18,7 @@ import numpy as np
 
 from fleet.arm.gen3 import gen3_xml
 from fleet.arm.plan_cache import cached_arrays
-from fleet.arm.trajectory import check_time
+from fleet.arm.time_limit import check_time
 from fleet.job import Work
 from fleet.motion import Plan, distinct
 from fleet.robot import Robot

@@ -1,10 +1,7 @@
 """Jerk-limited motion from rest to rest with its torque, and checks of it: limits, collisions, and time to plan."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from time import thread_time
 
 import mujoco
 import numpy as np
@@ -147,34 +144,6 @@ def _torque(arm: ArmModel, part: LoadedMotion) -> Array:
         motion = Motion(motion.q[:1], motion.qd[:1], motion.qdd[:1])
     tau = arm.inverse_dynamics(motion.q, motion.qd, motion.qdd, part.payload_kg, force_n)
     return np.broadcast_to(tau, (len(part.motion), JOINTS)) if len(motion) == 1 else tau
-
-
-class PlanningTimeout(Exception):
-    """A plan exceeded `time_limit`."""
-
-
-_limit: ContextVar[tuple[float, float] | None] = ContextVar("planning_limit", default=None)
-"""Length, s, and end in processor time of the thread, s."""
-
-
-@contextmanager
-def time_limit(limit_s: float) -> Iterator[None]:
-    """Limit the processor time of the block in this thread, s: afterwards `check_time` raises."""
-    token = _limit.set((limit_s, thread_time() + limit_s))
-    try:
-        yield
-    finally:
-        _limit.reset(token)
-
-
-def check_time() -> None:
-    """Check the time limit of this thread, if there is one.
-
-    Raises:
-        PlanningTimeout: the limit has passed.
-    """
-    if (limit := _limit.get()) is not None and thread_time() > limit[1]:
-        raise PlanningTimeout(f"planning took more than {limit[0]:g} s of processor time")
 
 
 ALLOWED_DEPTH_M = 0.005

@@ -8,9 +8,8 @@ lower index.
 Seeds, counts and actions of callers are checked here for the batch and the adapters too.
 """
 
-from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any, Literal, TypeGuard, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from gymnasium import spaces
@@ -27,123 +26,11 @@ from fleet.engine.state import State, World
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import Cell
+from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, decisions_of, seed_of
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
 from fleet.observation import Layout, Observation
 from fleet.telemetry import MODES
-
-Decisions = Literal["interval", "events"]
-"""Length of a step: one decision interval, or until an arm may claim a job or passes its warning limit at work."""
-
-_LARGEST = 2**62
-
-
-def seed_of(seed: object) -> np.random.SeedSequence:
-    """Seed of a shift, of any size.
-
-    Raises:
-        ValueError: no integer, or one below 0.
-    """
-    if not _whole(seed) or seed < 0:
-        raise ValueError(f"seed must be an integer >= 0 (got {seed!r}).")
-    return np.random.SeedSequence(int(seed))
-
-
-def seeds_of(seed: object, envs: int) -> list[np.random.SeedSequence]:
-    """Seeds of a batch: consecutive from one seed, one for each env, or random without any.
-
-    Raises:
-        ValueError: neither one seed nor one for each env.
-    """
-    if seed is None:
-        return np.random.SeedSequence().spawn(envs)
-    if _whole(seed):
-        return [seed_of(int(seed) + e) for e in range(envs)]  # as a uint8, 255 + 1 would be 0
-    if isinstance(seed, list | tuple | range | np.ndarray) and np.shape(seed) == (envs,):
-        return [seed_of(each) for each in seed]
-    raise ValueError(f"seed must be one integer or one for each of {envs} envs (got {seed!r}).")
-
-
-def at_least_one(name: str, value: object) -> int:
-    """A count.
-
-    Raises:
-        ValueError: no integer, or one below 1.
-    """
-    if not _whole(value) or value < 1 or value > _LARGEST:
-        raise ValueError(f"{name} must be an integer >= 1 (got {value!r}).")
-    return int(value)
-
-
-def switch(name: str, value: object) -> bool:
-    """A boolean.
-
-    Raises:
-        ValueError: no boolean.
-    """
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} must be True or False (got {value!r}).")
-    return bool(value)
-
-
-def decisions_of(value: object) -> Decisions:
-    """The length of a step.
-
-    Raises:
-        ValueError: none of the allowed ones.
-    """
-    for each in get_args(Decisions):
-        if value == each:
-            return each
-    raise ValueError(f"decisions must be one of {', '.join(map(repr, get_args(Decisions)))} (got {value!r}).")
-
-
-def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:
-    """Action of each agent, int64 [agent]; an omitted agent waits.
-
-    Raises:
-        ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
-    """
-    if not isinstance(actions, Mapping):
-        raise ValueError(f"step() takes a dictionary of agents and their actions (got {actions!r}).")
-    chosen = np.zeros(len(agents), dtype=np.int64)
-    found = 0
-    for a, agent in enumerate(agents):
-        if agent in actions:
-            chosen[a] = _integer(agent, actions[agent])
-            found += 1
-    if found < len(actions):
-        agent_of(agents, next(iter(sorted(set(actions) - set(agents), key=str))))
-    return chosen
-
-
-def agent_of(agents: Sequence[str], agent: object) -> str:
-    """A live agent.
-
-    Raises:
-        ValueError: there is no such agent; names those that exist.
-    """
-    if agent not in agents:
-        raise ValueError(f"No agent '{agent}' in this fleet. Agents: {', '.join(agents)}.")
-    return str(agent)
-
-
-def _integer(agent: str, action: object) -> int:
-    """One integer; one beyond 64 bits becomes an action that no action space has, so the agent waits."""
-    if type(action) is not int:
-        value = np.asarray(action)
-        if value.size == 1 and np.issubdtype(value.dtype, np.integer):
-            action = int(value.reshape(()))
-        elif not isinstance(action, int) or isinstance(action, bool):
-            raise ValueError(f"The action of '{agent}' must be one integer (got {action!r}).")
-    return max(-_LARGEST, min(_LARGEST, int(action)))
-
-
-def _whole(value: object) -> TypeGuard[int]:
-    """Whether it is one integer, of Python or NumPy."""
-    if isinstance(value, int):
-        return not isinstance(value, bool)
-    return isinstance(value, np.integer | np.ndarray) and np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iu"
 
 
 def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:

@@ -20,9 +20,10 @@ from fleet.engine.batch import TERMS, Engine, RewardWeights, Shift
 from fleet.engine.shift import deliver
 from fleet.engine.state import State
 from fleet.engine.tables import Tables
-from fleet.env.allocation_v1 import Decisions, arm_spaces, at_least_one, decisions_of, seeds_of, switch
+from fleet.env.allocation_v1 import arm_spaces
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.random_actions import random_legal as random_legal
+from fleet.env.validation import Decisions, at_least_one, decisions_of, seeds_of, switch
 from fleet.observation import Layout, Observation
 from fleet.seeding import exchange_seed, shift_seeds
 

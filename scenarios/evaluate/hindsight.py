@@ -13,8 +13,8 @@ from agents.schedules import LEAST_GAIN, Changes, Schedules, stack
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
-from fleet.env.allocation_v1 import actions_of
 from fleet.env.lookahead import CellSimulator, Lookahead
+from fleet.env.validation import actions_of
 from fleet.observation import Layout, Observation
 from scenarios.evaluate.rollout import UNLIMITED, DecisionLimit
 from scenarios.spec.options import Budget

@@ -16,8 +16,8 @@ import numpy as np
 from agents.policy import WAIT, Planner, Policy, only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import MemoryExchange
-from fleet.env.allocation_v1 import actions_of
 from fleet.env.lookahead import CellSimulator
+from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library, Obs
 from fleet.observation import Observation
 from scenarios.evaluate.statistics import FigureKind

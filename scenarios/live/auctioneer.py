@@ -12,7 +12,7 @@ from agents.policy import Policy
 from fleet.bus.client import BusClient
 from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus, Submission
 from fleet.bus.router import other_versions
-from fleet.env.allocation_v1 import actions_of
+from fleet.env.validation import actions_of
 from fleet.errors import BusError, FleetError, Refused
 from fleet.job import Job
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe

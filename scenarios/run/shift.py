@@ -10,7 +10,8 @@ import numpy as np
 from agents.policy import only_choices
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
-from fleet.env.allocation_v1 import AllocationEnv, actions_of
+from fleet.env.allocation_v1 import AllocationEnv
+from fleet.env.validation import actions_of
 from fleet.errors import FleetError, nearest
 from fleet.events import Event
 from fleet.observation import Observation

@@ -8,7 +8,7 @@ import numpy as np
 from fleet.arrivals import Arrivals
 from fleet.bus.exchange.channel import Channel, Partition, TopologyName
 from fleet.engine.batch import RewardWeights
-from fleet.env.allocation_v1 import Decisions
+from fleet.env.validation import Decisions
 from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
 from fleet.heat.effects import LONGEST_CONTACT_S, SHORTEST_CONTACT_S, burn_threshold_c
 from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_dwell, check_places

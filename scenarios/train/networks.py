@@ -15,7 +15,7 @@ from agents.learned.policy import save_policy
 from agents.learned.ppo import PpoConfig, Trainer, imitate
 from fleet.engine.batch import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
-from fleet.env.allocation_v1 import actions_of
+from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.files import atomic_path
 from scenarios.evaluate.rollout import Act, acts_of, known_in, rollout

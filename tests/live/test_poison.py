@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 from fleet.arm.planner import Planner
-from fleet.arm.trajectory import check_time
+from fleet.arm.time_limit import check_time
 from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol.auction import (
     Ack,

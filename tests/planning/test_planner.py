@@ -22,7 +22,8 @@ from fleet.arm.kinematics import InverseKinematics, Pose, Unreachable, angle_bet
 from fleet.arm.model import ArmModel
 from fleet.arm.plan_cache import CachedPlanner, LoadedPlans
 from fleet.arm.planner import Planner
-from fleet.arm.trajectory import CollisionChecker, PlanningTimeout, check_time, time_limit
+from fleet.arm.time_limit import PlanningTimeout, check_time, time_limit
+from fleet.arm.trajectory import CollisionChecker
 from fleet.errors import InfeasibleJob
 from fleet.job import KINDS, Fixture, Place, Work
 from fleet.motion import RATE_HZ, Plan

@@ -225,10 +225,9 @@ def test_an_unknown_arm_anothers_twin_and_no_cool_motion_are_refused(small_toml,
 TWIN = SimpleNamespace(version="ab12", data_hash="cd34", seed="[0, 1]/")
 
 
-def test_a_model_names_its_data_and_seed_and_a_calibrated_one_both_sources():
+def test_a_model_names_its_data_and_seed_and_a_calibrated_one_those_of_its_twin():
     assert provenance(Blind()) == {"version": "blind"}
     twin = {"version": "ab12", "data_hash": "cd34", "seed": "[0, 1]/"}
     assert provenance(TWIN) == {"version": "ab12", "twin": twin}
-    saturation = {"version": "ef56", "data_hash": "9988", "jobs": 300, "passed": 40}
-    model = SimpleNamespace(version="ab12+ef56", twin=TWIN, saturation=SimpleNamespace(**saturation))
-    assert provenance(model) == {"version": "ab12+ef56", "twin": twin, "saturation": saturation}
+    model = SimpleNamespace(version="ab12+ef56", twin=TWIN)
+    assert provenance(model) == {"version": "ab12+ef56", "twin": twin}

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.arm.space import plan_key, space_name
-from fleet.arm.trajectory import check_time, time_limit
+from fleet.arm.time_limit import check_time, time_limit
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.errors import InfeasibleJob, printable
