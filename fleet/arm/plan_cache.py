@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from fleet.arm.gen3 import ELBOW_ANGLES_DEG, GRAVITY_M_S2, gen3_xml
-from fleet.arm.kinematics import ARM, OwnFrame
+from fleet.arm.own_frame import ARM, OwnFrame
 from fleet.arm.task_phases import GRASP_S
 from fleet.errors import InfeasibleJob
 from fleet.files import atomic_path
