@@ -1,9 +1,4 @@
-"""Inverse kinematics of the Gen3: closed-form postures as seeds, refined on the exact model.
-
-A work as its arm sees it: arms of one kind that stand alike before their places have the same work, and one plan.
-Gravity and the floor are the same wherever an arm stands and whichever way it faces, so a plan depends on where places
-and fixtures are relative to the base alone.
-"""
+"""Inverse kinematics of the Gen3: closed-form postures as seeds, refined on the exact model."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -249,6 +244,3 @@ def _rz(angle: float) -> Array:
 def _ry(angle: float) -> Array:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-
-
-Triple = tuple[float, float, float]

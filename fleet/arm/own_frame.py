@@ -1,4 +1,4 @@
-"""A task in the frame of its arm: arms of one kind that stand alike before their places have the same task and one plan.
+"""A task in the frame of its arm: arms of one kind that stand alike before their places share plans.
 
 Gravity and the floor are the same wherever an arm stands and whichever way it faces, so a plan depends on where places
 and fixtures are relative to the base alone.
@@ -9,14 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from fleet.arm.kinematics import Triple
 from fleet.job import Fixture, Work
 from fleet.robot import Mount, Robot
 
+Triple = tuple[float, float, float]
+
 ARM = "arm"
 """Name of every arm in its own frame."""
-
-
 DIGITS = 9
 """Decimal places of positions, m, and angles, deg: a nanometre and less, so that rounding errors of the arms' own
 positions make no difference."""
