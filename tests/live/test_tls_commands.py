@@ -233,7 +233,7 @@ STEERING = {
     ("job", "change", "j", "--value", "2"): Change("j", value=2.0),
     ("arm", "pause"): Pause("*"),
     ("arm", "pause", "a"): Pause("a"),
-    ("arm", "resume"): Resume("*"),
+    ("arm", "pause", "--end"): Resume("*"),
     ("arm", "clear", "a"): ClearRequest("a", "ann"),
     ("arm", "reset", "a"): ResetRequest("ann"),
 }

@@ -542,7 +542,7 @@ def test_the_time_is_checked_in_every_part_of_a_plan(monkeypatch):
         clock[0] += 1.0
         return clock[0]
 
-    monkeypatch.setattr("fleet.arm.trajectory.thread_time", tick)
+    monkeypatch.setattr("fleet.arm.time_limit.thread_time", tick)
     planner = Planner(ROBOT, elbows=2)
     with time_limit(1e6):
         planner.plan(WORKS["pick_place"])

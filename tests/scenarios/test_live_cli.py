@@ -108,7 +108,7 @@ ARM = {
     "ghost": "No arm 'ghost'",
     "left --source log": "log with a FILE",
     "left some.csv": "log with a FILE",
-    "left --source video": "'video' is not one of 'sim', 'log'",
+    "left --source video": "No source 'video'. Allowed: log, sim.",
     "left --difficulty oracle": "No difficulty 'oracle'. Allowed: blind, twin.",
     "left --speed 0": "--speed must be 0.001 to 10000",
     "left --rate-hz 1000": "--rate-hz must be > 0 and at most 100 (got 1000).",

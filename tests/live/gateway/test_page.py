@@ -398,7 +398,7 @@ def test_the_number_of_readers_is_limited(gateway):
     ids=["bodies", "headers", "connections"],
 )
 def test_300_unfinished_requests_hold_nobody_up(router, arm, begun, monkeypatch):
-    monkeypatch.setattr("scenarios.cli.live.gateway.HEADER_S", 3 * PATIENCE_S)
+    monkeypatch.setattr("scenarios.live.gateway.HEADER_S", 3 * PATIENCE_S)
     with Served(router, body_s=3 * PATIENCE_S) as served, ExitStack() as lines:
         for _ in range(300):
             line = lines.enter_context(socket.create_connection(("127.0.0.1", served.port)))
@@ -410,7 +410,7 @@ def test_300_unfinished_requests_hold_nobody_up(router, arm, begun, monkeypatch)
 def test_requests_beyond_the_rate_are_refused_until_a_pause(router, monkeypatch):
     with Served(router) as served:
         with monkeypatch.context() as patch:
-            patch.setattr("scenarios.live.http_access.RATE_HZ", 1.0)  # which a slow machine also exceeds
+            patch.setattr("scenarios.live.gateway.RATE_HZ", 1.0)  # which a slow machine also exceeds
             answers = [served.ask("GET", "/")[0] for _ in range(400)]
         assert answers[:100] == [200] * 100
         assert 429 in answers
