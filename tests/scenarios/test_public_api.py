@@ -1,0 +1,53 @@
+"""The names of `import thermofleet`: each is there, loaded when it is used, and works from the name of a scenario."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import thermofleet as tf
+
+ROOT = Path(__file__).parents[2]
+
+
+def python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    path = f"import sys; sys.path[:0] = [{str(folder)!r}, {str(ROOT)!r}]; "
+    return subprocess.run([sys.executable, "-c", path + code], capture_output=True, text=True, check=False, timeout=300)
+
+
+def test_every_public_name_is_there_and_nothing_heavy_is_loaded_before_it_is_used(tmp_path):
+    assert set(tf.__all__) | {"__version__"} <= set(dir(tf))
+    assert all(getattr(tf, name) is not None for name in dir(tf))
+    heavy = "('torch', 'mujoco', 'zenoh', 'numba', 'numpy')"
+    done = python(f"import thermofleet; print([m for m in {heavy} if m in sys.modules])", tmp_path)
+    assert done.stdout == "[]\n"
+
+
+def test_a_wrong_name_is_answered_with_the_right_ones():
+    with pytest.raises(AttributeError, match=r"module 'thermofleet' has no attribute 'runn'; it has .*\brun\b"):
+        _ = tf.runn  # pyright: ignore
+
+
+def test_a_file_of_the_user_with_the_name_of_a_package_is_named(tmp_path):
+    (tmp_path / "fleet.py").write_text("")
+    done = python("import thermofleet; thermofleet.load", tmp_path)
+    said = done.stderr.splitlines()[-1]
+    assert said.startswith(
+        f"ImportError: Python finds '{tmp_path / 'fleet.py'}' instead of thermofleet's package 'fleet'"
+    )
+    assert "rename your file or folder" in said
+
+
+def test_a_shift_and_a_comparison_from_the_file_of_a_scenario(small_toml, plans, tmp_path):
+    shift = tf.run(small_toml, policy="round_robin", seed=3, difficulty="blind", out=tmp_path / "run")
+    rows = shift.telemetry.to_pandas()
+    assert len(rows) == len(shift.readings.time_s) * len(shift.arms)
+    again = tf.open_run(tmp_path / "run")
+    assert (again.metrics, again.reward, len(again.events)) == (shift.metrics, shift.reward, len(shift.events))
+    assert "<" in shift._repr_html_()
+    result = tf.compare(small_toml, ["round_robin", "wspt"], seeds=range(2), difficulty="blind", workers=1)
+    assert result.baseline == "round_robin"
+    assert "wspt" in result.table.markdown()
+    with pytest.raises(Exception, match=r"run\(\) has no option 'polcy'; did you mean 'policy'\?"):
+        tf.run(small_toml, polcy="wspt")
