@@ -42,7 +42,8 @@ def folder(tmp_path_factory):
     return where
 
 
-def test_logs_get_a_verdict_and_a_map(thermofleet, folder, tmp_path) -> None:
+def test_logs_get_a_verdict_and_a_map(thermofleet, folder, tmp_path, monkeypatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)  # no terminal: the table is as wide as it needs
     size = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "--allow-collapse")
     twins, drawn = tmp_path / "twins", tmp_path / "map.png"
     said = thermofleet("twin", "train", "--log", folder / "logs", *size, "--hold-out", 0.5, "--out", twins, "--json")

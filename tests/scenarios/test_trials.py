@@ -165,7 +165,7 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     assert by_policy["round_robin"] == alone
     said = {
         "Raises": ("KeyError: 'nobody' (at 30 s of the shift)", 'return seen["nobody"]'),
-        "Nonsense": ("ValueError: The action of 'left' must be one integer (got 'wait').", "allocation_v1.py"),
+        "Nonsense": ("ValueError: The action of 'left' must be one integer (got 'wait').", "validation.py"),
         "Needs": ("must be a class or function that is called without arguments", "policy_loader.py"),
         "Stuck": ("TooSlow: a decision took longer than 2.5 s", "while True: pass"),
     }
