@@ -35,8 +35,6 @@ from scenarios.show.run_page import report_html
 from scenarios.show.words import clock
 from scenarios.spec.schema import Scenario
 
-Array = np.ndarray
-
 MOST_SAMPLES = 20_000
 """Samples of telemetry in a report, in time."""
 ABSENT_SAMPLES = 30

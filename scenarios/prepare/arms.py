@@ -223,6 +223,3 @@ def _outside_limits_at_home(scenario: Scenario, arms: Sequence[PlannedArm], fold
                 f"({lower_c:g} °C); {advice}"
             )
     return found
-
-
-Array = np.ndarray

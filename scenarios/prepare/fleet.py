@@ -383,6 +383,3 @@ def env_of(
     options = {"weights": weights_of(fleet.scenario), "cell": cell_of(fleet.scenario), **options}
     options.setdefault("decisions", fleet.scenario.decisions)
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, **options)
-
-
-Array = np.ndarray

@@ -19,8 +19,6 @@ from twin.logs.recording import STEP_S, Recording
 from twin.thermal.checkpoint import load, save
 from twin.thermal.identify import Identified, identify
 
-Array = np.ndarray
-
 LOG_HZ = 2.0
 """Sampling rate of the public logs of a real Gen3."""
 AIR_SD_K = 1.5

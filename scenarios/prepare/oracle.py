@@ -13,8 +13,9 @@ from fleet.heat.thermal import (
     simulate_temperatures,
 )
 from fleet.motion import Plan, drives
-from scenarios.prepare.arms import Array
 from twin.thermal.thermal_twin import LinearHeat, peak_forecast
+
+Array = np.ndarray
 
 
 def peaks(
