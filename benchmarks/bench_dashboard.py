@@ -23,11 +23,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from benchmarks.harness import CHROMIUM, cpu_s, options, received, route, rss_mb, spawned
+from docs.bus_contract import EXAMPLES
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import auction as bus
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.cell import Cell, CellArm, CellRequest
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import DifficultyScores, State
 from scenarios.live.fleet_processes import PROGRAM
 

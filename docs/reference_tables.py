@@ -7,9 +7,9 @@ from math import prod
 from typing import Any
 
 from agents.registry import RULES, WRAPPERS
+from docs.bus_contract import EXAMPLES, Schema, descriptions, schemas
 from fleet.bus.protocol import messages
 from fleet.bus.protocol.auction import MOST_JOBS, ArmEvent
-from fleet.bus.protocol.contract import EXAMPLES, Schema, descriptions, schemas
 from fleet.bus.protocol.keys import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, Channel, MessageType
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.router import Limits

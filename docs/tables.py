@@ -43,7 +43,7 @@ from benchmarks.result_tables import (
     stored,
     trainings,
 )
-from fleet.bus.protocol.contract import asyncapi, schema_document
+from docs.bus_contract import asyncapi, schema_document
 from fleet.errors import FleetError
 from scenarios.evaluate.leaderboard import (
     BASELINE,

@@ -13,6 +13,7 @@ from copy import deepcopy
 import msgspec
 
 from benchmarks.chaos.fleet_under_test import Fleet
+from docs.bus_contract import EXAMPLES
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Award,
@@ -26,7 +27,6 @@ from fleet.bus.protocol.auction import (
     Submission,
 )
 from fleet.bus.protocol.consensus import Bid, Claim
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode, encoding
 from fleet.bus.protocol.operator import ClearRequest
 

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from docs.bus_contract import EXAMPLES
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.security.access_control import read_roster
 from fleet.errors import FleetError, visible

@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
+from docs.bus_contract import EXAMPLES, asyncapi, descriptions, schema_document
 from docs.tables import fill_tables, main
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import auction as trade
 from fleet.bus.protocol import keys, messages
 from fleet.bus.protocol.auction import JobSpec
-from fleet.bus.protocol.contract import EXAMPLES, asyncapi, descriptions, schema_document
 from fleet.bus.protocol.keys import ASKED, CHANNELS, MESSAGES, NAMELESS, TOPICS, Key, channel_of
 from fleet.bus.protocol.messages import (
     DifficultyScores,

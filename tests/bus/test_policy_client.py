@@ -14,8 +14,8 @@ import pytest
 import zenoh
 from jsonschema import Draft202012Validator
 
+from docs.bus_contract import EXAMPLES
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import decode, encoding
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES, ActReply, ActRequest
 from fleet.bus.router import Limits, Router, open_client

@@ -16,6 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
+from docs.bus_contract import EXAMPLES
 from fleet.arm.planner import Planner
 from fleet.arm.time_limit import check_time
 from fleet.bus.client import AnotherReplies, Replies
@@ -35,7 +36,6 @@ from fleet.bus.protocol.auction import (
     StatusRequest,
     Submission,
 )
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode
 from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import Refused

@@ -12,6 +12,7 @@ import pytest
 from msgspec.structs import replace
 from typer.testing import CliRunner
 
+from docs.bus_contract import EXAMPLES
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -29,7 +30,6 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import State, encode, encoding
 from fleet.bus.protocol.operator import (
     Cancel,

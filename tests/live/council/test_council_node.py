@@ -11,11 +11,11 @@ import pytest
 from msgspec.structs import replace
 
 from agents.auction import Consensus
+from docs.bus_contract import EXAMPLES
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobSpec, Status, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.operator import Cancel, Controlled, ControlRequest, Operation, Pause
 from fleet.bus.router import Router
 from fleet.errors import BusError

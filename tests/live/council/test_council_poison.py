@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agents.auction import Consensus
+from docs.bus_contract import EXAMPLES
 from fleet.bus.protocol.auction import ClockRequest, JobEstimate, JobSpec, PlanQuote, StatusRequest, Submission
 from fleet.bus.protocol.cell import CellRequest
 from fleet.bus.protocol.consensus import (
@@ -23,7 +24,6 @@ from fleet.bus.protocol.consensus import (
     HistoryRequest,
     JobOutcome,
 )
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import State, encode
 from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, ControlRequest, Operation, Pause, Resume, Settle
 from fleet.live.arm.awards import ArmHistory, AwardExecutor

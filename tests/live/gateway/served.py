@@ -8,11 +8,11 @@ import threading
 import time
 from contextlib import contextmanager
 
+from docs.bus_contract import EXAMPLES
 from fleet.bus.client import BusClient, Refused
 from fleet.bus.protocol import auction as bus
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.bus.protocol.operator import Controlled, ControlRequest
 from fleet.live.monitor.async_bridge import AsyncBridge

@@ -10,8 +10,8 @@ import json
 import sys
 from collections.abc import Mapping
 from functools import cache
-from importlib.resources import files
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -23,7 +23,7 @@ from fleet.job import Job, Work
 
 def _read() -> Mapping[type[msgspec.Struct], msgspec.Struct]:
     kinds = {kind.__name__: kind for kind in MESSAGES}
-    examples = json.loads(files("fleet").joinpath("data", "bus_examples.json").read_bytes())
+    examples = json.loads(Path(__file__).with_name("contract").joinpath("examples.json").read_bytes())
     return {kinds[name]: msgspec.convert(example, kinds[name]) for name, example in examples.items()}
 
 
