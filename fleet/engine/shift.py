@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fleet.bus.exchange.memory import Broadcast, Exchange, MemoryExchange, PeerView
+from fleet.bus.exchange.memory import Broadcast, Exchange, PeerView
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.state import PER_JOB, State, World
 from fleet.engine.tables import events_of, tables_of
@@ -186,7 +186,7 @@ class ShiftRunner:
         self._episode, self._watch = episode, watch
         self._layout = layout or Layout(len(world.arms), world.slots, plans=world.plans_per_job)
         self._reports_contacts = keep_events and not episode.plant.follows_plans
-        at_once = exchange is None or (isinstance(exchange, MemoryExchange) and exchange.perfect)
+        at_once = exchange is None or exchange.perfect
         self._exchange = None if at_once else exchange
         self._delivered_before = 0
         if self._exchange is not None:

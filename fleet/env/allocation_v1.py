@@ -17,7 +17,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-from fleet.bus.exchange.memory import Exchange, MemoryExchange
+from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import TERMS, RewardWeights
 from fleet.engine.shift import Episode as Episode
 from fleet.engine.shift import EpisodeFactory as EpisodeFactory
@@ -122,7 +122,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         world = self._episode.world
         self.possible_agents = list(world.arms)
         self.agents: list[str] = []
-        self._exchange = exchange or MemoryExchange(world.arms)
+        self._exchange = exchange or Exchange(world.arms)
         self.layout = Layout(len(world.arms), world.slots, near, world.plans_per_job)
         first = arm_spaces(self.layout)
         per_arm = [spaces_like(first) for _ in world.arms]

@@ -15,7 +15,7 @@ import numpy as np
 
 from agents.policy import WAIT, Planner, Policy, only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.memory import Exchange
 from fleet.env.lookahead import CellSimulator
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library, Obs
@@ -117,7 +117,7 @@ def play(
         limit_s: Most time for a decision, s of real time.
     """
     library, channel = _library(fleet), fleet.scenario.channel(channel)
-    exchanges = None if channel.perfect else [MemoryExchange(library.arms, channel) for _ in seeds]
+    exchanges = None if channel.perfect else [Exchange(library.arms, channel) for _ in seeds]
     env = BatchEnv(
         library,
         len(seeds),

@@ -12,7 +12,7 @@ import numpy as np
 from fleet.arm.plan_cache import rest_torque
 from fleet.arm.space import SpaceTable, space_table
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.bus.exchange.memory import Exchange, MemoryExchange
+from fleet.bus.exchange.memory import Exchange
 from fleet.difficulty import Blind
 from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.state import World
@@ -311,7 +311,7 @@ def open_exchange(
     choose("bus", bus, BusName)
     try:
         if bus == "memory":
-            return MemoryExchange(arms, channel)
+            return Exchange(arms, channel)
         require_extra("bus")
         from fleet.bus.exchange.zenoh import ZenohExchange
 

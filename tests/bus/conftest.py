@@ -23,11 +23,13 @@ Connect = Callable[[str], zenoh.Session]
 def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int = 4) -> Broadcast:
     """Broadcasts with awkward floats, unknown scores, empty slots, and jobs that come and go between ticks."""
     jobs = [f"job {number}" for number in rng.choice(8, size=slots, replace=False)]
-    for slot in np.flatnonzero(rng.random(slots) < 0.25):
+    empty = rng.random(slots) < 0.25
+    for slot in np.flatnonzero(empty):
         jobs[slot] = ""
     difficulty, p_saturation = rng.random((2, arms, slots)) * 10.0 ** rng.integers(-300, 1, (2, arms, slots))
     difficulty[rng.random((arms, slots)) < 0.3] = np.nan
     p_saturation[rng.random((arms, slots)) < 0.3] = np.nan
+    difficulty[:, empty] = p_saturation[:, empty] = np.nan
     return Broadcast(
         time_s=time_s,
         mode=rng.integers(0, 3, arms),

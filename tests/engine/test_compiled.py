@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import RewardWeights
 from fleet.engine.shift import Episode, ShiftRunner
 from fleet.motion import Drive
@@ -65,7 +65,7 @@ def test_compiled_and_uncompiled_agree_for_any_size(small, arms, jobs, slots) ->
 def test_compiled_and_uncompiled_agree_with_late_and_lost_messages(small) -> None:
     make = small.Shifts(arms=3, jobs=6, ticks=30)
     run = check_equal(
-        make(np.random.SeedSequence(2)), 2, exchange=lambda arms: MemoryExchange(arms, Channel(delay_s=20.0, loss=0.3))
+        make(np.random.SeedSequence(2)), 2, exchange=lambda arms: Exchange(arms, Channel(delay_s=20.0, loss=0.3))
     )
     assert 0 < run.messages < 3 * 2 * (run.tick + 1)
 

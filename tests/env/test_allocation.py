@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.registry import RULES, make_policy
-from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.memory import Exchange
 from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.engine.batch import TERMS, RewardWeights
 from fleet.engine.state import State
@@ -291,4 +291,4 @@ def test_bad_choices_are_refused(small) -> None:
             BatchEnv(shifts.library(), 2, decisions=given)
     library = shifts.library()
     with pytest.raises(ValueError, match="takes no exchanges"):
-        BatchEnv(library, 1, decisions="events", exchanges=[MemoryExchange(library.arms)])
+        BatchEnv(library, 1, decisions="events", exchanges=[Exchange(library.arms)])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.memory import Exchange
 from fleet.engine.state import DONE, State, World
 from fleet.engine.tables import Tables
 from fleet.env.allocation_v1 import Episode, parallel_env
@@ -131,7 +131,7 @@ def test_an_episode_with_losses_and_delay_repeats_by_seed(small) -> None:
     """Also if the env has run another episode in between."""
     make = small.Shifts(arms=3, jobs=6, ticks=30)
     names = make(np.random.SeedSequence(0)).world.arms
-    exchange = MemoryExchange(names, Channel(loss=0.4, delay_s=20.0))
+    exchange = Exchange(names, Channel(loss=0.4, delay_s=20.0))
     env = parallel_env(make, exchange=exchange)
 
     def trace(seed: int) -> list[np.ndarray]:

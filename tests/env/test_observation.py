@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from scipy.special import expit
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.memory import UNHEARD, MemoryExchange, PeerView
+from fleet.bus.exchange.memory import UNHEARD, Exchange, PeerView
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.profile_plant import sensor_noise
@@ -522,7 +522,7 @@ def test_peers_observe_what_the_arm_observes_of_itself(small) -> None:
 
 
 def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:
-    exchange = MemoryExchange(("arm_0", "arm_1"), Channel(delay_s=20.0))
+    exchange = Exchange(("arm_0", "arm_1"), Channel(delay_s=20.0))
     env = parallel_env(small.Shifts(arms=2), exchange=exchange)
     env.reset(seed=1)
     ages = []

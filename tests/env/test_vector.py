@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import BLOCK, shifts_of
 from fleet.engine.tables import stack_tables, tables_of
 from fleet.engine.world import Space
@@ -137,8 +137,8 @@ LATE = Channel(delay_s=25.0, loss=0.3)
 @pytest.mark.parametrize("e", [0, 3, 6])
 def test_a_row_with_an_exchange_equals_the_single_env(make, batch, play, e) -> None:
     arms = make(SHIFT).possible_agents
-    exchanges = [MemoryExchange(arms, LATE) for _ in range(7)]
-    env, many = make(SHIFT, exchange=MemoryExchange(arms, LATE)), batch(7, SHIFT, seed=SEED, exchanges=exchanges)
+    exchanges = [Exchange(arms, LATE) for _ in range(7)]
+    env, many = make(SHIFT, exchange=Exchange(arms, LATE)), batch(7, SHIFT, seed=SEED, exchanges=exchanges)
     actual, given = play.single(env, env.reset(seed=SEED + e)), many.reset()
     arrived, ends = [], 0
     for each in np.stack([numbers(e) for e in range(7)], axis=1):
@@ -159,7 +159,7 @@ def test_a_row_with_an_exchange_equals_the_single_env(make, batch, play, e) -> N
 def test_resetting_other_rows_keeps_delivered_messages(batch, play) -> None:
     """Also if the caller has overwritten returned observations."""
     one, other = (
-        batch(3, SHIFT, seed=SEED, autoreset=False, exchanges=[MemoryExchange(("arm_0", "arm_1", "arm_2"), LATE)] * 3)
+        batch(3, SHIFT, seed=SEED, autoreset=False, exchanges=[Exchange(("arm_0", "arm_1", "arm_2"), LATE)] * 3)
         for _ in range(2)
     )
     for env in (one, other):

@@ -1,19 +1,17 @@
 """Communication channels between arms: topology, delay, loss and partitions.
 
-A channel is a plain value; `fleet.bus.exchange.memory.Delivery` applies it.
+A channel is a value; `fleet.bus.exchange.memory.Delivery` applies it.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from fleet.errors import nearest
 from fleet.fields import MAX_SEED, check, option
 
-if TYPE_CHECKING:  # slow to import, and the help of commands needs neither
-    import networkx as nx
+if TYPE_CHECKING:  # slow to import, and the help of commands does not need it
     import numpy as np
 
     Array = np.ndarray
@@ -83,15 +81,13 @@ class Partition:
 class Channel:
     """How broadcasts reach peers. The default is perfect: every arm receives every broadcast at once."""
 
-    topology: "TopologyName | nx.Graph" = option(
+    topology: TopologyName = option(
         "Which arms receive each other's messages: complete, star, ring, line, random_geometric.",
         "complete",
         choices=TOPOLOGIES,
         panel=_PANEL,
     )
-    """Broadcasts are not forwarded. A star has the first arm in the middle; a ring and a line have the fleet's order. A
-    networkx graph has names of arms as nodes: an edge connects both ways, a directed one from tail to head, and an arm
-    without a node has no link."""
+    """A star has the first arm in the middle; a ring and a line have the fleet's order. Nothing is forwarded."""
     radius: float = option("random_geometric: range of an arm in a unit square.", 0.5, low=0, high=2, panel=_PANEL)
     topology_seed: int = option("random_geometric: seed of the arms' positions.", 0, low=0, high=MAX_SEED, panel=_PANEL)
     delay_s: float = option(
@@ -130,63 +126,41 @@ class Channel:
         """Whether loss or delay is random."""
         return bool(self.loss or self.jitter_s)
 
-    def graph(self, arms: Sequence[str]) -> "nx.Graph":
-        """Which arms receive from which, as a graph of their names.
-
-        Raises:
-            ValueError: a node is no arm.
-        """
-        import networkx as nx
+    def links(self, arms: Sequence[str]) -> "Array":
+        """Which arms receive from which, bool, [receiver, sender], False on the diagonal."""
         import numpy as np
 
-        if not isinstance(self.topology, str):
-            for node in self.topology:
-                if node not in arms:
-                    raise ValueError(f"The graph has an unknown arm '{node}'{nearest(str(node), arms)}")
-            return self.topology
-        graph = nx.Graph()
-        graph.add_nodes_from(arms)
+        index = np.arange(len(arms))
+        apart = abs(index[:, None] - index)
         match self.topology:
             case "complete":
-                graph.add_edges_from(combinations(arms, 2))
+                links = np.ones_like(apart, dtype=bool)
             case "star":
-                graph.add_edges_from((arms[0], arm) for arm in arms[1:])
-            case "ring" | "line":
-                nx.add_path(graph, arms)
-                if self.topology == "ring":
-                    graph.add_edge(arms[-1], arms[0])
+                links = (index[:, None] == 0) | (index == 0)
+            case "line":
+                links = apart == 1
+            case "ring":
+                links = (apart == 1) | (apart == len(arms) - 1)
             case "random_geometric":
-                places = np.random.default_rng(self.topology_seed).random((len(arms), 2))
-                near = zip(arms, places.tolist(), strict=True)
-                pairs = combinations(near, 2)
-                graph.add_edges_from((a, b) for (a, p), (b, q) in pairs if math.dist(p, q) <= self.radius)
-        graph.remove_edges_from(list(nx.selfloop_edges(graph)))
-        return graph
-
-    def links(self, arms: Sequence[str]) -> "Array":
-        """Which arms receive from which, bool, [receiver, sender], False on the diagonal; raises as `graph`."""
-        import numpy as np
-
-        graph = self.graph(arms)
-        links = np.array([[graph.has_edge(sender, receiver) for sender in arms] for receiver in arms])
+                points = np.random.default_rng(self.topology_seed).random((len(arms), 2)).tolist()
+                links = np.array([[math.dist(p, q) <= self.radius for q in points] for p in points])
         np.fill_diagonal(links, False)
         return links
 
     def check(self, arms: Sequence[str]) -> None:
-        """Refuse a channel that names unknown arms.
+        """Refuse a channel whose partitions name unknown arms.
 
         Raises:
             ValueError: names the arm, and the known ones.
         """
-        self.graph(arms)
         for partition in self.partitions:
             partition.cuts(arms)
 
     @property
     def text(self) -> str:
         """Short text, as `ring, 30 to 35 s late, 20 % lost`."""
-        named = self.topology if isinstance(self.topology, str) else "own graph"
-        parts = [f"{named} of radius {self.radius:g}" if named == "random_geometric" else named]
+        random = self.topology == "random_geometric"
+        parts = [f"{self.topology} of radius {self.radius:g}" if random else self.topology]
         if self.jitter_s:
             parts.append(f"{self.delay_s:g} to {self.delay_s + self.jitter_s:g} s late")
         elif self.delay_s:
@@ -198,20 +172,11 @@ class Channel:
 
     def described(self) -> dict[str, Any]:
         """The channel as JSON values, for a recording."""
-        topology: object = self.topology if isinstance(self.topology, str) else _edges(self.topology)
-        drawn = {"radius": self.radius, "topology_seed": self.topology_seed}
-        return {
-            "topology": topology,
-            **(drawn if topology == "random_geometric" else {}),
-            "delay_s": self.delay_s,
-            "jitter_s": self.jitter_s,
-            "loss": self.loss,
-            "partitions": [asdict(partition) for partition in self.partitions],
-        }
-
-
-def _edges(graph: "nx.Graph") -> dict[str, Any]:
-    return {"directed": graph.is_directed(), "edges": sorted([str(tail), str(head)] for tail, head in graph.edges())}
+        values = asdict(self)
+        values["partitions"] = list(values["partitions"])
+        if self.topology != "random_geometric":
+            del values["radius"], values["topology_seed"]
+        return values
 
 
 PERFECT = Channel()

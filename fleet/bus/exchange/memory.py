@@ -1,20 +1,18 @@
 """What arms of a simulated shift broadcast at each step, through a channel that may delay and lose messages.
 
-`MemoryExchange` delivers; `fleet.bus.exchange.zenoh.ZenohExchange` also publishes the messages on the bus. Delay
-and loss depend on the channel, the time and the random generator of the episode, never on the content: a seed delays
-and loses the same broadcasts under every policy.
+`Exchange` delivers; `fleet.bus.exchange.zenoh.ZenohExchange` also publishes the messages on the bus. Delay and loss
+depend on the channel, the time and the random generator of the episode, never on the content: a seed delays and loses
+the same broadcasts under every policy.
 """
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import BusError
-from fleet.telemetry import MODES
 
 Array = np.ndarray
 
@@ -66,82 +64,14 @@ class PeerView:
     """[receiver, sender]: simulation seconds since that broadcast; inf if nothing was received."""
 
 
-class Exchange(Protocol):
-    """Carries the broadcasts of one step from every arm to every arm."""
+class Exchange:
+    """Shares broadcasts in memory through a channel, on the time of the broadcasts.
 
-    arms: tuple[str, ...]
-    delivered: int
-    """Broadcasts delivered to a peer, over all steps; one per receiver and sender."""
-    late: int
-    """Broadcasts that were lost on the channel, over all steps."""
-
-    def begin(self, rng: np.random.Generator | None = None) -> None:
-        """Begin an episode without any received broadcasts; `rng` is for channels with loss or jitter."""
-        ...
-
-    def share(self, broadcast: Broadcast) -> PeerView:
-        """Broadcast one step, and return the view of every arm after it.
-
-        Raises:
-            ValueError: the broadcast does not fit the arms, holds infinite numbers, or is older than the last one
-                (`begin` first).
-            BusError: the bus could not be opened, or is closed.
-        """
-        ...
-
-    def close(self) -> None:
-        """Release all resources; may be called twice."""
-        ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object, /) -> None: ...
-
-
-def check(broadcast: Broadcast, arms: tuple[str, ...]) -> None:
-    """Refuse a broadcast that does not fit the arms or cannot be encoded.
-
-    Raises:
-        ValueError: names the field, what it is and what it should be.
+    Attributes:
+        arms: Names of the arms.
+        delivered: Broadcasts delivered to a peer, over all episodes; one per receiver and sender.
+        late: Broadcasts that were lost on the channel, over all episodes.
     """
-    slots = len(broadcast.jobs)
-    shapes = {
-        "mode": (len(arms),),
-        "headroom_k": (len(arms),),
-        "busy_s": (len(arms),),
-        "difficulty": (len(arms), slots),
-        "p_saturation": (len(arms), slots),
-    }
-    for name, shape in shapes.items():
-        if np.shape(getattr(broadcast, name)) != shape:
-            raise ValueError(
-                f"Broadcast.{name} must have the shape {shape} (got {np.shape(getattr(broadcast, name))})."
-            )
-    if broadcast.temp_c.ndim != 2 or len(broadcast.temp_c) != len(arms) or not broadcast.temp_c.shape[1]:
-        raise ValueError(
-            f"Broadcast.temp_c must be [arm, joint] with {len(arms)} arms (got shape {broadcast.temp_c.shape})."
-        )
-    if len(broadcast.twin) != len(arms):
-        raise ValueError(f"Broadcast.twin needs one version per arm ({len(arms)}, got {len(broadcast.twin)}).")
-    named = [job for job in broadcast.jobs if job]
-    if len(set(named)) != len(named):
-        raise ValueError(f"Broadcast.jobs names a job twice (got {broadcast.jobs}).")
-    if not math.isfinite(broadcast.time_s):
-        raise ValueError(f"Broadcast.time_s must be finite (got {broadcast.time_s}).")
-    for name in ("temp_c", "headroom_k", "busy_s"):
-        if not np.isfinite(getattr(broadcast, name)).all():
-            raise ValueError(f"Broadcast.{name} must be finite (got {getattr(broadcast, name)}).")
-    for name in ("difficulty", "p_saturation"):
-        if np.isinf(getattr(broadcast, name)).any():
-            raise ValueError(
-                f"Broadcast.{name} must be finite, or NaN where not known (got {getattr(broadcast, name)})."
-            )
-    if not np.isin(broadcast.mode, range(len(MODES))).all():
-        raise ValueError(f"Broadcast.mode must be one of 0..{len(MODES) - 1} (got {broadcast.mode}).")
-
-
-class MemoryExchange:
-    """Shares broadcasts in memory through a channel, on the time of the broadcasts."""
 
     def __init__(
         self, arms: Sequence[str], channel: Channel = PERFECT, *, rng: np.random.Generator | None = None
@@ -181,18 +111,15 @@ class MemoryExchange:
         """Broadcast one step, and return the view of every arm after it.
 
         Raises:
-            ValueError: the broadcast does not fit the arms or holds infinite numbers; or the channel has loss or
-                jitter, and there is no rng.
+            ValueError: it is older than the last broadcast; or the channel has loss or jitter, and there is no rng.
             BusError: the exchange is closed.
         """
         if self._closed:
             raise BusError("This exchange is closed.")
-        check(broadcast, self.arms)
         if broadcast.time_s < self._now_s:
             sent_s, last_s = f"{broadcast.time_s:g} s", f"{self._now_s:g} s"
             raise ValueError(f"Broadcast of {sent_s} after that of {last_s}; begin() starts a new episode.")
-        self._tick, self._now_s = self._tick + 1, float(broadcast.time_s)
-        broadcast = _copy(broadcast)  # the caller may reuse its arrays at the next step
+        self._tick, self._now_s = self._tick + 1, broadcast.time_s
         if self._delivery is None:
             self.delivered += len(self.arms) * (len(self.arms) - 1)
             return _view_at_once(broadcast)
@@ -295,21 +222,6 @@ class Delivery:
                 due_s[cut & (due_s >= from_s)] = np.inf
         self.late += int(self._linked.sum()) - int(np.isfinite(due_s).sum())
         return due_s
-
-
-def _copy(broadcast: Broadcast) -> Broadcast:
-    """A copy, with NaN in empty slots."""
-    empty = [slot for slot, job in enumerate(broadcast.jobs) if not job]
-    difficulty, p_saturation = (np.array(a, float) for a in (broadcast.difficulty, broadcast.p_saturation))
-    difficulty[:, empty] = p_saturation[:, empty] = np.nan
-    return replace(
-        broadcast,
-        mode=np.array(broadcast.mode, int),
-        headroom_k=np.array(broadcast.headroom_k, float),
-        busy_s=np.array(broadcast.busy_s, float),
-        difficulty=difficulty,
-        p_saturation=p_saturation,
-    )
 
 
 def _view_at_once(broadcast: Broadcast) -> PeerView:

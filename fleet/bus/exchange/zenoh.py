@@ -1,7 +1,7 @@
 """The exchange of a simulated shift that is also on the bus: others can watch the shift, record it, or take part in it.
 
 At each step an arm publishes its `state` and then its `difficulty`. It publishes `info` when it changes, and a
-liveliness token shows that the arm is present. Arms know of their peers what a `MemoryExchange` delivers, so the result
+liveliness token shows that the arm is present. Arms know of their peers what an `Exchange` delivers, so the result
 of a shift depends neither on the load of the machine nor on others on the bus.
 """
 
@@ -17,7 +17,7 @@ import zenoh
 
 from fleet.bus.client import BusClient
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.bus.exchange.memory import Broadcast, MemoryExchange, PeerView
+from fleet.bus.exchange.memory import Broadcast, Exchange, PeerView
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.router import Router, reachable
@@ -29,8 +29,8 @@ _LOG = logging.getLogger(__name__)
 Array = np.ndarray
 
 
-class ZenohExchange(MemoryExchange):
-    """A `MemoryExchange` that publishes the messages of each step, through a router and a client in this process.
+class ZenohExchange(Exchange):
+    """An `Exchange` that publishes the messages of each step, through a router and a client in this process.
 
     Nothing is opened before the first `share` or the `with` block. One thread at a time may use an exchange. The bus
     carries every message, also those that the channel loses or delays.
@@ -62,7 +62,7 @@ class ZenohExchange(MemoryExchange):
         keys.chunk(fleet)
         self._fleet, self._timeout_s = fleet, timeout_s
         self._endpoint = None if endpoint is None else reachable(endpoint)
-        self._publishers: list[_Publishers] = []
+        self._publishers: list[_ArmPublishers] = []
         self._published = 0
         """Steps, over all episodes."""
         self._resources = ExitStack()
@@ -97,7 +97,7 @@ class ZenohExchange(MemoryExchange):
             present = client.tokens(keys.of_every_arm(self._fleet, "alive"), timeout_s=self._timeout_s)
             if taken := sorted(present & set(self.arms)):
                 raise BusError(f"Fleet '{self._fleet}' already has {', '.join(taken)} on the bus at {self._endpoint}.")
-            self._publishers = [_Publishers(client, arm) for arm in self.arms]
+            self._publishers = [_ArmPublishers(client, arm) for arm in self.arms]
         except zenoh.ZError as error:
             self._give_up()
             raise BusError(f"The bus at {self._endpoint} could not be opened: {error}") from error
@@ -110,7 +110,7 @@ class ZenohExchange(MemoryExchange):
         """Publish the broadcast of one step, and return the view of every arm after it.
 
         Raises:
-            ValueError: as a `MemoryExchange`.
+            ValueError: as an `Exchange`.
             BusError: the bus could not be opened, was lost, or is closed.
         """
         view = super().share(broadcast)
@@ -156,7 +156,7 @@ class ZenohExchange(MemoryExchange):
             _LOG.exception("While closing after another error:")
 
 
-class _Publishers:
+class _ArmPublishers:
     """Publishers and token of one arm."""
 
     def __init__(self, client: BusClient, arm: str) -> None:
@@ -164,7 +164,7 @@ class _Publishers:
         self._state = client.publisher(keys.of_arm(client.fleet, arm, "state"), State)
         self._difficulty = client.publisher(keys.of_arm(client.fleet, arm, "difficulty"), DifficultyScores)
         self._info = client.publisher(keys.of_arm(client.fleet, arm, "info"), Info)
-        # Declared last: whoever sees the token can be sure that the router has the publishers.
+        # Declared last: a participant that sees the token can be sure that the router has the publishers.
         client.declare_token(keys.of_arm(client.fleet, arm, "alive"))
 
     def publish(self, state: State, difficulty: DifficultyScores) -> None:
