@@ -74,7 +74,7 @@ def auction(benefit: Array, epsilon: float) -> list[tuple[int, int]]:
 class Auction(Wsept):
     """Batch auction of the open jobs by expected worth per time, as in `wsept`, within arms · ε of the best total.
 
-    `wsept` makes as many pairs as possible first. Scope central: the auctioneer compares the bids of all arms.
+    `wsept` makes as many pairs as possible first.
     """
 
     only_choices = True

@@ -16,8 +16,8 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from agents.policy import WAIT, ArmPolicy, Local, Lookahead, Planner, Policy, per_option, plans_of
-from agents.rules import Ahead, Matching
+from agents.policy import WAIT, ArmPolicy, CellLookahead, Local, PlanningPolicy, Policy, per_option, plans_of
+from agents.rules import Ahead, CentralRule, Matched
 from fleet.observation import Observation
 from fleet.robot import RATING
 
@@ -211,16 +211,16 @@ class GuardedFleet:
 class GuardedPlanner(GuardedFleet):
     """A policy that plans in a simulator, which knows of no guards, with a guard for each arm."""
 
-    def plan_in(self, cell: Lookahead) -> None:
+    def plan_in(self, cell: CellLookahead) -> None:
         """Let the policy plan in the simulator of a shift."""
-        if isinstance(self._policy, Planner):
+        if isinstance(self._policy, PlanningPolicy):
             self._policy.plan_in(cell)
 
 
 def guarded(guard: Callable[[], Guard], policy: Policy | ArmPolicy) -> Policy | ArmPolicy:
     """A policy, for one arm or for all, whose claims pass a guard."""
     if hasattr(policy, "act"):
-        kind = GuardedPlanner if isinstance(policy, Planner) else GuardedFleet
+        kind = GuardedPlanner if isinstance(policy, PlanningPolicy) else GuardedFleet
         return kind(guard, policy)  # pyright: ignore  # hasattr does not narrow the type
     return GuardedArm(guard, policy)  # pyright: ignore
 
@@ -228,25 +228,20 @@ def guarded(guard: Callable[[], Guard], policy: Policy | ArmPolicy) -> Policy | 
 Floats = Array | float
 
 
-class Thermometer(Matching):
+class Thermometer(Matched, CentralRule):
     """Matching by value per time, among claims for which the arm is cool enough. It needs no twin.
 
     An arm may claim a job if the headroom of joints 1 to 4, in K, is at least the payload in kg times
-    min(duration / 15 min, 1). Scope central: it compares the arms' times.
+    min(duration / 15 min, 1).
     """
 
-    scope: ClassVar = "central"
     only_choices = True
 
-    def cost(self, observations: Sequence[Observation]) -> Array:
-        """Minus value per second, [arm, option]; inf for claims that are not allowed."""
-        return np.stack([-self._rate(seen) for seen in observations])
-
-    def _rate(self, seen: Observation) -> Array:
+    def index(self, seen: Observation) -> Array:
         """Value per second of every option, [option]; −inf for those that must not be claimed."""
         needed_k = per_option(seen, seen.payload_kg) * np.minimum(seen.duration_s, QUARTER_S) / QUARTER_S
         cool = warning_of(seen) - seen.temp_c[:LARGE].max() >= needed_k
-        return _per_second(seen, per_option(seen, seen.value), cool)
+        return np.where(cool, per_option(seen, seen.value) / np.maximum(seen.duration_s, 1.0), -np.inf)
 
 
 QUARTER_S = 900.0
@@ -254,7 +249,7 @@ LARGE = 4
 """Joints 1 to 4 have the large motors, which carry payloads."""
 
 
-class Wsept(Thermometer):
+class Wsept(Matched, CentralRule):
     """Matching by expected worth per time: weighted shortest expected processing time, with the cost of heat.
 
     The worth of a claim is the expected value of the job, less the expected cost of heat. The true peak is assumed to
@@ -262,8 +257,7 @@ class Wsept(Thermometer):
     limit. A fault costs the value of the job and `fault_price`, each minute above the warning limit `minute_price`. An
     arm takes the plan of a job with the most worth per time, and makes no claim without a positive worth.
 
-    Without a predicted peak, P(saturation) gives one; with neither, heat costs almost nothing. Scope central: it
-    compares the arms' worths.
+    Without a predicted peak, P(saturation) gives one; with neither, heat costs almost nothing.
 
     Source: Rothkopf, Management Science 12, 1966 (weighted expected processing times).
     """
@@ -280,13 +274,13 @@ class Wsept(Thermometer):
     """Price of a minute of tardiness for each unit of a job's value, as in the default reward: for others, as the worth
     of `wsept` has no tardiness."""
 
-    def _rate(self, seen: Observation) -> Array:
+    def index(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
         value, hottest_c = per_option(seen, seen.value), float(seen.temp_c.max())
         warning_c, error_c = warning_of(seen), error_of(seen)
         peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
         worth = self.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c)
-        return _per_second(seen, worth, worth > 0)
+        return np.where(worth > 0, worth / np.maximum(seen.duration_s, 1.0), -np.inf)
 
     @classmethod
     def predicted_peak_c(cls, peak_c: Array, p_saturation: Array, warning_c: Floats) -> Array:
@@ -329,16 +323,13 @@ class Wsept(Thermometer):
 
 
 class WseptAhead(Ahead, Wsept):
-    """As `wsept`, with arms that are home soon as well: a job waits for such an arm if that is worth more per time.
-
-    Scope central, as `wsept`.
-    """
+    """As `wsept`, with arms that are home soon as well: a job waits for such an arm if that is worth more per time."""
 
     only_choices = True
 
 
 class WseptLocal(Local):
-    """As `wsept` for a fleet of one: every arm claims the job that is worth most per time to it. Scope arm."""
+    """As `wsept` for a fleet of one: every arm claims the job that is worth most per time to it."""
 
     central = Wsept
     only_choices = True
@@ -355,9 +346,3 @@ def warning_of(seen: Observation) -> float:
 def error_of(seen: Observation) -> float:
     """The error limit, °C."""
     return float(seen.error_headroom_k) + float(seen.temp_c.max())
-
-
-def _per_second(seen: Observation, worth: Array, allowed: Array) -> Array:
-    """Worth over duration, [option]; −inf where it is not allowed or not legal."""
-    rate = worth / np.maximum(seen.duration_s, 1.0)
-    return np.where(seen.action_mask[1:-1].astype(bool) & allowed, rate, -np.inf).astype(float)

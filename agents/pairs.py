@@ -21,7 +21,7 @@ import numpy as np
 
 from agents.heat import Wsept
 from agents.policy import Local, plans_of
-from agents.rules import Matching
+from agents.rules import CentralRule, Matched
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import FIELDS, Observation
@@ -225,8 +225,8 @@ def scores(seen: Observation, parameters: Array) -> Array:
     return result
 
 
-class PairPolicy(Matching):
-    """Matching by learned scores of arms and jobs. Scope central: it compares all pairs.
+class PairPolicy(Matched, CentralRule):
+    """Matching by learned scores of arms and jobs.
 
     Args:
         parameters: float [PARAMETERS], as a training found them.
@@ -291,7 +291,7 @@ def shipped_parameters() -> Array:
 
 
 class WseptLearned(PairPolicy):
-    """As `wsept`, by scores that were learned on the training split of the suite with the true state. Scope central."""
+    """As `wsept`, by scores that were learned on the training split of the suite with the true state."""
 
     only_choices = True
 
@@ -300,7 +300,7 @@ class WseptLearned(PairPolicy):
 
 
 class WseptUntrained(PairPolicy):
-    """As `wsept_learned`, with the parameters that a training begins with: its ablation. Scope central."""
+    """As `wsept_learned`, with the parameters that a training begins with: its ablation."""
 
     only_choices = True
 
@@ -309,7 +309,7 @@ class WseptUntrained(PairPolicy):
 
 
 class WseptLearnedLocal(Local):
-    """As `wsept_learned` for a fleet of one: every arm claims the job with the highest score for it. Scope arm."""
+    """As `wsept_learned` for a fleet of one: every arm claims the job with the highest score for it."""
 
     central = WseptLearned
     only_choices = True

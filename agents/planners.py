@@ -42,7 +42,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from agents.heat import Wsept, error_of, warning_of
-from agents.policy import WAIT, Lookahead, no_simulator, per_option, plans_of
+from agents.policy import WAIT, CellLookahead, no_simulator, per_option, plans_of
 from agents.rules import claims_of
 from agents.schedules import LEAST_GAIN, Changes, Schedules
 from fleet.observation import Observation
@@ -71,10 +71,10 @@ class Mpc:
     """Simulated changes of each search."""
 
     def __init__(self) -> None:
-        self._cell: Lookahead | None = None
+        self._cell: CellLookahead | None = None
         self.reset(np.random.default_rng(0))
 
-    def plan_in(self, cell: Lookahead) -> None:
+    def plan_in(self, cell: CellLookahead) -> None:
         """Plan in the simulator of a shift, from its beginning."""
         self._cell = cell
 
@@ -107,7 +107,7 @@ class Mpc:
         assert self._schedule is not None
         return actions | _claims(self._schedule, slot_job, observations, now_s)
 
-    def _search(self, cell: Lookahead, observations: Mapping[str, Observation], new: list[int]) -> Schedules:
+    def _search(self, cell: CellLookahead, observations: Mapping[str, Observation], new: list[int]) -> Schedules:
         """The best schedule found for the jobs in the slots."""
         present, simulator, rng = cell.look(observations), cell.simulator, self._rng
         jobs, now_s, horizon_s, dt_s = present.can.shape[1], present.now_s, simulator.horizon_s, simulator.dt_s

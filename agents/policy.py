@@ -6,11 +6,10 @@ in the process of each arm.
 """
 
 from collections.abc import Callable, Mapping
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from agents.schedules import Schedules
 from fleet.errors import FleetError
 from fleet.observation import Observation
 
@@ -42,45 +41,13 @@ class Policy(_Resettable, Protocol):
         ...
 
 
-class Present(Protocol):
-    """The jobs of a shift at a moment: `fleet.env.lookahead.Present`, which explains the fields."""
+class CellLookahead(Protocol):
+    """A simulator of a cell, tied to one of its shifts: `fleet.env.lookahead.Lookahead`, which explains the members."""
 
     @property
-    def now_s(self) -> float: ...
-    @property
-    def open(self) -> Array: ...
-    @property
-    def can(self) -> Array: ...
-    @property
-    def stations(self) -> Array: ...
-
-
-class Executed(Protocol):
-    """Simulated results of schedules: `fleet.engine.play.Executed`, which explains the fields."""
-
-    @property
-    def reward(self) -> Array: ...
-    @property
-    def start_s(self) -> Array: ...
-
-
-class Simulator(Protocol):
-    """Simulates schedules of a cell: `fleet.env.lookahead.CellSimulator`, which explains the members."""
-
-    @property
-    def rows(self) -> int: ...
-    @property
-    def dt_s(self) -> float: ...
-    @property
-    def horizon_s(self) -> float: ...
-    def run(self, schedules: Schedules, discount: Array) -> Executed: ...
-
-
-class Lookahead(Protocol):
-    """A simulator of a cell, tied to one of its shifts: `fleet.env.lookahead.Lookahead`."""
-
-    @property
-    def simulator(self) -> Simulator: ...
+    def simulator(self) -> Any:  # fleet.env.lookahead.CellSimulator
+        """Simulates schedules (`agents.schedules.Schedules`) from the time of the last `look`."""
+        ...
 
     @property
     def slot_job(self) -> Array:
@@ -92,20 +59,20 @@ class Lookahead(Protocol):
         """Time since the shift began."""
         ...
 
-    def with_limits(self, warning_c: float, error_c: float) -> "Lookahead":
+    def with_limits(self, warning_c: float, error_c: float) -> "CellLookahead":
         """The same simulator with other motor limits, °C, for example with a margin."""
         ...
 
-    def look(self, seen: Mapping[str, Observation]) -> Present:
+    def look(self, seen: Mapping[str, Observation]) -> Any:  # fleet.env.lookahead.Present
         """Begin at the present."""
         ...
 
 
 @runtime_checkable
-class Planner(Protocol):
+class PlanningPolicy(Protocol):
     """A policy that plans in a simulator of its cell."""
 
-    def plan_in(self, cell: Lookahead) -> None:
+    def plan_in(self, cell: CellLookahead) -> None:
         """Plan in the simulator of a shift; called once before it begins."""
         ...
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # slow to import, and the help of commands needs names only
 
 
 @dataclass(frozen=True)
-class Rule:
+class BuiltInPolicy:
     """One policy that comes with the project."""
 
     target: str
@@ -41,48 +41,50 @@ def _imported(target: str) -> Any:
 _RELATIVE, _THERMAL, _TIME = "difficulty relative to the fleet", "thermal", "time until the finish"
 _SSI, _KUHN = "Koenig et al. 2006", "Kuhn 1955"
 
-RULES: dict[str, Rule] = {
-    "random": Rule("rules:RandomLegal", "none", scope="arm"),
-    "round_robin": Rule("rules:RoundRobin", "none"),
-    "fifo": Rule("rules:Fifo", "release, then duration", "Pinedo 2022"),
-    "edd": Rule("rules:Edd", "due date, then duration", "Jackson 1955"),
-    "spt": Rule("rules:Spt", "duration", "Smith 1956"),
-    "atc": Rule("rules:Atc", "time per value, later due dates discounted", "Vepsalainen & Morton 1987"),
-    "least_loaded": Rule("rules:LeastLoaded", "work of the arm in the shift", "Pinedo 2022"),
-    "coolest_first": Rule("rules:CoolestFirst", "hottest motor"),
-    "least_difficulty": Rule("rules:LeastDifficulty", _RELATIVE, scope="arm"),
-    "consensus": Rule("auction:Consensus", _RELATIVE, "Choi, Brunet & How 2009", scope="arm"),
-    "wspt": Rule("rules:Wspt", "time per value", "Smith 1956"),
-    "wspt_cool": Rule("rules:WsptCool", "time per value, P(saturation) ≤ 0.5", "Smith 1956"),
-    "thermometer": Rule("heat:Thermometer", "time per value, headroom suits the load", _KUHN),
-    "wsept": Rule("heat:Wsept", "time per expected worth", "Rothkopf 1966"),
-    "wsept_ahead": Rule("heat:WseptAhead", "time per expected worth, with arms that are home soon", "Rothkopf 1966"),
-    "wsept_local": Rule(
+RULES: dict[str, BuiltInPolicy] = {
+    "random": BuiltInPolicy("rules:RandomLegal", "none", scope="arm"),
+    "round_robin": BuiltInPolicy("rules:RoundRobin", "none"),
+    "fifo": BuiltInPolicy("rules:Fifo", "release, then duration", "Pinedo 2022"),
+    "edd": BuiltInPolicy("rules:Edd", "due date, then duration", "Jackson 1955"),
+    "spt": BuiltInPolicy("rules:Spt", "duration", "Smith 1956"),
+    "atc": BuiltInPolicy("rules:Atc", "time per value, later due dates discounted", "Vepsalainen & Morton 1987"),
+    "least_loaded": BuiltInPolicy("rules:LeastLoaded", "work of the arm in the shift", "Pinedo 2022"),
+    "coolest_first": BuiltInPolicy("rules:CoolestFirst", "hottest motor"),
+    "least_difficulty": BuiltInPolicy("rules:LeastDifficulty", _RELATIVE, scope="arm"),
+    "consensus": BuiltInPolicy("auction:Consensus", _RELATIVE, "Choi, Brunet & How 2009", scope="arm"),
+    "wspt": BuiltInPolicy("rules:Wspt", "time per value", "Smith 1956"),
+    "wspt_cool": BuiltInPolicy("rules:WsptCool", "time per value, P(saturation) ≤ 0.5", "Smith 1956"),
+    "thermometer": BuiltInPolicy("heat:Thermometer", "time per value, headroom suits the load", _KUHN),
+    "wsept": BuiltInPolicy("heat:Wsept", "time per expected worth", "Rothkopf 1966"),
+    "wsept_ahead": BuiltInPolicy(
+        "heat:WseptAhead", "time per expected worth, with arms that are home soon", "Rothkopf 1966"
+    ),
+    "wsept_local": BuiltInPolicy(
         "heat:WseptLocal", "time per expected worth, each arm for itself", "Rothkopf 1966", scope="arm"
     ),
-    "wsept_untrained": Rule("pairs:WseptUntrained", "time per worth with the first parameters of a training"),
-    "wsept_learned": Rule("pairs:WseptLearned", "time per learned worth", "Salimans et al. 2017"),
-    "wsept_learned_local": Rule(
+    "wsept_untrained": BuiltInPolicy("pairs:WseptUntrained", "time per worth with the first parameters of a training"),
+    "wsept_learned": BuiltInPolicy("pairs:WseptLearned", "time per learned worth", "Salimans et al. 2017"),
+    "wsept_learned_local": BuiltInPolicy(
         "pairs:WseptLearnedLocal",
         "time per learned worth, each arm for itself",
         "Salimans et al. 2017",
         scope="arm",
     ),
-    "auction": Rule("auction:Auction", "time per expected worth, within n · ε", "Bertsekas 1988"),
-    "rolling_horizon": Rule(
+    "auction": BuiltInPolicy("auction:Auction", "time per expected worth, within n · ε", "Bertsekas 1988"),
+    "rolling_horizon": BuiltInPolicy(
         "planners:RollingHorizon", "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"
     ),
-    "mpc": Rule(
+    "mpc": BuiltInPolicy(
         "planners:Mpc",
         "discounted reward of the rest of the shift, in a simulator of the cell",
         "Mayne et al. 2000",
         plans=True,
     ),
-    "ssi": Rule("rules:Ssi", _THERMAL, _SSI),
-    "matching": Rule("rules:Matching", _THERMAL, _KUHN),
-    "matching_ahead": Rule("rules:MatchingAhead", "thermal, with arms that are home soon", _KUHN),
-    "quickest_ssi": Rule("rules:QuickestSsi", _TIME, _SSI),
-    "quickest_matching": Rule("rules:QuickestMatching", _TIME, _KUHN),
+    "ssi": BuiltInPolicy("rules:Ssi", _THERMAL, _SSI),
+    "matching": BuiltInPolicy("rules:Matching", _THERMAL, _KUHN),
+    "matching_ahead": BuiltInPolicy("rules:MatchingAhead", "thermal, with arms that are home soon", _KUHN),
+    "quickest_ssi": BuiltInPolicy("rules:QuickestSsi", _TIME, _SSI),
+    "quickest_matching": BuiltInPolicy("rules:QuickestMatching", _TIME, _KUHN),
 }
 """The policies, simple ones first."""
 
@@ -92,7 +94,7 @@ class Wrapper:
     """A guard that comes with the project; `NAME:POLICY` wraps any policy in it."""
 
     target: str
-    """MODULE:CLASS, as in `Rule`."""
+    """MODULE:CLASS, as in `BuiltInPolicy`."""
     effect: str
     """Description, for a table."""
     source: str
@@ -124,7 +126,7 @@ NAMES_HELP += f"of `thermofleet train`; {WRAPPERS_HELP}."
 """Allowed names of a policy, for `--help`."""
 
 
-def rule_of(name: str) -> Rule:
+def rule_of(name: str) -> BuiltInPolicy:
     """The policy of a name.
 
     Raises:

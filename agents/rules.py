@@ -49,7 +49,7 @@ class RandomLegal:
 
 
 class RoundRobin:
-    """The oldest job goes to the next able arm in turn. Scope central: it reads the mask of every arm."""
+    """The oldest job goes to the next able arm in turn."""
 
     scope: ClassVar = "central"
     only_choices = True
@@ -65,7 +65,7 @@ class RoundRobin:
         """One pass over the slots from the oldest job; each goes to the next able arm."""
         arms = list(observations)
         actions = dict.fromkeys(arms, WAIT)
-        for slot in range(_slots(observations)):
+        for slot in range(len(observations[arms[0]].offered)):
             in_turn = [arms[(self._turn + step) % len(arms)] for step in range(len(arms))]
             arm, option = _first_able(in_turn, slot, observations, actions)
             if arm is not None:
@@ -75,7 +75,7 @@ class RoundRobin:
 
 
 class CoolestFirst(Stateless):
-    """The oldest job goes to the free arm with most headroom. Scope central: it compares all headrooms."""
+    """The oldest job goes to the free arm with most headroom."""
 
     scope: ClassVar = "central"
     only_choices = True
@@ -115,31 +115,48 @@ class LeastDifficulty(Stateless):
         return least_difficult(observation, slots[min(before, len(slots) - 1)]) + 1
 
 
-class IndexRule(Stateless):
-    """The pair of free arm and job with the highest index first; ties go to the older job, then to the first arm."""
+class CentralRule(Stateless):
+    """Claims of pairs of arm and option by a cost matrix [arm, option], the cheapest pair first.
+
+    Ties go to the older job, then to the first arm. This is a sequential single-item auction with one job per arm.
+    """
 
     scope: ClassVar = "central"
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The claims of the pairs."""
-        cost = np.stack(
-            [
-                np.where(seen.action_mask[1:-1] > 0, -self.index(seen).astype(float), np.inf)
-                for seen in observations.values()
-            ]
-        )
-        return claims_of(observations, cheapest_pairs(cost, _plans(observations)))
+        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
+            return dict.fromkeys(observations, WAIT)
+        seen = list(observations.values())
+        return claims_of(observations, self.pairs(self.cost(seen), plans_of(seen[0])))
+
+    def cost(self, observations: Sequence[Observation]) -> Array:
+        """Minus the index, [arm, option]; inf where an arm may not claim."""
+        legal = [seen.action_mask[1:-1] > 0 for seen in observations]
+        return np.where(legal, [-self.index(seen).astype(float) for seen in observations], np.inf)
 
     def index(self, seen: Observation) -> Array:
         """Index of every option, legal or not, [option]; −inf for those that must not be claimed."""
         raise NotImplementedError
 
+    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
+        """Pairs (arm, option) of a cost matrix [arm, option] of jobs with `plans` options each."""
+        return cheapest_pairs(cost, plans)
 
-class Wspt(IndexRule):
+
+class Matched:
+    """Base of rules that make as many pairs as possible, at the least total cost."""
+
+    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
+        """Pairs (arm, option) of a cost matrix [arm, option] of jobs with `plans` options each."""
+        return matched_options(cost, plans)
+
+
+class Wspt(CentralRule):
     """The pair of free arm and job with the highest value per time first: weighted shortest processing time.
 
     Optimal for the weighted sum of completion times on one machine (W. E. Smith, Naval Research Logistics Quarterly 3,
-    1956), a strong rule on unrelated machines. It ignores temperatures. Scope central: it compares the arms' times.
+    1956), a strong rule on unrelated machines. It ignores temperatures.
     """
 
     only_choices = True
@@ -155,7 +172,7 @@ class Wspt(IndexRule):
 class WsptCool(Wspt):
     """As `wspt`, but no arm claims a job in which a motor would more likely than not pass the warning limit.
 
-    Such a job waits until an arm has cooled. Scope central, as `wspt`.
+    Such a job waits until an arm has cooled.
     """
 
     only_choices = True
@@ -189,7 +206,7 @@ def claims_of(observations: Mapping[str, Observation], pairs: list[tuple[int, in
 def oldest_jobs_to(order: Sequence[str], observations: Mapping[str, Observation]) -> dict[str, int]:
     """Actions after one pass over the slots from the oldest job; each goes to the first able arm of an order."""
     actions = dict.fromkeys(observations, WAIT)
-    for slot in range(_slots(observations)):
+    for slot in range(len(observations[order[0]].offered)):
         arm, option = _first_able(order, slot, observations, actions)
         if arm is not None:
             actions[arm] = option + 1
@@ -210,19 +227,11 @@ def _open(observation: Observation, mine: list[int]) -> Array:
     return (observation.offered > 0) & (may | ~able)
 
 
-def _slots(observations: Mapping[str, Observation]) -> int:
-    return len(next(iter(observations.values())).offered)
-
-
-def _plans(observations: Mapping[str, Observation]) -> int:
-    return plans_of(next(iter(observations.values())))
-
-
 def _first_able(
     arms: Sequence[str], slot: int, observations: Mapping[str, Observation], actions: Mapping[str, int]
 ) -> tuple[str | None, int]:
     """The first of the arms that may claim the slot and has no claim yet, and its fastest legal option."""
-    plans = _plans(observations)
+    plans = plans_of(observations[arms[0]])
     for arm in arms:
         if actions[arm] == WAIT:
             for option in range(slot * plans, (slot + 1) * plans):
@@ -294,46 +303,24 @@ def _mean(values: Array, where: Array, one: Observation, otherwise: float = 0.0)
     return per_option(one, np.where(count > 0, total / np.maximum(count, 1), otherwise))
 
 
-class Ssi(Stateless):
-    """Sequential single-item auction: greedy, the cheapest pair of arm and job first.
+class Ssi(CentralRule):
+    """Sequential single-item auction: the pair of arm and job with the least thermal cost first."""
 
-    Scope central: it compares the costs of all arms.
-    """
-
-    scope: ClassVar = "central"
     only_choices = True
-
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """The claims of the pairs of arm and job."""
-        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
-            return dict.fromkeys(observations, WAIT)
-        seen = list(observations.values())
-        return claims_of(observations, self.pairs(self.cost(seen), plans_of(seen[0])))
 
     def cost(self, observations: Sequence[Observation]) -> Array:
         """[arm, option] of the observations of all arms."""
         return thermal(observations)
 
-    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
-        """Pairs (arm, option) of a cost matrix [arm, option]."""
-        return cheapest_pairs(cost, plans)
 
-
-class Matching(Ssi):
-    """As many jobs as possible at the least total cost: an optimal matching of arms and jobs.
-
-    Scope central: it compares the costs of all arms.
-    """
+class Matching(Matched, Ssi):
+    """As many jobs as possible at the least total thermal cost: an optimal matching of arms and jobs."""
 
     only_choices = True
 
-    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
-        """Pairs (arm, option) of a cost matrix [arm, option]."""
-        return matched_options(cost, plans)
 
-
-class QuickestSsi(Ssi):
-    """As `ssi`, by the time until the finish alone. Scope central."""
+class QuickestSsi(CentralRule):
+    """As `ssi`, by the time until the finish alone."""
 
     only_choices = True
 
@@ -342,8 +329,8 @@ class QuickestSsi(Ssi):
         return quickest(observations)
 
 
-class QuickestMatching(QuickestSsi, Matching):
-    """As `matching`, by the time until the finish alone. Scope central."""
+class QuickestMatching(Matched, QuickestSsi):
+    """As `matching`, by the time until the finish alone."""
 
     only_choices = True
 
@@ -383,7 +370,7 @@ class Ahead:
 
 
 class MatchingAhead(Ahead, Matching):
-    """As `matching`, with arms that are home soon as well. Scope central, as `matching`."""
+    """As `matching`, with arms that are home soon as well."""
 
     only_choices = True
 
@@ -416,11 +403,8 @@ TIME_DIGITS = 1
 """Due dates of a job by different arms are equal up to rounding; decimals of a second that count."""
 
 
-class Fifo(IndexRule):
-    """First in, first out: the oldest job of the queue first, to the arm that needs the least time for it.
-
-    Scope central: it compares the arms' times.
-    """
+class Fifo(CentralRule):
+    """First in, first out: the oldest job of the queue first, to the arm that needs the least time for it."""
 
     only_choices = True
 
@@ -429,10 +413,10 @@ class Fifo(IndexRule):
         return _first_by(per_option(seen, np.arange(len(seen.offered))), seen.duration_s)
 
 
-class Edd(IndexRule):
+class Edd(CentralRule):
     """Earliest due date first, to the arm that needs the least time for the job.
 
-    Optimal for the largest lateness on one machine (Jackson 1955). Scope central: it compares the arms' times.
+    Optimal for the largest lateness on one machine (Jackson 1955).
     """
 
     only_choices = True
@@ -445,16 +429,16 @@ class Edd(IndexRule):
 class Spt(QuickestSsi):
     """Shortest processing time first: the claims of `quickest_ssi`, whose arms are all free when they claim.
 
-    Optimal for the sum of completion times on one machine (Smith 1956). Scope central: it compares the arms' times.
+    Optimal for the sum of completion times on one machine (Smith 1956).
     """
 
     only_choices = True
 
 
-class Atc(IndexRule):
+class Atc(CentralRule):
     """Apparent tardiness cost: value per time, discounted by exp(−slack / (k · mean duration)) until the slack is 0.
 
-    Without slack it is `wspt`; with much slack the less urgent job waits. Scope central: it compares the arms' times.
+    Without slack it is `wspt`; with much slack the less urgent job waits.
 
     Source: Vepsalainen & Morton, Management Science 33, 1987; k = 2 as there for little congestion.
     """
@@ -475,7 +459,7 @@ class LeastLoaded:
     """The oldest job goes to the able arm with the least working time in this shift, by the durations of its claimed
     plans.
 
-    Scope central: it compares the work of all arms. The observation does not contain the work so far, so the rule adds
+    The observation does not contain the work so far, so the rule adds
     the durations of its claims; a claim that lost is subtracted.
     """
 

@@ -2,9 +2,9 @@
 
     python -m benchmarks.bench_decisions [--arms 16] [--jobs 50] [--decisions 30] [--policies a,b] [--wall] [--out FILE]
 
-Prints Markdown for docs/policies.md and writes JSON to FILE. The observations are drawn: jobs of 2 to 30 min, values of
-1 to 4 and predicted peaks of 35 to 75 °C. Each arm can do 60 % of them, and half of the arms are free. The time is CPU
-time, which other programs on the machine hardly change; with --wall real time, for a policy `bus:NAME`. That of a
+Prints Markdown for docs/policies.md and writes JSON to FILE. The observations are sampled: jobs of 2 to 30 min, values
+of 1 to 4 and predicted peaks of 35 to 75 °C. Each arm can do 60 % of them, and half of the arms are free. The time is
+CPU time, which other programs on the machine hardly change; with --wall real time, for a policy `bus:NAME`. That of a
 policy of scope `arm` is for one free arm; that of `mpc` for the decisions with a search in a shift of 16 arms and 48
 slots. For `rolling_horizon` the largest gap that the solver left is added. Exits with an error if a median exceeds its
 limit.
@@ -23,7 +23,7 @@ import numpy as np
 
 from agents.auction import Consensus
 from agents.planners import Mpc, RollingHorizon
-from agents.policy import Planner
+from agents.policy import PlanningPolicy
 from agents.registry import RULES
 from agents.rules import Ssi
 from benchmarks.harness import options, seconds, write_text
@@ -31,8 +31,7 @@ from fleet.env.lookahead import Lookahead
 from fleet.observation import Layout, Observation
 from scenarios.evaluate.hindsight import ShiftSimulator
 from scenarios.policy_loader import policy_at, scope_of
-from scenarios.prepare.fleet import ShiftFactory, prepare
-from scenarios.prepare.known_cell import simulator_of_shift
+from scenarios.prepare.fleet import ShiftFactory, prepare, simulator_of_shift
 from scenarios.spec.jobs import weights_of
 from scenarios.suite.splits import instance
 
@@ -47,7 +46,7 @@ SHIFT = "validation/0005"
 def limit_ms(name: str) -> float:
     """The largest median of a policy."""
     kind = RULES[name].kind if name in RULES else None
-    if kind is None or issubclass(kind, RollingHorizon | Planner):
+    if kind is None or issubclass(kind, RollingHorizon | PlanningPolicy):
         return HORIZON_MS
     return MATCHING_MS if issubclass(kind, Ssi | Consensus) else RULE_MS
 

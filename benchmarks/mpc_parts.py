@@ -1,7 +1,7 @@
 """Variants of `mpc` without discount, search or heat, for `thermofleet compare`; docs/policies.md has the command."""
 
 from agents.planners import Mpc
-from agents.policy import Lookahead
+from agents.policy import CellLookahead
 
 OUT_OF_REACH_C = 1e6
 """Limits of motor temperatures where heat shall not count."""
@@ -26,6 +26,6 @@ class WithoutHeat(Mpc):
 
     only_choices = True
 
-    def plan_in(self, cell: Lookahead) -> None:
+    def plan_in(self, cell: CellLookahead) -> None:
         """Plan in the simulator of a shift, with limits out of reach."""
         super().plan_in(cell.with_limits(OUT_OF_REACH_C, OUT_OF_REACH_C))

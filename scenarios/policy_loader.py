@@ -17,7 +17,7 @@ import numpy as np
 
 from agents.heat import guarded
 from agents.pairs import PAIRS, load_pairs
-from agents.policy import SCOPES, ArmPolicy, Local, Planner, Policy, for_all_arms, no_simulator
+from agents.policy import SCOPES, ArmPolicy, Local, PlanningPolicy, Policy, for_all_arms, no_simulator
 from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
 from fleet.errors import NAME_RULE, FleetError, is_name, nearest, printable
 from fleet.seeding import child
@@ -156,7 +156,7 @@ def without_simulator(name: str, policy: Policy) -> Policy:
     Raises:
         FleetError: it plans in a simulator.
     """
-    if isinstance(policy, Planner):
+    if isinstance(policy, PlanningPolicy):
         raise no_simulator(name)
     return policy
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.policy import WAIT, Planner, Policy, only_choices
+from agents.policy import WAIT, PlanningPolicy, Policy, only_choices
 from agents.schedules import LEAST_GAIN, Changes, Schedules, stack
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.state import World
@@ -111,7 +111,7 @@ class ShiftSimulator:
         engine.reset(np.arange(self.rows), self._shifts)
         engine.observe(np.arange(self.rows), self._vectors)
         for e, policy in enumerate(policies):
-            if isinstance(policy, Planner) and self._simulator:
+            if isinstance(policy, PlanningPolicy) and self._simulator:
                 policy.plan_in(Lookahead(self._simulator(), engine, e))
         reward, running = np.zeros(self.rows), np.ones(self.rows, bool)
         running[given:] = False

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from agents.policy import WAIT, Planner, Policy, only_choices
+from agents.policy import WAIT, PlanningPolicy, Policy, only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.env.lookahead import CellSimulator
@@ -23,8 +23,7 @@ from fleet.observation import Observation
 from scenarios.evaluate.statistics import FigureKind
 from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.batch import library_of
-from scenarios.prepare.fleet import Fleet
-from scenarios.prepare.known_cell import as_known, simulator_of
+from scenarios.prepare.fleet import Fleet, as_known, simulator_of
 from scenarios.run.metrics import HeatUse, common_figures
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import DECISION_LIMIT_S
@@ -170,7 +169,7 @@ def play(
             with guarded(e):
                 policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
         for e, each in policies.items():
-            if isinstance(each, Planner):
+            if isinstance(each, PlanningPolicy):
                 cell = env.lookahead(_simulator(fleet), e)  # may compile, which is no time of the policy
                 with guarded(e):
                     each.plan_in(cell)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
 from agents.planners import NONE, Mpc, RollingHorizon, Sequences, pack
-from agents.policy import WAIT, EveryArm, Local, Planner
+from agents.policy import WAIT, EveryArm, Local, PlanningPolicy
 from agents.registry import RULES, make_policy
 from agents.schedules import Schedules
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
@@ -23,6 +23,7 @@ from scenarios.evaluate.hindsight import ShiftSimulator
 from scenarios.live.auctioneer import central_allocation
 from scenarios.policy_loader import policy_of, without_simulator
 from scenarios.spec.load import load
+from tests.agents.observations import observation
 from tests.exhaustive import optimum
 from tests.profiles import examples
 
@@ -41,14 +42,11 @@ def seen(
     **fields,
 ):
     """What an arm knows that has one plan for each job."""
-    d = np.array(duration_s, dtype=float)
-    layout, idle = Layout(1, len(d)), busy_s == 0.0
-    legal = (np.broadcast_to(station_free, d.shape) > 0) & idle
-    blank = layout.read(np.zeros(layout.size, np.float32), np.pad(legal, 1, constant_values=(1, 0)).astype(np.int8))
+    d, idle = np.array(duration_s, dtype=float), busy_s == 0.0
     known = {
-        "idle": np.array(float(idle)),
-        "working": np.array(float(not idle)),
-        "busy_s": np.array(busy_s),
+        "idle": float(idle),
+        "working": float(not idle),
+        "busy_s": busy_s,
         "offered": np.ones(len(d)),
         "feasible": np.ones(len(d)),
         "space_free": np.full(len(d), float(idle)),
@@ -59,11 +57,11 @@ def seen(
         "peak_c": np.broadcast_to(peak_c, d.shape),
         "p_saturation": np.full(len(d), 0.001),
         "temp_c": np.full(7, temp_c),
-        "ambient_c": np.array(25.0),
-        "headroom_k": np.array(WARNING_C - temp_c),
-        "error_headroom_k": np.array(75.0 - temp_c),
+        "ambient_c": 25.0,
+        "headroom_k": WARNING_C - temp_c,
+        "error_headroom_k": 75.0 - temp_c,
     }
-    return replace(blank, **{**known, **fields})
+    return observation(len(d), legal=(np.broadcast_to(station_free, d.shape) > 0) & idle, **{**known, **fields})
 
 
 def act(*fleet: Observation) -> list[int]:
@@ -247,11 +245,11 @@ def test_a_later_reward_is_worth_less(small):
 def test_where_there_is_no_simulator_an_error_says_so(small):
     assert [name for name, rule in RULES.items() if rule.plans] == ["mpc"]
     for name in ("mpc", "limited:mpc"):
-        assert isinstance(policy_of(name), Planner)
+        assert isinstance(policy_of(name), PlanningPolicy)
         for refused in (alone, lambda name: central_allocation(name, load("quickstart"), 0)):
             with pytest.raises(FleetError, match=f"'{name}' plans in a simulator of its cell, and there is none here"):
                 refused(name)
-    assert not isinstance(policy_of("limited:wsept"), Planner)
+    assert not isinstance(policy_of("limited:wsept"), PlanningPolicy)
     world, _ = small.Shifts().shop(small.Shifts().drawn(np.random.SeedSequence(1))[0])
     with pytest.raises(FleetError, match="Choose another"):
         ShiftSimulator(world, WEIGHTS, 1).follow([make_policy("mpc")])

@@ -11,21 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents import staleness
-from agents.policy import EveryArm
 from agents.rules import LeastDifficulty
 from agents.staleness import advantage, fading_weights
-from fleet.env.allocation_v1 import parallel_env
-from fleet.observation import LONG_S, Layout, Observation
+from fleet.observation import LONG_S, Observation
+from tests.agents.observations import observation
 
 
 def heard(own: list[float], peers: list[list[float]], ages_s: list[float]) -> Observation:
     """What the first arm knows that finds the slots so difficult, and was told so much, so long ago; NaN not told."""
     told = np.array(peers, dtype=float).reshape(len(ages_s), len(own))
-    slots = len(own)
-    layout = Layout(1 + len(ages_s), slots)
-    known = ~np.isnan(told)
-    return replace(
-        layout.read(np.zeros(layout.size, np.float32), np.append(np.ones(slots + 1, np.int8), np.int8(0))),
+    slots, known = len(own), ~np.isnan(told)
+    return observation(
+        slots,
+        peers=len(ages_s),
         idle=1.0,
         offered=np.ones(slots),
         feasible=np.ones(slots),
@@ -33,8 +31,6 @@ def heard(own: list[float], peers: list[list[float]], ages_s: list[float]) -> Ob
         difficulty=np.nan_to_num(np.array(own)),
         peer_heard=np.array([float(age < LONG_S) for age in ages_s]),
         peer_age_s=np.array(ages_s, dtype=np.float32),
-        peer_working=np.zeros(len(ages_s)),
-        peer_faulted=np.zeros(len(ages_s)),
         peer_known=known.astype(float),
         peer_difficulty=np.where(known, told, 0.0),
     )
@@ -103,20 +99,3 @@ def test_a_peer_with_an_old_claim_gives_way_to_one_with_a_fresh_one():
         assert choice(heard([3.0, 2.0], [[3.0, 1.8]], [0.0])) == 1
         # Now its claim on the second counts for e^-8: this arm takes what it finds easiest against the average.
         assert choice(heard([3.0, 1.9], [[2.9, 2.0]], [80.0])) == 2
-
-
-def test_a_shift_with_fresh_words_does_not_depend_on_the_scales(small):
-    def trace() -> list[dict[str, int]]:
-        policy = EveryArm(LeastDifficulty)
-        env = parallel_env(small.Shifts(arms=3, jobs=15, ticks=80))
-        env.reset(seed=2)
-        said = []
-        while env.agents:
-            said.append(policy.act(env.knowledge()))
-            env.step(said[-1])
-        return said
-
-    usual = trace()
-    for seconds in ({"FADING_S": 0.1, "EXPIRY_S": 0.1}, {"FADING_S": 1e12, "EXPIRY_S": math.inf}):
-        with scales(**seconds):
-            assert trace() == usual
