@@ -23,7 +23,8 @@ from fleet.observation import Observation
 from scenarios.evaluate.statistics import FigureKind
 from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.batch import library_of
-from scenarios.prepare.fleet import Fleet, as_known, simulator_of
+from scenarios.prepare.fleet import Fleet
+from scenarios.prepare.known_cell import as_known, simulator_of
 from scenarios.run.metrics import HeatUse, common_figures
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import DECISION_LIMIT_S
