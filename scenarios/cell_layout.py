@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from fleet.env.render.scene import Cell, mount_kind
+from fleet.env.render.scene import CellMap, mount_kind
 from fleet.errors import ScenarioError
 from scenarios.spec.schema import Scenario
 
 
-def cell_of(scenario: Scenario) -> Cell:
+def cell_of(scenario: Scenario) -> CellMap:
     """The cell of a scenario, with arms, places and fixtures in the order of the scenario."""
     robots = [arm.robot() for arm in scenario.arms]
-    return Cell(
+    return CellMap(
         arms=tuple(robot.name for robot in robots),
         mounts_m=tuple(robot.mount.position_m for robot in robots),
         kinds=tuple(mount_kind(robot.mount) for robot in robots),

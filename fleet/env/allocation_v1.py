@@ -25,7 +25,7 @@ from fleet.engine.shift import ShiftRunner, Watch
 from fleet.engine.state import State, World
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
-from fleet.env.render.scene import Cell
+from fleet.env.render.scene import CellMap
 from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, decisions_of, seed_of
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
@@ -97,7 +97,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         keep_events: bool = False,
         watch: Watch | None = None,
         render_mode: str | None = None,
-        cell: Cell | None = None,
+        cell: CellMap | None = None,
         mask_in: MaskPlace = "obs",
         near: tuple[tuple[int, ...], ...] | None = None,
         decisions: Decisions = "interval",

@@ -162,10 +162,10 @@ def layout_command(
     if out is not None:
         from matplotlib.image import imsave
 
-        from fleet.env.render.picture import Picture
+        from fleet.env.render.picture import draw
 
         with new_file(out) as file:
-            imsave(file, Picture().frame(layout_scene(chosen, report)), format="png")
+            imsave(file, draw(layout_scene(chosen, report)), format="png")
         say(f"Drew the cell: {out}.")
     for problem in report.problems:
         say(f"Error: {problem}")

@@ -61,8 +61,8 @@ class Exclusion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Assignment:
-    """One work of one arm among those done at the same time."""
+class ArmTask:
+    """The task of one arm in a set of tasks that can be done at the same time."""
 
     arm: str
     job: str
@@ -79,7 +79,7 @@ class LayoutReport:
     exclusions: tuple[Exclusion, ...]
     excluded_share: float
     """Share of the pairs of plans of two arms that exclude each other."""
-    at_once: tuple[Assignment, ...]
+    at_once: tuple[ArmTask, ...]
     """A largest set of works that different arms can do at the same time, each at its own stations."""
     largest: bool
     """Whether no larger set exists; False if the search ended at its time limit."""
@@ -111,7 +111,7 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
 
 
 def layout_scene(scenario: Scenario, report: LayoutReport) -> "Scene":
-    """The cell with the arms that can work at once at their stations, for `fleet.env.render.picture.Picture`."""
+    """The cell with the arms that can work at once at their stations, for `fleet.env.render.picture.draw`."""
     from fleet.env.render.scene import Scene
     from fleet.telemetry import IDLE, WORKING
 
@@ -217,7 +217,7 @@ def _exclusions(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) ->
     return tuple(sorted(exclusions, key=lambda pair: (-pair.share, pair.same_place, pair.jobs, pair.arms)))
 
 
-def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) -> tuple[tuple[Assignment, ...], bool]:
+def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) -> tuple[tuple[ArmTask, ...], bool]:
     """Volumes without conflicts and with different stations, and whether no set is larger; an integer program."""
     volumes, conflicts = space.rows(plans)
     used, first = np.unique(volumes, return_index=True)
@@ -243,7 +243,7 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
     )
     chosen = [] if result.x is None else first[result.x > 0.5].tolist()
     streams = _streams(scenario, plans)
-    works = (Assignment(arm=plans[i].arm, job=streams[i], places=plans[i].work.stations) for i in chosen)
+    works = (ArmTask(arm=plans[i].arm, job=streams[i], places=plans[i].work.stations) for i in chosen)
     return tuple(works), result.status == 0
 
 

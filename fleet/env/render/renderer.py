@@ -6,36 +6,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fleet.engine.state import State, World
-from fleet.env.render.scene import Cell, scene_of
+from fleet.env.render.scene import CellMap, scene_of
 from fleet.errors import FleetError, install
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from fleet.env.render.picture import Picture
 
 log = logging.getLogger(__name__)
 
 DPI = 100
 NO_WINDOW = (
     "There is no display to show the fleet on (%s). Use render_mode='rgb_array' for the frames, or "
-    "`thermofleet run SCENARIO` and `thermofleet film RUN` for a film."
+    "`thermofleet run SCENARIO` and `thermofleet view RUN --out FILE.mp4` for a film."
 )
 
 
 class Renderer:
-    """Renders states of one environment.
-
-    A copy or pickle draws the same and has a window of its own, not yet open.
+    """Renders states of one environment. A copy or pickle has no window yet.
 
     Args:
         cell: Positions of arms and stations; a grid if not given.
-        title: Of the window.
     """
 
-    def __init__(self, cell: Cell | None = None, title: str = "thermofleet") -> None:
-        self._cell, self._title = cell, title
-        self._picture: Picture | None = None
+    def __init__(self, cell: CellMap | None = None) -> None:
+        self._cell = cell
         self._figure: Figure | None = None
         self._closed = False
         """Whether the user closed the window, or there is no display."""
@@ -46,13 +40,11 @@ class Renderer:
         Raises:
             FleetError: matplotlib is not installed.
         """
-        if self._picture is None:
-            try:
-                from fleet.env.render.picture import Picture
-            except ImportError as error:
-                raise FleetError(f"Rendering needs matplotlib: {install('report')}.") from error
-            self._picture = Picture()
-        return self._picture.frame(scene_of(world, state, self._cell))
+        try:
+            from fleet.env.render.picture import draw
+        except ImportError as error:
+            raise FleetError(f"Rendering needs matplotlib: {install('report')}.") from error
+        return draw(scene_of(world, state, self._cell))
 
     def show(self, frame: np.ndarray) -> bool:
         """Show a frame, uint8 [height, width, 3], in the window; return whether there is a window.
@@ -82,8 +74,8 @@ class Renderer:
             plt.close(self._figure)
         self._figure, self._closed = None, False
 
-    def __reduce__(self) -> tuple[type["Renderer"], tuple[Cell | None, str]]:
-        return Renderer, (self._cell, self._title)
+    def __reduce__(self) -> tuple[type["Renderer"], tuple[CellMap | None]]:
+        return Renderer, (self._cell,)
 
     def _open(self, frame: np.ndarray) -> "Figure | None":
         """A matplotlib window, or None without a display."""
@@ -97,7 +89,7 @@ class Renderer:
                 log.warning(NO_WINDOW, f"matplotlib's backend is {backend}")
                 return None
             height, width = frame.shape[:2]
-            figure = plt.figure(num=self._title, figsize=(width / DPI, height / DPI), dpi=DPI)
+            figure = plt.figure(num="thermofleet", figsize=(width / DPI, height / DPI), dpi=DPI)
         except ImportError as error:  # a chosen backend whose toolkit or display is missing
             log.warning(NO_WINDOW, str(error))
             return None

@@ -25,7 +25,7 @@ LEVEL_DEG = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
+class CellMap:
     """Positions of arms, stations and fixtures; hashable."""
 
     arms: tuple[str, ...]
@@ -37,17 +37,6 @@ class Cell:
     """Name and tool point of each station."""
     fixtures: tuple[Fixture, ...] = ()
 
-    def __post_init__(self) -> None:
-        if not len(self.arms) == len(self.mounts_m) == len(self.kinds):
-            raise ValueError(
-                f"Cell needs a mount and a kind per arm (got {len(self.arms)} arms, {len(self.mounts_m)} mounts, "
-                f"{len(self.kinds)} kinds)."
-            )
-        if not self.arms:
-            raise ValueError("Cell needs at least one arm.")
-        if not all(math.isfinite(x) for point in (*self.mounts_m, *(p for _, p in self.stations)) for x in point):
-            raise ValueError("Cell.mounts_m and stations must be finite, in m.")
-
 
 def mount_kind(mount: Mount) -> MountKind:
     """Mount of an arm, from the direction of its base."""
@@ -58,11 +47,11 @@ def mount_kind(mount: Mount) -> MountKind:
     return "wall" if abs(up) < math.sin(math.radians(LEVEL_DEG)) else "tilted"
 
 
-def grid_cell(arms: tuple[str, ...], stations: tuple[str, ...]) -> Cell:
+def grid_cell(arms: tuple[str, ...], stations: tuple[str, ...]) -> CellMap:
     """A cell for a fleet of unknown positions: arms in rows, stations in rows in front of them."""
     across = math.ceil(math.sqrt(len(arms)))
     front = 0.4 - math.ceil(len(arms) / across)
-    return Cell(
+    return CellMap(
         arms=arms,
         mounts_m=tuple((float(i % across), float(-(i // across)), 0.0) for i in range(len(arms))),
         kinds=("floor",) * len(arms),
@@ -91,7 +80,7 @@ class QueuedJob:
 class Scene:
     """One moment of a shift."""
 
-    cell: Cell
+    cell: CellMap
     time_s: float
     horizon_s: float
     temp_c: Array
@@ -114,17 +103,9 @@ class Scene:
     faults: int
     title: str = ""
 
-    def __post_init__(self) -> None:
-        arms = len(self.cell.arms)
-        for name in ("temp_c", "mode", "job", "progress", "at"):
-            if len(getattr(self, name)) != arms:
-                raise ValueError(f"Scene.{name} needs one entry per arm, {arms} (got {len(getattr(self, name))}).")
-        if not self.warning_c < self.error_c:
-            raise ValueError(f"Scene needs warning_c < error_c (got {self.warning_c}, {self.error_c}).")
 
-
-def scene_of(world: World, state: State, cell: Cell | None = None, *, env: int = 0, title: str = "") -> Scene:
-    """Scene of one env from the simulator's state.
+def scene_of(world: World, state: State, cell: CellMap | None = None) -> Scene:
+    """Scene of env 0 from the simulator's state.
 
     Args:
         cell: Positions of arms and stations; `grid_cell` if not given.
@@ -136,45 +117,42 @@ def scene_of(world: World, state: State, cell: Cell | None = None, *, env: int =
     if cell.arms != world.arms:
         raise ValueError(f"The cell has the arms {', '.join(cell.arms)}; the world has {', '.join(world.arms)}.")
     slot_job, mask = open_jobs(world, state)
-    jobs, mode = world.jobs, state.mode[env]
-    time_s = float(state.tick[env] * world.dt_s)
-    current = np.where(mode == WORKING, state.job[env], -1).tolist()
-    on_offer, options = slot_job[env].tolist(), world.plans_per_job
+    jobs, mode = world.jobs, state.mode[0]
+    time_s = float(state.tick[0] * world.dt_s)
+    current = np.where(mode == WORKING, state.job[0], -1).tolist()
+    on_offer, options = slot_job[0].tolist(), world.plans_per_job
     return Scene(
         cell=cell,
         time_s=time_s,
         horizon_s=world.horizon_s,
-        temp_c=state.temp_c[env, :, WINDING].copy(),
+        temp_c=state.temp_c[0, :, WINDING].copy(),
         warning_c=world.limits.warning_c,
         error_c=world.limits.error_c,
         mode=tuple(mode.tolist()),
-        job=tuple(jobs.names[env][j] if j >= 0 else "" for j in current),
-        progress=tuple(_progress(world, state, env, a, j) for a, j in enumerate(current)),
-        at=tuple(
-            tuple(world.stations[s] for s in jobs.stations[env, j].tolist() if s >= 0 and j >= 0) for j in current
-        ),
+        job=tuple(jobs.names[0][j] if j >= 0 else "" for j in current),
+        progress=tuple(_progress(world, state, a, j) for a, j in enumerate(current)),
+        at=tuple(tuple(world.stations[s] for s in jobs.stations[0, j].tolist() if s >= 0 and j >= 0) for j in current),
         queue=tuple(
             QueuedJob(
-                job=jobs.names[env][j],
-                payload_kg=float(jobs.payload_kg[env, j]),
-                due_in_s=float(jobs.due_s[env, j]) - time_s,
-                able=tuple(np.any(world.offers.plan[env, :, j] >= 0, axis=-1).tolist()),
-                free=tuple(np.any(mask[env, :, 1 + slot * options :][:, :options], axis=-1).tolist()),
+                job=jobs.names[0][j],
+                payload_kg=float(jobs.payload_kg[0, j]),
+                due_in_s=float(jobs.due_s[0, j]) - time_s,
+                able=tuple(np.any(world.offers.plan[0, :, j] >= 0, axis=-1).tolist()),
+                free=tuple(np.any(mask[0, :, 1 + slot * options :][:, :options], axis=-1).tolist()),
             )
             for slot, j in enumerate(on_offer)
             if j >= 0
         ),
-        waiting=int((jobs.exists[env] & (state.status[env] == WAITING) & (jobs.release_s[env] <= time_s)).sum()),
-        finished=int((jobs.exists[env] & (state.status[env] == DONE)).sum()),
-        faults=int(state.faults[env].sum()),
-        title=title,
+        waiting=int((jobs.exists[0] & (state.status[0] == WAITING) & (jobs.release_s[0] <= time_s)).sum()),
+        finished=int((jobs.exists[0] & (state.status[0] == DONE)).sum()),
+        faults=int(state.faults[0].sum()),
     )
 
 
-def _progress(world: World, state: State, env: int, arm: int, job: int) -> float:
+def _progress(world: World, state: State, arm: int, job: int) -> float:
     """Finished share of the job of an arm; 0 for no job, -1."""
     if job < 0:
         return 0.0
-    approach, cycle, retreat = world.plans.times_s[state.plan[env, arm]].tolist()
-    whole_s = approach + int(state.todo[env, arm]) * cycle + retreat
-    return min(1.0, float(state.progress_s[env, arm]) / whole_s) if whole_s > 0 else 0.0
+    approach, cycle, retreat = world.plans.times_s[state.plan[0, arm]].tolist()
+    whole_s = approach + int(state.todo[0, arm]) * cycle + retreat
+    return min(1.0, float(state.progress_s[0, arm]) / whole_s) if whole_s > 0 else 0.0
