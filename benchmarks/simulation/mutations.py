@@ -24,9 +24,7 @@ from fleet.live.consensus.grants import Claimant, Granter
 from fleet.live.consensus.jobs import JobGranted
 from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, Journal
 from fleet.live.supervisor import Supervisor
-from scenarios.live import recorder as recorder_module
 from scenarios.live.recorder import GapFetcher, Recorder
-from scenarios.live.recording import PartOpened
 
 Patch = tuple[Any, str, Callable[[Any], Any]]
 """Where, the name, and what makes the replacement of what was there."""
@@ -339,15 +337,8 @@ def _cleared_at_once(clear: Any) -> Any:
 def _gaps_unnoticed(take: Any) -> Any:
     def patched(self: Any, record: Any) -> bool:
         new = take(self, record)
-        self.sought.clear()
+        self.missing.clear()
         return new
-
-    return patched
-
-
-def _of_any_part(_: Any) -> Any:
-    def patched(journal: Any, number: int) -> Any:
-        return [record for record in journal.records() if not isinstance(record, PartOpened)]
 
     return patched
 
@@ -415,9 +406,4 @@ add_mutation(
     "repeats-recorded",
     "a message is recorded once",
     (Recorder, "_fill", lambda _: lambda self, series, count, time_s: True),
-)
-add_mutation(
-    "part-twice",
-    "the journal of a complete part is ignored",
-    (recorder_module, "records_of", _of_any_part),
 )

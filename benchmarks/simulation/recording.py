@@ -24,7 +24,6 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.operator import Operation
 from fleet.events import EVENTS_PER_BOOT
-from fleet.live.journal import Journal
 from scenarios.live import recorder as recorder_module
 from scenarios.live.recorder import Recorder, RecorderNode
 from scenarios.live.recording import Kind, read_card, read_parts
@@ -56,13 +55,12 @@ def simulated_files(disk: Callable[[], Any]) -> Iterator[None]:
         path.write_bytes(content.getvalue())
 
     module: Any = recorder_module
-    before = module.os, module.pq, module.Journal
+    before = module.os, module.pq
     module.os, module.pq = DiskCalls(disk), SimpleNamespace(write_table=write_table)
-    module.Journal = lambda path, kind: Journal(path, kind, sync=disk().fsync)
     try:
         yield
     finally:
-        module.os, module.pq, module.Journal = before
+        module.os, module.pq = before
 
 
 class Sent:
@@ -92,7 +90,7 @@ class Sent:
         if node is None:
             return ["it is down"]
         recorder = node.recorder
-        seeks = [f"'{gap.sender}' is sought from {gap.first} to {gap.last}" for gap in recorder.sought]
+        seeks = [f"'{gap.sender}' is sought from {gap.first} to {gap.last}" for gap in recorder.missing]
         last = {f"{kind} of {name}": number for kind, name, number in sorted(self.messages) if kind != "events"}
         last |= {f"events of {own.name}": own.cache[-1][1].number for own in self.cached.values() if _has_events(own)}
         heard = {name.partition(", epoch")[0]: count.last for name, count in recorder.counts.items()}

@@ -42,7 +42,7 @@ def up_command(
     host: str = option("--tls: address on which the router listens, as 0.0.0.0. Default: loopback only.", ""),
     page: bool = option(f"Also serve a live page (bus gateway --page), on port {PAGE_PORT} if free.", False),
 ) -> None:
-    """Start a whole fleet, each participant as its own process, and keep it running until its jobs are done.
+    """Start a fleet, one process per participant, and run it until its jobs are done.
 
     A process that exits is restarted with back-off; Ctrl-C stops all in order. The same command with the same --out
     continues from the journals. With --arms it starts a part of the fleet.
@@ -61,7 +61,7 @@ def arm_command(
     given: Annotated[Given, From(LiveSpec, "difficulty", "risk", "seed", "journal", "jobs", "fleet", "new_epoch")],
     source: Literal["sim", "log"] = option("sim (the scenario's arm), or log FILE.", "sim"),
     policy: str = option(
-        f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, your own as "
+        f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, a user-defined one as "
         f"FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}. Default: an auctioneer awards them.",
         "",
     ),
@@ -72,7 +72,7 @@ def arm_command(
     capacity: int = option("Maximum concurrent jobs.", 1, low=1, high=256),
     endpoint: str = options.ENDPOINT,
 ) -> None:
-    """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
+    """Run one arm of a fleet until Ctrl-C or SIGTERM: publish its state, quote and execute jobs, report results."""
     from scenarios.spec.load import load
 
     chosen = load(scenario)
@@ -94,7 +94,7 @@ def auctioneer_command(
     name: str = option("Name of the auctioneer; part of its keys.", "auctioneer", is_name=True),
     endpoint: str = options.ENDPOINT,
 ) -> None:
-    """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
+    """Auction jobs to the arms of a fleet, serve the fleet clock, and record awards in a journal."""
     from scenarios.live.auctioneer import run_auctioneer
     from scenarios.spec.load import load
 
@@ -118,7 +118,7 @@ def router_command(
         "Refuse to start unless every arm of this scenario has a certificate.", None, panel=_TLS
     ),
 ) -> None:
-    """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; it prints its endpoint once it listens."""
+    """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; its endpoint is printed once it listens."""
     from fleet.bus.router import Limits, Router
     from fleet.bus.security.tls import Tls
     from scenarios.signals import until_stopped
@@ -140,9 +140,9 @@ def watch_command(
     fleet: str = options.FLEET,
     as_json: bool = option("Print one snapshot as JSON.", False, flag="--json"),
     joints: bool = option("Show every joint; the key j changes that.", False),
-    scenario: str = option("Scenario of the fleet, to show what is left of the shift; the bus does not tell.", ""),
+    scenario: str = option("Scenario of the fleet, to show the remaining time of the shift.", ""),
 ) -> None:
-    """Watch a fleet until it has ended, or Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
+    """Watch temperatures, difficulty, jobs and the age of messages, until the fleet ends or Ctrl-C."""
     from scenarios.live.watch import watch
     from scenarios.spec.load import load
 
@@ -153,15 +153,11 @@ def doctor_command(
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
     seconds: float = option("Real seconds to listen.", 3.0, low=0, high=600, above=True),
-    auctioneer: bool = option(
-        "The fleet should have one; --no-auctioneer: it should have none.", True, flag="--auctioneer/--no-auctioneer"
-    ),
-    scenario: str = option(
-        "Every arm of this scenario should be present. Default: only the arms that are found are checked.", ""
-    ),
+    auctioneer: bool = option("Expect an auctioneer, or none.", True, flag="--auctioneer/--no-auctioneer"),
+    scenario: str = option("Scenario whose arms must all be present. Default: check only the arms that are found.", ""),
     as_json: bool = options.JSON,
 ) -> None:
-    """Check the health of a fleet: whether its arms and its auctioneer are present, and their clocks agree.
+    """Check the health of a fleet: presence and clocks of its arms and auctioneer, and malformed messages.
 
     Exit code 0: healthy; 1: a fault was found, or no fleet; 2: the router cannot be reached.
     """
@@ -178,10 +174,10 @@ def record_command(
     out: Path = option("Folder of the recording; an interrupted one is continued.", MISSING),
     endpoint: str = options.ENDPOINT,
     rotate: float = option(
-        "Real seconds between two parts; a message is durable within a second.", 60.0, low=0.1, high=86_400
+        "Real seconds between two parts; a message is durable once it is in a part.", 10.0, low=0.1, high=86_400
     ),
 ) -> None:
-    """Record what arms and auctioneer publish: a journal, then Parquet parts; readable at once."""
+    """Record the messages of arms and auctioneer as Parquet parts, which can be read meanwhile."""
     from fleet.bus.client import BusClient
     from fleet.live.policy_client import CONNECT_S
     from scenarios.live.recorder import BACKLOG, record
@@ -208,16 +204,16 @@ def replay_command(
 ) -> None:
     """Publish a run or a recording on the bus, in real time or at --speed."""
     from fleet.bus.client import BusClient
-    from scenarios.live.replayer import Replay
+    from scenarios.live.recording import open_messages, replay
     from scenarios.signals import until_stopped
 
-    replay = Replay.of(path)
-    if not len(replay):
-        raise FleetError(f"'{path}' holds no messages.")
-    with until_stopped() as stop, BusClient(endpoint, fleet or replay.fleet) as link:
+    messages = open_messages(path)
+    if not len(messages):
+        raise FleetError(f"'{path}' holds no messages. Record longer.")
+    with until_stopped() as stop, BusClient(endpoint, fleet or messages.fleet) as link:
         echo(f"ready replay {endpoint}")
-        count = replay.play(link, speed=speed, stopped=stop.is_set)
-    say(f"Published {count} of {len(replay)} messages.", out_console)
+        count = replay(messages, link, speed=speed, stopped=stop.is_set)
+    say(f"Published {count} of {len(messages)} messages.", out_console)
     stop.leave("The replay was interrupted.")
 
 
@@ -225,14 +221,12 @@ def gateway_command(
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
     page: bool = option(
-        "Also serve a live page: arms in 3-D, temperatures, jobs, offers, alerts, and what the role of a "
-        "token may request.",
+        "Also serve a live page: arms in 3-D, temperatures, jobs, offers, alerts, and the requests that the "
+        "token's role permits.",
         False,
     ),
-    scenario: str = option(
-        "--page: scenario of the cell, to draw its fixtures too. Default: as the auctioneer describes it.", ""
-    ),
-    port: int = option("TCP port of the gateway; 0 takes a free one.", PAGE_PORT, low=0, high=65535),
+    scenario: str = option("--page: scenario of the cell. Default: the cell as the auctioneer describes it.", ""),
+    port: int = option("TCP port of the gateway; 0 is any free one.", PAGE_PORT, low=0, high=65535),
     host: str = option("Listening address; beyond loopback only with a token.", "127.0.0.1"),
     token: str = option(
         "Bearer token for all requests. Prefer the variable: other users can read command lines.",
@@ -264,7 +258,7 @@ def gateway_command(
 def ros2_command(
     mode: Literal["bridge", "listen", "jobs"] = argument(
         "bridge: publish every arm as JointState and DiagnosticArray. listen: show a real arm with a ROS 2 "
-        "driver as an arm that takes no jobs. jobs: serve the action thermofleet_msgs/action/DoJob, with rclpy."
+        "driver as an arm that takes no jobs. jobs: serve the action thermofleet_msgs/action/DoJob (needs rclpy)."
     ),
     topic: str = argument("listen: topic of the arm's sensor_msgs/JointState, as /joint_states.", ""),
     endpoint: str = options.ENDPOINT,
@@ -284,9 +278,9 @@ def ros2_command(
     joints: str = option("Names of its joints in ROS 2, from joint 1 on.", "", panel=_LISTEN),
     rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True, panel=_LISTEN),
 ) -> None:
-    """Connect a fleet and ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
+    """Connect a fleet to ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
     if (mode == "listen") != bool(topic):
-        raise FleetError(f"TOPIC is for listen, and listen needs one (got {mode} {topic}".rstrip() + ").")
+        raise FleetError(f"Only listen takes a TOPIC, and needs one (got {mode} {topic}".rstrip() + ").")
     from scenarios.live.ros2 import run_bridge, run_jobs, run_listener
 
     if mode == "jobs":

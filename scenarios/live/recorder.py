@@ -1,8 +1,8 @@
-"""Record the messages of arms and auctioneers: durable within seconds, without duplicates, and with known gaps.
+"""Record the messages of arms and auctioneers once each, with known gaps.
 
-A message goes to the append-only journal first (`save`), later to Parquet parts (`write`). The card names the last
-complete part, so a crash loses and duplicates no row. Every sender numbers its messages: repeated ones are dropped,
-missing ones are fetched from the caches of the publishers (`GapFetcher`), and lost ones become a row of `gaps`.
+Messages are durable once they are in a Parquet part; the card names the last complete part, so a crash duplicates no
+row. Every sender numbers its messages: repeated ones are dropped, missing ones are fetched from the caches of the
+publishers (`GapFetcher`), also those that a crash of the recorder lost, and lost ones become a row of `gaps`.
 """
 
 import fcntl
@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import msgspec
 import pyarrow.parquet as pq
@@ -27,28 +28,21 @@ from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Operation
-from fleet.errors import BusError, FleetError, JournalError
+from fleet.errors import BusError, FleetError
 from fleet.events import EVENTS_PER_BOOT
 from fleet.files import atomic_path
-from fleet.live.journal import Journal
 from scenarios.live.recording import (
     CARD,
-    JOURNAL,
     KINDS,
     RECORDING_FORMAT,
     SOURCES,
-    Card,
-    Count,
     Gap,
     Kind,
     Message,
-    PartOpened,
-    Received,
-    Record,
+    RecordingCard,
+    SenderCount,
     part_file,
     read_card,
-    records_of,
-    to_record,
     to_row,
     to_table,
 )
@@ -68,7 +62,7 @@ MAX_KEYS = 64
 SWEEP_S, SWEEP_KEYS = 60.0, 8
 """Real seconds between two sweeps, and senders asked in one, by turns: a cache may hold a thousand messages."""
 TURN_S, BATCH = 0.5, 1000
-"""Real seconds, and messages, after which received messages are written to the disk."""
+"""Real seconds, and messages, after which a turn of the recorder ends."""
 CELL_S, CELL_REPLY_S = 30.0, 5.0
 """Real seconds: between two requests for the cell, until one has a reply; until a request times out."""
 BACKLOG = 200_000
@@ -81,18 +75,18 @@ RETRY_S = 5.0
 
 @dataclass(frozen=True)
 class Series:
-    """The place of a message among those that its sender numbers."""
+    """The messages that a sender numbers, and the number of one of them."""
 
     sender: str
-    """As in the card: `state of arm_0`."""
+    """As in the card: `telemetry of arm_0`."""
     number: int
     epoch: str
     first: int
     """Least number since the last start of the sender."""
     continues: bool
-    """Whether the numbers of an epoch go on when the sender starts again; its times are in no order then."""
+    """Whether the numbers of an epoch continue when the sender starts again; its times are in no order then."""
     whole: bool = True
-    """Whether what was sent before the recording began belongs to it, as far as it is cached."""
+    """Whether cached messages from before the recording belong to it."""
 
     @property
     def name(self) -> str:
@@ -104,7 +98,7 @@ def series_of(message: Message) -> Series:
     """Return the series that a message belongs to."""
     match message:
         case State():
-            return Series(f"state of {message.arm}", message.tick, message.epoch, 1, False, whole=False)
+            return Series(f"telemetry of {message.arm}", message.tick, message.epoch, 1, False, whole=False)
         case ArmEvent(number=number):
             first = number // EVENTS_PER_BOOT * EVENTS_PER_BOOT + 1
             return Series(f"events of {message.arm}", number, message.epoch, first, False)
@@ -115,25 +109,22 @@ def series_of(message: Message) -> Series:
 
 
 class Recorder:
-    """Keeps every message once. `open` starts or continues a recording; call `save` often and `write` sometimes.
+    """Keeps every message once, in memory until `write`. `open` starts or continues a recording.
 
     Attributes:
-        counts: Messages by series: `state of arm_0`.
-        sought: Gaps that are still being fetched.
+        counts: Messages by series: `telemetry of arm_0`.
+        missing: Gaps that are still being fetched.
         parts: Number of the last complete part.
         cell: Description of the cell, for the card.
     """
 
-    def __init__(self, folder: Path, fleet: str, card: Card | None) -> None:
-        self.folder, self.fleet = folder, fleet
-        self.counts: dict[str, Count] = {} if card is None else card.speakers
-        self.sought: list[Gap] = [] if card is None else list(card.sought)
-        self.parts = 0 if card is None else card.parts
-        self._rows: dict[Kind, int] = {} if card is None else card.rows
-        self.cell: Cell | None = None if card is None else card.cell
-        self._saved: list[Received | Gap] = []
-        self._unsaved: list[Received | Gap] = []
-        self._journal: Journal[Record] = Journal(folder / JOURNAL, Record)
+    def __init__(self, folder: Path, card: RecordingCard) -> None:
+        self.folder, self.fleet = folder, card.fleet
+        self.counts = card.senders
+        self.missing = list(card.missing)
+        self.parts, self.cell = card.parts, card.cell
+        self._written = card.rows
+        self._rows: list[Message | Gap] = []
 
     @classmethod
     def open(cls, folder: Path, fleet: str) -> "Recorder":
@@ -142,52 +133,33 @@ class Recorder:
         Raises:
             FleetError: the folder cannot be written, holds something else, or a recording of another fleet.
         """
-        card = read_card(folder) if (folder / CARD).exists() else None
-        if card is None and any(folder.iterdir()):
+        if (folder / CARD).exists():
+            card = read_card(folder)
+        elif any(folder.iterdir()):
             raise FleetError(f"'{folder}' holds other files; --out needs a new folder or an earlier recording.")
-        if card is not None and card.fleet != fleet:
+        else:
+            card = RecordingCard(RECORDING_FORMAT, "recording", fleet, 0, {})
+        if card.fleet != fleet:
             raise FleetError(f"'{folder}' is a recording of fleet '{card.fleet}', not of '{fleet}'.")
-        recorder = cls(folder, fleet, card)
-        recorder._write_card("recording", recorder.parts, recorder._rows)
-        recorder._continue_journal()
+        recorder = cls(folder, card)
+        recorder.write()
         return recorder
-
-    def close(self) -> None:
-        """Release the journal; rows that were not saved are lost."""
-        self._journal.close()
 
     @property
     def waiting(self) -> int:
         """Number of rows that are in no part yet."""
-        return len(self._saved) + len(self._unsaved)
+        return len(self._rows)
 
     def add(self, sender: str, message: Message) -> None:
         """Keep a message, unless it was kept before or memory is full."""
-        if self.waiting < MAX_WAITING:
-            record = to_record(message)
-            if self._take(record):
-                self._unsaved.append(record)
+        if self.waiting < MAX_WAITING and self._take(message):
+            self._rows.append(message)
 
-    def give_up(self, gap: Gap, reason: str) -> None:
-        """Abandon a gap: it becomes a row."""
-        if gap in self.sought:
-            self.sought.remove(gap)
-            self._unsaved.append(structs.replace(gap, reason=reason))
-
-    def save(self) -> None:
-        """Write rows to the journal, durably.
-
-        Raises:
-            FleetError: a disk error; no row is lost, and the next call tries again.
-        """
-        if not self._unsaved:
-            return
-        try:
-            self._journal.append(*self._unsaved)
-        except JournalError as error:
-            raise FleetError(str(error)) from error
-        self._saved += self._unsaved
-        self._unsaved.clear()
+    def abandon(self, gap: Gap, reason: str) -> None:
+        """Fetch a gap no more: it becomes a row."""
+        if gap in self.missing:
+            self.missing.remove(gap)
+            self._rows.append(structs.replace(gap, reason=reason))
 
     def write(self, *, status: str = "recording") -> None:
         """Write all rows as a new part, and the card; a status other than `recording` ends the recording.
@@ -195,64 +167,39 @@ class Recorder:
         Raises:
             FleetError: a disk error; no row is lost, and the next call tries again.
         """
-        if ends := status != "recording":
-            for gap in list(self.sought):
-                self.give_up(gap, "the recording ended before they were fetched")
+        if status != "recording":
+            for gap in list(self.missing):
+                self.abandon(gap, "the recording ended before they were fetched")
         rows: dict[Kind, list[dict[str, object]]] = {kind: [] for kind in KINDS}
-        for record in (*self._saved, *self._unsaved):
+        for record in self._rows:
             kind, row = to_row(record)
             rows[kind].append(row)
         for kind in KINDS:
             if rows[kind]:
                 with self._draft(part_file(self.folder, kind, self.parts + 1)) as draft:
                     pq.write_table(to_table(kind, rows[kind]), draft, write_page_checksum=True)
-        written = self.parts + bool(self.waiting)
-        counted: dict[Kind, int] = {kind: self._rows.get(kind, 0) + len(rows[kind]) for kind in KINDS}
-        self._write_card(status, written, counted)
-        self.parts, self._rows = written, counted
-        self._saved.clear()
-        self._unsaved.clear()
-        try:  # a crash before this leaves a journal of a complete part, which is ignored
-            self._journal.close()
-            if ends:
-                for path in (self._journal.path, self._journal.path.with_name(f"{JOURNAL}.lock")):
-                    path.unlink(missing_ok=True)
-            else:
-                self._journal.open()
-                self._journal.rewrite(PartOpened(self.parts + 1))
-        except (JournalError, OSError) as error:
-            raise FleetError(f"{error}") from error
+        card = RecordingCard(
+            format=RECORDING_FORMAT,
+            status=status,
+            fleet=self.fleet,
+            parts=self.parts + bool(self._rows),
+            senders={name: count for name, count in sorted(self.counts.items()) if count.kept},
+            missing=tuple(self.missing),
+            rows={kind: self._written.get(kind, 0) + len(rows[kind]) for kind in KINDS},
+            cell=self.cell,
+        )
+        with self._draft(self.folder / CARD) as draft:
+            draft.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
+        self.parts, self._written = card.parts, card.rows
+        self._rows.clear()
 
     # Inside
 
-    def _continue_journal(self) -> None:
-        """Recover the rows of the journal after a crash; a damaged journal is quarantined."""
-        try:
-            self._journal.open()
-        except JournalError as error:
-            if isinstance(error.__cause__, OSError):  # not damaged: a disk error, or another process has it
-                raise FleetError(str(error)) from error
-            aside = self._journal.path.with_name(f"damaged-after-{self.parts:06d}.journal")
-            self._journal.path.replace(aside)
-            _LOG.error("%s Quarantined as '%s'.", error, aside.name)
-            self._journal.open()
-            time_s = max((count.time_s for count in self.counts.values()), default=0.0)
-            self._unsaved.append(Gap("all", 0, 0, time_s, time_s, f"the journal was damaged: {aside.name}"))
-        records = records_of(self._journal, self.parts + 1)
-        for record in records:
-            if isinstance(record, Gap):
-                self.sought = [gap for gap in self.sought if structs.replace(gap, reason=record.reason) != record]
-            else:
-                self._take(record)
-        self._saved = records
-        if not records:
-            self._journal.rewrite(PartOpened(self.parts + 1))
-
-    def _take(self, record: Received) -> bool:
+    def _take(self, message: Message) -> bool:
         """Count a message; return whether it is new."""
-        series = series_of(record.message)
-        number, time_s = series.number, record.message.time_s
-        count = self.counts.setdefault(series.name, Count())
+        series = series_of(message)
+        number, time_s = series.number, message.time_s
+        count = self.counts.setdefault(series.name, SenderCount())
         begins = bool(series.epoch) and series.epoch not in count.epochs
         restarted = not series.continues and number <= count.last and (begins or time_s > count.time_s)
         if number <= count.last and not restarted:
@@ -260,39 +207,33 @@ class Recorder:
         if begins:
             count.epochs += (series.epoch,)
         expected = series.first if restarted or series.first > count.last else count.last + 1
-        if not count.kept:  # what was sent before: as much of it as the sender may have cached
+        if not count.kept:  # earlier messages: as many as the sender may have cached
             expected = max(series.first, number - HISTORY) if series.whole else number
         if expected < number:
             after_s = 0.0 if begins else max(count.time_s, 0.0)
             gap = Gap(series.sender, expected, number - 1, after_s, time_s, epoch=series.epoch)
-            self.sought.append(gap)
+            self.missing.append(gap)
             count.missed += number - expected
         count.kept += 1
         count.last, count.time_s = number, time_s
         return True
 
-    def _fill(self, series: Series, count: Count, time_s: float) -> bool:
+    def _fill(self, series: Series, count: SenderCount, time_s: float) -> bool:
         """Whether a late message belongs to a gap, which then shrinks or splits."""
         number = series.number
-        for gap in self.sought:
+        for gap in self.missing:
             own = gap.sender == series.sender and gap.first <= number <= gap.last
             own &= gap.epoch == series.epoch or (not series.continues and "" in (gap.epoch, series.epoch))
             if own and (series.continues or gap.after_s <= time_s <= gap.time_s):
-                self.sought.remove(gap)
+                self.missing.remove(gap)
                 if gap.first < number:
-                    self.sought.append(structs.replace(gap, last=number - 1, time_s=time_s))
+                    self.missing.append(structs.replace(gap, last=number - 1, time_s=time_s))
                 if number < gap.last:
-                    self.sought.append(structs.replace(gap, first=number + 1, after_s=time_s))
+                    self.missing.append(structs.replace(gap, first=number + 1, after_s=time_s))
                 count.kept, count.missed = count.kept + 1, count.missed - 1
                 return True
         count.twice += 1
         return False
-
-    def _write_card(self, status: str, parts: int, rows: dict[Kind, int]) -> None:
-        senders = {name: count for name, count in sorted(self.counts.items()) if count.kept}
-        card = Card(RECORDING_FORMAT, status, self.fleet, parts, senders, tuple(self.sought), rows, self.cell)
-        with self._draft(self.folder / CARD) as draft:
-            draft.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
 
     @contextmanager
     def _draft(self, path: Path) -> Iterator[Path]:
@@ -343,7 +284,7 @@ class GapFetcher:
             self.close()
             self._count()
             self._due_s = real_s + PAUSE_S
-        elif senders := tuple(dict.fromkeys(gap.sender for gap in self._recorder.sought))[:MAX_KEYS]:
+        elif senders := tuple(dict.fromkeys(gap.sender for gap in self._recorder.missing))[:MAX_KEYS]:
             self._due_s = real_s + FETCH_S
             self._begin(senders)
         elif real_s >= self._swept_s + SWEEP_S:
@@ -372,17 +313,18 @@ class GapFetcher:
             return
         self._link, self._asked = link, senders
         for sender in senders:
-            label, _, name = sender.partition(" of ")
-            role, topic, kind = SOURCES[label]
-            link.subscribe(str(keys.Key(link.fleet, role, name, topic)), kind, self._recorder.add, history=True)
+            kind, _, name = sender.partition(" of ")
+            source = SOURCES[cast(Kind, kind)]
+            key = str(keys.ParsedKey(link.fleet, source.role, name, source.topic))
+            link.subscribe(key, source.message, self._recorder.add, history=True)
 
     def _count(self) -> None:
         """Abandon the gaps of senders after `ATTEMPTS` requests."""
-        missing = {gap.sender for gap in self._recorder.sought}
+        missing = {gap.sender for gap in self._recorder.missing}
         self._tries = Counter({sender: self._tries[sender] + (sender in self._asked) for sender in missing})
-        for gap in list(self._recorder.sought):
+        for gap in list(self._recorder.missing):
             if self._tries[gap.sender] >= ATTEMPTS:
-                self._recorder.give_up(gap, f"not in the cache of its publisher, asked {ATTEMPTS} times")
+                self._recorder.abandon(gap, f"not in the cache of its publisher, asked {ATTEMPTS} times")
         self._tries = Counter({sender: count for sender, count in self._tries.items() if count < ATTEMPTS})
 
 
@@ -397,7 +339,7 @@ class RecorderNode:
         Args:
             link: Open client of the bus.
             connect: Makes another client of the fleet, not open yet, which fetches missed messages.
-            rotate_s: Real seconds between two Parquet parts; rows are in the journal before.
+            rotate_s: Real seconds between two Parquet parts.
         """
         self._link, self.recorder, self._rotate_s = link, recorder, rotate_s
         self._fetcher = GapFetcher(recorder, connect)
@@ -419,8 +361,7 @@ class RecorderNode:
             if real_s >= self._due_s or (self.recorder.waiting >= MAX_ROWS and not self._failure):
                 self._due_s = real_s + self._rotate_s
                 self.recorder.write()
-            self.recorder.save()
-            self._failure = ""
+                self._failure = ""
         except FleetError as error:
             if not self._failure:
                 _LOG.error("Not recorded yet: %s", error)
@@ -454,7 +395,7 @@ def record(
     """Record until stopped; return the recorder, everything written.
 
     Args:
-        rotate_s: Real seconds between two Parquet parts; rows are in the journal before.
+        rotate_s: Real seconds between two Parquet parts.
         connect: Makes another client of the fleet, which fetches missed messages.
 
     Raises:
@@ -462,13 +403,12 @@ def record(
     """
     with (
         lock_folder(folder),
-        closing(Recorder.open(folder, link.fleet)) as recorder,
-        closing(RecorderNode(link, recorder, connect, rotate_s=rotate_s)) as node,
+        closing(RecorderNode(link, Recorder.open(folder, link.fleet), connect, rotate_s=rotate_s)) as node,
     ):
         while not stopped():
             node.serve()
         node.end()
-    return recorder
+    return node.recorder
 
 
 @contextmanager

@@ -1,45 +1,55 @@
-"""Format of a recording of the bus, and how it is read, also while it grows.
+"""Recordings of a live fleet: their format, how they are read, also while they grow, and replay on the bus.
 
 `recording.json` describes the recording. `telemetry-000001.parquet`, `events-…`, `results-…`, `operations-…` and
-`gaps-…` are its parts; columns are fields of the messages `State`, `ArmEvent`, `Result` and `Operation`. What is not in
-a part yet is in `open.journal`. A row of `gaps` names missing messages of a sender, and the reason.
+`gaps-…` are its parts; columns are fields of the messages `State`, `ArmEvent`, `Result` and `Operation`. A row of
+`gaps` names missing messages of a sender, and the reason.
 """
 
+import json
 import math
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from heapq import merge
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, NamedTuple, cast
 
 import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import inspect, structs
 
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import FleetError
-from fleet.live.journal import Journal
 from fleet.robot import JOINTS
+from scenarios.run.log import check_format
 
 Message = State | ArmEvent | Result | Operation
 Kind = Literal["telemetry", "events", "results", "operations", "gaps"]
-MESSAGES: tuple[Kind, ...] = ("telemetry", "events", "results", "operations")
-KINDS: tuple[Kind, ...] = (*MESSAGES, "gaps")
-SOURCES: Mapping[str, tuple[keys.Role, str, type[Message]]] = {
-    "state": ("arm", "state", State),
-    "events": ("arm", "event", ArmEvent),
-    "results": ("auction", "result", Result),
-    "operations": ("auction", "operation", Operation),
+
+
+class Source(NamedTuple):
+    """The key that messages of a kind have, and their type."""
+
+    role: keys.Role
+    topic: str
+    message: type[Message]
+
+
+SOURCES: Mapping[Kind, Source] = {
+    "telemetry": Source("arm", "state", State),
+    "events": Source("arm", "event", ArmEvent),
+    "results": Source("auction", "result", Result),
+    "operations": Source("auction", "operation", Operation),
 }
-"""Keys that are recorded, and what is published there, by the name of the series in the card."""
-RECORDING_FORMAT = 6
-CARD, JOURNAL = "recording.json", "open.journal"
+KINDS: tuple[Kind, ...] = (*SOURCES, "gaps")
+RECORDING_FORMAT = 7
+CARD = "recording.json"
 SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c")
 _COLUMNS = {
     inspect.IntType: pa.int64(),
@@ -49,70 +59,42 @@ _COLUMNS = {
 }
 _SORTED_BY: dict[Kind, str] = {"telemetry": "tick", "gaps": "first"}
 """Besides the time; `number` for the other kinds."""
-_READS = 5
-"""Attempts to read a recording between two commits of its recorder."""
+TURN_S, TOKENS_S = 0.2, 2.0
+"""Real seconds between two checks for a stop request; until the router must have named the present arms."""
 
 
-class Gap(msgspec.Struct, frozen=True, tag="gap"):
+class Gap(msgspec.Struct, frozen=True):
     """Messages of a sender that are missing, by their numbers."""
 
     sender: str
-    """As in the card: `state of arm_0`."""
+    """As in the card: `telemetry of arm_0`."""
     first: int
     last: int
     after_s: float
-    """Fleet time of the message before the gap, and of the one after it."""
+    """Fleet time of the message before the gap."""
     time_s: float
+    """Fleet time of the message after the gap."""
     reason: str = ""
     """Why they are lost; "" while they are being fetched."""
     epoch: str = ""
-    """In which the numbers were given; "" for unknown."""
-
-
-class ReceivedState(msgspec.Struct, frozen=True, tag="telemetry"):
-    """A message in the journal, as are the next three."""
-
-    message: State
-
-
-class ReceivedEvent(msgspec.Struct, frozen=True, tag="events"):
-    message: ArmEvent
-
-
-class ReceivedResult(msgspec.Struct, frozen=True, tag="results"):
-    message: Result
-
-
-class ReceivedOperation(msgspec.Struct, frozen=True, tag="operations"):
-    message: Operation
-
-
-class PartOpened(msgspec.Struct, frozen=True, tag="part"):
-    """First record of the journal: what follows becomes the part of this number."""
-
-    number: int
-
-
-Received = ReceivedState | ReceivedEvent | ReceivedResult | ReceivedOperation
-Record = Received | Gap | PartOpened
+    """Epoch of the numbers; "" if unknown."""
 
 
 @dataclass(eq=False)
-class Count:
+class SenderCount:
     """Number of messages of one sender."""
 
     kept: int = 0
     twice: int = 0
     missed: int = 0
-    """Messages that are known to be missing."""
     last: int = -1
+    """Number of the last message."""
     time_s: float = -math.inf
     """Fleet time of the last message."""
     epochs: tuple[str, ...] = ()
-    """In which the sender gave its numbers."""
 
 
-class Card(msgspec.Struct, frozen=True):
+class RecordingCard(msgspec.Struct, frozen=True):
     """Content of `recording.json`."""
 
     format: int
@@ -120,13 +102,13 @@ class Card(msgspec.Struct, frozen=True):
     fleet: str
     parts: int
     """Number of the last complete part."""
-    speakers: dict[str, Count]
-    sought: tuple[Gap, ...] = ()
-    """Missing messages that are still being fetched."""
+    senders: dict[str, SenderCount]
+    missing: tuple[Gap, ...] = ()
+    """Messages that are still being fetched."""
     rows: dict[Kind, int] = {}
-    """Number of rows in all parts, by kind; none in recordings of earlier versions."""
+    """Number of rows in all parts, by kind."""
     cell: Cell | None = None
-    """As an auctioneer described it, without the work of the arms; None while none has."""
+    """Description by an auctioneer, without the plans of the arms; None if there is none yet."""
 
 
 def _columns(message: type[msgspec.Struct]) -> dict[str, pa.DataType]:
@@ -142,11 +124,10 @@ def _columns(message: type[msgspec.Struct]) -> dict[str, pa.DataType]:
     return columns
 
 
-_STATE = _columns(State)
-"""Columns of a state; those of `SENSORS` have one for each joint."""
+_STATE = {name: kind for name, kind in _columns(State).items() if name not in SENSORS}
 SCHEMAS: dict[Kind, pa.Schema] = {
     "telemetry": pa.schema(
-        {"time_s": pa.float64(), **{name: kind for name, kind in _STATE.items() if name not in SENSORS}}
+        {"time_s": pa.float64(), **_STATE}
         | {f"{name}_{joint + 1}": pa.float32() for name in SENSORS for joint in range(JOINTS)}
     ),
     "events": pa.schema({"time_s": pa.float64(), **_columns(ArmEvent), "joint": pa.int8()}),
@@ -161,60 +142,52 @@ SCHEMAS: dict[Kind, pa.Schema] = {
 }
 
 
-def to_record(message: Message) -> Received:
-    """Wrap a message for the journal."""
-    match message:
-        case State():
-            return ReceivedState(message)
-        case ArmEvent():
-            return ReceivedEvent(message)
-        case Result():
-            return ReceivedResult(message)
-        case Operation():
-            return ReceivedOperation(message)
-
-
-def to_row(record: Received | Gap) -> tuple[Kind, dict[str, object]]:
-    """Kind and columns of a record."""
+def to_row(record: Message | Gap) -> tuple[Kind, dict[str, object]]:
+    """Kind and columns of a message or a gap."""
     match record:
         case Gap():
             return "gaps", structs.asdict(record)
-        case ReceivedEvent(message):
-            return "events", structs.asdict(message)
-        case ReceivedResult(message):
-            fields = structs.asdict(message)
-            fields["offers"] = msgspec.json.encode(message.offers).decode() if message.offers else ""
+        case ArmEvent():
+            return "events", structs.asdict(record)
+        case Result():
+            fields = structs.asdict(record)
+            fields["offers"] = msgspec.json.encode(record.offers).decode() if record.offers else ""
             return "results", fields | structs.asdict(fields.pop("status"))
-        case ReceivedOperation(message):
-            request = message.request
+        case Operation():
+            request = record.request
             action = cast(dict[str, object], msgspec.to_builtins(request.action))
-            fields = structs.asdict(message) | {name: action.get(name, "") for name in ("action", "job", "arm")}
+            fields = structs.asdict(record) | {name: action.get(name, "") for name in ("action", "job", "arm")}
             fields |= {"request": request.request, "by": request.by, "content": msgspec.json.encode(request).decode()}
             return "operations", fields
-        case ReceivedState(message):
-            row: dict[str, object] = {name: getattr(message, name) for name in _STATE if name not in SENSORS}
+        case State():
+            row: dict[str, object] = {name: getattr(record, name) for name in _STATE}
             for name in SENSORS:
-                row |= {f"{name}_{joint + 1}": value for joint, value in enumerate(getattr(message, name)[:JOINTS])}
+                row |= {f"{name}_{joint + 1}": value for joint, value in enumerate(getattr(record, name)[:JOINTS])}
             return "telemetry", row
 
 
-def read_card(folder: Path) -> Card:
+def read_card(folder: Path) -> RecordingCard:
     """Read the description of a recording.
 
     Raises:
         FleetError: it is no recording, or of another format.
     """
     try:
-        version = msgspec.json.decode((folder / CARD).read_bytes(), type=dict)["format"]
-        card = msgspec.json.decode((folder / CARD).read_bytes(), type=Card) if version == RECORDING_FORMAT else None
+        text = (folder / CARD).read_bytes()
+        version = msgspec.json.decode(text, type=dict)["format"]
+        if version == RECORDING_FORMAT:
+            return msgspec.json.decode(text, type=RecordingCard)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, KeyError) as error:
         raise FleetError(f"'{folder}' is no recording of the bus: {CARD} is missing or damaged.") from error
-    if card is None:
-        raise FleetError(
-            f"'{folder}' is a recording of format {version}, of another version of thermofleet; this version reads "
-            f"{RECORDING_FORMAT}. Record it again."
-        )
-    return card
+    raise FleetError(
+        f"'{folder}' is a recording of format {version}, and this version of thermofleet reads format "
+        f"{RECORDING_FORMAT}. Read it with the version that wrote it."
+    )
+
+
+def part_file(folder: Path, kind: Kind, number: int) -> Path:
+    """Path of one part."""
+    return folder / f"{kind}-{number:06d}.parquet"
 
 
 def part_files(folder: Path, kind: Kind) -> list[Path]:
@@ -223,31 +196,29 @@ def part_files(folder: Path, kind: Kind) -> list[Path]:
     return [path for path in paths if path.exists()]
 
 
-def part_file(folder: Path, kind: Kind, number: int) -> Path:
-    """Path of one part."""
-    return folder / f"{kind}-{number:06d}.parquet"
-
-
 def to_table(kind: Kind, rows: list[dict[str, object]]) -> pa.Table:
     """Rows as a table with the columns of their kind."""
     return pa.Table.from_pylist(rows, schema=SCHEMAS[kind])
 
 
 def read_parts(folder: Path, kind: Kind) -> pa.Table:
-    """Read all rows of a kind so far, in order of time.
+    """Read all rows of a kind, in order of time.
 
     Raises:
-        FleetError: it is no recording, or its journal or a part is damaged.
+        FleetError: it is no recording, or a part is damaged.
     """
-    rows, tables = list[dict[str, object]](), list[pa.Table]()
-    for _ in range(_READS):
-        parts = read_card(folder).parts
-        rows = [row for own, row in map(to_row, _open_records(folder, parts + 1)) if own == kind]
-        tables = [_read_part(path, kind) for path in part_files(folder, kind)]
-        if read_card(folder).parts == parts:
-            break
-    table = pa.concat_tables([*tables, to_table(kind, rows)])
+    tables = [_read_part(path, kind) for path in part_files(folder, kind)]
+    table = pa.concat_tables([*tables, SCHEMAS[kind].empty_table()])
     return table.sort_by([("time_s", "ascending"), (_SORTED_BY.get(kind, "number"), "ascending")])
+
+
+def _read_part(path: Path, kind: Kind) -> pa.Table:
+    try:
+        return pq.read_table(path, schema=SCHEMAS[kind], page_checksum_verification=True)
+    except (OSError, pa.ArrowException) as error:
+        raise FleetError(
+            f"Cannot read '{path}': {error} Restore the file, or move it away to read the recording without it."
+        ) from error
 
 
 def lost_rows(folder: Path) -> dict[Kind, int]:
@@ -261,40 +232,63 @@ def lost_rows(folder: Path) -> dict[Kind, int]:
     return {kind: number - there[kind] for kind, number in rows.items() if number > there[kind]}
 
 
-def _read_part(path: Path, kind: Kind) -> pa.Table:
+@dataclass(frozen=True, eq=False)
+class RecordedMessages:
+    """The messages of a run or of a recording."""
+
+    fleet: str
+    telemetry: pa.Table
+    events: pa.Table
+    results: pa.Table
+    operations: pa.Table
+    warning_c: float = 60.0
+    """Warning limit of the headroom, if no headroom was recorded."""
+
+    def __len__(self) -> int:
+        return sum(table.num_rows for table in (self.telemetry, self.events, self.results, self.operations))
+
+    def __iter__(self) -> Iterator[Message]:
+        """All messages in order of time."""
+        streams: tuple[Iterator[Message], ...] = (
+            states(self.telemetry, warning_c=self.warning_c),
+            _events(self.events),
+            map(_result, self.results.to_pylist()),
+            map(_operation, self.operations.to_pylist()),
+        )
+        return merge(*streams, key=lambda message: message.time_s)
+
+
+def open_messages(folder: Path) -> RecordedMessages:
+    """Read the folder of a run or of a recording, which may still grow.
+
+    Raises:
+        FleetError: it is neither.
+    """
+    if (folder / CARD).exists():
+        return RecordedMessages(read_card(folder).fleet, *(read_parts(folder, kind) for kind in SOURCES))
     try:
-        return pq.read_table(path, schema=SCHEMAS[kind], page_checksum_verification=True)
-    except (OSError, pa.ArrowException) as error:
+        run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        check_format(run, folder)
+        return RecordedMessages(
+            fleet=run["scenario"]["name"],
+            telemetry=pq.read_table(folder / "telemetry.parquet"),
+            events=pq.read_table(folder / "events.parquet"),
+            results=pa.table({}),
+            operations=pa.table({}),
+            warning_c=run["scenario"]["limits"]["warning_c"],
+        )
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowInvalid) as error:
         raise FleetError(
-            f"Cannot read '{path}': {error} Restore the file, or move it away to read the recording without it."
+            f"'{folder}' is neither the folder of a run (run.json, telemetry.parquet, events.parquet) nor a recording "
+            f"of the bus ({CARD})."
         ) from error
-
-
-def _open_records(folder: Path, number: int) -> list[Received | Gap]:
-    """Records of the part that is not complete yet, from a copy of its journal: the recorder has locked the file."""
-    with tempfile.TemporaryDirectory() as place:
-        copy = Path(place) / JOURNAL
-        try:
-            shutil.copyfile(folder / JOURNAL, copy)
-        except FileNotFoundError:
-            return []
-        with Journal(copy, Record) as journal:
-            return records_of(journal, number)
-
-
-def records_of(journal: Journal[Record], number: int) -> list[Received | Gap]:
-    """Records of the part of this number in a journal; none if it is of an earlier part."""
-    records = list(journal.records())
-    if not records or records[0] != PartOpened(number):
-        return []
-    return [record for record in records[1:] if not isinstance(record, PartOpened)]
 
 
 def states(table: pa.Table, *, warning_c: float = 60.0) -> Iterator[State]:
     """Yield telemetry of a recording or a run as messages; sensors that were not recorded are left out.
 
     Args:
-        warning_c: Warning limit of the headroom, where no headroom was recorded.
+        warning_c: Warning limit of the headroom, if no headroom was recorded.
     """
     ticks: dict[str, int] = {}
     for batch in table.to_batches(max_chunksize=10_000):
@@ -312,3 +306,55 @@ def _joints(row: dict[str, float | None], name: str) -> tuple[float, ...]:
     """Values of a sensor, [joint]; empty if one is missing."""
     values = [row.get(f"{name}_{joint + 1}") for joint in range(JOINTS)]
     return () if None in values else cast(tuple[float, ...], tuple(values))
+
+
+def _events(table: pa.Table) -> Iterator[ArmEvent]:
+    numbers: dict[str, int] = {}
+    for row in table.to_pylist():
+        arm = row["arm"]
+        if arm:  # otherwise an event of the whole fleet
+            numbers[arm] = row.get("number", numbers.get(arm, -1) + 1)
+            value = None if row["value"] != row["value"] else row["value"]  # NaN in a run
+            yield msgspec.convert({**row, "number": numbers[arm], "value": value}, ArmEvent)
+
+
+def _result(row: dict[str, object]) -> Result:
+    status = {name: row[name] for name in JobStatus.__struct_fields__}
+    offers = json.loads(str(row["offers"] or "[]"))
+    return msgspec.convert({**row, "status": status, "offers": offers}, Result)
+
+
+def _operation(row: dict[str, object]) -> Operation:
+    request = msgspec.json.decode(str(row["content"]), type=ControlRequest)
+    return msgspec.convert({**row, "request": request}, Operation)
+
+
+def replay(messages: RecordedMessages, link: BusClient, *, speed: float, stopped: Callable[[], bool]) -> int:
+    """Publish messages at their own pace times `speed`, with the tokens of their arms; return how many were published.
+
+    Raises:
+        FleetError: an arm of the recording is present on the bus.
+    """
+    arms = sorted(set(messages.telemetry["arm"].to_pylist())) if messages.telemetry.num_rows else []
+    present = link.tokens(keys.of_every_arm(link.fleet, "alive"), timeout_s=TOKENS_S)
+    if taken := sorted(present & set(arms)):
+        raise FleetError(f"Arm '{taken[0]}' of fleet '{link.fleet}' is on the bus already. Give another --fleet.")
+    for arm in arms:
+        link.declare_token(keys.of_arm(link.fleet, arm, "alive"))
+    publishers: dict[str, Callable[[Message], None]] = {}
+    start_s, first_s, count = time.monotonic(), None, 0
+    for message in messages:
+        first_s = message.time_s if first_s is None else first_s
+        due_s = start_s + (message.time_s - first_s) / speed
+        while time.monotonic() < due_s and not stopped():
+            link.serve(min(due_s, time.monotonic() + TURN_S))
+        if stopped():
+            break
+        source = next(source for source in SOURCES.values() if isinstance(message, source.message))
+        sender = message.auctioneer if isinstance(message, Result | Operation) else message.arm
+        key = str(keys.ParsedKey(link.fleet, source.role, sender, source.topic))
+        if key not in publishers:
+            publishers[key] = link.publisher(key, source.message)
+        publishers[key](message)
+        count += 1
+    return count

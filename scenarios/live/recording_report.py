@@ -28,7 +28,7 @@ from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, segment_
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
-from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
+from scenarios.live.recording import SENSORS, SOURCES, Kind, lost_rows, read_card, read_parts
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import SAME_MOMENT_DIGITS
 from scenarios.show.run_page import report_html
@@ -66,8 +66,8 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         FleetError: it is no recording, has no states of arms yet, or has arms that the scenario does not have.
     """
     card = read_card(folder)
-    epochs = dict.fromkeys(epoch for count in card.speakers.values() for epoch in count.epochs)
-    table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in MESSAGES)
+    epochs = dict.fromkeys(epoch for count in card.senders.values() for epoch in count.epochs)
+    table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in SOURCES)
     arms = tuple(sorted(set(table["arm"].to_pylist())))
     if not arms:
         raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
@@ -81,7 +81,7 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         "policy": "live recording",
         "metrics": _metrics(telemetry, events, results, arms, limits.warning_c) | heat_use(table, arms),
         "messages": {
-            sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.speakers.items()
+            sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.senders.items()
         },
         "missing": _missing(read_parts(folder, "gaps"), lost_rows(folder)),
         "jobs submitted by": _submitters(results),

@@ -22,11 +22,11 @@ from hypothesis import strategies as st
 from msgspec import structs
 from msgspec.structs import replace
 
+from docs.bus_contract import EXAMPLES
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.contract import EXAMPLES
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Settle
 from fleet.bus.router import Router
@@ -35,18 +35,17 @@ from fleet.events import Event
 from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder, lock_folder, record
-from scenarios.live.recording import CARD, JOURNAL, part_files, read_card, read_parts, states
+from scenarios.live.recording import CARD, open_messages, part_files, read_card, read_parts, replay
 from scenarios.live.recording_report import heat_use, open_recording, order_events
-from scenarios.live.replayer import Replay
 from scenarios.run.records import ShiftLog
 from scenarios.run.schedule import schedule
 from scenarios.show.run_page import report_html
 from tests.profiles import examples
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, serve_until, wait_until
 
 
 def state(arm, tick, time_s=None):
-    """A word with float32 readings, which come back exactly."""
+    """A message with float32 readings, which are read back exactly."""
     temps = tuple(float(np.float32(20.0 + tick + j / 8)) for j in range(7))
     return State(
         arm=arm,
@@ -76,94 +75,48 @@ def operation(number):
 
 def test_recorded_messages_are_read_back(tmp_path):
     recorder = Recorder.open(tmp_path, "f")
-    said = [state(arm, tick) for tick in range(5) for arm in ("a", "b")]
-    for word in said:
-        recorder.add(word.arm, word)
-    for number in range(3):
-        recorder.add("a", event("a", number))
-        recorder.add("boss", result(number))
-        recorder.add("boss", operation(number))
+    sent = [state(arm, tick) for tick in range(5) for arm in ("a", "b")]
+    sent += [make(number) for number in range(3) for make in (partial(event, "a"), result, operation)]
+    for message in sent:
+        recorder.add("", message)
     recorder.write(status="finished")
-    read = list(states(read_parts(tmp_path, "telemetry")))
-    assert sorted(read, key=lambda w: (w.tick, w.arm)) == sorted(said, key=lambda w: (w.tick, w.arm))
-    told = Replay.of(tmp_path)
-    assert [w for w in told.messages() if isinstance(w, ArmEvent)] == [event("a", n) for n in range(3)]
-    assert [w for w in told.messages() if isinstance(w, Result)] == [result(n) for n in range(3)]
-    assert [w for w in told.messages() if isinstance(w, Operation)] == [operation(n) for n in range(3)]
+    assert sorted(map(repr, open_messages(tmp_path))) == sorted(map(repr, sent))
     assert read_card(tmp_path).status == "finished"
 
 
 @examples(50)
-@given(
-    st.lists(st.tuples(st.integers(0, 30), st.sampled_from(["", "save", "write", "crash"])), min_size=1, max_size=60)
-)
+@given(st.lists(st.tuples(st.integers(0, 30), st.sampled_from(["", "write", "crash"])), min_size=1, max_size=60))
 def test_every_message_is_kept_once_and_gaps_are_known(tmp_path_factory, steps):
-    """Whatever the order of messages, and wherever the recorder crashes after a save."""
+    """Whatever the order of messages, and wherever the recorder crashes after a part."""
     folder = tmp_path_factory.mktemp("r")
     recorder = Recorder.open(folder, "f")
     first, kept = steps[0][0], set()
     for tick, then in steps:
         recorder.add("a", state("a", tick))
-        if tick >= first:  # what was sent before it joined is unknown to it
+        if tick >= first:  # messages from before it joined are unknown to it
             kept.add(tick)
-        if then == "write":
+        if then:
             recorder.write()
-        elif then:
-            recorder.save()
         if then == "crash":
-            recorder.close()
             recorder = Recorder.open(folder, "f")
-    recorder.save()
+    recorder.write()
     assert read_parts(folder, "telemetry")["tick"].to_pylist() == sorted(kept)
-    sought = {tick for gap in recorder.sought for tick in range(gap.first, gap.last + 1)}
-    assert sought == set(range(first, max(kept) + 1)) - kept
-    count = recorder.counts["state of a"]
-    assert (count.kept, count.missed) == (len(kept), len(sought))
+    missing = {tick for gap in recorder.missing for tick in range(gap.first, gap.last + 1)}
+    assert missing == set(range(first, max(kept) + 1)) - kept
+    count = recorder.counts["telemetry of a"]
+    assert (count.kept, count.missed) == (len(kept), len(missing))
     recorder.write(status="finished")
     gaps = read_parts(folder, "gaps").to_pylist()
-    assert {tick for gap in gaps for tick in range(gap["first"], gap["last"] + 1)} == sought
+    assert {tick for gap in gaps for tick in range(gap["first"], gap["last"] + 1)} == missing
     assert all("the recording ended" in gap["reason"] for gap in gaps)
-
-
-@examples(60)
-@given(st.data())
-def test_a_torn_journal_loses_only_what_was_not_saved(tmp_path_factory, data):
-    folder = tmp_path_factory.mktemp("r")
-    recorder = Recorder.open(folder, "f")
-    sizes = []
-    for tick in range(4):
-        recorder.add("a", state("a", tick))
-        recorder.save()
-        sizes.append((folder / JOURNAL).stat().st_size)
-    recorder.close()
-    size = data.draw(st.integers(0, sizes[-1]))
-    (folder / JOURNAL).write_bytes((folder / JOURNAL).read_bytes()[:size])
-    again = Recorder.open(folder, "f")
-    again.write()
-    expected = [tick for tick, end in enumerate(sizes) if end <= size]
-    assert read_parts(folder, "telemetry")["tick"].to_pylist() == expected
-
-
-def test_a_damaged_journal_is_put_aside_and_the_recording_says_so(tmp_path):
-    recorder = Recorder.open(tmp_path, "f")
-    for tick in range(2):
-        recorder.add("a", state("a", tick))
-        recorder.save()
-    recorder.close()
-    damaged = (tmp_path / JOURNAL).read_bytes().replace(b'"tick":0', b'"tick":7')
-    (tmp_path / JOURNAL).write_bytes(damaged)
-    again = Recorder.open(tmp_path, "f")
-    again.write()
-    (gap,) = read_parts(tmp_path, "gaps").to_pylist()
-    assert "the journal was damaged: damaged-after-000000.journal" in gap["reason"]
-    assert (tmp_path / "damaged-after-000000.journal").read_bytes() == damaged
 
 
 def test_messages_of_a_restarted_arm_are_kept(tmp_path):
     recorder = Recorder.open(tmp_path, "f")
-    for word in (state("a", 7, 70.0), state("a", 0, 80.0), state("a", 1, 81.0), state("a", 0, 80.0)):
-        recorder.add("a", word)
-    assert (recorder.counts["state of a"].kept, recorder.counts["state of a"].missed) == (3, 0)
+    for message in (state("a", 7, 70.0), state("a", 0, 80.0), state("a", 1, 81.0), state("a", 0, 80.0)):
+        recorder.add("a", message)
+    count = recorder.counts["telemetry of a"]
+    assert (count.kept, count.missed) == (3, 0)
 
 
 def test_a_new_epoch_in_the_same_folder_is_no_repetition(tmp_path):
@@ -177,14 +130,12 @@ def test_a_new_epoch_in_the_same_folder_is_no_repetition(tmp_path):
     ]
     for message in (*sent, *sent[-12:]):
         recorder.add("", message)
-    recorder.save()
-    recorder.close()
+    recorder.write()
     again = Recorder.open(tmp_path, "f")
     for message in sent[-12:]:
         again.add("", message)
     again.write(status="finished")
-    read = list(Replay.of(tmp_path).messages())
-    assert sorted(map(repr, read)) == sorted(map(repr, sent))
+    assert sorted(map(repr, open_messages(tmp_path))) == sorted(map(repr, sent))
     assert read_parts(tmp_path, "gaps").num_rows == 0
 
 
@@ -199,30 +150,12 @@ def test_a_result_of_an_earlier_time_is_no_restart(tmp_path):
     assert read_parts(tmp_path, "gaps").num_rows == 0
 
 
-def test_a_full_disk_at_the_start_puts_no_journal_aside(tmp_path, monkeypatch):
-    recorder = Recorder.open(tmp_path, "f")
-    recorder.add("a", state("a", 0))
-    recorder.save()
-    recorder.close()
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as broken:
-        broken.setattr("fleet.live.journal.os.open", full)
-        with pytest.raises(FleetError, match="No space left on device"):
-            Recorder.open(tmp_path, "f")
-    Recorder.open(tmp_path, "f").write()
-    assert read_parts(tmp_path, "telemetry").num_rows == 1
-
-
 def test_a_recording_is_readable_meanwhile_and_can_be_continued(tmp_path):
     first = Recorder.open(tmp_path, "f")
     first.add("a", state("a", 0))
     first.write()
     assert read_parts(tmp_path, "telemetry").num_rows == 1
-    first.add("a", state("a", 1))  # never saved: the process died
-    first.close()
+    first.add("a", state("a", 1))  # in no part: the process exits
     again = Recorder.open(tmp_path, "f")
     again.add("a", state("a", 0))  # from a cache
     again.add("a", state("a", 1))
@@ -254,8 +187,8 @@ def test_a_folder_without_a_recording_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FleetError, match="holds other files"):
         Recorder.open(tmp_path, "f")
-    with pytest.raises(FleetError, match="neither a run"):
-        Replay.of(tmp_path)
+    with pytest.raises(FleetError, match="neither the folder of a run"):
+        open_messages(tmp_path)
     (tmp_path / "new").mkdir()
     Recorder.open(tmp_path / "new", "f")
     with pytest.raises(FleetError, match="of fleet 'f', not of 'g'"):
@@ -276,7 +209,7 @@ class Recording:
     def _run(self, endpoint, folder):
         with BusClient(endpoint, "f") as link:
             connect = partial(BusClient, endpoint, "f", timeout_s=0.5)
-            self.recorder = record(link, folder, rotate_s=2.0, stopped=self._stop.is_set, connect=connect)
+            self.recorder = record(link, folder, rotate_s=0.2, stopped=self._stop.is_set, connect=connect)
 
     def __enter__(self):
         self._thread.start()
@@ -285,16 +218,6 @@ class Recording:
     def __exit__(self, *exc):
         self._stop.set()
         self._thread.join(PATIENCE_S)
-
-
-def wait_for(condition, link=None, patience_s=PATIENCE_S):
-    deadline_s = time.monotonic() + patience_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "waited in vain"
-        if link is not None:
-            link.serve(time.monotonic() + 0.05)
-        else:
-            threading.Event().wait(0.05)
 
 
 def rows(folder, kind="telemetry"):
@@ -306,43 +229,42 @@ def test_no_message_is_lost_when_the_router_restarts(tmp_path):
         router = Router().open()
         port = int(router.endpoint.rpartition(":")[2])
         arm = stack.enter_context(BusClient(router.endpoint, "f"))
-        say = arm.publisher(keys.of_arm("f", "a", "state"), State)
+        publish = arm.publisher(keys.of_arm("f", "a", "state"), State)
         recording = stack.enter_context(Recording(router.endpoint, tmp_path))
         for tick in range(50):
-            say(state("a", tick))
-        wait_for(lambda: rows(tmp_path) == 50)
+            publish(state("a", tick))
+        wait_until(lambda: rows(tmp_path) == 50)
         router.close()
         for tick in range(50, 250):
-            say(state("a", tick))
+            publish(state("a", tick))
         with Router(port):
-            said = 250
+            sent = 250
 
-            def goes_on():
-                nonlocal said
-                say(state("a", said))
-                said += 1
-                return rows(tmp_path) > 260
+            def publish_next():
+                nonlocal sent
+                publish(state("a", sent))
+                sent += 1
 
-            wait_for(goes_on)
-            wait_for(lambda: rows(tmp_path) == said)
+            wait_until(lambda: rows(tmp_path) > 260, publish_next)
+            wait_until(lambda: rows(tmp_path) == sent)
             recording.__exit__()
-    assert read_parts(tmp_path, "telemetry")["tick"].to_pylist() == list(range(said))
-    assert recording.recorder.counts["state of a"].missed == 0
+    assert read_parts(tmp_path, "telemetry")["tick"].to_pylist() == list(range(sent))
+    assert recording.recorder.counts["telemetry of a"].missed == 0
 
 
 def test_gaps_are_fetched_from_the_publishers_cache_or_become_rows(tmp_path):
     """A publisher sends numbers 0 and 3 live; its cache has 1, and nobody has 2."""
     with Router() as router, BusClient(router.endpoint, "f") as boss, Recording(router.endpoint, tmp_path) as recording:
-        wait_for(lambda: (tmp_path / CARD).exists())
+        wait_until(lambda: (tmp_path / CARD).exists())
         live = [keys.of_auction("f", "boss", "result"), Result]
         boss.publish(*live[:1], result(0))
-        wait_for(lambda: rows(tmp_path, "results") == 1)
+        wait_until(lambda: rows(tmp_path, "results") == 1)
         boss.publish(*live[:1], result(3))
-        wait_for(lambda: rows(tmp_path, "results") == 2)
+        wait_until(lambda: rows(tmp_path, "results") == 2)
         with BusClient(router.endpoint, "f") as again:
             again.publisher(*live)(result(1))
-            wait_for(lambda: rows(tmp_path, "results") == 3)
-            wait_for(lambda: rows(tmp_path, "gaps") == 1, patience_s=PATIENCE_S)
+            wait_until(lambda: rows(tmp_path, "results") == 3)
+            wait_until(lambda: rows(tmp_path, "gaps") == 1)
     assert read_parts(tmp_path, "results")["number"].to_pylist() == [0, 1, 3]
     (gap,) = read_parts(tmp_path, "gaps").to_pylist()
     assert (gap["sender"], gap["first"], gap["last"]) == ("results of boss", 2, 2)
@@ -361,7 +283,7 @@ def test_the_cell_of_the_auctioneer_is_kept_and_asked_for_once(tmp_path):
         boss.reply_to(keys.of_jobs("f", "cell"), CellRequest, describe)
         for _ in range(2):  # the second continues the recording
             with Recording(router.endpoint, tmp_path):
-                wait_for(lambda: (tmp_path / CARD).exists() and read_card(tmp_path).cell, boss)
+                serve_until(lambda: (tmp_path / CARD).exists() and read_card(tmp_path).cell, boss)
     kept = read_card(tmp_path).cell
     assert len(asked) == 1
     assert (kept.places, kept.fixtures, kept.warning_c) == (cell.places, cell.fixtures, cell.warning_c)
@@ -376,13 +298,13 @@ def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(
         first.add("a", event("a", tick))
         first.add("boss", result(tick))
     first.write()
-    told = Replay.of(tmp_path / "first")
+    messages = open_messages(tmp_path / "first")
     with Router() as router, Recording(router.endpoint, tmp_path / "second"), BusClient(router.endpoint, "f") as link:
-        wait_for(lambda: (tmp_path / "second" / CARD).exists(), link)
-        assert told.play(link, speed=100.0, stopped=lambda: False) == 60
-        wait_for(lambda: rows(tmp_path / "second", "results") == 20, link)
+        serve_until(lambda: (tmp_path / "second" / CARD).exists(), link)
+        assert replay(messages, link, speed=100.0, stopped=lambda: False) == 60
+        serve_until(lambda: rows(tmp_path / "second", "results") == 20, link)
         with BusClient(router.endpoint, "f") as other, pytest.raises(FleetError, match="on the bus already"):
-            told.play(other, speed=100.0, stopped=lambda: False)
+            replay(messages, other, speed=100.0, stopped=lambda: False)
     for kind in ("telemetry", "events", "results"):
         assert read_parts(tmp_path / "second", kind).equals(read_parts(tmp_path / "first", kind)), kind
 
@@ -466,7 +388,6 @@ def test_the_heat_of_a_recording_has_the_closed_forms_of_its_laws(tmp_path):
         recorder.add("hot", state)
         recorder.add("bare", State(arm="bare", tick=tick, time_s=60.0 * tick, mode="idle", temp_c=(), headroom_k=1.0))
     recorder.write(status="finished")
-    recorder.close()
     found = heat_use(read_parts(tmp_path, "telemetry"), ["hot", "bare"])
     assert found["insulation_ppb"] == {"hot": pytest.approx(1e9 / 20_000.0)}
     assert found["tool_drift_mm"] == {"hot": pytest.approx(1e3 * 23.6e-6 * 20.0 * 1.1878, rel=1e-3)}
@@ -546,7 +467,7 @@ def test_a_possible_log_is_left_as_it_is():
 
 def test_the_command_writes_the_page_beside_the_recording(tmp_path, capsys):
     recorder = record_events(tmp_path / "r", LOG)
-    recorder.save()  # still going on
+    recorder.write()  # still going on
     with pytest.raises(SystemExit) as code:
         main(["report", str(tmp_path / "r")])
     assert code.value.code == 0
@@ -569,7 +490,7 @@ def test_the_offers_behind_an_award_are_kept_listed_and_replayed(tmp_path):
     assert "the offers behind 2 awards" in html
     assert "<td>a-1</td><td>arm_0</td><td>P 0.04, 52 °C, d 0.53, 4 min</td>" in html
     assert "<td>b-1</td><td>arm_1</td><td>cannot do it</td>" in html
-    replayed = [message for message in Replay.of(tmp_path / "r").messages() if isinstance(message, Result)]
+    replayed = [message for message in open_messages(tmp_path / "r") if isinstance(message, Result)]
     assert [len(message.offers) for message in replayed] == [2, 2]
     assert replayed[0].offers[0].plan == result.offers[0].plan
 
@@ -606,7 +527,7 @@ def test_a_part_that_was_cut_is_named(tmp_path):
 
 
 def test_a_changed_byte_in_a_part_is_an_error_that_names_it(tmp_path):
-    """Without a checksum the other word would be read."""
+    """Without a checksum the other text would be read."""
     record_events(tmp_path / "r", LOG).write()
     part = next((tmp_path / "r").glob("events-*.parquet"))
     content = part.read_bytes()
@@ -620,7 +541,6 @@ def test_the_rows_of_a_removed_part_are_counted_as_missing(tmp_path):
     """Also in a recording that goes on in another process."""
     first = record_events(tmp_path / "r", LOG)
     first.write()
-    first.close()
     again = Recorder.open(tmp_path / "r", "shop")
     again.add("boss", Result("boss", 0, 0.0, JobStatus("x", "waiting")))
     again.write(status="finished")
