@@ -2,11 +2,11 @@
 
     python -m benchmarks.bench_report RUN [--arms 100] [--film] [--loads 5] [--chromium PROGRAM]
 
-RUN is a folder of `thermofleet run`. Its page is made anew and opened --loads times; times are those of the browser's
-own clock (User Timing): when the shift can be played in 3-D, and when every figure is drawn. --arms measures the page
-of a larger fleet too, whose arms repeat those of RUN, each row of copies 137 s later than the one before. Beside the
-pictures a second while the time of the replay changes with each stands what the browser draws of an empty page. --film
-films the whole shift at 120 times its speed.
+RUN is a folder of `thermofleet run`. Its page is written again and opened --loads times; times are those of the
+browser's own clock (User Timing): when the shift can be played in 3-D, and when every figure is rendered. --arms
+measures the page of a larger fleet too, whose arms repeat those of RUN, each row of copies 137 s later than the one
+before. Frames a second are those of the replay while it moves, beside those of an empty page. --film films the whole
+shift at 120 times real time.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from scenarios.show.run_page import report_html
 
 COLUMNS = {
     "playable s": "playable",
-    "drawn s": "ready",
+    "rendered s": "ready",
     "longest task s": "longest",
     "scrub pictures/s": "scrub",
     "empty page": "empty",
@@ -120,7 +120,7 @@ def main() -> None:
         __doc__,
         "run",
         run=Path,
-        arms=(0, "measure the page of so many arms too"),
+        arms=(0, "number of arms of a second, larger page"),
         film=False,
         loads=5,
         chromium="/usr/bin/chromium",
@@ -139,7 +139,7 @@ def main() -> None:
     if given.film:
         with tempfile.TemporaryDirectory() as folder:
             out, start_s = Path(folder, "shift.mp4"), time.monotonic()
-            command = [*PROGRAM, "film", str(given.run)]
+            command = [*PROGRAM, "view", str(given.run)]
             subprocess.run([*command, "--out", str(out)], check=True, stderr=subprocess.DEVNULL)
             print(f"film {time.monotonic() - start_s:.0f} s, {out.stat().st_size / 1e6:.1f} MB")
 

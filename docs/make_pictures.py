@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 from playwright.sync_api import sync_playwright
 
-from scenarios.train.pairs import draw_curves
+from scenarios.train.training import draw_curves
 
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "docs" / "pictures"
@@ -57,13 +57,13 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         film, report = str(Path(folder) / "film"), str(Path(folder) / "report")
         thermofleet("run", *FILM_RUN, "--out", film)
-        thermofleet("film", film, "--out", str(PICTURES / "shift.gif"), *FILM)
+        thermofleet("view", film, "--out", str(PICTURES / "shift.gif"), *FILM)
         thermofleet("run", *REPORT_RUN, "--out", report)
         screenshot(Path(report) / "report.html", PICTURES / "report.png")
     for scenario in CELLS:
         thermofleet("layout", scenario, "--out", str(PICTURES / "library" / f"{scenario}.png"), "--overwrite")
     trainings = sorted((ROOT / "docs" / "results" / "learned").glob("train-pairs-*"))
-    draw_curves(trainings, PICTURES / "learning_pairs.png")
+    draw_curves(trainings, PICTURES / "learning_pairs.png", "normalised score")
     for picture in sorted(PICTURES.rglob("*.*")):
         print(f"{picture.relative_to(ROOT)}: {picture.stat().st_size / 1e6:.2f} MB")
 

@@ -1,4 +1,4 @@
-"""Commands that look at scenarios and results: show, layout, view, film, report and trace."""
+"""Commands that look at scenarios and results: show, layout, view and report."""
 
 import os
 import re
@@ -25,11 +25,14 @@ SMALLEST, LARGEST = 160, 3840
 MOST_FRAMES = 100_000
 MOST_GIF_PIXELS = 600_000_000
 """Of all frames of a GIF together: they stay in memory until the file is written."""
+FILMS, SCENES = (".mp4", ".webm", ".gif"), (".mcap", ".glb")
+"""Suffixes of the files that `view --out` writes."""
 NO_DISPLAY = (
-    "MuJoCo's viewer needs a display, and there is none (DISPLAY and WAYLAND_DISPLAY are not set). Use "
-    "`thermofleet film RUN`, `--mcap` or `--gltf`, or open the run's report.html."
+    "MuJoCo's viewer needs a display, and there is none (DISPLAY and WAYLAND_DISPLAY are not set). Write a file with "
+    "--out, or open the run's report.html."
 )
-_HOLD = "How long an arm holds a payload"
+_FILM, _SCENE = "Films (.mp4, .webm, .gif)", "Scenes (.mcap, .glb)"
+_HOLD = "Time that an arm can hold a payload"
 
 
 def show_command(
@@ -37,7 +40,7 @@ def show_command(
         "A library name, a .toml file, or an instance of the suite, as test/0017. Default: list the library.", None
     ),
     hold: float | None = option(
-        "Show no scenario, but how long an arm can hold this payload, kg.",
+        "Show how long an arm can hold this payload, kg, instead of a scenario.",
         None,
         low=BOUNDS["payload_kg"].low,
         high=BOUNDS["payload_kg"].high,
@@ -62,13 +65,13 @@ def show_command(
     The thermal load factor is the heat of all jobs relative to the capacity of
     the fleet. Above 1.2 no policy keeps all motors below the warning limit.
     With --hold it shows the time until the motors of an arm that holds a payload
-    reach the warning and error limits. With --suite it lists instances: a scenario
-    in a cell (a group of arms with stations and tasks) with a seed.
+    reach the warning and error limits. With --suite it lists benchmark instances:
+    an instance is a cell (arms, stations and task types) with a seed.
     """
     if scenario is not None and (hold is not None or suite is not None):
-        raise FleetError(f"--{'suite' if hold is None else 'hold'} needs no scenario; leave '{scenario}' out.")
+        raise FleetError(f"--{'suite' if hold is None else 'hold'} takes no scenario; leave '{scenario}' out.")
     if hold is not None and suite is not None:
-        raise FleetError("Give either --hold or --suite.")
+        raise FleetError(f"--hold and --suite exclude each other (got {hold:g} and {suite}). Leave one out.")
     if hold is not None:
         from scenarios.motion import hold as holding
 
@@ -140,10 +143,10 @@ def layout_command(
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
 ) -> None:
-    """Show the reach of each arm, which jobs exclude each other in space, and how many arms can work at once.
+    """Show each arm's reach, jobs that exclude each other in space, and the number of arms that can work at once.
 
-    Lists all problems of the cell, for example two arms that are too close at
-    home. Exit code 2: there are problems.
+    All problems of the cell are listed, for example two arms that are too close
+    at home. Exit code 2: there are problems.
     """
     from scenarios.result_folder import check_file, new_file
     from scenarios.show.layout import layout_report, layout_scene, layout_tables
@@ -176,35 +179,50 @@ def layout_command(
 def view_command(
     what: str = argument("Folder of `thermofleet run`, or a scenario."),
     *,
-    given: Annotated[Given, From(Shot, "speed", "begin_s", "meshes", speed=30.0)],
-    mcap: Path | None = option(
-        "Write the run as this file (.mcap) instead, in messages of ROS 2, for Foxglove, Rerun, RViz or "
-        "PlotJuggler; needs the extra `mcap`.",
+    out: Path | None = option(
+        "Write a file instead of opening the viewer: a film (.mp4, .webm, .gif), ROS 2 messages for Foxglove, Rerun, "
+        "RViz or PlotJuggler (.mcap; extra `mcap`), or an animation for augmented reality and the web (.glb).",
         None,
     ),
-    gltf: Path | None = option(
-        "Write the run as this file (.glb) instead, for viewers of augmented reality and of the web; --speed "
-        "is that of its animation.",
-        None,
-    ),
+    given: Annotated[Given, From(Shot, "speed", "begin_s", "end_s", "fps", "meshes")],
+    size: str = option("Width x height, px; even numbers.", "1280x720", panel=_FILM),
     every: float | None = option(
-        "Time between two postures in these files, s. Default: as recorded, up to 250,000 postures.",
+        "Time between two postures, s. Default: as recorded, up to 250,000 postures.",
         None,
         low=0.01,
         high=3600,
+        panel=_SCENE,
     ),
     overwrite: bool = options.OVERWRITE,
 ) -> None:
-    """Play a recorded shift in MuJoCo's viewer, or show the cell of a scenario; close its window to end.
+    """Play a recorded shift in MuJoCo's viewer, or write it as a film or a scene; or show the cell of a scenario.
 
-    With --mcap or --gltf the shift is written as a file instead, without a display.
+    Motors are coloured by temperature. Close the window of the viewer to end.
     """
-    shot = Shot(**given)
-    if mcap is not None or gltf is not None:
-        _write_files(what, mcap, gltf, every, shot.speed, overwrite)
+    width, height = _size(size)
+    shot = Shot(**given, width=width, height=height)
+    suffix = "" if out is None else out.suffix.lower()
+    if every is not None and suffix not in SCENES:
+        raise FleetError("--every is for --out FILE.mcap and FILE.glb: leave it out.")
+    if out is None:
+        _play(what, shot)
         return
-    if every is not None:
-        raise FleetError("--every is for --mcap and --gltf.")
+    from scenarios.extras import require_extra
+    from scenarios.result_folder import check_file
+
+    check_file(out, (*FILMS, *SCENES), overwrite)
+    for extra in {".mcap": ("mcap", "ros2"), ".glb": ("report",)}.get(suffix, ()):
+        require_extra(extra)
+    if not (Path(what) / "run.json").exists():
+        raise FleetError(f"--out needs the folder of a `thermofleet run` (got '{what}').")
+    if suffix in FILMS:
+        _write_film(Path(what), out, shot)
+    else:
+        _write_scene(Path(what), out, every, shot.speed)
+
+
+def _play(what: str, shot: Shot) -> None:
+    """Play a run, or show the cell of a scenario, until the window is closed."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise FleetError(NO_DISPLAY)
     import numpy as np
@@ -216,7 +234,8 @@ def view_command(
 
     if (Path(what) / "run.json").exists():
         run = open_run(Path(what))
-        film, last_s, began_s = Film(run, meshes=shot.meshes), float(run.readings.time_s[-1]), time.monotonic()
+        film, began_s = Film(run, meshes=shot.meshes), time.monotonic()
+        last_s = min(shot.end_s, float(run.readings.time_s[-1]))
         player = film.player
 
         def update() -> object:
@@ -236,68 +255,41 @@ def view_command(
     player.open_viewer(update)
 
 
-def _write_files(
-    what: str, mcap: Path | None, gltf: Path | None, every_s: float | None, speed: float, overwrite: bool
-) -> None:
-    from scenarios.extras import require_extra
-    from scenarios.result_folder import check_file, new_file
-
-    if mcap is not None:
-        check_file(mcap, (".mcap",), overwrite, "--mcap")
-        require_extra("mcap")
-        require_extra("ros2")
-    if gltf is not None:
-        check_file(gltf, (".glb",), overwrite, "--gltf")
-        require_extra("report")
-    if not (Path(what) / "run.json").exists():
-        raise FleetError(f"--mcap and --gltf need the folder of a `thermofleet run` (got '{what}').")
+def _write_scene(run: Path, out: Path, every_s: float | None, speed: float) -> None:
+    """Write the moments of a run as MCAP or as glTF."""
+    from scenarios.result_folder import new_file
     from scenarios.run.log import open_run
     from scenarios.show.moments import Moments
 
-    moments = Moments(open_run(Path(what)), every_s)
-    for path, hint in (
-        (mcap, f"open it in Foxglove, or: ros2 bag play {mcap}"),
-        (gltf, f"{speed:g} × real time; open it in Blender or a web viewer"),
-    ):
-        if path is None:
-            continue
-        with progress_bar(kept="") as progress, new_file(path) as file:
-            if path is mcap:
-                from scenarios.show.mcap import write_mcap
+    moments = Moments(open_run(run), every_s)
+    with progress_bar(kept="") as progress, new_file(out) as file:
+        if out.suffix.lower() == ".mcap":
+            from scenarios.show.mcap import write_mcap
 
-                write_mcap(file, moments, progress)
-            else:
-                from scenarios.show.gltf import write_gltf
+            write_mcap(file, moments, progress)
+            hint = f"open it in Foxglove, or: ros2 bag play {out}"
+        else:
+            from scenarios.show.gltf import write_gltf
 
-                write_gltf(file, moments, speed, progress)
-        size = f"{path.stat().st_size / 1e6:.1f} MB"
-        say(f"Wrote {len(moments.poses)} moments, {size}: {path} ({hint}).", out_console)
+            write_gltf(file, moments, speed, progress)
+            hint = f"{speed:g} × real time; open it in Blender or a web viewer"
+    say(f"Wrote {len(moments.poses)} moments, {out.stat().st_size / 1e6:.1f} MB: {out} ({hint}).", out_console)
 
 
-def film_command(
-    run: Path = argument("Folder of `thermofleet run`."),
-    *,
-    given: Annotated[Given, From(Shot, "speed", "fps", "begin_s", "end_s", "meshes")],
-    out: Path = option("Output file: .mp4, .webm or .gif.", Path("shift.mp4")),
-    size: str = option("Width x height, px; even numbers.", "1280x720"),
-    overwrite: bool = options.OVERWRITE,
-) -> None:
-    """Film a recorded shift: the arms move, their motors coloured by temperature."""
+def _write_film(run: Path, out: Path, shot: Shot) -> None:
     from scenarios.progress import Count
-    from scenarios.result_folder import check_file, new_file
+    from scenarios.result_folder import new_file
 
-    suffix = out.suffix.lower()
-    check_file(out, (".mp4", ".webm", ".gif"), overwrite)
-    width, height = _size(size)
     if sys.platform.startswith("linux"):  # MuJoCo chooses its OpenGL when it is loaded, and the default needs a display
         os.environ.setdefault("MUJOCO_GL", "egl")
     from scenarios.run.log import open_run
     from scenarios.show.film import frames, times, write_film
 
-    shot = Shot(**given, width=width, height=height)
     stored = open_run(run)
     at_s = times(stored, shot)
-    most = min(MOST_FRAMES, MOST_GIF_PIXELS // (width * height)) if suffix == ".gif" else MOST_FRAMES
+    most = (
+        min(MOST_FRAMES, MOST_GIF_PIXELS // (shot.width * shot.height)) if out.suffix.lower() == ".gif" else MOST_FRAMES
+    )
     if len(at_s) > most:
         raise FleetError(
             f"The film would have {len(at_s)} pictures; at most {most} are possible in this size. Raise --speed (now "
@@ -310,7 +302,7 @@ def film_command(
                 progress("filming", Count(number, len(at_s)))
                 yield picture
 
-        count = write_film(file, suffix[1:], counted(), shot)
+        count = write_film(file, out.suffix[1:].lower(), counted(), shot)
     length_s, megabytes = count / shot.fps, out.stat().st_size / 1e6
     say(f"Filmed {count} pictures, {length_s:.1f} s, {megabytes:.1f} MB: {out}.", out_console)
 
@@ -326,19 +318,31 @@ def _size(asked: str) -> tuple[int, int]:
 
 
 def report_command(
-    folder: Path = argument("Folder of `thermofleet run`, or of a recording, finished or not."),
+    folder: Path | None = argument("Folder of a run or of a recording. Default: the newest one in runs/.", None),
     out: Path | None = option("The HTML file. Default: in the folder of a run, beside that of a recording.", None),
-    scenario: str | None = option(
-        "Of a recording: the scenario of the fleet, if no auctioneer described its cell.", None
-    ),
+    scenario: str | None = option("Of a recording: scenario of the fleet, if no auctioneer described its cell.", None),
     meshes: bool = option("Of a run: Kinova's shells; needs the extra `meshes`.", False),
+    trace: str | None = option(
+        "Write no page, but print what led to this event: job, award, plan, offers, twin, training data, configuration "
+        "and code. EVENT is a row of the event log from 0; a kind such as fault, also with an arm or a job as "
+        "fault@arm_1; or a job, for its award. Of several events, the first one.",
+        None,
+        metavar="EVENT",
+    ),
+    as_json: bool = option("--trace: print JSON.", False, flag="--json"),
 ) -> None:
-    """Write the report of a live recording, as `run` writes one of a simulated shift, or that of a run anew."""
+    """Write the page of a run or recording, finished or not; with --trace, follow an event to its causes."""
     from scenarios.live.recording_report import open_recording
     from scenarios.result_folder import new_file
     from scenarios.run.log import open_run
     from scenarios.spec.load import load
 
+    if as_json and trace is None:
+        raise FleetError("--json is for --trace: leave it out.")
+    folder = folder or last_folder(Path("runs"))
+    if trace is not None:
+        _print_trace(folder, trace, as_json)
+        return
     if (folder / "run.json").exists():
         path, run = out or folder / "report.html", open_run(folder)
         html = run.page(meshes=meshes)
@@ -350,22 +354,14 @@ def report_command(
     say(f"Open {path} in a browser.", out_console)
 
 
-def trace_command(
-    event: str = argument(
-        "A row of the event log from 0; a kind such as fault, also with an arm or a job as fault@arm_1; or a "
-        "job, for its award. Of several events, the first one."
-    ),
-    folder: Path | None = option("Folder of a run or a recording; default: the last of runs/.", None, flag="--in"),
-    as_json: bool = options.JSON,
-) -> None:
-    """Follow an event to its job, plan, offers, twin, training data, configuration and code."""
+def _print_trace(folder: Path, event: str, as_json: bool) -> None:
     from scenarios.live.trace import thread_of, thread_table
 
-    found = thread_of(folder or last_folder(Path("runs")), event)
+    thread = thread_of(folder, event)
     if as_json:
-        print_json(found.as_json())
+        print_json(thread.as_json())
     else:
-        out_console.print(thread_table(found))
+        out_console.print(thread_table(thread))
 
 
 def last_folder(runs: Path) -> Path:
@@ -374,7 +370,7 @@ def last_folder(runs: Path) -> Path:
     Raises:
         FleetError: there is none.
     """
-    cards = [*runs.glob("*/run.json"), *runs.glob("*/recording.json")] if runs.is_dir() else []
+    cards = [card for name in ("*/run.json", "*/recording.json", "*/*/recording.json") for card in runs.glob(name)]
     if not cards:
-        raise FleetError(f"There is no run in '{runs}'; name the folder of a run or a recording with --in.")
+        raise FleetError(f"There is no run in '{runs}'. Give the folder of a run or of a recording.")
     return max(cards, key=lambda card: card.stat().st_mtime_ns).parent

@@ -34,7 +34,7 @@ class LazyCommand(NamedTuple):
     """A command whose module is imported when it runs."""
 
     panel: str
-    """Its part of `thermofleet --help`."""
+    """Heading in `thermofleet --help`."""
     target: str
     """MODULE:NAME of its function, the module relative to this package."""
     help: str
@@ -47,28 +47,26 @@ GROUPS = {
     "bus": LazyCommand(_LIVE, "", "Run, watch, record and connect the other processes of a fleet."),
     "twin": LazyCommand(_TWIN, "", "Train, score and use the digital twin of an arm."),
 }
-"""Groups of commands, which have no function of their own."""
+"""Groups of commands."""
 COMMANDS = {
     "demo": LazyCommand(_LOOK, "run:demo_command", "Run the quickstart shift under two policies."),
     "run": LazyCommand(_LOOK, "run:run_command", "Run one shift of a scenario and record it."),
     "show": LazyCommand(_LOOK, "look:show_command", "List the scenarios or the suite, or show one scenario."),
     "layout": LazyCommand(_LOOK, "look:layout_command", "Show reach, space and problems of a cell."),
-    "view": LazyCommand(_LOOK, "look:view_command", "Play a shift in MuJoCo's viewer."),
-    "film": LazyCommand(_LOOK, "look:film_command", "Film a recorded shift."),
-    "report": LazyCommand(_LOOK, "look:report_command", "Write the page of a run or of a recording."),
-    "trace": LazyCommand(_LOOK, "look:trace_command", "Follow an event to its causes."),
+    "view": LazyCommand(_LOOK, "look:view_command", "Play a shift in MuJoCo's viewer, or write it as a film or scene."),
+    "report": LazyCommand(_LOOK, "look:report_command", "Write the page of a run or recording, or trace an event."),
     "compare": LazyCommand(_POLICIES, "evaluate:compare_command", "Compare policies on the same seeds."),
     "bounds": LazyCommand(_POLICIES, "evaluate:bounds_command", "Bound the reward of shifts."),
     "leaderboard": LazyCommand(_POLICIES, "evaluate:leaderboard_command", "Print the leaderboard, or check a result."),
     "train": LazyCommand(_POLICIES, "evaluate:train_command", "Train a policy by reinforcement learning."),
     "up": LazyCommand(_LIVE, "live:up_command", "Start a whole fleet, one process per participant."),
-    "job submit": LazyCommand(_LIVE, "jobs:submit_command", "Submit jobs, or ask what they would cost."),
+    "job submit": LazyCommand(_LIVE, "jobs:submit_command", "Submit jobs, or request quotes."),
     "job list": LazyCommand(_LIVE, "jobs:list_command", "List the jobs of a fleet."),
     "job cancel": LazyCommand(_LIVE, "jobs:cancel_command", "Cancel jobs."),
     "job change": LazyCommand(_LIVE, "jobs:change_command", "Change due date and value of a job."),
     "job settle": LazyCommand(_LIVE, "jobs:settle_command", "Resolve a job with unknown outcome."),
     "arm run": LazyCommand(_LIVE, "live:arm_command", "Run one arm of a fleet."),
-    "arm pause": LazyCommand(_LIVE, "jobs:pause_command", "Give an arm, or all arms, no more jobs; or end that."),
+    "arm pause": LazyCommand(_LIVE, "jobs:pause_command", "Pause one arm or all arms; or resume."),
     "arm reset": LazyCommand(_LIVE, "jobs:reset_command", "Clear the fault of an arm."),
     "arm clear": LazyCommand(_LIVE, "jobs:clear_command", "Free the space of an absent arm."),
     "bus router": LazyCommand(_LIVE, "live:router_command", "Run the Zenoh router of a fleet."),
@@ -79,20 +77,22 @@ COMMANDS = {
     "bus replay": LazyCommand(_LIVE, "live:replay_command", "Replay a run or a recording on the bus."),
     "bus gateway": LazyCommand(_LIVE, "live:gateway_command", "Serve a fleet over HTTP, with a live page."),
     "bus keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
-    "bus ros2": LazyCommand(_LIVE, "live:ros2_command", "Connect a fleet and ROS 2."),
-    "twin train": LazyCommand(_TWIN, "twin:train_command", "Train the twins of a scenario, or that of logs."),
+    "bus ros2": LazyCommand(_LIVE, "live:ros2_command", "Connect a fleet to ROS 2."),
+    "twin train": LazyCommand(_TWIN, "twin:train_command", "Train the twins of a scenario, or one from logs."),
     "twin score": LazyCommand(_TWIN, "twin:score_command", "Score and judge every job of a scenario, or a log."),
     "twin identify": LazyCommand(_TWIN, "twin:identify_command", "Identify an arm's thermal network."),
     "twin generate": LazyCommand(_TWIN, "twin:generate_command", "Generate new cool motion."),
     "twin recover": LazyCommand(_TWIN, "twin:recover_command", "Find a posture with less load for a warm arm."),
     "twin export": LazyCommand(_TWIN, "twin:export_command", "Export a twin as ONNX."),
-    "twin report": LazyCommand(_TWIN, "twin:report_command", "Write the paper's pictures as one page."),
+    "twin report": LazyCommand(_TWIN, "twin:report_command", "Write the paper's figures as one page."),
 }
 MOVED = {
     **{word: f"job {word}" for word in ("submit", "cancel", "change", "settle")},
     **{word: f"arm {word}" for word in ("pause", "reset", "clear")},
     **{word: f"bus {word}" for word in ("router", "watch", "doctor", "gateway", "record", "replay", "ros2", "keys")},
     "list": "show",
+    "film": "view --out",
+    "trace": "report --trace",
     "hold": "show --hold",
     "suite": "show --suite",
     "ablate": "compare --difficulty",
@@ -108,7 +108,7 @@ MOVED = {
 
 
 class LazyGroup(TyperGroup):
-    """The commands of `COMMANDS` under some words: listed by their entries, imported when they run."""
+    """The commands of `COMMANDS` below `words`: listed from their entries, imported when they run."""
 
     words: tuple[str, ...] = ()
     """Before the name of each command."""
@@ -195,7 +195,7 @@ def _given(error: typer.TyperException, words: Sequence[str]) -> str | None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command line: an error that the user can correct is one sentence and exit code 2; Ctrl-C is 130."""
+    """Run the command line. Exit codes: 2 for an error that the user can correct, with one sentence; 130 for Ctrl-C."""
     _log_warnings()
     try:
         code = app(args=list(argv) if argv is not None else None, prog_name="thermofleet", standalone_mode=False)

@@ -135,9 +135,9 @@ class LiveSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """What to film and how."""
+    """Part of a shift to show, and how."""
 
-    speed: float = option("Shift seconds per second of the film.", 120.0, low=0.1, high=3600)
+    speed: float = option("Shift seconds per second of the viewer or film.", 120.0, low=0.1, high=3600)
     fps: int = option("Pictures per second.", 30, low=1, high=60)
     width: int = 1280
     height: int = 720

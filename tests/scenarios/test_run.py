@@ -312,7 +312,7 @@ def test_the_command_shows_one_screen_or_json(folder: Path, capsys, monkeypatch)
     assert last_folder(Path("runs")) == Path("runs/one")
     for options in ([], ["--json"]):
         with pytest.raises(SystemExit) as ended:
-            main(["trace", "finish", *options])
+            main(["report", "--trace", "finish", *options])
         assert ended.value.code in (0, None)
     screen, text = capsys.readouterr().out.split("{", 1)
     assert len(screen.splitlines()) < 60
@@ -328,7 +328,7 @@ def test_the_command_shows_one_screen_or_json(folder: Path, capsys, monkeypatch)
 
 def test_a_folder_without_a_run_is_said(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FleetError, match="There is no run in 'runs'; name the folder"):
+    with pytest.raises(FleetError, match=r"There is no run in 'runs'\. Give the folder"):
         last_folder(Path("runs"))
     with pytest.raises(FleetError, match="is neither a folder of `thermofleet run` nor of `thermofleet bus record`"):
         thread_of(tmp_path, "fault")
@@ -351,7 +351,6 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
         offers = (ArmOffer("a", "idle", True, quoted), ArmOffer("b", "working", False))
         recorder.add("boss", Result(auctioneer="boss", number=number, time_s=time_s, status=status, offers=offers))
     recorder.write(status="finished")
-    recorder.close()
     thread = thread_of(tmp_path, "warning")
     assert thread.award is not None
     assert (thread.award.time_s, thread.twin) == (20.0, {"arm": "a", "version": "d:0123"})

@@ -37,7 +37,7 @@ def run(run_folder: Path) -> RunLog:
 def file(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("gltf") / "shift.glb"
     with pytest.raises(SystemExit) as ended:
-        main(["view", str(run_folder), "--gltf", str(path), "--speed", str(SPEED)])
+        main(["view", str(run_folder), "--out", str(path), "--speed", str(SPEED)])
     assert ended.value.code in (0, None)
     return path
 

@@ -105,7 +105,7 @@ FILM = "from scenarios.cli.main import main; main()"
 
 
 def film(run: Path, out: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", FILM, "film", str(run), "--out", str(out), *options]
+    command = [sys.executable, "-c", FILM, "view", str(run), "--out", str(out), *options]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, env=os.environ | {"MUJOCO_GL": "egl"})
 
 
@@ -220,7 +220,7 @@ EVERY_S = 20
 
 def written(run_folder: Path, path: Path) -> Path:
     with pytest.raises(SystemExit) as ended:
-        main(["view", str(run_folder), "--mcap", str(path), "--every", "20"])
+        main(["view", str(run_folder), "--out", str(path), "--every", "20"])
     assert ended.value.code in (0, None)
     return path
 
@@ -308,9 +308,9 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, opene
 @pytest.mark.parametrize(
     ("options", "needed"),
     [
-        (["--mcap", "shift.bag"], "--mcap must end in .mcap (got 'shift.bag')"),
-        (["--mcap", "there.mcap"], "'there.mcap' exists; give another --mcap"),
-        (["--every", "5"], "--every is for --mcap and --gltf"),
+        (["--out", "shift.bag"], "--out must end in .mp4, .webm, .gif, .mcap, .glb (got 'shift.bag')"),
+        (["--out", "there.mcap"], "'there.mcap' exists; give another --out"),
+        (["--every", "5"], "--every is for --out FILE.mcap and FILE.glb"),
     ],
 )
 def test_a_file_that_cannot_be_is_refused(
