@@ -1,4 +1,4 @@
-"""How long-running functions report their progress, and how it is told in words."""
+"""Progress of long-running functions: stages, fractions and the time left."""
 
 import re
 from collections.abc import Callable
@@ -22,11 +22,11 @@ STAGES = {
     "teaching": "Training the networks",
     "writing": "Writing the files",
 }
-"""What is going on, for people; other stages are shown by their names."""
+"""Text of a stage; other stages are shown by their names."""
 HINTS = {
-    "training": "those that are not in the cache; up to a minute per arm and core, full size minutes",
+    "training": "only those missing from the cache; up to a minute per arm and core, minutes at full size",
     "learning the log": "up to a minute, several minutes at full size",
-    "teaching": "those that the report compares and the cache lacks; the longest part",
+    "teaching": "only those missing from the cache; the longest part",
 }
 """Added to the first line of a long stage."""
 LEAST_S = 5.0

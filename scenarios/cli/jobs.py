@@ -1,6 +1,6 @@
 """Commands that steer a live fleet: `thermofleet job` and `thermofleet arm pause | reset | clear`."""
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import typer
 
@@ -11,25 +11,22 @@ from scenarios.cli import options
 from scenarios.table import Table
 from scenarios.terminal import out_console, print_json
 
-if TYPE_CHECKING:  # slow to import
-    from fleet.bus.protocol.operator import Action
-
 _RANGES = {name: {"low": bounds.low, "high": bounds.high} for name, bounds in BOUNDS.items()}
 _ONE = "One job instead of a file"
 LISTEN_S = 1.0
 """Real seconds of listening for the list of jobs."""
 JOB = argument("Name of the job.")
 ARM = argument("Name of the arm.", is_name=True)
-BY = option("Who requests it, for journal and status. Default: the name of the user.", "")
+BY = option("Name of the requester, kept in the journal. Default: the user's name.", "")
 
 
 def submit_command(
     file: str = argument("Jobs as JSON: a list, or one job per line; - reads standard input.", ""),
     wait: bool = option("Follow the jobs to their end; exit code 1 if one stays unfinished.", False),
-    quote: bool = option("Submit nothing: print the cost of each plan of every arm, or why it cannot.", False),
+    quote: bool = option("Submit nothing; print every arm's quote for each of its plans, or why it has none.", False),
     timeout: float = option("--quote: real seconds to wait for arms.", 5.0, low=0, high=600, above=True),
     as_json: bool = option("--quote: print JSON.", False, flag="--json"),
-    by: str = option("Name of the submitter, for the records.", ""),
+    by: str = option("Name of the submitter, kept in the journal.", ""),
     kind: str = option("pick_place, hold, press or sort.", "", panel=_ONE),
     name: str = option("Name of the job. Default: its kind.", "", panel=_ONE),
     place: list[str] | None = option("Place of the cell; twice for pick_place and sort.", None, panel=_ONE),
@@ -45,7 +42,7 @@ def submit_command(
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
 ) -> None:
-    """Submit jobs to a fleet; accepted jobs are durable. With --quote, only ask what they would cost.
+    """Submit jobs to a fleet; accepted jobs are durable. With --quote, print quotes and submit nothing.
 
     A quote has the fastest plan first. Columns:
     peak: predicted temperature of the hottest motor
@@ -57,7 +54,8 @@ def submit_command(
     Exit code 1: a job was refused or stays unfinished; with --quote, no arm can do it.
     """
     if bool(file) == bool(kind):
-        raise FleetError("Give either a FILE of jobs or one job by --kind and --place.")
+        given = "both" if file else "neither"
+        raise FleetError(f"Give either a FILE of jobs or one job by --kind and --place (got {given}).")
     if wait and quote:
         raise FleetError("--quote submits nothing: leave --wait out.")
     if as_json and not quote:
@@ -74,7 +72,7 @@ def submit_command(
 
 
 def list_command(endpoint: str = options.ENDPOINT, fleet: str = options.FLEET, as_json: bool = options.JSON) -> None:
-    """List the jobs of a fleet by name: state, arm, cycles and reason."""
+    """List the jobs of a fleet by name, with state, arm, cycles and reason."""
     import time
 
     from fleet.bus.client import BusClient
@@ -103,25 +101,27 @@ def cancel_command(
 ) -> None:
     """Cancel jobs.
 
-    An arm at work ends the cycle in progress and goes home. A job in its last
-    cycle is finished.
+    A working arm completes its cycle and goes home. A job in its last cycle is
+    finished.
     """
     from fleet.bus.protocol.operator import Cancel
+    from scenarios.live.requests import control
 
-    _control([Cancel(job) for job in jobs], by, endpoint, fleet)
+    control([Cancel(job) for job in jobs], by, endpoint, fleet)
 
 
 def settle_command(
     job: str = JOB,
-    outcome: Literal["done", "redo"] = argument("done, or redo: its last cycle is done again."),
+    outcome: Literal["done", "redo"] = argument("done, or redo to repeat its last cycle."),
     by: str = BY,
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
 ) -> None:
     """Resolve a job with unknown outcome, after inspecting the cell."""
     from fleet.bus.protocol.operator import Settle
+    from scenarios.live.requests import control
 
-    _control([Settle(job, outcome)], by, endpoint, fleet)
+    control([Settle(job, outcome)], by, endpoint, fleet)
 
 
 def change_command(
@@ -133,39 +133,43 @@ def change_command(
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
 ) -> None:
-    """Change due date and value of a job that is not settled."""
-    if (due is not None and no_due) or (due is None and not no_due and value is None):
-        raise FleetError("Give --due or --no-due, --value, or both a due date and a value.")
+    """Change the due date or the value of an unsettled job."""
+    if due is not None and no_due:
+        raise FleetError(f"--due and --no-due exclude each other (got --due {due:g}). Leave one out.")
+    if due is None and not no_due and value is None:
+        raise FleetError("There is nothing to change. Give --due, --no-due or --value.")
     from msgspec import UNSET
 
     from fleet.bus.protocol.operator import Change
+    from scenarios.live.requests import control
 
     due_s = None if no_due else UNSET if due is None else due
-    _control([Change(job, due_s, UNSET if value is None else value)], by, endpoint, fleet)
+    control([Change(job, due_s, UNSET if value is None else value)], by, endpoint, fleet)
 
 
 def pause_command(
     arm: str = argument("Name of the arm. Default: all arms.", "*"),
-    end: bool = option("End the pause.", False),
+    end: bool = option("Resume.", False),
     by: str = BY,
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
 ) -> None:
-    """Give an arm, or all, no more jobs; with --end, give it jobs again.
+    """Pause one arm or all arms: no more jobs are awarded to them. With --end, resume.
 
-    An arm at work ends the cycle in progress and goes home; its job goes to
-    another arm. A job in its last cycle is finished.
+    A working arm completes its cycle and goes home; its job goes to another arm.
+    A job in its last cycle is finished.
     """
     from fleet.bus.protocol.operator import Pause, Resume
+    from scenarios.live.requests import control
 
-    _control([Resume(arm) if end else Pause(arm)], by, endpoint, fleet)
+    control([Resume(arm) if end else Pause(arm)], by, endpoint, fleet)
 
 
 def reset_command(arm: str = ARM, by: str = BY, endpoint: str = options.ENDPOINT, fleet: str = options.FLEET) -> None:
     """Clear the fault of an arm now.
 
-    The arm ends its cycle and goes home by itself: nobody may be in its way.
-    An arm that is too hot refuses.
+    The arm completes its cycle and moves home: keep people away from it. The
+    request is refused while a motor is too hot.
     """
     from scenarios.live.requests import reset_arm
 
@@ -173,19 +177,12 @@ def reset_command(arm: str = ARM, by: str = BY, endpoint: str = options.ENDPOINT
 
 
 def clear_command(arm: str = ARM, by: str = BY, endpoint: str = options.ENDPOINT, fleet: str = options.FLEET) -> None:
-    """Free the space that an absent arm takes, so that other arms can use it.
+    """Free the space of an absent arm for other arms.
 
-    First stop the process of the arm, and make sure that the arm is at home
-    or removed, and switched off. Start the process again only when the arm is
-    at home. The request is refused for an arm that is present, because its own
-    quotes report its space.
+    First stop the process of the arm, and make sure that the arm is at home or
+    removed, and switched off. Start the process again only when the arm is at
+    home. The request is refused for a present arm: its quotes report its space.
     """
     from scenarios.live.requests import clear_space
 
     clear_space(arm, by, endpoint, fleet)
-
-
-def _control(actions: "list[Action]", by: str, endpoint: str, fleet: str) -> None:
-    from scenarios.live.requests import control
-
-    control(actions, by, endpoint, fleet)

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import get_args
 
-from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, of_arms, read_roster, rights
+from fleet.bus.security.access_control import ROLES, Role, Roster, RosterEntry, of_arms, read_roster, rights
 from fleet.errors import FleetError, nearest
 from fleet.fields import argument, option
 from scenarios.cli import options
@@ -19,14 +19,16 @@ _ROLES = ", ".join(ROLES)
 def keys_command(
     folder: Path = argument("Folder of one fleet's keys.", metavar="DIR"),
     scenario: str | None = argument(
-        "Make new keys for the arms of this scenario; default: show the present keys.", None
+        "Make new keys for the arms of this scenario. Default: show the present keys.", None
     ),
     extra: list[str] | None = option(f"NAME:ROLE, another participant; roles: {_ROLES}.", None),
     add: list[str] | None = option("NAME:ROLE, a new certificate from the present authority.", None),
     days: int = option("Lifetime of the participants' certificates, days.", DAYS, low=1, high=MAX_DAYS),
-    host: list[str] | None = option("Another name or address of the router than localhost, 127.0.0.1 and ::1.", None),
+    host: list[str] | None = option(
+        "Name or address of the router, besides localhost, 127.0.0.1 and ::1; may be repeated.", None
+    ),
     overwrite: bool = option("Replace all keys; with --add, replace one certificate.", False),
-    no_auctioneer: bool = option("For arms that allocate jobs by consensus and reply to submitters.", False),
+    no_auctioneer: bool = option("Rights for arms that allocate jobs by consensus, without an auctioneer.", False),
     as_json: bool = options.JSON,
 ) -> None:
     """Make, extend and show keys and certificates for mutual TLS."""
@@ -61,7 +63,7 @@ def keys_command(
         say(f"Keys of the fleet '{roster.fleet}' are in {folder}. Keep {folder / 'ca.key'} where no participant runs.")
 
 
-def participant_of(text: str) -> Participant:
+def participant_of(text: str) -> RosterEntry:
     """The participant of `NAME:ROLE`; a name may hold colons.
 
     Raises:
@@ -74,7 +76,7 @@ def participant_of(text: str) -> Participant:
     if known is None:
         raise FleetError(f"'{text}': no role '{role}'{nearest(role, ROLES)}")
     try:
-        return Participant(name, known)
+        return RosterEntry(name, known)
     except ValueError as error:
         raise FleetError(str(error)) from error
 
@@ -94,7 +96,7 @@ def _table(roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table
 def _plain(roster: Roster, ends: dict[str, datetime]) -> dict[str, object]:
     from fleet.bus.security.certificates import CA
 
-    def row(one: Participant) -> dict[str, object]:
+    def row(one: RosterEntry) -> dict[str, object]:
         who = {"name": one.name, "role": one.role, "common_name": one.common_name, "ends": ends[one.name].isoformat()}
         return {**who, **asdict(rights(roster.fleet, one, by_consensus=roster.by_consensus))}
 

@@ -42,13 +42,13 @@ RANDOMISE = option(
     None,
     metavar="FIELD=VALUE",
 )
-WORKERS = option("Number of processes; default: one per core.", None, low=1, high=1024)
+WORKERS = option("Number of processes. Default: one per core.", None, low=1, high=1024)
 JSON = option("Print JSON.", False, flag="--json")
 OVERWRITE = option("Replace an earlier result.", False)
 
 # Live fleets.
 ENDPOINT = option("Endpoint of the fleet's router.", spec_options.ENDPOINT, env="THERMOFLEET_ENDPOINT")
-FLEET = option("Name of the fleet; not needed if there is only one.", "", env="THERMOFLEET_FLEET", is_name=True)
+FLEET = option("Name of the fleet. Default: the only one at the router.", "", env="THERMOFLEET_FLEET", is_name=True)
 
 # Twins.
 SCENARIO_OR_LOG = argument("A library name (see `thermofleet show`) or a .toml file; or use --log.", None)
@@ -63,7 +63,7 @@ def channel_of(scenario: "Scenario", **fields: Any) -> Channel:
     """The channel that the command line describes; `fields` are those of `Channel`, which checks them (hence Any).
 
     Raises:
-        FleetError: says what was given and what is allowed.
+        FleetError: a field has another form, or is out of range.
     """
     try:
         channel = Channel(**fields)
@@ -77,7 +77,7 @@ def parse_randomisation(texts: list[str] | None) -> "Randomisation | None":
     """The randomisation of texts such as `ambient_k=[-2, 8]`, each a TOML document; None without any.
 
     Raises:
-        FleetError: says what was given and what is allowed.
+        FleetError: a field has another form, or is out of range.
     """
     from scenarios.prepare.randomisation import Randomisation
 

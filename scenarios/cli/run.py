@@ -41,7 +41,7 @@ def run_command(
     out: Path | None = option("Folder of the recording; default: runs/SCENARIO-POLICY-SEED.", None),
     overwrite: bool = options.OVERWRITE,
     listen: int = option(
-        "Loopback port of the router, so that other programs can subscribe. 0: a private router on a free port.",
+        "Loopback port on which other programs can subscribe. 0: a private router on a free port.",
         0,
         low=0,
         high=65535,
@@ -93,7 +93,7 @@ def demo_command(
     *,
     given: Annotated[Given, From(RunSpec, "seed", seed=20)],
 ) -> None:
-    """Run the quickstart shift under two policies, side by side."""
+    """Run the quickstart shift under two policies, and compare them on one page."""
     from scenarios.result_folder import disk_errors
     from scenarios.show.run_page import pair_page
     from scenarios.spec.load import load
