@@ -12,7 +12,7 @@ from scenarios.terminal import Interrupted
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
 
-class Stop:
+class StopRequest:
     """Whether a stop was requested, and by which signal.
 
     A signal that one of Zenoh's threads receives often does not wake a lock or queue on which the main thread waits.
@@ -43,7 +43,7 @@ class Stop:
 
 
 @contextmanager
-def until_stopped() -> Iterator[Stop]:
+def until_stopped() -> Iterator[StopRequest]:
     """Turn Ctrl-C and SIGTERM into stop requests; in the main thread only."""
     exit_with_supervisor()
     receiver, sender = socket.socketpair()
@@ -51,7 +51,7 @@ def until_stopped() -> Iterator[Stop]:
         sender.setblocking(False)
         before_fd = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
         before = [signal.signal(number, lambda *_: None) for number in NUMBERS]
-        stop = Stop(receiver)
+        stop = StopRequest(receiver)
         try:
             yield stop
         finally:

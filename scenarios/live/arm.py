@@ -30,12 +30,12 @@ from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal, own_records, put_aside
 from fleet.motion import Plan
-from scenarios.live.auctioneer import live_fleet, own_jobs, summary
+from scenarios.live.auctioneer import live_fleet, scenario_jobs, summary
 from scenarios.live.cell import cell_message, cell_space
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import arm_policy_of, scope_of
 from scenarios.progress import Progress
-from scenarios.signals import Stop, until_stopped
+from scenarios.signals import StopRequest, until_stopped
 from scenarios.spec.options import LiveModel, LiveSpec, RiskName
 from scenarios.spec.schema import Scenario
 from scenarios.terminal import echo, progress_bar
@@ -302,7 +302,7 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
         choose=chosen.choose,
         slots=scenario.slots,
         places=frozenset(place.name for place in scenario.places),
-        stream=tuple(own_jobs(scenario, seed)) if stream else (),
+        stream=tuple(scenario_jobs(scenario, seed)) if stream else (),
         horizon_s=fleet.horizon_s,
         excludes=cell_space(scenario),
         cell=cell_message(scenario, name),
@@ -320,7 +320,7 @@ def refuse_auctioneer(link: BusClient) -> None:
         raise BusError(f"Fleet '{link.fleet}' has an auctioneer: '{names}'. Stop it first, or leave --policy out.")
 
 
-def serve_until_done(node: ArmNode, stop: Stop) -> bool:
+def serve_until_done(node: ArmNode, stop: StopRequest) -> bool:
     """Serve until all jobs are settled, and print a summary; return False if stopped before that."""
     source = node.work_source
     assert isinstance(source, ConsensusNode)

@@ -23,7 +23,7 @@ from fleet.live.journal import Journal, put_aside
 from scenarios.live.cell import cell_message, cell_space
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
-from scenarios.signals import Stop, until_stopped
+from scenarios.signals import StopRequest, until_stopped
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.options import LiveSpec
 from scenarios.spec.schema import Scenario
@@ -115,7 +115,7 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
     """
     bus = OnBus(fleet=spec.fleet or scenario.name, endpoint=endpoint, limit_s=ON_BUS_S)
     allocate = central_allocation(spec.policy, scenario, spec.seed, ends=spec.jobs == "scenario", bus=bus)
-    own = own_jobs(scenario, spec.seed) if spec.jobs == "scenario" else []
+    own = scenario_jobs(scenario, spec.seed) if spec.jobs == "scenario" else []
     fleet, folder = folder_of(spec.journal, spec.fleet, scenario)
     refuse_other_way(folder, (arm.name for arm in scenario.arms), alone=False)
     with progress_bar() as progress:
@@ -159,7 +159,9 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
         stop.leave(f"Interrupted at {node.time_s:.0f} s; the journal is {book.path}, and the same command continues.")
 
 
-def submit_stream(node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], horizon_s: float, stop: Stop) -> None:
+def submit_stream(
+    node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], horizon_s: float, stop: StopRequest
+) -> None:
     """Serve, and submit a stream of jobs as they are released, until all are settled or the shift is over."""
     left = [] if node.auctioneer.ledger.ended else list(stream)
     while not stop.is_set():
@@ -183,7 +185,7 @@ def submit_stream(node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], ho
         node.serve(time.monotonic() + TURN_S)
 
 
-def own_jobs(scenario: Scenario, seed: int) -> list[tuple[float, JobSpec]]:
+def scenario_jobs(scenario: Scenario, seed: int) -> list[tuple[float, JobSpec]]:
     """Job stream of a scenario for one seed, the same as in `thermofleet run`, each job with the time to submit it.
 
     That is when it and all jobs that it waits for are released.

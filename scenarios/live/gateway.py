@@ -16,7 +16,7 @@ import secrets
 import signal
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from http import HTTPStatus
@@ -77,8 +77,6 @@ MAX_SENDERS = 4096
 """Tokens and addresses whose rate is kept."""
 MAX_BYTES = 60_000
 """Of a body: what the router forwards, less the overhead of a message."""
-MAX_BODIES = 32
-"""Unfinished bodies; the next one ends the oldest."""
 MAX_READERS, MAX_REQUESTS = 64, 16
 BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
 """Real seconds: for a body to arrive; for a reader to take what was sent; between two heartbeats."""
@@ -103,19 +101,19 @@ HEADERS = {
 
 
 class LivePage:
-    """The page of a gateway."""
+    """The page of a gateway; without a model the cell is drawn as the auctioneer describes it."""
 
     def __init__(self, model: Mapping[str, Any] | None = None) -> None:
-        """Prepare; without a model the cell is drawn as the auctioneer describes it."""
-        self._given, self._model = model is not None, model
+        self._given = model
         self._cell: Cell | None = None
+        self._model: Mapping[str, Any] = {}
 
     async def scene(self, ask_cell: Callable[[], Awaitable[Cell]]) -> Mapping[str, Any]:
-        """The cell in three dimensions; raises BusError if no participant describes it, or with wrong numbers."""
-        if self._given and self._model is not None:
-            return self._model
+        """The cell in three dimensions; raises BusError if no participant describes it, or with invalid numbers."""
+        if self._given is not None:
+            return self._given
         cell = await ask_cell()
-        if self._model is None or cell != self._cell:
+        if cell != self._cell:
             try:
                 self._model = await asyncio.to_thread(_model_of, cell)
             except ValueError as error:
@@ -166,7 +164,7 @@ Endpoint = Callable[[Request], Awaitable[Response]]
 NO_TOKENS: Mapping[str, Role] = {}
 
 
-class Problem(Exception):
+class HttpProblem(Exception):
     """An HTTP error with a sentence that says what is wrong."""
 
     def __init__(self, status: HTTPStatus, detail: str) -> None:
@@ -265,32 +263,6 @@ class AccessCheck:
         return problem_response(HTTPStatus.TOO_MANY_REQUESTS, detail, {"Retry-After": str(math.ceil(1 / RATE_HZ))})
 
 
-class Bodies:
-    """Limits the time and the number of unfinished bodies, so that slow senders do not block fast ones."""
-
-    def __init__(self, body_s: float) -> None:
-        self.body_s = body_s
-        self._unfinished: dict[asyncio.Timeout, None] = {}
-
-    @asynccontextmanager
-    async def reading(self) -> AsyncIterator[None]:
-        """Within it one body is read.
-
-        Raises:
-            TimeoutError: it took too long, or too many newer ones arrived meanwhile.
-        """
-        async with asyncio.timeout(self.body_s) as limit:
-            self._unfinished[limit] = None
-            if len(self._unfinished) > MAX_BODIES:
-                oldest = next(iter(self._unfinished))
-                del self._unfinished[oldest]
-                oldest.reschedule(asyncio.get_running_loop().time())
-            try:
-                yield
-            finally:
-                self._unfinished.pop(limit, None)
-
-
 def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
     """Problem details, RFC 9457."""
     fields = {"type": "about:blank", "title": status.phrase, "status": status.value, "detail": detail}
@@ -354,11 +326,11 @@ def application(
         page: Shown to browsers at `/`; None for none.
     """
     boot = secrets.token_hex(4)  # event numbers are valid for one start of the gateway
-    slots, bodies, shown = asyncio.Semaphore(MAX_REQUESTS), Bodies(body_s), page or LivePage()
+    slots, shown = asyncio.Semaphore(MAX_REQUESTS), page or LivePage()
 
     async def limited(request: Callable[[], Awaitable[Reply]]) -> Reply:
         if slots.locked():
-            raise Problem(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_REQUESTS} requests are waiting; try again.")
+            raise HttpProblem(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_REQUESTS} requests are waiting; try again.")
         async with slots:
             return await request()
 
@@ -374,7 +346,7 @@ def application(
         """Passes the body of a request on to the auctioneer."""
 
         async def post(request: Request) -> Response:
-            message = await read_body(request, kind, bodies)
+            message = await read_body(request, kind, body_s)
             return json_response(await ask(keys.of_jobs(bridge.fleet, topic), message, reply))
 
         return post
@@ -388,9 +360,9 @@ def application(
         return json_response(await ask(keys.of_jobs(bridge.fleet, "status"), StatusRequest(names), Status))
 
     async def post_reset(request: Request) -> Response:
-        body = await read_body(request, ResetBody, bodies)
+        body = await read_body(request, ResetBody, body_s)
         if not is_name(body.arm):
-            raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
+            raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
         key = keys.of_arm(bridge.fleet, body.arm, "reset")
         return json_response(await ask(key, ResetRequest(body.by), ResetReply))
 
@@ -404,17 +376,17 @@ def application(
         return json_response(await shown.scene(ask_cell))
 
     async def post_ask(request: Request) -> Response:
-        body = await read_body(request, AskBody, bodies)
+        body = await read_body(request, AskBody, body_s)
         try:
             quote_request = decode(QuoteRequest, encode(QuoteRequest("http", body.jobs, dry_run=True)))
         except MalformedMessage as error:
-            raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+            raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
         return json_response(await limited(lambda: bridge.quotes(quote_request)))
 
     async def events(request: Request) -> Response:
         if readers.closed or len(readers.connected) >= MAX_READERS:
             detail = f"{len(readers.connected)} readers are connected; try again later."
-            raise Problem(HTTPStatus.SERVICE_UNAVAILABLE, detail)
+            raise HttpProblem(HTTPStatus.SERVICE_UNAVAILABLE, detail)
         last_event = request.headers.get("last-event-id", "")
         return EventStream(bridge.feed, readers, boot, last_event, heartbeat_s, stuck_s)
 
@@ -440,7 +412,7 @@ def application(
     routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
     if page is not None:
         routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
-    handlers = dict.fromkeys((Problem, BusError, Refused, HTTPException, Exception), error_response)
+    handlers = dict.fromkeys((HttpProblem, BusError, Refused, HTTPException, Exception), error_response)
     access = Middleware(AccessCheck, tokens=tokens, **({"public": is_public} if page is not None else {}))
     return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
 
@@ -500,37 +472,37 @@ def _checked(needed: Role, handle: Endpoint) -> Endpoint:
     async def check(request: Request) -> Response:
         role: Role = request.scope["role"]
         if ROLES.index(role) < ROLES.index(needed):
-            raise Problem(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")
+            raise HttpProblem(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")
         return await handle(request)
 
     return check
 
 
-async def read_body(request: Request, kind: type[Body], bodies: Bodies) -> Body:
+async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
     """Read the message that is the body of a request.
 
     Raises:
-        Problem: too large, too slow, not JSON, or not a message of this kind.
+        HttpProblem: too large, too slow, not JSON, or not a message of this kind.
     """
     content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if content_type != "application/json":
         detail = f"The body must be application/json (got '{content_type}')."
-        raise Problem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
+        raise HttpProblem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
     parts: list[bytes] = []
     try:
-        async with bodies.reading():
+        async with asyncio.timeout(body_s):
             async for part in request.stream():
                 parts.append(part)
                 if sum(map(len, parts)) > MAX_BYTES:
                     detail = f"A body has at most {MAX_BYTES} bytes; send several requests."
-                    raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
+                    raise HttpProblem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
         return decode(kind, b"".join(parts))
     except TimeoutError as error:
-        raise Problem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {bodies.body_s:g} s.") from error
+        raise HttpProblem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {body_s:g} s.") from error
     except ClientDisconnect as error:
-        raise Problem(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
+        raise HttpProblem(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
     except MalformedMessage as error:
-        raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+        raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
 
 
 def json_response(value: object) -> Response:
@@ -541,7 +513,7 @@ def json_response(value: object) -> Response:
 def error_response(_: Request, error: Exception) -> Response:
     """Problem details of an error."""
     match error:
-        case Problem():
+        case HttpProblem():
             return problem_response(error.status, error.detail)
         case BusError() | Refused():
             return problem_response(HTTPStatus.SERVICE_UNAVAILABLE, str(error))

@@ -41,7 +41,7 @@ from fleet.job import BOUNDS, KINDS
 from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import the_fleet
-from scenarios.signals import Stop, until_stopped
+from scenarios.signals import StopRequest, until_stopped
 from scenarios.table import Column, Table
 from scenarios.terminal import echo, out_console, say
 
@@ -172,7 +172,7 @@ def submit(client: JobClient, jobs: Sequence[JobSpec], fleet: str) -> list[Admis
         ) from error
 
 
-def follow(link: BusClient, client: JobClient, stop: Stop) -> list[str]:
+def follow(link: BusClient, client: JobClient, stop: StopRequest) -> list[str]:
     """Serve until all followed jobs have ended, or until stopped; return the names of those not finished.
 
     Raises:

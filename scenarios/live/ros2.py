@@ -10,7 +10,7 @@ from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.cli.options import split_names, the_fleet
 from scenarios.extras import require_extra
-from scenarios.signals import Stop, until_stopped
+from scenarios.signals import StopRequest, until_stopped
 from scenarios.terminal import echo
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def run_jobs(endpoint: str, fleet: str, *, domain: int) -> None:
         _serve(jobs.serve, stop, "The action server was stopped; submitted jobs go on.")
 
 
-def _serve(serve: Callable[[float], None], stop: Stop, farewell: str) -> None:
+def _serve(serve: Callable[[float], None], stop: StopRequest, farewell: str) -> None:
     while not stop.is_set():
         serve(time.monotonic() + TURN_S)
     stop.leave(farewell)

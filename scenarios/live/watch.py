@@ -28,7 +28,7 @@ from scenarios.show.watch import (
     space_line,
     time_line,
 )
-from scenarios.signals import Stop, until_stopped
+from scenarios.signals import StopRequest, until_stopped
 from scenarios.terminal import echo, err_console, out_console, say
 
 WAIT_S, GONE_S = 0.5, 3.0
@@ -82,7 +82,7 @@ def watch(
         stop.leave("Stopped watching.")
 
 
-def wait_for_fleet(endpoint: str, stop: Stop) -> str:
+def wait_for_fleet(endpoint: str, stop: StopRequest) -> str:
     """Name of the only fleet at the router, once there is one.
 
     Raises:

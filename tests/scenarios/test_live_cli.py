@@ -40,7 +40,7 @@ from fleet.job import Job, Place, Work
 from fleet.live.job_client import batches
 from scenarios.live import auctioneer as live_auction
 from scenarios.live.arm import ambient_of, replayed_arm, simulated_arm, wait_for_name
-from scenarios.live.auctioneer import job_spec, own_jobs
+from scenarios.live.auctioneer import job_spec, scenario_jobs
 from scenarios.live.journals import refuse_other_way
 from scenarios.live.requests import read_jobs
 from scenarios.prepare.fleet import make_env, prepare, prepare_arm
@@ -301,7 +301,7 @@ def test_the_stream_is_the_one_of_a_run(small_toml, plans):
     env = make_env(scenario, difficulty="blind", cache=plans)
     for seed in (0, 3):
         env.reset(seed=seed)
-        table, drawn = env.world.jobs, own_jobs(scenario, seed)
+        table, drawn = env.world.jobs, scenario_jobs(scenario, seed)
         assert {word.name for _, word in drawn} == set(table.names[0])
         for name, release_s, repetitions in zip(table.names[0], table.release_s[0], table.repetitions[0], strict=True):
             (word,) = (word for _, word in drawn if word.name == name)
@@ -309,7 +309,7 @@ def test_the_stream_is_the_one_of_a_run(small_toml, plans):
 
 
 def test_a_job_is_submitted_after_those_it_waits_for(small_toml):
-    drawn = own_jobs(load(small_toml), 0)
+    drawn = scenario_jobs(load(small_toml), 0)
     assert [at_s for at_s, _ in drawn] == sorted(at_s for at_s, _ in drawn)
     seen: set[str] = set()
     for at_s, word in drawn:
