@@ -60,9 +60,13 @@ def submit_command(
         raise FleetError("--quote submits nothing: leave --wait out.")
     if as_json and not quote:
         raise FleetError("--json is for --quote: leave it out.")
-    from scenarios.live.requests import one_job, quote_jobs, read_jobs, submit_jobs
+    from scenarios.live.requests import job_of, quote_jobs, read_jobs, submit_jobs
 
-    jobs = read_jobs(file) if file else [one_job(name or kind, kind, place or [], payload, repetitions, dwell, force)]
+    if file:
+        jobs = read_jobs(file)
+    else:
+        fields = {"name": name or kind, "kind": kind, "places": place or [], "repetitions": repetitions}
+        jobs = [job_of({**fields, "payload_kg": payload, "dwell_s": dwell, "force_n": force})]
     if quote:
         done = quote_jobs(jobs, endpoint, fleet, timeout_s=timeout, as_json=as_json)
     else:

@@ -1,11 +1,11 @@
-"""Requests to a live fleet: submit and follow jobs, ask for quotes, steer jobs and arms."""
+"""Requests to a live fleet: submit and follow jobs, request quotes, steer jobs and arms."""
 
 import getpass
 import re
 import secrets
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,7 +16,6 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     MOST_QUOTED,
     NOT_PLANNED,
-    Admission,
     JobEstimate,
     JobSpec,
     JobStatus,
@@ -41,16 +40,14 @@ from fleet.job import BOUNDS, KINDS
 from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import the_fleet
-from scenarios.signals import StopRequest, until_stopped
+from scenarios.signals import until_stopped
 from scenarios.table import Column, Table
-from scenarios.terminal import echo, out_console, say
+from scenarios.terminal import echo, out_console, print_json, say
 
 REPLY_S, ATTEMPTS = 5.0, 3
-"""Real seconds to wait for a reply, and number of attempts: the same request again is carried out once."""
+"""Real seconds to wait for a reply, and number of attempts: a repeated request is carried out once."""
 TURN_S = 0.2
-"""Real seconds between two checks for a stop request."""
-PAUSE_S = 0.2
-"""Real seconds before a request for quotes is repeated."""
+"""Real seconds between two checks for a stop request, and before a request for quotes is repeated."""
 PATIENCE_S = 30.0
 """Real seconds without a reply after which following ends."""
 MOST_CHARACTERS = 128
@@ -68,18 +65,40 @@ def submit_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, by: str =
         wait: Follow the accepted jobs to their end.
 
     Raises:
-        FleetError: the submission is refused, or there is no auctioneer.
+        FleetError: the submission is refused, there is no auctioneer, or it disappears while jobs are followed.
     """
+    states: dict[str, str] = {}
+
+    def show_change(status: JobStatus) -> None:
+        if states.get(status.job) != status.state:
+            states[status.job] = status.state
+            echo(describe_status(status))
+
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        client = JobClient(link, by, print_changes())
-        admissions = submit(client, jobs, link.fleet)
+        client = JobClient(link, by, show_change)
+        try:
+            admissions = client.submit_and_wait(jobs)
+        except Refused as error:
+            raise FleetError(f"The auctioneer refused the submission: {error}") from error
+        except NoReply as error:
+            raise BusError(
+                f"No auctioneer of fleet '{link.fleet}' replied. Is `thermofleet bus auctioneer` running? Arms that "
+                "allocate by consensus reply once all are present, or a majority has been for 20 s."
+            ) from error
         for admission in admissions:
             decision = "accepted" if admission.accepted else "refused"
             echo(f"{admission.job}: {decision}{f': {admission.reason}' if admission.reason else ''}")
-        accepted = [admission.job for admission in admissions if admission.accepted]
-        unfinished = follow(link, client, stop) if wait else []
+        while wait and client.open and not stop.is_set():
+            client.step()
+            link.serve(time.monotonic() + TURN_S)
+            if time.monotonic() > client.heard_s + PATIENCE_S:
+                raise BusError(
+                    f"No reply from an auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; its journal has the "
+                    "accepted jobs."
+                )
         stop.leave("Stopped following; the auctioneer has the jobs.")
-    return len(accepted) == len(admissions) and not unfinished
+    ended = not wait or all(status and status.state == "finished" for status in client.statuses.values())
+    return ended and all(admission.accepted for admission in admissions)
 
 
 def quote_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, timeout_s: float, as_json: bool) -> bool:
@@ -92,20 +111,20 @@ def quote_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, timeout_s:
         FleetError: there are too many jobs, or no arm replies.
     """
     if len(jobs) > MOST_QUOTED:
-        raise FleetError(f"A request can name at most {MOST_QUOTED} jobs (got {len(jobs)}).")
+        raise FleetError(f"A request for quotes can name at most {MOST_QUOTED} jobs (got {len(jobs)}).")
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         key, request = keys.of_every_arm(link.fleet, "quote"), QuoteRequest("dry run", tuple(jobs), dry_run=True)
         answers = link.query_and_wait(key, request, Quote, timeout_s=timeout_s)
         until_s = time.monotonic() + timeout_s
         while _is_unplanned(answers) and time.monotonic() < until_s:
-            link.serve(time.monotonic() + PAUSE_S)
+            link.serve(time.monotonic() + TURN_S)
             answers = link.query_and_wait(key, request, Quote, timeout_s=timeout_s)
         name = link.fleet
     quotes = {quote.arm: quote for quote in sorted(answers.messages.values(), key=lambda quote: quote.arm)}
     if not quotes and not answers.refused:
         raise BusError(f"No arm of fleet '{name}' replied. Is `thermofleet arm run` running?")
     if as_json:
-        echo(msgspec.json.format(msgspec.json.encode(list(quotes.values())), indent=1).decode())
+        print_json(list(quotes.values()))
     else:
         out_console.print(quote_table(jobs, quotes))
     for reason in answers.refused.values():
@@ -114,11 +133,17 @@ def quote_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, timeout_s:
     return feasible.issuperset(job.name for job in jobs)
 
 
+def _is_unplanned(answers: Replies[Quote]) -> bool:
+    """Whether an arm is still planning a job."""
+    estimates = (estimate for quote in answers.messages.values() for estimate in quote.estimates)
+    return any(estimate.reason == NOT_PLANNED for estimate in estimates)
+
+
 def read_jobs(file: str) -> list[JobSpec]:
     """Read the jobs of a file, or of standard input for `-`.
 
     Raises:
-        FleetError: names the line (or the place in the list) and what is wrong there.
+        FleetError: a job is invalid; names the line, or the index in the list.
     """
     name = "standard input" if file == "-" else file
     try:
@@ -142,6 +167,21 @@ def _decode(raw: bytes, kind: type[Decoded], where: str) -> Decoded:
         raise FleetError(f"{where}: {explain(error)}") from error
 
 
+def job_of(fields: Mapping[str, object]) -> JobSpec:
+    """The job with these fields.
+
+    Raises:
+        FleetError: a field is invalid.
+    """
+    try:
+        msgspec.json.encode(fields)
+        return msgspec.convert(fields, JobSpec)
+    except msgspec.ValidationError as error:
+        raise FleetError(f"Invalid job: {explain(error)}") from error
+    except UnicodeEncodeError as error:
+        raise FleetError(f"--kind and --place must be UTF-8 text (got {error.object!a}).") from error
+
+
 def explain(error: Exception) -> str:
     """Sentence for an error of msgspec, with the field as the file names it."""
     problem, _, path = str(error).partition(" - at `$")
@@ -155,91 +195,13 @@ def explain(error: Exception) -> str:
     return f"{problem}{f' (at {path})' if path else ''}."
 
 
-def submit(client: JobClient, jobs: Sequence[JobSpec], fleet: str) -> list[Admission]:
-    """Submit jobs and return the auctioneer's decision on each.
-
-    Raises:
-        FleetError: it refused, or there is none.
-    """
-    try:
-        return client.submit_and_wait(jobs)
-    except Refused as error:
-        raise FleetError(f"The auctioneer refused the submission: {error}") from error
-    except NoReply as error:
-        raise BusError(
-            f"No auctioneer of fleet '{fleet}' replied. Is `thermofleet bus auctioneer` running? Arms that allocate by "
-            "consensus reply once all are present, or a majority has been for 20 s."
-        ) from error
-
-
-def follow(link: BusClient, client: JobClient, stop: StopRequest) -> list[str]:
-    """Serve until all followed jobs have ended, or until stopped; return the names of those not finished.
-
-    Raises:
-        BusError: the auctioneer is gone, and does not come back.
-    """
-    while client.open and not stop.is_set():
-        client.step()
-        link.serve(time.monotonic() + TURN_S)
-        if time.monotonic() > client.heard_s + PATIENCE_S:
-            raise BusError(
-                f"No reply from an auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; its journal has the "
-                "accepted jobs."
-            )
-    return [name for name, status in client.statuses.items() if status is None or status.state != "finished"]
-
-
-def print_changes() -> Callable[[JobStatus], None]:
-    """A function that prints a status of a job if its state is another one than before."""
-    states: dict[str, str] = {}
-
-    def show(status: JobStatus) -> None:
-        if states.get(status.job) != status.state:
-            states[status.job] = status.state
-            echo(describe_status(status))
-
-    return show
-
-
-def _is_unplanned(answers: Replies[Quote]) -> bool:
-    """Whether an arm is still planning a job."""
-    estimates = (estimate for quote in answers.messages.values() for estimate in quote.estimates)
-    return any(estimate.reason == NOT_PLANNED for estimate in estimates)
-
-
-def one_job(
-    name: str, kind: str, places: Sequence[str], payload_kg: float, repetitions: int, dwell_s: float, force_n: float
-) -> JobSpec:
-    """Make the job that the options describe.
-
-    Raises:
-        FleetError: there is no such job.
-    """
-    fields = {
-        "name": name,
-        "kind": kind,
-        "places": list(places),
-        "payload_kg": payload_kg,
-        "repetitions": repetitions,
-        "dwell_s": dwell_s,
-        "force_n": force_n,
-    }
-    try:
-        msgspec.json.encode(fields)
-        return msgspec.convert(fields, JobSpec)
-    except msgspec.ValidationError as error:
-        raise FleetError(f"Invalid job: {explain(error)}") from error
-    except UnicodeEncodeError as error:
-        raise FleetError(f"--kind and --place must be UTF-8 text (got {error.object!a}).") from error
-
-
 def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
     """All estimates: jobs in the given order, and under each job the arms."""
     rows = list[tuple[str, ...]]()
     for job in jobs:
         name = job.name
         for arm, quote in quotes.items():
-            plans = [cells for each in quote.estimates if each.job == job.name for cells in rows_of(each)]
+            plans = [cells for each in quote.estimates if each.job == job.name for cells in _cells(each)]
             for number, cells in enumerate(plans):
                 rows.append((name, "" if number else arm, *cells))
                 name = ""
@@ -248,71 +210,27 @@ def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
     return Table(head=head, rows=tuple(rows))
 
 
-def rows_of(estimate: JobEstimate) -> list[list[str]]:
-    """Cells of each plan of an estimate; a dash for what the arm does not know."""
+_FIGURES = {
+    "peak_c": ".1f",
+    "gained_k": "+.1f",
+    "p_saturation": ".2f",
+    "difficulty": ".2f",
+    "duration_s": ".0f",
+    "finish_in_s": ".0f",
+}
+"""Fields of a plan in a table of quotes, and their formats."""
+
+
+def _cells(estimate: JobEstimate) -> list[list[str]]:
+    """Cells of each plan of an estimate; a dash for an unknown figure."""
     if not estimate.feasible:
         return [["–"] * 7 + [f"cannot: {estimate.reason}"]]
-    return [_cells(plan) for plan in estimate.plans]
+    return [[str(plan.plan), *(_figure(plan, *each) for each in _FIGURES.items()), ""] for plan in estimate.plans]
 
 
-def _cells(plan: PlanQuote) -> list[str]:
-    figures = (
-        (plan.peak_c, ".1f"),
-        (plan.gained_k, "+.1f"),
-        (plan.p_saturation, ".2f"),
-        (plan.difficulty, ".2f"),
-        (plan.duration_s, ".0f"),
-        (plan.finish_in_s, ".0f"),
-    )
-    return [str(plan.plan), *("–" if value is None else format(value, form) for value, form in figures), ""]
-
-
-def clear_space(arm: str, by: str, endpoint: str, fleet: str) -> None:
-    """Free the space of an absent arm.
-
-    Raises:
-        BusError: the request is refused, or there is no reply.
-    """
-    request = ClearRequest(arm, person(by))
-    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        replies = link.query_and_wait(keys.of_jobs(link.fleet, "clear"), request, Cleared, timeout_s=REPLY_S)
-        name = link.fleet
-    for reason in replies.refusals:
-        where = " by all arms" if replies.messages else ""
-        raise BusError(f"The space of '{arm}' was not freed{where}: {reason}")
-    if not replies.messages:
-        raise BusError(f"No auctioneer or arm of fleet '{name}' replied within {REPLY_S:g} s. {_NEEDS_ROLE}")
-    echo(f"{arm}: its space is free until the arm reports its space again.")
-
-
-def person(by: str) -> str:
-    """Name of the person who sends a request: the given one, or the user of this process, "" if it has no name.
-
-    Raises:
-        FleetError: it is too long.
-    """
-    if len(by) > MOST_CHARACTERS:
-        raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
-    try:
-        return by or getpass.getuser()
-    except (KeyError, OSError):
-        return ""
-
-
-def reset_arm(arm: str, by: str, endpoint: str, fleet: str) -> None:
-    """Clear the fault of an arm.
-
-    Raises:
-        Refused: the arm refuses.
-        BusError: it does not reply.
-    """
-    request = ResetRequest(person(by))
-    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        try:
-            reply = link.ask(keys.of_arm(link.fleet, arm, "reset"), request, ResetReply, timeout_s=REPLY_S)
-        except NoReply as error:
-            raise BusError(f"The arm '{arm}' did not reply. {_NEEDS_ROLE}") from error
-    echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
+def _figure(plan: PlanQuote, name: str, form: str) -> str:
+    value = getattr(plan, name)
+    return "–" if value is None else format(value, form)
 
 
 def control(actions: Sequence[Action], by: str, endpoint: str, fleet: str) -> None:
@@ -322,7 +240,7 @@ def control(actions: Sequence[Action], by: str, endpoint: str, fleet: str) -> No
         Refused: one is refused.
         BusError: no reply.
     """
-    by = person(by)
+    by = _person(by)
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         key = keys.of_jobs(link.fleet, "control")
         for action in actions:
@@ -334,10 +252,10 @@ def control(actions: Sequence[Action], by: str, endpoint: str, fleet: str) -> No
                 raise BusError(
                     f"No auctioneer or arm of fleet '{link.fleet}' replied within {wait_s}. {_NEEDS_ROLE}"
                 ) from error
-            echo(describe(action, reply))
+            echo(_describe(action, reply))
 
 
-def describe(action: Action, reply: Controlled) -> str:
+def _describe(action: Action, reply: Controlled) -> str:
     """One line about the outcome of an action."""
     note = f" {reply.note}" if reply.note else ""
     if isinstance(action, Pause | Resume):
@@ -346,3 +264,51 @@ def describe(action: Action, reply: Controlled) -> str:
     job = reply.job
     state = "settled" if job is None else f"{job.state}, {job.cycles} of {job.repetitions} cycles"
     return f"{action.job}: {state}.{note}"
+
+
+def clear_space(arm: str, by: str, endpoint: str, fleet: str) -> None:
+    """Free the space of an absent arm.
+
+    Raises:
+        BusError: the request is refused, or there is no reply.
+    """
+    request = ClearRequest(arm, _person(by))
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        replies = link.query_and_wait(keys.of_jobs(link.fleet, "clear"), request, Cleared, timeout_s=REPLY_S)
+        name = link.fleet
+    for reason in replies.refusals:
+        where = " by all arms" if replies.messages else ""
+        raise BusError(f"The space of '{arm}' was not freed{where}: {reason}")
+    if not replies.messages:
+        raise BusError(f"No auctioneer or arm of fleet '{name}' replied within {REPLY_S:g} s. {_NEEDS_ROLE}")
+    echo(f"{arm}: its space is free until the arm reports its space again.")
+
+
+def reset_arm(arm: str, by: str, endpoint: str, fleet: str) -> None:
+    """Clear the fault of an arm.
+
+    Raises:
+        Refused: the arm refuses.
+        BusError: it does not reply.
+    """
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        key = keys.of_arm(link.fleet, arm, "reset")
+        try:
+            reply = link.ask(key, ResetRequest(_person(by)), ResetReply, timeout_s=REPLY_S)
+        except NoReply as error:
+            raise BusError(f"The arm '{arm}' did not reply. {_NEEDS_ROLE}") from error
+    echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
+
+
+def _person(by: str) -> str:
+    """Name of the requester: the given one, or the user of this process, "" if it has no name.
+
+    Raises:
+        FleetError: it is too long.
+    """
+    if len(by) > MOST_CHARACTERS:
+        raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
+    try:
+        return by or getpass.getuser()
+    except (KeyError, OSError):
+        return ""
