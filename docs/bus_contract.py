@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from fleet.bus.protocol import auction, cell, consensus, keys, messages, operator, policy
-from fleet.bus.protocol.keys import CHANNELS, MESSAGES, PATTERNS, Channel, MessageType
+from fleet.bus.protocol.keys import CHANNELS, MESSAGES, PATTERNS, BusChannel, MessageType
 from fleet.job import Job, Work
 
 
@@ -151,7 +151,7 @@ def asyncapi() -> Schema:
     }
 
 
-def _channel(channel: Channel) -> Schema:
+def _channel(channel: BusChannel) -> Schema:
     parameters = [name for name in _PARAMETERS if f"{{{name}}}" in channel.address]
     zenoh: Schema = {"pattern": channel.pattern, "sender": channel.sender, "receiver": channel.receiver}
     if channel.pattern != "token":
@@ -171,7 +171,7 @@ def _channel(channel: Channel) -> Schema:
     }
 
 
-def _operations(channel: Channel) -> Schema:
+def _operations(channel: BusChannel) -> Schema:
     """What can be done at a key, from both sides: publish and subscribe, or query and answer."""
     if channel.message is None:
         return {}
@@ -193,7 +193,7 @@ def _operations(channel: Channel) -> Schema:
     }
 
 
-def _in(channel: Channel, kind: MessageType) -> dict[str, str]:
+def _in(channel: BusChannel, kind: MessageType) -> dict[str, str]:
     return {"$ref": f"#/channels/{channel.name}/messages/{kind.__name__}"}
 
 

@@ -10,7 +10,7 @@ from agents.registry import RULES, WRAPPERS
 from docs.bus_contract import EXAMPLES, Schema, descriptions, schemas
 from fleet.bus.protocol import messages
 from fleet.bus.protocol.auction import MOST_JOBS, ArmEvent
-from fleet.bus.protocol.keys import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, Channel, MessageType
+from fleet.bus.protocol.keys import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, BusChannel, MessageType
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.router import Limits
 from fleet.engine.batch import RewardWeights
@@ -91,17 +91,17 @@ def _event_table() -> str:
     return table(("kind", "meaning", "`value`", "live arm"), rows)
 
 
-def _short(channel: Channel) -> str:
+def _short(channel: BusChannel) -> str:
     """The key without the prefix that all keys share."""
     return f"…/{channel.address.split('/{fleet}/')[1]}"
 
 
-def _own(channel: Channel) -> list[MessageType]:
+def _own(channel: BusChannel) -> list[MessageType]:
     """The messages of a key, without the refusal, which can replace any reply."""
     return [kind for kind in (channel.message, channel.reply) if kind is not None]
 
 
-def _links(channel: Channel) -> str:
+def _links(channel: BusChannel) -> str:
     return " → ".join(f"[{kind.__name__}](#{kind.__name__.lower()})" for kind in _own(channel)) or "no payload"
 
 

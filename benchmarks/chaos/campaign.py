@@ -15,7 +15,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, Clock, ClockRequest, JobSpec
 from fleet.bus.router import open_client
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import HERE, make
 from fleet.bus.security.tls import Tls
 from fleet.live.supervisor import Supervisor
@@ -54,7 +54,7 @@ def start_fleet(fault: Fault, folder: Path, *, speed: float, namespaces: bool = 
         place = folder / "keys" if fault.tls or isinstance(cut, Namespaces) else None
         if place is not None:
             hosts = cut.hosts.values() if isinstance(cut, Namespaces) else ()
-            make(place, of_arms(SCENARIO, arms, [Participant(ROGUE, "arm")]), days=30, hosts=(*HERE, *hosts))
+            make(place, of_arms(SCENARIO, arms, [RosterEntry(ROGUE, "arm")]), days=30, hosts=(*HERE, *hosts))
         router, arm_parts, record, auction = parts_of(
             SCENARIO,
             arms,

@@ -28,7 +28,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import SETTLED, JobStatus, Status, StatusRequest
 from fleet.bus.router import open_client
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import HERE, make
 from fleet.bus.security.tls import Tls
 from fleet.live.supervisor import Backoff, Part, Supervisor
@@ -51,7 +51,7 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
         cable = stack.enter_context(Namespaces(["b"], port_a) if namespaces else Proxy(port_a))
         hosts = tuple(cable.hosts.values()) if isinstance(cable, Namespaces) else ()
         place, at_a, at_b = folder / "keys", f"tls/127.0.0.1:{port_a}", f"tls/127.0.0.1:{port_b}"
-        make(place, of_arms(FLEET, names, [Participant(FAR, "router")]), days=30, hosts=(*HERE, *hosts))
+        make(place, of_arms(FLEET, names, [RosterEntry(FAR, "router")]), days=30, hosts=(*HERE, *hosts))
         beyond = ("--host", "0.0.0.0") if hosts else ()
         router = (*PROGRAM, "bus", "router", "--tls", str(place))
         near = Part(name="router", argv=(*router, "--port", str(port_a), *beyond), ready=at_a)

@@ -101,15 +101,15 @@ def awards_of(fleet: Fleet, arm: str) -> list[Award]:
     ]
 
 
-def _every_key(fleet: str, arms: tuple[str, ...]) -> list[keys.Key]:
+def _every_key(fleet: str, arms: tuple[str, ...]) -> list[keys.ParsedKey]:
     owners: list[tuple[keys.Role, str]] = [("arm", arm) for arm in (*arms, "nobody")]
     owners.append(("auction", "auctioneer"))
     named = [
-        keys.Key(fleet, role, name, topic, arms[0] if topic in keys.ASKED else "")
+        keys.ParsedKey(fleet, role, name, topic, arms[0] if topic in keys.ASKED else "")
         for role, name in owners
         for topic in keys.TOPICS[role]
     ]
-    rest = [keys.Key(fleet, role, "", topic) for role in keys.NAMELESS for topic in keys.TOPICS[role]]
+    rest = [keys.ParsedKey(fleet, role, "", topic) for role in keys.NAMELESS for topic in keys.TOPICS[role]]
     return [*named, *rest]
 
 

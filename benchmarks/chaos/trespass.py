@@ -35,7 +35,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import Refusal, State, encode, encoding
 from fleet.bus.router import open_client
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 
@@ -69,7 +69,7 @@ def connections(endpoint: str, place: Path, arms: tuple[str, ...]) -> Iterator[A
             make(here, of_arms("f", arms), days=30)
             (here / "ca.pem").write_bytes((place / "ca.pem").read_bytes())
         (expired / "ca.key").write_bytes((place / "ca.key").read_bytes())
-        issue(expired, Participant(arms[0], "arm"), days=1, now=datetime.now(UTC) - timedelta(days=2))
+        issue(expired, RosterEntry(arms[0], "arm"), days=1, now=datetime.now(UTC) - timedelta(days=2))
         nothing = {"root_ca_certificate": str(place / "ca.pem")}
         yield "no certificate", _opens(endpoint, nothing)
         yield "plain TCP", _opens(endpoint.replace("tls/", "tcp/"), {})

@@ -114,7 +114,7 @@ def key_seeds() -> Iterator[bytes]:
         for topic in topics:
             with suppress(ValueError):
                 name = "" if role in keys.NAMELESS else "arm 1+b"
-                yield str(keys.Key("f", role, name, topic, "x" if topic in keys.ASKED else "")).encode()
+                yield str(keys.ParsedKey("f", role, name, topic, "x" if topic in keys.ASKED else "")).encode()
 
 
 def jobs(data: bytes) -> None:
@@ -199,7 +199,7 @@ def checkpoint(data: bytes) -> None:
     place.mkdir(exist_ok=True)
     which = data[0] % 4 if data else 0
     name, load = (
-        (thermal.CARD, thermal.load_twin),
+        (thermal.CARD, thermal.load),
         (thermal.CURVE, thermal.load_curve),
         (vae.CARD, vae.load),
         (vae.WEIGHTS, vae.load),

@@ -17,7 +17,7 @@ from benchmarks.simulation.world import Process, Sleep, World
 from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import channel_for
-from fleet.bus.protocol.messages import decode_as, encode, encoding
+from fleet.bus.protocol.messages import decode, encode, encoding
 from fleet.errors import BusError, Refused
 
 ENCODED = 0.02
@@ -206,7 +206,7 @@ class SimulatedClient:
         """Return the message; sometimes as its bytes give it."""
         if self.world.rng.random() >= ENCODED:
             return message
-        return decode_as(type(message), encoding(type(message)), encode(message))
+        return decode(type(message), encode(message), encoding(type(message)))
 
     # Publishing
 

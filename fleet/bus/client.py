@@ -14,9 +14,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from functools import partial
-from queue import Empty
-from threading import Lock
+from functools import lru_cache, partial
 from typing import Any, Generic, Self, TypeVar, TypeVarTuple
 
 import msgspec
@@ -25,15 +23,24 @@ from zenoh import ext as advanced
 
 from fleet.bus.mailbox import Mailbox
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.keys import Channel, channel_for, channel_of
-from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode_as, encode, encoding
+from fleet.bus.protocol.keys import BusChannel, Pattern, channel_for, channel_of
+from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode, encode, encoding
 from fleet.bus.router import connect, plain_reason
-from fleet.bus.security.access_control import Participant, rights_by_role
+from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import participant_at
 from fleet.errors import BusError, Refused
 
+_LOG = logging.getLogger(__name__)
+
 Message = TypeVar("Message", bound=msgspec.Struct)
+Request = TypeVar("Request", bound=msgspec.Struct)
+Reply = TypeVar("Reply", bound=msgspec.Struct)
 Entry = TypeVar("Entry")
+Arguments = TypeVarTuple("Arguments")
+
+BACKLOG = 4096
+MOST_REPLIES = 1024
+"""Replies to one query that are read: one of each arm of the largest fleet."""
 
 _SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer"}
 """The field of a message that names the sender, by the role in its key."""
@@ -86,27 +93,6 @@ class Replies(Generic[Message]):
             raise Refused(reason)
         raise NoReply(key, late=bool(self.refused))
 
-    def take(self, key: str, sent_encoding: str, payload: bytes, kind: type[Message]) -> Message | None:
-        """Add a reply of this kind, or a refusal; return the reply.
-
-        Raises:
-            MalformedMessage: it is neither, or names another sender than its key; added to `refused`.
-        """
-        try:
-            if sent_encoding == encoding(Refusal):
-                _add(self.refused, key, read_message(Refusal, key, sent_encoding, payload)[1].reason)
-                return None
-            message = read_message(kind, key, sent_encoding, payload)[1]
-        except ValueError as error:
-            _add(self.refused, key, str(error))
-            raise MalformedMessage(str(error)) from error
-        _add(self.messages, key, message)
-        return message
-
-    def miss(self, reason: str) -> None:
-        """Add an error of Zenoh, which names no replier."""
-        _add(self.refused, "?", "" if reason == "Timeout" else reason)
-
 
 def replier(key: str) -> str:
     """Who replies to the queries of a key, for example `auctioneer` or `arm 'arm_0'`."""
@@ -122,29 +108,11 @@ def read_message(kind: type[Message], key: str, sent_encoding: str, payload: byt
         MalformedMessage: another encoding, not of this type, or the message names another sender than its key.
     """
     sender = keys.parse(key)
-    message = decode_as(kind, sent_encoding, payload)
-    name = _SENDER.get(sender.role, "")
-    return sender.name, check_name(message, sender.name, name) if hasattr(message, name) else message
-
-
-def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:
-    """Add without replacing another entry: several may reply under one key, as two auctioneers do."""
-    name, number = key, 1
-    while name in table:
-        number += 1
-        name = f"{key} ({number})"
-    table[name] = entry
-
-
-_LOG = logging.getLogger(__name__)
-
-Request = TypeVar("Request", bound=msgspec.Struct)
-Reply = TypeVar("Reply", bound=msgspec.Struct)
-Arguments = TypeVarTuple("Arguments")
-
-BACKLOG = 4096
-MOST_REPLIES = 1024
-"""Replies to one query that are read: one of each arm of the largest fleet."""
+    message = decode(kind, payload, sent_encoding)
+    field_of_sender = _SENDER.get(sender.role, "")
+    if hasattr(message, field_of_sender):
+        check_name(message, sender.name, field_of_sender)
+    return sender.name, message
 
 
 class BusClient:
@@ -178,11 +146,9 @@ class BusClient:
         self.rejections: deque[str] = deque(maxlen=8)
         self.overrun = 0
         self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
-        self._waiting: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox()
-        self._backlog = backlog
-        self._overrunning = Lock()
+        self._calls: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox(backlog)
         self._session: zenoh.Session | None = None
-        self._participant: Participant | None = None
+        self._participant: RosterEntry | None = None
         self._resources = ExitStack()
         # A process that exits without closing its session would hang.
         self._at_exit = weakref.finalize(self, self._resources.close)
@@ -203,7 +169,8 @@ class BusClient:
         except zenoh.ZError as error:
             raise BusError(f"The session at {self._endpoint} did not close cleanly: {plain_reason(error)}.") from error
         finally:
-            self._waiting = Mailbox()
+            for _ in self._calls.take():
+                pass
 
     def __enter__(self) -> Self:
         return self.open()
@@ -218,32 +185,28 @@ class BusClient:
 
         Returns how many it handled. Waking once for many messages costs much less than once for each.
         """
-        self._waiting.wait(at_least, until_s)
         handled = 0
-        for handle, arguments in self._waiting.drain():
+        for handle, arguments in self._calls.take(until_s, count=at_least):
             handle(*arguments)
             handled += 1
         return handled
 
     def post(self, handle: Callable[[*Arguments], None], *arguments: *Arguments, urgent: bool = False) -> None:
         """Queue a call of `handle` for `serve`, which an urgent one wakes at once; any thread may post."""
-        if len(self._waiting) >= self._backlog:
-            with self._overrunning, suppress(Empty):
-                self._waiting.get()
-                self.overrun += 1
-                if self.overrun == 1 or self.overrun % 1000 == 0:
-                    _LOG.warning("Dropped %d message(s): they arrive faster than they are handled.", self.overrun)
-        self._waiting.put((handle, arguments), urgent=urgent)
+        if self._calls.put((handle, arguments), urgent=urgent):
+            self.overrun += 1
+            if self.overrun == 1 or self.overrun % 1000 == 0:
+                _LOG.warning("Dropped %d message(s): they arrive faster than they are handled.", self.overrun)
 
     # Publishing
 
     def publisher(self, key: str, kind: type[Message]) -> Callable[[Message], None]:
         """A function that publishes messages under one key; late subscribers get the history that the registry sets."""
-        channel = channel_for(key, "publish", kind)
+        channel, settings = _transport(key, "publish", kind)
         publisher = advanced.declare_advanced_publisher(
             self._open(),
             key,
-            **_settings(channel, kind),
+            **settings,
             cache=advanced.CacheConfig(channel.history),
             publisher_detection=True,
             # Sporadic: the sequence number is repeated only after a publication, so silence costs nothing.
@@ -253,8 +216,8 @@ class BusClient:
 
     def publish(self, key: str, message: msgspec.Struct) -> None:
         """Publish one message to the present subscribers, without history."""
-        channel = channel_for(key, "publish", type(message))
-        self._open().put(key, encode(message), **_settings(channel, type(message)))
+        _, settings = _transport(key, "publish", type(message))
+        self._open().put(key, encode(message), **settings)
 
     def declare_token(self, key: str) -> None:
         """Show a liveliness token until this client is closed or loses its connection."""
@@ -285,11 +248,12 @@ class BusClient:
         Raises:
             BusError: the client is not open, or its certificate does not allow the query: a router would drop it.
         """
-        channel = channel_for(key, "query", type(request))
+        channel, settings = _transport(key, "query", type(request))
         if channel.reply is not kind:
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
-        self._check_may_query(key)
-        pending = _PendingQuery(kind, most=most, post=self.post, each=each, reject=self.reject, done=done)
+        if self._participant is not None:
+            self._check_may_query(self._participant, key)
+        pending = _PendingQuery(self, kind, most, each, done)
         try:
             self._open().get(
                 key,
@@ -299,7 +263,7 @@ class BusClient:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
                 cancellation_token=pending.token,
-                **_settings(channel, type(request)),
+                **settings,
             )
         except zenoh.ZError as error:
             raise BusError(f"The query of '{key}' failed: {error}") from error
@@ -417,18 +381,16 @@ class BusClient:
 
     # Inside
 
-    def _check_may_query(self, key: str) -> None:
-        if self._participant is None:
-            return
+    def _check_may_query(self, participant: RosterEntry, key: str) -> None:
         queried = zenoh.KeyExpr(key)
         allowed = [
             role
-            for role, rights in rights_by_role(self.fleet, self._participant.name).items()
+            for role, rights in rights_by_role(self.fleet, participant.name).items()
             if any(zenoh.KeyExpr(expression).includes(queried) for expression in rights.queries)
         ]
-        if self._participant.role not in allowed:
+        if participant.role not in allowed:
             needed = f"; that takes a certificate of the role {' or '.join(allowed)}" if allowed else ""
-            raise BusError(f"'{self._participant.common_name}' may not query '{key}'{needed}.")
+            raise BusError(f"'{participant.common_name}' may not query '{key}'{needed}.")
 
     def _open(self) -> zenoh.Session:
         if self._session is None:
@@ -471,9 +433,9 @@ class BusClient:
                 return
             try:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
-                request = decode_as(kind, "" if query.encoding is None else str(query.encoding), payload)
-                if querier := keys.parse(own_key).asker:
-                    request = check_name(request, querier, "arm")
+                request = decode(kind, payload, "" if query.encoding is None else str(query.encoding))
+                if own_key != key:  # it ends in the name of the querier
+                    check_name(request, keys.parse(own_key).asker, "arm")
                 reply = handle(request)
             except MalformedMessage as error:
                 self.reject(f"query of '{own_key}': {error}")
@@ -486,7 +448,9 @@ class BusClient:
 
 
 class _PendingQuery(Generic[Reply]):
-    """A query that is not complete. Zenoh's thread calls `receive` and `finish`, which only queue calls.
+    """A query that is not complete; arguments as of `BusClient.query`.
+
+    Zenoh's thread calls `receive` and `finish`, which only queue calls.
 
     Attributes:
         token: Cancels the query when more replies arrive than are read.
@@ -494,54 +458,51 @@ class _PendingQuery(Generic[Reply]):
 
     def __init__(
         self,
+        client: BusClient,
         kind: type[Reply],
-        *,
         most: int,
-        post: Callable[..., None],
         each: Callable[[Reply], None],
-        reject: Callable[[str], None],
         done: Callable[[Replies[Reply]], None],
     ) -> None:
-        """Start the clock; arguments as of `BusClient.query`.
-
-        Args:
-            post: Queues a call for the thread of the client.
-            reject: Gets the reason why a reply is malformed.
-        """
         self.token = zenoh.CancellationToken()
-        self._kind, self._most, self._post, self._each, self._reject, self._done = kind, most, post, each, reject, done
+        self._client, self._kind, self._most, self._each, self._done = client, kind, most, each, done
         self._replies: Replies[Reply] = Replies()
         self._start_s = time.monotonic()
         self._arrived = 0
 
     def receive(self, reply: zenoh.Reply) -> None:
-        """Queue a reply."""
         self._arrived += 1
         if self._arrived <= self._most:
-            self._post(self._take, reply)
+            self._client.post(self._take, reply)
         elif self._arrived == self._most + 1:
-            self._post(self._stop)
+            self._client.post(self._stop)
 
     def finish(self) -> None:
-        """Queue the end: no reply follows."""
-        self._post(self._complete)
+        self._client.post(self._complete)
 
     def _take(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:
-            self._replies.miss(_error_in(reply))
+            # Any: Zenoh's stubs do not state that a reply has either `ok` or `err`.
+            error: Any = reply.err
+            reason = "" if error is None else error.payload.to_bytes().decode(errors="replace")
+            _add(self._replies.refused, "?", "" if reason == "Timeout" else reason)
             return
-        replier = str(reply.ok.key_expr)
+        key, sent_encoding = str(reply.ok.key_expr), str(reply.ok.encoding)
+        kind = Refusal if sent_encoding == encoding(Refusal) else self._kind
         try:
-            payload = reply.ok.payload.to_bytes()
-            message = self._replies.take(replier, str(reply.ok.encoding), payload, self._kind)
-        except MalformedMessage as error:
-            self._reject(f"reply under '{replier}': {error}")
+            _, message = read_message(kind, key, sent_encoding, reply.ok.payload.to_bytes())
+        except ValueError as error:
+            _add(self._replies.refused, key, str(error))
+            self._client.reject(f"reply under '{key}': {error}")
+            return
+        if isinstance(message, Refusal):
+            _add(self._replies.refused, key, message.reason)
         else:
-            if message is not None:
-                self._each(message)
+            _add(self._replies.messages, key, message)
+            self._each(message)
 
     def _stop(self) -> None:
-        self._replies.miss(f"More than {self._most} replies to one query; no more are read.")
+        _add(self._replies.refused, "?", f"More than {self._most} replies to one query; no more are read.")
         self.token.cancel()  # and so calls `finish`
 
     def _complete(self) -> None:
@@ -549,18 +510,20 @@ class _PendingQuery(Generic[Reply]):
         self._done(self._replies)
 
 
-def _error_in(reply: zenoh.Reply) -> str:
-    # Any: Zenoh's stubs do not state that a reply has either `ok` or `err`.
-    error: Any = reply.err
-    return "" if error is None else error.payload.to_bytes().decode(errors="replace")
+def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:
+    """Add without replacing another entry: several may reply under one key, as two auctioneers do."""
+    name, number = key, 1
+    while name in table:
+        number += 1
+        name = f"{key} ({number})"
+    table[name] = entry
 
 
-# Any in both: Zenoh's stubs have no types for settings, and type handlers by their internals.
-
-
-def _settings(channel: Channel, kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """How Zenoh transports a message of this type."""
-    return {
+@lru_cache(4096)
+def _transport(key: str, pattern: Pattern, kind: type[msgspec.Struct]) -> tuple[BusChannel, dict[str, Any]]:
+    """The channel of a key or key expression, and how Zenoh transports its messages; raises as `channel_for`."""
+    channel = channel_for(key, pattern, kind)
+    return channel, {  # Any: Zenoh's stubs have no types for settings
         "encoding": encoding(kind),
         "congestion_control": getattr(zenoh.CongestionControl, channel.congestion),
         "priority": getattr(zenoh.Priority, channel.priority),
@@ -569,4 +532,4 @@ def _settings(channel: Channel, kind: type[msgspec.Struct]) -> dict[str, Any]:
 
 def _direct(handle: Callable[[Any], None], drop: Callable[[], None] | None = None) -> Any:
     """A handler on Zenoh's receiving thread: it only queues, so a Python thread in between would only cost time."""
-    return zenoh.handlers.Callback(handle, drop, indirect=False)
+    return zenoh.handlers.Callback(handle, drop, indirect=False)  # Any: the stubs type handlers by their internals

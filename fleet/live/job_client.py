@@ -58,9 +58,11 @@ class JobClient:
         self._cancels: dict[str, ControlRequest] = {}
         """Requests without a reply, by job."""
         self._auctioneers: set[str] = set()
+        self._result_s: dict[str, float] = {}
+        """Real second of the last result of each followed job."""
         self._retry_s = self._status_s = -math.inf
         """Real seconds at which the next attempts and the next status requests are due."""
-        link.subscribe(keys.of_every_auction(link.fleet, "result"), Result, lambda _, result: self._set(result.status))
+        link.subscribe(keys.of_every_auction(link.fleet, "result"), Result, self._apply_result)
         link.watch_tokens(keys.of_every_auction(link.fleet, "alive"), self._watch)
 
     def submit(self, *jobs: JobSpec) -> None:
@@ -95,6 +97,7 @@ class JobClient:
         """Stop following a job."""
         self.statuses.pop(job, None)
         self._unsubmitted.pop(job, None)
+        self._result_s.pop(job, None)
 
     @property
     def open(self) -> list[str]:
@@ -128,7 +131,8 @@ class JobClient:
             names = [name for name in self.open if name not in self._unsubmitted]
             for start in range(0, len(names), JOBS_PER_MESSAGE):
                 asked = StatusRequest(tuple(names[start : start + JOBS_PER_MESSAGE]))
-                self._link.query(keys.of_jobs(fleet, "status"), asked, Status, self._apply_statuses, timeout_s=REPLY_S)
+                done = partial(self._apply_statuses, real_s)
+                self._link.query(keys.of_jobs(fleet, "status"), asked, Status, done, timeout_s=REPLY_S)
 
     def _watch(self, auctioneer: str, present: bool) -> None:
         (self._auctioneers.add if present else self._auctioneers.discard)(auctioneer)
@@ -151,11 +155,17 @@ class JobClient:
         for reason in replies.refusals:
             _LOG.warning("Refused: %s", reason)
 
-    def _apply_statuses(self, replies: Replies[Status]) -> None:
+    def _apply_result(self, _auctioneer: str, result: Result) -> None:
+        if result.status.job in self.statuses:
+            self._result_s[result.status.job] = time.monotonic()
+            self._set(result.status)
+
+    def _apply_statuses(self, asked_s: float, replies: Replies[Status]) -> None:
         for reply in replies.messages.values():
             self.heard_s = time.monotonic()
             for status in reply.jobs:
-                self._set(status)
+                if self._result_s.get(status.job, -math.inf) < asked_s:  # otherwise the reply may be the older one
+                    self._set(status)
 
     def _set(self, status: JobStatus) -> None:
         if status.job not in self.statuses:

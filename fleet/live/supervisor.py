@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from queue import Empty
 
 from fleet.bus.mailbox import Mailbox
 from fleet.errors import FleetError
@@ -196,11 +195,10 @@ class Supervisor:
         for running in self._parts.values():
             if running.process is None and not running.over and running.due_s <= now_s:
                 self._launch_again(running)
-        try:
-            name = self._ended.get(now_s + wait_s)
-        except Empty:
-            return ""
-        return name if self._handle_exit(self._parts[name]) else ""
+        for name in self._ended.take(now_s + wait_s):
+            if self._handle_exit(self._parts[name]):
+                return name
+        return ""
 
     def stop(self) -> None:
         """Stop all, rank after rank: by SIGTERM, and by SIGKILL after `patience_s`."""

@@ -21,9 +21,9 @@ from fleet.bus.security import certificates
 from fleet.bus.security.access_control import (
     ROLES,
     ROSTER,
-    Participant,
     Role,
     Roster,
+    RosterEntry,
     access_control,
     of_arms,
     read_roster,
@@ -36,7 +36,7 @@ DOCS = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="
 ROSTER_ARMS = ("arm_0", "arm_1", "arm 2+*@", "arm_10")
 NAMES = {"auction": ("auctioneer", "other"), "policy": ("mine", "other")}
 EVERY_KEY = [
-    str(keys.Key("f", role, name, topic, asker))
+    str(keys.ParsedKey("f", role, name, topic, asker))
     for role, topics in TOPICS.items()
     for topic in topics
     for name in ([""] if role in NAMELESS else NAMES.get(role, ROSTER_ARMS))
@@ -52,7 +52,7 @@ def documented() -> dict[str, tuple[list[str], list[str]]]:
 
 def test_the_documentation_has_the_rules_that_are_kept():
     start = keys.all_of_fleet("f").removesuffix("**")
-    kept = {role: rights("f", Participant("NAME", role)) for role in ROLES if role != "router"}
+    kept = {role: rights("f", RosterEntry("NAME", role)) for role in ROLES if role != "router"}
     assert documented() == {
         role: ([key.removeprefix(start) for key in may.publishes], [key.removeprefix(start) for key in may.queries])
         for role, may in kept.items()
@@ -75,7 +75,7 @@ def allowed(rules: dict, who: str, flow: str, message: str, key: str) -> bool:
 def test_every_key_has_the_speakers_that_it_should_have(message):
     """Of all keys there are: those of an arm belong to that arm, those of a policy to that policy, all others to the
     auctioneer they name, or to any."""
-    roster = of_arms("f", ROSTER_ARMS, [Participant("mine", "policy")])
+    roster = of_arms("f", ROSTER_ARMS, [RosterEntry("mine", "policy")])
     rules = access_control(roster)
     for key, participant in product(EVERY_KEY, roster.participants):
         place = keys.parse(key)
@@ -205,7 +205,7 @@ def test_openssl_agrees_about_dates_and_authorities(folder, tmp_path):
     make(place, of_arms("f", ["arm_0"]), days=30)
     verify = ("verify", "-x509_strict", "-CAfile", place / "ca.pem")
     assert "error" in openssl(*verify, folder / "arm_0.pem")
-    issue(place, Participant("arm_0", "arm"), days=1, now=datetime.now(UTC) - timedelta(days=3))
+    issue(place, RosterEntry("arm_0", "arm"), days=1, now=datetime.now(UTC) - timedelta(days=3))
     assert "certificate has expired" in openssl(*verify, place / "arm_0.pem")
     with pytest.raises(BusError, match=r"/arm_0\.pem' expired on \d{4}-\d\d-\d\d \d\d:\d\d UTC"):
         check(place, "arm_0")
@@ -221,7 +221,7 @@ def test_openssl_agrees_about_dates_and_authorities(folder, tmp_path):
 def test_a_certificate_lasts_as_long_as_was_said_and_no_longer_than_its_authority(tmp_path, days):
     now = datetime.now(UTC).replace(microsecond=0)
     new_authority(tmp_path, "f", now=now - timedelta(days=1))
-    ends = issue(tmp_path, Participant("a", "arm"), days=days, now=now)
+    ends = issue(tmp_path, RosterEntry("a", "arm"), days=days, now=now)
     assert read(tmp_path, "a").not_valid_after_utc == ends
     assert ends - now == timedelta(days=min(days, LONGEST_DAYS - 1))
     check(tmp_path, "a", now=ends)
@@ -321,30 +321,30 @@ def test_adding_that_breaks_off_leaves_a_folder_that_can_be_added_to(tmp_path, m
 
     monkeypatch.setattr(os, "replace", breaks)
     with pytest.raises(BusError, match="No space left"):
-        add(place, Participant("b", "arm"), days=3)
+        add(place, RosterEntry("b", "arm"), days=3)
     monkeypatch.undo()
     assert read_roster(place) == of_arms("f", ["a"])
     assert not [name for name in contents(place) if name.endswith(".tmp")]
-    add(place, Participant("b", "arm"), days=3)
+    add(place, RosterEntry("b", "arm"), days=3)
     check(place, "b")
-    assert read_roster(place).named("b") == Participant("b", "arm")
+    assert read_roster(place).named("b") == RosterEntry("b", "arm")
 
 
 def test_one_is_added_by_the_same_authority_once(tmp_path):
     place = tmp_path / "k"
     make(place, of_arms("f", ["a"]), days=3)
     before = contents(place)
-    add(place, Participant("gateway", "submitter"), days=3)
+    add(place, RosterEntry("gateway", "submitter"), days=3)
     check(place, "gateway")
     after = contents(place)
     assert {name for name in after if after[name] != before.get(name)} == {"gateway.pem", "gateway.key", ROSTER}
     with pytest.raises(BusError, match="'gateway' has a certificate"):
-        add(place, Participant("gateway", "submitter"), days=3)
+        add(place, RosterEntry("gateway", "submitter"), days=3)
     with pytest.raises(BusError, match=r"has the role submitter in .* not monitor"):
-        add(place, Participant("gateway", "monitor"), days=3, overwrite=True)
+        add(place, RosterEntry("gateway", "monitor"), days=3, overwrite=True)
     with pytest.raises(BusError, match="'GATEWAY' is taken"):
-        add(place, Participant("GATEWAY", "monitor"), days=3)
-    add(place, Participant("gateway", "submitter"), days=3, overwrite=True)
+        add(place, RosterEntry("GATEWAY", "monitor"), days=3)
+    add(place, RosterEntry("gateway", "submitter"), days=3, overwrite=True)
     assert contents(place)["gateway.pem"] != after["gateway.pem"]
     check(place, "gateway")
 
@@ -354,14 +354,14 @@ def test_without_the_key_of_the_authority_nobody_is_added(tmp_path):
     make(place, of_arms("f", ["a"]), days=3)
     (place / "ca.key").unlink()
     with pytest.raises(BusError, match=r"There is no '.*ca\.key'"):
-        add(place, Participant("b", "arm"), days=3)
+        add(place, RosterEntry("b", "arm"), days=3)
     assert read_roster(place) == of_arms("f", ["a"])
 
 
 def test_an_expired_authority_signs_nothing_and_vouches_for_nobody(tmp_path):
     new_authority(tmp_path, "f", now=datetime.now(UTC) - timedelta(days=LONGEST_DAYS + 1))
     with pytest.raises(BusError, match=r"/ca\.pem' expired on"):
-        issue(tmp_path, Participant("a", "arm"), days=1)
+        issue(tmp_path, RosterEntry("a", "arm"), days=1)
 
 
 @pytest.mark.parametrize(
@@ -423,4 +423,4 @@ def test_files_stay_in_the_folder_and_differ(arms, fleet):
 def test_names_that_cannot_be_are_refused(arms, complaint):
     with pytest.raises(ValueError, match=complaint):
         of_arms("f", arms)
-    assert Roster("f", (Participant("x" * 60, "arm"),))
+    assert Roster("f", (RosterEntry("x" * 60, "arm"),))

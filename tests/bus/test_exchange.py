@@ -24,7 +24,7 @@ from fleet.bus.exchange.channel import PERFECT, TOPOLOGIES, Channel, Partition
 from fleet.bus.exchange.memory import UNHEARD, Delivery, Exchange, PeerView
 from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.messages import DifficultyScores, Info, State, check_name, decode, encode, encoding
+from fleet.bus.protocol.messages import DifficultyScores, Info, State, decode, encode, encoding
 from fleet.bus.router import Router, open_client
 from fleet.env.allocation_v1 import parallel_env
 from fleet.errors import BusError
@@ -487,7 +487,8 @@ def test_the_bus_carries_every_message_and_the_arms_know_what_the_memory_deliver
     for sample in heard:
         key = keys.parse(str(sample.key_expr))
         kind = State if key.topic == "state" else DifficultyScores
-        message = check_name(decode(kind, sample.payload.to_bytes()), key.name, "arm")
+        message = decode(kind, sample.payload.to_bytes())
+        assert message.arm == key.name
         words, arm = said[message.tick], arms.index(key.name)
         assert message.time_s == words.time_s
         if isinstance(message, State):
@@ -576,7 +577,8 @@ def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
         index = ARMS.index(key.name)
         kind = Info if key.topic == "info" else DifficultyScores
         assert str(sample.encoding) == encoding(kind)
-        word = check_name(decode(kind, sample.payload.to_bytes()), key.name, "arm")
+        word = decode(kind, sample.payload.to_bytes())
+        assert word.arm == key.name
         assert word.twin == words.twin[index]
         if isinstance(word, Info):
             assert word.joints == 7

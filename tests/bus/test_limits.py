@@ -11,7 +11,7 @@ import zenoh
 
 from fleet.bus.protocol import keys
 from fleet.bus.router import Limits, Router, open_client
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 from tests.waiting import PATIENCE_S
@@ -146,7 +146,7 @@ def test_a_question_to_a_cache_is_not_larger_than_others(connect, asked):
 
 def test_without_a_policy_in_the_roster_no_request_may_be_large():
     """Only of parameters does the router not know the size: it does not assemble them."""
-    without, policy = of_arms("f", ["arm_0"]), of_arms("f", ["arm_0"], [Participant("mine", "policy")])
+    without, policy = of_arms("f", ["arm_0"]), of_arms("f", ["arm_0"], [RosterEntry("mine", "policy")])
     largest = [
         (max(size["size_limit"] for size in limits.settings(roster)["low_pass_filter"]), limits.assembled_bytes(roster))
         for limits in [Limits()]

@@ -19,7 +19,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import auction as trade
 from fleet.bus.protocol import keys, messages
 from fleet.bus.protocol.auction import JobSpec
-from fleet.bus.protocol.keys import ASKED, CHANNELS, MESSAGES, NAMELESS, TOPICS, Key, channel_of
+from fleet.bus.protocol.keys import ASKED, CHANNELS, MESSAGES, NAMELESS, TOPICS, ParsedKey, channel_of
 from fleet.bus.protocol.messages import (
     DifficultyScores,
     Info,
@@ -41,11 +41,11 @@ wild = st.sampled_from(["*", "**", "@", "@v1", "a b", "$*", "?", "#", "%", "%2F"
 PLACES = [(role, topic) for role, topics in TOPICS.items() for topic in topics]
 
 
-def keys_at(places: list[tuple[str, str]]) -> st.SearchStrategy[Key]:
+def keys_at(places: list[tuple[str, str]]) -> st.SearchStrategy[ParsedKey]:
     """Keys of some roles and topics."""
     return st.sampled_from(places).flatmap(
         lambda place: st.builds(
-            Key,
+            ParsedKey,
             fleet=chunks | wild,
             role=st.just(place[0]),
             name=st.just("") if place[0] in NAMELESS else chunks | wild,
@@ -171,9 +171,9 @@ def test_who_asks_as_nobody_is_not_answered(asked):
 
 def test_nobody_speaks_for_another_arm_and_only_what_an_arm_asks_as_itself_ends_in_its_name():
     with pytest.raises(ValueError, match=r"Keys of 'result' do not end in a querier's name \(got 'x'\)"):
-        str(Key("f", "auction", "a", "result", "x"))
+        str(ParsedKey("f", "auction", "a", "result", "x"))
     with pytest.raises(ValueError, match="must have 1 to 128"):
-        str(Key("f", "auction", "a", "lease"))
+        str(ParsedKey("f", "auction", "a", "lease"))
     with pytest.raises(MalformedMessage, match="'arm_1' claims to be by 'arm_0'"):
         received(State, encode(STATE), "arm_1")
 
@@ -236,7 +236,9 @@ WORD = DifficultyScores("arm_0", 3, 30.0, "twin-1", ("a", "b"), (0.25, None), (N
 
 def received(kind, payload, arm):
     """The message that came under the key of an arm."""
-    return check_name(decode(kind, payload), arm, "arm")
+    message = decode(kind, payload)
+    check_name(message, arm, "arm")
+    return message
 
 
 @given(states | difficulty_words() | infos)

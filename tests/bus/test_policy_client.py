@@ -19,7 +19,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import decode, encoding
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES, ActReply, ActRequest
 from fleet.bus.router import Limits, Router, open_client
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
@@ -230,7 +230,7 @@ def test_endpoints_beyond_loopback_are_refused_before_the_first_decision():
 
 def test_with_certificates_the_auctioneer_alone_asks_and_the_policy_alone_replies(tmp_path):
     folder = tmp_path / "keys"
-    make(folder, of_arms("f", ["arm_0"], [Participant("mine", "policy"), Participant("other", "policy")]), days=1)
+    make(folder, of_arms("f", ["arm_0"], [RosterEntry("mine", "policy"), RosterEntry("other", "policy")]), days=1)
     with Router(tls=Tls(folder, "router")) as router:
 
         def asked(who: str) -> dict[str, int]:

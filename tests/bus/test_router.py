@@ -19,7 +19,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
 from fleet.bus.router import Limits, Router, loopback, open_client, reachable
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls, identified
 from fleet.errors import BusError, NoRouter, is_name
@@ -172,7 +172,7 @@ ROUTES_S = 0.5
 leave the other one without routes for good (Zenoh 1.10.2, panic in `unregister_router_entities`)."""
 
 ARMS = tuple(f"arm_{number}" for number in range(4))
-FAR = Participant("router_b", "router")
+FAR = RosterEntry("router_b", "router")
 
 
 @pytest.fixture(scope="module")
@@ -321,9 +321,9 @@ def test_a_router_in_no_roster_has_no_rights(place, tmp_path):
     rogue.mkdir()
     for name in ("ca.pem", "ca.key"):
         (rogue / name).write_bytes((place / name).read_bytes())
-    roster = of_arms("f", ARMS, [Participant("router_c", "router")])
+    roster = of_arms("f", ARMS, [RosterEntry("router_c", "router")])
     for name in ("router_c", "router"):
-        issue(rogue, Participant(name, "router"), days=20)
+        issue(rogue, RosterEntry(name, "router"), days=20)
     (rogue / "roster.json").write_bytes(msgspec.json.encode(roster))
     with Router(tls=Tls(place, "router")) as near:
         heard = queue.Queue()

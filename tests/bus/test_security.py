@@ -17,7 +17,7 @@ from fleet.bus.protocol.auction import Ack, Award, JobSpec, Lease, LeaseEntry, L
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, GrantedEntry
 from fleet.bus.protocol.messages import encode, encoding
 from fleet.bus.router import Router, open_client
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import add, issue, make
 from fleet.bus.security.tls import Tls
 from tests.waiting import PATIENCE_S, serve_until
@@ -366,7 +366,7 @@ def test_somebody_whom_the_authority_knows_and_the_roster_does_not_may_do_nothin
     stranger.mkdir()
     for name in ("ca.pem", "ca.key"):
         (stranger / name).write_bytes((folder / name).read_bytes())
-    issue(stranger, Participant("arm_9", "arm"), days=1)
+    issue(stranger, RosterEntry("arm_9", "arm"), days=1)
     heard: queue.Queue[str] = queue.Queue()
     ear = inside(guarded).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
     with (
@@ -388,7 +388,7 @@ def test_somebody_whom_the_authority_knows_and_the_roster_does_not_may_do_nothin
 def test_one_that_is_added_may_speak_when_the_router_starts_again(tmp_path, inside):
     place = tmp_path / "k"
     make(place, of_arms("f", ["arm_0"]), days=30)
-    new, key = Participant("arm_7", "arm"), keys.of_arm("f", "arm_7", "state")
+    new, key = RosterEntry("arm_7", "arm"), keys.of_arm("f", "arm_7", "state")
     add(place, new, days=30)
     heard: queue.Queue[str] = queue.Queue()
     for _ in range(2):  # the second time with a new certificate of the same authority

@@ -15,7 +15,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Clock, ClockRequest
 from fleet.bus.router import Router, fleets_at, open_client
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
@@ -33,7 +33,7 @@ def rogue_folder(place: Path, true: Path, how: str) -> Path:
         return place
     for name in ("ca.pem", "ca.key"):
         (place / name).write_bytes((true / name).read_bytes())
-    role = Participant("arm_0", "router" if how == "wrong end" else "arm")
+    role = RosterEntry("arm_0", "router" if how == "wrong end" else "arm")
     ago = timedelta(days=2) if how == "expired" else timedelta(days=-2) if how == "not yet" else timedelta()
     issue(place, role, days=1, now=datetime.now(UTC) - ago)
     return place
@@ -132,7 +132,7 @@ def test_no_participant_can_play_the_router(folder):
 def test_a_line_ends_with_its_certificate(folder, guarded, tmp_path):
     place = rogue_folder(tmp_path / "k", folder, "good")
     soon = datetime.now(UTC) + timedelta(seconds=2.0)
-    issue(place, Participant("arm_0", "arm"), days=1, now=soon - timedelta(days=1))
+    issue(place, RosterEntry("arm_0", "arm"), days=1, now=soon - timedelta(days=1))
     seen: queue.Queue[zenoh.Sample] = queue.Queue()
     with open_client(guarded.endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "monitor")) as monitor:
         key = keys.of_arm("f", "arm_0", "alive")

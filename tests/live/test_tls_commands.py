@@ -2,9 +2,8 @@
 
 import http.client
 import json
-import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -45,16 +44,16 @@ from fleet.bus.protocol.operator import (
     Settle,
 )
 from fleet.bus.router import Router, open_client
-from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from scenarios.cli.main import app
 from tests import commands
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, serving
 
 ARM = "arm 1+b"
-EXTRA = Participant("gateway", "submitter")
+EXTRA = [RosterEntry("gateway", "submitter"), RosterEntry("b", "arm")]
 TOKEN = "a token of this test"
 COMMANDS = {
     "watch": ["bus", "watch", "--json"],
@@ -65,44 +64,55 @@ COMMANDS = {
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory):
-    """A router with TLS, one arm and an auctioneer, each with its own certificate, on a thread of their own."""
-    place, stop = tmp_path_factory.mktemp("keys") / "f", threading.Event()
-    make(place, of_arms("f", [ARM], [EXTRA]), days=30)
-    with ExitStack() as stack:
-        router = stack.enter_context(Router(tls=Tls(place, "router")))
+    """A router with TLS, one arm and an auctioneer, each with its own certificate; `received` has all requests."""
+    place, received, began_s = tmp_path_factory.mktemp("keys") / "f", [], time.monotonic()
+    make(place, of_arms("f", [ARM], EXTRA), days=30)
 
-        def line(name):
-            return stack.enter_context(BusClient(Tls(place, name).endpoint(router.endpoint), "f"))
+    def now_s():
+        return time.monotonic() - began_s
 
-        arm, auctioneer, began_s = line(ARM), line("auctioneer"), time.monotonic()
+    def quote(request):
+        offers = tuple(JobEstimate(job.name, (PlanQuote(difficulty=0.25),)) for job in request.jobs)
+        return Quote(ARM, request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
 
-        def quote(request):
-            offers = tuple(JobEstimate(job.name, (PlanQuote(difficulty=0.25),)) for job in request.jobs)
-            return Quote(ARM, request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
+    def controlled(request):
+        return Controlled("auctioneer", request.request, True, "", JobStatus("j", "waiting"), {})
 
-        def now_s():
-            return time.monotonic() - began_s
+    with Router(tls=Tls(place, "router")) as router:
+        ends = {name: Tls(place, name).endpoint(router.endpoint) for name in (ARM, "auctioneer")}
+        with BusClient(ends[ARM], "f") as arm, BusClient(ends["auctioneer"], "f") as auctioneer:
+            status = Status("auctioneer", 1.0, (JobStatus("j", "waiting"),))
+            cell = replace(EXAMPLES[Cell], auctioneer="auctioneer")
+            replies = [
+                (arm, keys.of_arm("f", ARM, "quote"), QuoteRequest, quote),
+                (arm, keys.of_arm("f", ARM, "reset"), ResetRequest, lambda _: ResetReply(ARM, True)),
+                (auctioneer, keys.of_clock("f"), ClockRequest, lambda _: Clock(now_s(), 1.0)),
+                (auctioneer, keys.of_jobs("f", "status"), StatusRequest, lambda _: status),
+                (
+                    auctioneer,
+                    keys.of_jobs("f", "submit"),
+                    Submission,
+                    lambda _: SubmissionReply("auctioneer", (Admission("crate", True),)),
+                ),
+                (auctioneer, keys.of_jobs("f", "control"), ControlRequest, controlled),
+                (auctioneer, keys.of_jobs("f", "clear"), ClearRequest, lambda _: Cleared("auctioneer", ARM)),
+                (auctioneer, keys.of_jobs("f", "cell"), CellRequest, lambda _: cell),
+            ]
+            for link, key, kind, reply in replies:
+                link.reply_to(key, kind, lambda request, reply=reply: (received.append(request), reply(request))[1])
+            arm.declare_token(keys.of_arm("f", ARM, "alive"))
+            auctioneer.declare_token(keys.of_auction("f", "auctioneer", "alive"))
 
-        arm.reply_to(keys.of_arm("f", ARM, "quote"), QuoteRequest, quote)
-        arm.declare_token(keys.of_arm("f", ARM, "alive"))
-        auctioneer.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(now_s(), 1.0))
-        status = Status("auctioneer", 1.0, (JobStatus("j", "waiting"),))
-        auctioneer.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: status)
-        taken = SubmissionReply("auctioneer", (Admission("crate", True),))
-        auctioneer.reply_to(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
-        auctioneer.declare_token(keys.of_auction("f", "auctioneer", "alive"))
-
-        def live():
-            while not stop.is_set():
+            def publish():
                 arm.publish(keys.of_arm("f", ARM, "state"), State(ARM, 1, now_s(), "idle", (30.0,), 30.0))
-                for each in (arm, auctioneer):
-                    each.serve(time.monotonic() + 0.02)
 
-        thread = threading.Thread(target=live)
-        thread.start()
-        yield SimpleNamespace(endpoint=router.endpoint, keys=place)
-        stop.set()
-        thread.join(PATIENCE_S)
+            with serving(arm, auctioneer, meanwhile=publish):
+                yield SimpleNamespace(
+                    address=router.endpoint,
+                    endpoint=lambda name: Tls(place, name).endpoint(router.endpoint),
+                    keys=place,
+                    received=received,
+                )
 
 
 def run(command, endpoint):
@@ -110,7 +120,7 @@ def run(command, endpoint):
 
 
 def test_a_monitor_can_watch(fleet):
-    done = run("watch", Tls(fleet.keys, "monitor").endpoint(fleet.endpoint))
+    done = run("watch", fleet.endpoint("monitor"))
     assert done.exit_code == 0, done.exception
     now = json.loads(done.stdout)
     assert [(arm["arm"], arm["present"]) for arm in now["arms"]] == [(ARM, True)]
@@ -118,14 +128,14 @@ def test_a_monitor_can_watch(fleet):
 
 
 def test_the_doctor_finds_a_fleet_with_access_control_healthy(fleet):
-    done = run("doctor", Tls(fleet.keys, "monitor").endpoint(fleet.endpoint))
+    done = run("doctor", fleet.endpoint("monitor"))
     assert (done.exit_code, "The fleet is healthy." in done.stdout) == (0, True), done.stdout
 
 
 @contextmanager
 def gateway(fleet, name):
     """The address of a gateway with the certificate of this one."""
-    started = commands.start(*COMMANDS["gateway"], "--endpoint", Tls(fleet.keys, name).endpoint(fleet.endpoint))
+    started = commands.start(*COMMANDS["gateway"], "--endpoint", fleet.endpoint(name))
     try:
         ready = started.stdout.readline()
         assert ready.startswith("ready gateway http://127.0.0.1:"), ready + started.stderr.read()
@@ -177,7 +187,7 @@ def expired(place, true, days=-2):
     of_another_authority(place, true)
     for name in ("ca.pem", "ca.key"):
         (place / name).write_bytes((true / name).read_bytes())
-    issue(place, Participant("monitor", "monitor"), days=1, now=datetime.now(UTC) + timedelta(days=days))
+    issue(place, RosterEntry("monitor", "monitor"), days=1, now=datetime.now(UTC) + timedelta(days=days))
 
 
 def not_yet(place, true):
@@ -208,11 +218,11 @@ def test_a_tls_error_is_one_sentence(fleet, tmp_path, command, how):
     if how in ("another authority", "expired", "not yet"):
         {"expired": expired, "not yet": not_yet}.get(how, of_another_authority)(here, fleet.keys)
     endpoint = {
-        "none": fleet.endpoint,
-        "plain": fleet.endpoint.replace("tls/", "tcp/"),
-        "missing": f"{fleet.endpoint}#{fleet.keys}/nobody",
-        "wrong role": f"{fleet.endpoint}#{fleet.keys}/router",
-    }.get(how, f"{fleet.endpoint}#{here}/monitor")
+        "none": fleet.address,
+        "plain": fleet.address.replace("tls/", "tcp/"),
+        "missing": f"{fleet.address}#{fleet.keys}/nobody",
+        "wrong role": f"{fleet.address}#{fleet.keys}/router",
+    }.get(how, f"{fleet.address}#{here}/monitor")
     done = run(command, endpoint)
     assert isinstance(done.exception, BusError)
     with pytest.raises(BusError, match=WRONG[how]):
@@ -221,8 +231,8 @@ def test_a_tls_error_is_one_sentence(fleet, tmp_path, command, how):
 
 def test_the_doctor_mentions_a_certificate_unknown_to_the_router(fleet, tmp_path):
     expired(tmp_path / "k", fleet.keys)
-    issue(tmp_path / "k", Participant("spy", "monitor"), days=20)
-    done = run("doctor", f"{fleet.endpoint}#{tmp_path}/k/spy")
+    issue(tmp_path / "k", RosterEntry("spy", "monitor"), days=20)
+    done = run("doctor", f"{fleet.address}#{tmp_path}/k/spy")
     assert done.exit_code == 1
     assert "the router does not know this certificate" in " ".join(done.stdout.split())
 
@@ -232,101 +242,65 @@ STEERING = {
     ("job", "settle", "j", "redo"): Settle("j", "redo"),
     ("job", "change", "j", "--value", "2"): Change("j", value=2.0),
     ("arm", "pause"): Pause("*"),
-    ("arm", "pause", "a"): Pause("a"),
+    ("arm", "pause", ARM): Pause(ARM),
     ("arm", "pause", "--end"): Resume("*"),
-    ("arm", "clear", "a"): ClearRequest("a", "ann"),
-    ("arm", "reset", "a"): ResetRequest("ann"),
+    ("arm", "clear", ARM): ClearRequest(ARM, "ann"),
+    ("arm", "reset", ARM): ResetRequest("ann"),
 }
 
 OTHERS = ("monitor", "submitter", "recorder", "b")
 
 
-@pytest.fixture(scope="module")
-def steered_fleet(tmp_path_factory):
-    """A router with TLS, and an arm and an auctioneer that keep every request."""
-    place, stop, received = tmp_path_factory.mktemp("keys") / "f", threading.Event(), []
-    make(place, of_arms("f", ["a"], [Participant("b", "arm")]), days=30)
-
-    def keep(reply):
-        return lambda request: (received.append(request), reply(request))[1]
-
-    def controlled(request):
-        return Controlled("auctioneer", request.request, True, "", JobStatus("j", "waiting"), {})
-
-    with ExitStack() as stack:
-        router = stack.enter_context(Router(tls=Tls(place, "router")))
-        arm, auctioneer = (
-            stack.enter_context(BusClient(Tls(place, name).endpoint(router.endpoint), "f"))
-            for name in ("a", "auctioneer")
-        )
-        arm.reply_to(keys.of_arm("f", "a", "reset"), ResetRequest, keep(lambda _: ResetReply("a", True)))
-        auctioneer.reply_to(keys.of_jobs("f", "control"), ControlRequest, keep(controlled))
-        auctioneer.reply_to(keys.of_jobs("f", "clear"), ClearRequest, keep(lambda _: Cleared("auctioneer", "a")))
-        cell = replace(EXAMPLES[Cell], auctioneer="auctioneer")
-        auctioneer.reply_to(keys.of_jobs("f", "cell"), CellRequest, keep(lambda _: cell))
-
-        def serve():
-            while not stop.is_set():
-                for each in (arm, auctioneer):
-                    each.serve(time.monotonic() + 0.02)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        yield SimpleNamespace(received=received, endpoint=lambda who: Tls(place, who).endpoint(router.endpoint))
-        stop.set()
-        thread.join(PATIENCE_S)
-
-
 @pytest.mark.parametrize("command", STEERING, ids=" ".join)
-def test_an_operator_may(steered_fleet, command):
-    steered_fleet.received.clear()
-    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", steered_fleet.endpoint("operator")])
+def test_an_operator_may(fleet, command):
+    fleet.received.clear()
+    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", fleet.endpoint("operator")])
     assert done.exit_code == 0, done.exception
-    (request,) = steered_fleet.received
+    (request,) = fleet.received
     assert request.by == "ann"
     assert STEERING[command] in (request, getattr(request, "action", None))
 
 
 @pytest.mark.parametrize("who", OTHERS)
 @pytest.mark.parametrize("command", STEERING, ids=" ".join)
-def test_nobody_else_may(steered_fleet, command, who):
-    steered_fleet.received.clear()
-    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", steered_fleet.endpoint(who)])
+def test_nobody_else_may(fleet, command, who):
+    fleet.received.clear()
+    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", fleet.endpoint(who)])
     assert isinstance(done.exception, BusError)
     assert "may not query" in str(done.exception)
     assert "a certificate of the role" in str(done.exception)
     assert "operator" in str(done.exception)
-    assert steered_fleet.received == []
+    assert fleet.received == []
 
 
 @pytest.mark.parametrize("who", OTHERS)
-def test_the_router_drops_what_a_client_sends_against_its_role(steered_fleet, who):
+def test_the_router_drops_what_a_client_sends_against_its_role(fleet, who):
     """Without our client's own check."""
-    steered_fleet.received.clear()
+    fleet.received.clear()
     messages = [
         *((keys.of_jobs("f", "control"), ControlRequest(str(i), a)) for i, a in enumerate([Cancel("j"), Pause("*")])),
-        (keys.of_jobs("f", "clear"), ClearRequest("a", "ann")),
-        (keys.of_arm("f", "a", "reset"), ResetRequest("ann")),
+        (keys.of_jobs("f", "clear"), ClearRequest(ARM, "ann")),
+        (keys.of_arm("f", ARM, "reset"), ResetRequest("ann")),
     ]
-    session = open_client(steered_fleet.endpoint(who), timeout_s=PATIENCE_S)
+    session = open_client(fleet.endpoint(who), timeout_s=PATIENCE_S)
     try:
         for key, message in messages:
             replies = session.get(key, payload=encode(message), encoding=encoding(type(message)), timeout=0.5)
             assert [reply for reply in replies if reply.ok is not None] == []
     finally:
         session.close()
-    test_an_operator_may(steered_fleet, ("arm", "pause"))  # whatever came before would have been served by now
-    assert len(steered_fleet.received) == 1
+    test_an_operator_may(fleet, ("arm", "pause"))  # whatever came before would have been served by now
+    assert len(fleet.received) == 1
 
 
 @pytest.mark.parametrize(("who", "may"), [("operator", True), ("submitter", True), ("b", False)])
-def test_the_cell_is_described_to_those_who_submit(steered_fleet, who, may):
-    steered_fleet.received.clear()
-    with BusClient(steered_fleet.endpoint(who), "f") as link:
+def test_the_cell_is_described_to_those_who_submit(fleet, who, may):
+    fleet.received.clear()
+    with BusClient(fleet.endpoint(who), "f") as link:
         if may:
             replies = link.query_and_wait(keys.of_jobs("f", "cell"), CellRequest(), Cell, timeout_s=PATIENCE_S)
             assert [cell.scenario for cell in replies.messages.values()] == [EXAMPLES[Cell].scenario]
         else:
             with pytest.raises(BusError, match="may not query"):
                 link.query_and_wait(keys.of_jobs("f", "cell"), CellRequest(), Cell, timeout_s=PATIENCE_S)
-    assert len(steered_fleet.received) == may
+    assert len(fleet.received) == may

@@ -22,7 +22,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
 from fleet.bus.router import Router, open_client
-from fleet.bus.security.access_control import Participant
+from fleet.bus.security.access_control import RosterEntry
 from fleet.bus.security.certificates import issue
 from fleet.bus.security.tls import Tls, identified
 from fleet.errors import FleetError
@@ -270,8 +270,8 @@ def test_a_whole_fleet_works_with_tls_and_access_control(thermofleet, small_toml
 def test_the_list_of_keys_shows_which_are_invalid_now(tmp_path, thermofleet):
     place, now = tmp_path / "keys", datetime.now(UTC)
     assert thermofleet("bus", "keys", place, "quickstart")[0] == 0
-    issue(place, Participant("arm_0", "arm"), days=1, now=now - timedelta(days=3))
-    issue(place, Participant("arm_1", "arm"), days=1, now=now + timedelta(days=3))
+    issue(place, RosterEntry("arm_0", "arm"), days=1, now=now - timedelta(days=3))
+    issue(place, RosterEntry("arm_1", "arm"), days=1, now=now + timedelta(days=3))
     rows = dict(line.split(maxsplit=1) for line in thermofleet("bus", "keys", place)[1].splitlines()[2:])
     assert rows["arm_0"].rstrip().endswith(f"{now - timedelta(days=2):%Y-%m-%d %H:%M} UTC, expired")
     assert rows["arm_1"].rstrip().endswith(f"{now + timedelta(days=4):%Y-%m-%d %H:%M} UTC, not yet valid")

@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from fleet.bus.protocol.messages import Count, Name, Number, Person, Share, finite
+from fleet.bus.protocol.messages import Count, FiniteStruct, Name, Number, Person, Share
 from fleet.errors import check_names
 from fleet.fields import MAX_SPEED, MIN_SPEED
 from fleet.job import BOUNDS, DWELL_S, Kind, check_bounds, check_duration, check_dwell, check_places
@@ -117,7 +117,7 @@ class QuoteRequest(msgspec.Struct, frozen=True):
     """Cycles that are done, by job; 0 if not named. The estimate is for the other cycles."""
 
 
-class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
+class PlanQuote(FiniteStruct, frozen=True, omit_defaults=True):
     """Cost of one job for one arm by one of its plans; unknown values are null or left out."""
 
     plan: Count = 0
@@ -138,11 +138,6 @@ class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
     """Time until its last cycle would be done, after the arm's current jobs; without the way home."""
     space: Name | None = None
     """Name of the space of its plan, from home to home; null for unknown: its whole workspace counts as taken."""
-
-    def __post_init__(self) -> None:
-        finite("PlanQuote", "joint_difficulty", self.joint_difficulty or ())
-        for name in ("peak_c", "gained_k", "p_saturation", "difficulty", "duration_s", "finish_in_s"):
-            finite("PlanQuote", name, (getattr(self, name),))
 
 
 class JobEstimate(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -175,7 +170,7 @@ class JobEstimate(msgspec.Struct, frozen=True, omit_defaults=True):
         )
 
 
-class Quote(msgspec.Struct, frozen=True):
+class Quote(FiniteStruct, frozen=True):
     """Reply to a `QuoteRequest`."""
 
     arm: Name
@@ -196,10 +191,6 @@ class Quote(msgspec.Struct, frozen=True):
     space: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] | None = None
     """Names of the spaces that the arm takes now and those of its jobs; empty at home without jobs. null if not
     reported: the arm then counts as at home if its mode is idle, otherwise its whole workspace counts as taken."""
-
-    def __post_init__(self) -> None:
-        for name in ("valid_s", "time_s", "headroom_k"):
-            finite("Quote", name, (getattr(self, name),))
 
 
 class Award(msgspec.Struct, frozen=True):
@@ -267,7 +258,7 @@ class Lease(msgspec.Struct, frozen=True):
     """Awards with permission to commit: the last cycle may begin under a lease, and these jobs go to no other arm."""
 
 
-class Report(msgspec.Struct, frozen=True):
+class Report(FiniteStruct, frozen=True):
     """Request to `auction/{auctioneer}/report/{arm}`: outcome of an award. Repeated until there is a `Receipt`."""
 
     arm: Name
@@ -285,9 +276,6 @@ class Report(msgspec.Struct, frozen=True):
     faulted: bool = False
     """With `returned`: the arm faulted in this job. After two faults of one arm, or three of all arms, the job becomes
     `given_up`."""
-
-    def __post_init__(self) -> None:
-        finite("Report", "time_s", (self.time_s,))
 
 
 class Receipt(msgspec.Struct, frozen=True):
@@ -426,7 +414,7 @@ class ClockRequest(msgspec.Struct, frozen=True):
     """Request to `clock/now`: the fleet time."""
 
 
-class Clock(msgspec.Struct, frozen=True):
+class Clock(FiniteStruct, frozen=True):
     """Reply to a `ClockRequest`."""
 
     time_s: Number
@@ -435,7 +423,3 @@ class Clock(msgspec.Struct, frozen=True):
     """Fleet seconds per real second."""
     epoch: str = ""
     """Name of the journal that the fleet continues; a new one after its loss, or in a new shift."""
-
-    def __post_init__(self) -> None:
-        finite("Clock", "time_s", (self.time_s,))
-        finite("Clock", "speed", (self.speed,))

@@ -20,11 +20,11 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.auction import MOST_JOBS, Award, JobEstimate, JobSpec, LeaseTime
-from fleet.bus.protocol.messages import Count, Name, Number, finite
+from fleet.bus.protocol.messages import Count, FiniteStruct, Name, Number
 from fleet.bus.protocol.operator import Operation
 
 
-class Bid(msgspec.Struct, frozen=True):
+class Bid(FiniteStruct, frozen=True):
     """Published under `arm/{arm}/bid`: jobs that an arm would take, and at what cost."""
 
     arm: Name
@@ -50,9 +50,6 @@ class Bid(msgspec.Struct, frozen=True):
     digest: Count = 0
     """Checksum of the job outcomes and operator requests at this arm. A peer with another checksum sends its own."""
 
-    def __post_init__(self) -> None:
-        finite("Bid", "time_s", (self.time_s,))
-
 
 class ClaimEntry(msgspec.Struct, frozen=True):
     """A job that an arm has or requests."""
@@ -74,7 +71,7 @@ Faults = Annotated[dict[Name, Name], msgspec.Meta(max_length=16)]
 """Faults in a job at the sender: the arm, by award."""
 
 
-class JobOutcome(msgspec.Struct, frozen=True):
+class JobOutcome(FiniteStruct, frozen=True):
     """Outcome of a job, or of one attempt at it."""
 
     job: Name
@@ -87,10 +84,7 @@ class JobOutcome(msgspec.Struct, frozen=True):
     cycles: Count
     time_s: Number
     reason: str = ""
-    faults: Faults = {}
-
-    def __post_init__(self) -> None:
-        finite("JobOutcome", "time_s", (self.time_s,))
+    faults: Faults = msgspec.field(default_factory=dict)
 
 
 class Claim(msgspec.Struct, frozen=True):

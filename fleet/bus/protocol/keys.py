@@ -42,7 +42,7 @@ SESSION_LEASE_S = 2.0
 
 
 @dataclass(frozen=True)
-class Channel:
+class BusChannel:
     """One key of the bus."""
 
     role: Role
@@ -101,36 +101,38 @@ class Channel:
         return tuple(message for message in (self.message, self.reply, refusal) if message is not None)
 
 
-CHANNELS: tuple[Channel, ...] = (
-    Channel("arm", "alive", "token", lease_s=SESSION_LEASE_S),
-    Channel("arm", "state", "publish", messages.State, history=HISTORY, rate_hz=STATE_HZ, limit_hz=100.0),
-    Channel("arm", "info", "publish", messages.Info, history=1),
-    Channel("arm", "difficulty", "publish", messages.DifficultyScores, history=1),
-    Channel("arm", "event", "publish", auction.ArmEvent, history=HISTORY),
-    Channel("arm", "quote", "query", auction.QuoteRequest, auction.Quote, receiver="auctioneer; any for a dry run"),
-    Channel("arm", "award", "query", auction.Award, auction.Ack, receiver="auctioneer"),
-    Channel("arm", "history", "query", consensus.HistoryRequest, consensus.History, receiver="auctioneer, or arm"),
-    Channel("arm", "reset", "query", operator.ResetRequest, operator.ResetReply, receiver="operator"),
-    Channel("arm", "bid", "publish", consensus.Bid, receiver="arm", history=1, rate_hz=1.0),
-    Channel("arm", "claim", "query", consensus.Claim, consensus.ClaimReply, receiver="arm", lease_s=auction.LEASE_S),
-    Channel("arm", "operation", "publish", operator.Operation, history=HISTORY),
-    Channel("auction", "alive", "token", lease_s=SESSION_LEASE_S),
-    Channel("auction", "announce", "publish", auction.Announcement, history=HISTORY),
-    Channel("auction", "result", "publish", auction.Result, history=HISTORY),
-    Channel("auction", "operation", "publish", operator.Operation, history=HISTORY),
-    Channel("auction", "lease", "query", auction.LeaseRequest, auction.Lease, receiver="arm", lease_s=auction.LEASE_S),
-    Channel("auction", "report", "query", auction.Report, auction.Receipt, receiver="arm"),
-    Channel("jobs", "submit", "query", auction.Submission, auction.SubmissionReply),
-    Channel("jobs", "status", "query", auction.StatusRequest, auction.Status),
-    Channel("jobs", "clear", "query", operator.ClearRequest, operator.Cleared, receiver="operator"),
-    Channel("jobs", "control", "query", operator.ControlRequest, operator.Controlled, receiver="operator"),
-    Channel("jobs", "cell", "query", cell.CellRequest, cell.Cell),
-    Channel("clock", "now", "query", auction.ClockRequest, auction.Clock),
-    Channel("policy", "act", "query", policy.ActRequest, policy.ActReply, receiver="auctioneer, or simulated shift"),
+CHANNELS: tuple[BusChannel, ...] = (
+    BusChannel("arm", "alive", "token", lease_s=SESSION_LEASE_S),
+    BusChannel("arm", "state", "publish", messages.State, history=HISTORY, rate_hz=STATE_HZ, limit_hz=100.0),
+    BusChannel("arm", "info", "publish", messages.Info, history=1),
+    BusChannel("arm", "difficulty", "publish", messages.DifficultyScores, history=1),
+    BusChannel("arm", "event", "publish", auction.ArmEvent, history=HISTORY),
+    BusChannel("arm", "quote", "query", auction.QuoteRequest, auction.Quote, receiver="auctioneer; any for a dry run"),
+    BusChannel("arm", "award", "query", auction.Award, auction.Ack, receiver="auctioneer"),
+    BusChannel("arm", "history", "query", consensus.HistoryRequest, consensus.History, receiver="auctioneer, or arm"),
+    BusChannel("arm", "reset", "query", operator.ResetRequest, operator.ResetReply, receiver="operator"),
+    BusChannel("arm", "bid", "publish", consensus.Bid, receiver="arm", history=1, rate_hz=1.0),
+    BusChannel("arm", "claim", "query", consensus.Claim, consensus.ClaimReply, receiver="arm", lease_s=auction.LEASE_S),
+    BusChannel("arm", "operation", "publish", operator.Operation, history=HISTORY),
+    BusChannel("auction", "alive", "token", lease_s=SESSION_LEASE_S),
+    BusChannel("auction", "announce", "publish", auction.Announcement, history=HISTORY),
+    BusChannel("auction", "result", "publish", auction.Result, history=HISTORY),
+    BusChannel("auction", "operation", "publish", operator.Operation, history=HISTORY),
+    BusChannel(
+        "auction", "lease", "query", auction.LeaseRequest, auction.Lease, receiver="arm", lease_s=auction.LEASE_S
+    ),
+    BusChannel("auction", "report", "query", auction.Report, auction.Receipt, receiver="arm"),
+    BusChannel("jobs", "submit", "query", auction.Submission, auction.SubmissionReply),
+    BusChannel("jobs", "status", "query", auction.StatusRequest, auction.Status),
+    BusChannel("jobs", "clear", "query", operator.ClearRequest, operator.Cleared, receiver="operator"),
+    BusChannel("jobs", "control", "query", operator.ControlRequest, operator.Controlled, receiver="operator"),
+    BusChannel("jobs", "cell", "query", cell.CellRequest, cell.Cell),
+    BusChannel("clock", "now", "query", auction.ClockRequest, auction.Clock),
+    BusChannel("policy", "act", "query", policy.ActRequest, policy.ActReply, receiver="auctioneer, or simulated shift"),
 )
-CHANNEL: Mapping[tuple[str, str], Channel] = {(channel.role, channel.topic): channel for channel in CHANNELS}
+CHANNEL: Mapping[tuple[str, str], BusChannel] = {(channel.role, channel.topic): channel for channel in CHANNELS}
 """By role and topic."""
-PUBLISHED: Mapping[Channel, MessageType] = {
+PUBLISHED: Mapping[BusChannel, MessageType] = {
     channel: channel.message for channel in CHANNELS if channel.pattern == "publish" and channel.message is not None
 }
 """Those that can be subscribed to, with their messages."""
@@ -148,7 +150,7 @@ MAX_CACHED, MAX_CACHED_CHARACTERS = 4096, 256
 
 
 @dataclass(frozen=True)
-class Key:
+class ParsedKey:
     """A parsed concrete key."""
 
     fleet: str
@@ -183,12 +185,12 @@ class Key:
 
 def of_arm(fleet: str, arm: str, topic: str) -> str:
     """Key of one arm: `thermofleet/v4/{fleet}/arm/{arm}/{topic}`."""
-    return str(Key(fleet, "arm", arm, topic))
+    return str(ParsedKey(fleet, "arm", arm, topic))
 
 
 def of_every(fleet: str, role: Role, topic: str) -> str:
     """Key expression that matches a topic of every participant of a role in one fleet; not for publications."""
-    return str(Key(fleet, role, "x", topic)).replace(f"/{role}/x/", f"/{role}/*/")
+    return str(ParsedKey(fleet, role, "x", topic)).replace(f"/{role}/x/", f"/{role}/*/")
 
 
 def of_every_arm(fleet: str, topic: str) -> str:
@@ -198,7 +200,7 @@ def of_every_arm(fleet: str, topic: str) -> str:
 
 def of_auction(fleet: str, auctioneer: str, topic: str) -> str:
     """Key of one auctioneer: `thermofleet/v4/{fleet}/auction/{auctioneer}/{topic}`."""
-    return str(Key(fleet, "auction", auctioneer, topic))
+    return str(ParsedKey(fleet, "auction", auctioneer, topic))
 
 
 def of_every_auction(fleet: str, topic: str) -> str:
@@ -210,7 +212,7 @@ def asked_by(fleet: str, asked: str, topic: str, arm: str) -> str:
     """Key under which an arm queries another participant: `thermofleet/v4/{fleet}/auction/{asked}/{topic}/{arm}`
     for an auctioneer, `…/arm/{asked}/…` for an arm.
     """
-    return str(Key(fleet, ASKED[topic], asked, topic, arm))
+    return str(ParsedKey(fleet, ASKED[topic], asked, topic, arm))
 
 
 def asked_by_every_arm(fleet: str, asked: str, topic: str) -> str:
@@ -240,17 +242,17 @@ def answered(expression: str, asked: str) -> str:
 
 def of_jobs(fleet: str, topic: str) -> str:
     """Key at which outsiders submit jobs, query their status or free space: `thermofleet/v4/{fleet}/jobs/{topic}`."""
-    return str(Key(fleet, "jobs", "", topic))
+    return str(ParsedKey(fleet, "jobs", "", topic))
 
 
 def of_clock(fleet: str) -> str:
     """Key at which fleet time is queried: `thermofleet/v4/{fleet}/clock/now`."""
-    return str(Key(fleet, "clock", "", "now"))
+    return str(ParsedKey(fleet, "clock", "", "now"))
 
 
 def of_policy(fleet: str, policy: str) -> str:
     """Key at which a policy in another process is queried: `thermofleet/v4/{fleet}/policy/{policy}/act`."""
-    return str(Key(fleet, "policy", policy, "act"))
+    return str(ParsedKey(fleet, "policy", policy, "act"))
 
 
 def all_of_fleet(fleet: str) -> str:
@@ -285,17 +287,17 @@ def caches_of(expression: str) -> str:
     return f"{expression}/@adv/**"
 
 
-def parse(key: str) -> Key:
+def parse(key: str) -> ParsedKey:
     """The parsed concrete key, the inverse of `str`.
 
     Raises:
-        ValueError: not a key of this version, or not written as `str(Key(...))` would write it (wildcards, for one).
+        ValueError: not a key of this version, or not written as `str(ParsedKey(...))` writes it (wildcards, for one).
     """
     # The same few keys come with every message; longer ones than ours are not cached.
     return _parse_cached(key) if len(key) <= MAX_CACHED_CHARACTERS else _parse(key)
 
 
-def _parse(key: str) -> Key:
+def _parse(key: str) -> ParsedKey:
     parts = key.split("/")
     asked = len(parts) == 7 and parts[5] in ASKED
     named = len(parts) == 6 or asked
@@ -312,7 +314,7 @@ def _parse(key: str) -> Key:
         names = [unquote(part, errors="strict") for part in chunks]
     except UnicodeDecodeError as error:
         raise ValueError(f"'{key}' holds a percent escape that is no UTF-8.") from error
-    parsed = Key(names[0], role, names[1], parts[5] if named else parts[4], names[2])
+    parsed = ParsedKey(names[0], role, names[1], parts[5] if named else parts[4], names[2])
     try:
         written = str(parsed)
     except ValueError as error:
@@ -336,7 +338,7 @@ def chunk(name: str) -> str:
     return quote(name, safe="")
 
 
-def channel_of(expression: str) -> Channel:
+def channel_of(expression: str) -> BusChannel:
     """The channel that a key, or a key expression with wildcards for names, belongs to.
 
     Raises:
@@ -351,7 +353,7 @@ def channel_of(expression: str) -> Channel:
     return channel
 
 
-def channel_for(expression: str, pattern: Pattern, message: MessageType | None = None) -> Channel:
+def channel_for(expression: str, pattern: Pattern, message: MessageType | None = None) -> BusChannel:
     """The channel of a key or key expression, if it is used as the table says.
 
     Raises:

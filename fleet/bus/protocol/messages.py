@@ -10,6 +10,7 @@ from math import isfinite
 from typing import Annotated, TypeVar
 
 import msgspec
+from msgspec import inspect
 
 from fleet.errors import BusError
 from fleet.telemetry import Mode
@@ -32,7 +33,38 @@ class MalformedMessage(BusError, ValueError):
     """A message that does not fit its key or its schema."""
 
 
-class State(msgspec.Struct, frozen=True, omit_defaults=True):
+class FiniteStruct(msgspec.Struct, frozen=True):
+    """A message that refuses NaN and infinity, which JSON cannot express, when it is constructed."""
+
+    def __post_init__(self) -> None:
+        for name in _float_fields(type(self)):
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not isfinite(number):
+                    raise ValueError(f"{type(self).__name__}.{name} must be finite (got {number}).")
+
+
+@cache
+def _float_fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
+    """Names of the fields that hold a float, None, or a tuple of these."""
+
+    def holds_float(of: inspect.Type) -> bool:
+        match of:
+            case inspect.FloatType():
+                return True
+            case inspect.VarTupleType(item_type):
+                return holds_float(item_type)
+            case inspect.UnionType(types):
+                return any(map(holds_float, types))
+            case _:
+                return False
+
+    described = inspect.type_info(kind)
+    assert isinstance(described, inspect.StructType)
+    return tuple(field.name for field in described.fields if holds_float(field.type))
+
+
+class State(FiniteStruct, frozen=True, omit_defaults=True):
     """Telemetry of an arm; only the newest is valid. Quantities that are not measured are omitted."""
 
     arm: Name
@@ -74,18 +106,14 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """As in `Clock`, of its time; "" for unknown."""
 
     def __post_init__(self) -> None:
-        for name in ("time_s", "headroom_k", "busy_s", "ambient_c", "job_value", "job_peak_c", "job_p_saturation"):
-            finite("State", name, (getattr(self, name),))
-        for name in ("temp_c", "housing_c", "q", "qd", "tau", "current_a"):
+        super().__post_init__()
+        for name in ("housing_c", "q", "qd", "tau", "current_a"):
             values = getattr(self, name)
-            if not values:
-                continue
-            finite("State", name, values)
-            if len(values) != len(self.temp_c):
+            if values and len(values) != len(self.temp_c):
                 raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")
 
 
-class DifficultyScores(msgspec.Struct, frozen=True):
+class DifficultyScores(FiniteStruct, frozen=True):
     """Difficulty of the open jobs for an arm, by its twin."""
 
     arm: Name
@@ -104,14 +132,13 @@ class DifficultyScores(msgspec.Struct, frozen=True):
     """Predicted temperature of the hottest motor during the job, [job]; null where unknown, empty if all are."""
 
     def __post_init__(self) -> None:
-        finite("DifficultyScores", "time_s", (self.time_s,))
+        super().__post_init__()
         for name in ("difficulty", "p_saturation", "peak_c"):
             values = getattr(self, name)
             if len(values) != len(self.jobs) and (values or name != "peak_c"):
                 raise ValueError(
                     f"DifficultyScores.{name} needs one value per job ({len(self.jobs)}, got {len(values)})."
                 )
-            finite("DifficultyScores", name, values)
         if len(set(self.jobs)) != len(self.jobs):
             raise ValueError(f"DifficultyScores.jobs names a job twice (got {self.jobs}).")
 
@@ -138,8 +165,6 @@ class Refusal(msgspec.Struct, frozen=True):
 
 Message = TypeVar("Message", bound=msgspec.Struct)
 
-_ENCODER = msgspec.json.Encoder()
-
 
 @cache
 def _decoder(kind: type[Message]) -> msgspec.json.Decoder[Message]:
@@ -157,38 +182,32 @@ def encoding(kind: type[msgspec.Struct]) -> str:
     return f"application/json;{schema(kind)}"
 
 
-def encode(message: msgspec.Struct) -> bytes:
-    """The message as JSON; floats come back exactly."""
-    return _ENCODER.encode(message)
+encode = msgspec.json.Encoder().encode
+"""The message as JSON; floats come back exactly."""
 
 
-def decode(kind: type[Message], payload: bytes) -> Message:
+def decode(kind: type[Message], payload: bytes, sent_encoding: str | None = None) -> Message:
     """The message of this type in a payload.
 
+    Args:
+        sent_encoding: The encoding that it was sent with; None for a payload from elsewhere, of any size.
+
     Raises:
-        MalformedMessage: not JSON, not of this type, or not finite.
+        MalformedMessage: larger than `MOST_BYTES`, another encoding, not JSON, or not of this type.
     """
+    if sent_encoding is not None:
+        if len(payload) > MOST_BYTES:
+            raise MalformedMessage(f"It has {len(payload):,} bytes, and at most {MOST_BYTES:,} are allowed.")
+        if sent_encoding != encoding(kind):
+            raise MalformedMessage(f"It is encoded as '{sent_encoding}', not as '{encoding(kind)}'.")
     try:
         return _decoder(kind).decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MalformedMessage(f"Not a {schema(kind)}: {error}") from error
 
 
-def decode_as(kind: type[Message], sent_encoding: str, payload: bytes) -> Message:
-    """The message of this type in a payload that was sent with an encoding.
-
-    Raises:
-        MalformedMessage: larger than `MOST_BYTES`, another encoding, or not of this type.
-    """
-    if len(payload) > MOST_BYTES:
-        raise MalformedMessage(f"It has {len(payload):,} bytes, and at most {MOST_BYTES:,} are allowed.")
-    if sent_encoding != encoding(kind):
-        raise MalformedMessage(f"It is encoded as '{sent_encoding}', not as '{encoding(kind)}'.")
-    return decode(kind, payload)
-
-
-def check_name(message: Message, name: str, field: str) -> Message:
-    """The message, if its field `field` holds the name in its key.
+def check_name(message: msgspec.Struct, name: str, field: str) -> None:
+    """Refuse a message whose field `field` is not the name in its key.
 
     Raises:
         MalformedMessage: it names another.
@@ -196,15 +215,3 @@ def check_name(message: Message, name: str, field: str) -> Message:
     claimed = getattr(message, field)
     if claimed != name:
         raise MalformedMessage(f"A {schema(type(message))} under the key of '{name}' claims to be by '{claimed}'.")
-    return message
-
-
-def finite(kind: str, name: str, values: tuple[float | None, ...]) -> None:
-    """Refuse NaN and infinity in a field.
-
-    Raises:
-        ValueError: names the field.
-    """
-    for value in values:
-        if value is not None and not isfinite(value):
-            raise ValueError(f"{kind}.{name} must be finite (got {value}).")

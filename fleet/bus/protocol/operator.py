@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.auction import JobStatus
-from fleet.bus.protocol.messages import Count, Name, Number, Person, finite
+from fleet.bus.protocol.messages import Count, FiniteStruct, Name, Number, Person
 
 JobName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 
@@ -121,7 +121,7 @@ class ResetReply(msgspec.Struct, frozen=True):
     arm."""
 
 
-class Operation(msgspec.Struct, frozen=True):
+class Operation(FiniteStruct, frozen=True):
     """Published under `auction/{auctioneer}/operation`, without an auctioneer under `arm/{arm}/operation`: an operator
     request was carried out, even if it changed nothing. A repeated request is not published."""
 
@@ -135,6 +135,3 @@ class Operation(msgspec.Struct, frozen=True):
     """As in `Clock`: `number` restarts with a new epoch."""
     awards: Annotated[tuple[Name, ...], msgspec.Meta(max_length=16)] = ()
     """With `redo`, without an auctioneer: the awards of the job whose last cycle was not done."""
-
-    def __post_init__(self) -> None:
-        finite("Operation", "time_s", (self.time_s,))

@@ -28,7 +28,7 @@ _SUBSCRIBE = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness
 _RECEIVE = ("put", "liveliness_token", "declare_subscriber", "declare_queryable", "query", "reply")
 
 
-class Participant(msgspec.Struct, frozen=True):
+class RosterEntry(msgspec.Struct, frozen=True):
     """A participant that may connect."""
 
     name: str
@@ -59,7 +59,7 @@ class Roster(msgspec.Struct, frozen=True):
     """The participants of one fleet."""
 
     fleet: str
-    participants: tuple[Participant, ...]
+    participants: tuple[RosterEntry, ...]
 
     def __post_init__(self) -> None:
         keys.chunk(self.fleet)
@@ -68,7 +68,7 @@ class Roster(msgspec.Struct, frozen=True):
             if files[i] in files[:i]:
                 raise ValueError(f"The name '{participant.name}' is taken; names of participants must be unique.")
 
-    def named(self, name: str) -> Participant:
+    def named(self, name: str) -> RosterEntry:
         """The participant of a name.
 
         Raises:
@@ -90,7 +90,7 @@ class Roster(msgspec.Struct, frozen=True):
         return tuple(participant.name for participant in self.participants if participant.role == role)
 
 
-def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = (), *, auctioneer: bool = True) -> Roster:
+def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[RosterEntry] = (), *, auctioneer: bool = True) -> Roster:
     """The roster of a fleet: these arms, one participant of every other role but `policy`, named like the role, and
     the extra ones.
 
@@ -102,8 +102,8 @@ def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = (), 
     """
     left_out = ("arm", "policy") if auctioneer else ("arm", "policy", "auctioneer")
     roles = [role for role in get_args(Role) if role not in left_out]
-    others = tuple(Participant(role, role) for role in roles)
-    return Roster(fleet, (*others, *(Participant(arm, "arm") for arm in arms), *extra))
+    others = tuple(RosterEntry(role, role) for role in roles)
+    return Roster(fleet, (*others, *(RosterEntry(arm, "arm") for arm in arms), *extra))
 
 
 def read_roster(folder: Path) -> Roster:
@@ -139,7 +139,7 @@ class Rights:
     queries: tuple[str, ...] = ()
 
 
-def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) -> Rights:
+def rights(fleet: str, participant: RosterEntry, *, by_consensus: bool = False) -> Rights:
     """The rights of a participant.
 
     Args:
@@ -176,7 +176,7 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
 
 def rights_by_role(fleet: str, name: str) -> dict[Role, Rights]:
     """The rights that a participant of this name would have in each role."""
-    return {role: rights(fleet, Participant(name, role)) for role in get_args(Role)}
+    return {role: rights(fleet, RosterEntry(name, role)) for role in get_args(Role)}
 
 
 def access_control(roster: Roster, router: str = "router") -> dict[str, Any]:

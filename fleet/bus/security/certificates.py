@@ -26,7 +26,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from fleet.bus.security.access_control import LONGEST_COMMON_NAME, ROSTER, Participant, Roster, read_roster
+from fleet.bus.security.access_control import LONGEST_COMMON_NAME, ROSTER, Roster, RosterEntry, read_roster
 from fleet.errors import BusError
 from fleet.files import atomic_path
 
@@ -55,7 +55,7 @@ def new_authority(folder: Path, fleet: str, *, now: datetime | None = None) -> N
 
 
 def issue(
-    folder: Path, participant: Participant, *, days: int, hosts: Sequence[str] = HERE, now: datetime | None = None
+    folder: Path, participant: RosterEntry, *, days: int, hosts: Sequence[str] = HERE, now: datetime | None = None
 ) -> datetime:
     """Write `NAME.pem` and `NAME.key` of a participant, signed by the authority in the folder.
 
@@ -284,7 +284,7 @@ def make(
 
 
 def add(
-    folder: Path, participant: Participant, *, days: int, hosts: Sequence[str] = HERE, overwrite: bool = False
+    folder: Path, participant: RosterEntry, *, days: int, hosts: Sequence[str] = HERE, overwrite: bool = False
 ) -> datetime:
     """Issue a certificate by the present authority, to a new participant or, with `overwrite`, to a present one.
 

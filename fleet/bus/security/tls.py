@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 from urllib.parse import unquote
 
-from fleet.bus.security.access_control import ROLES, Participant, Role, file_of
+from fleet.bus.security.access_control import ROLES, Role, RosterEntry, file_of
 from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
@@ -102,7 +102,7 @@ def identified(endpoint: str) -> tuple[str, Tls | None]:
     return address, Tls(Path(path).parent, unquote(Path(path).name))
 
 
-def participant_at(endpoint: str) -> Participant | None:
+def participant_at(endpoint: str) -> RosterEntry | None:
     """The participant in the certificate of an endpoint; None without TLS, or if the certificate names none.
 
     Raises:
@@ -115,7 +115,7 @@ def participant_at(endpoint: str) -> Participant | None:
     from fleet.bus.security.certificates import common_name, read
 
     role, _, name = common_name(read(tls.folder, tls.file)).partition(":")
-    return Participant(unquote(name), cast(Role, role)) if role in ROLES else None
+    return RosterEntry(unquote(name), cast(Role, role)) if role in ROLES else None
 
 
 _NO_REPLY = "the server does not use TLS: no reply to the handshake"
