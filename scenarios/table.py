@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 
-MOST_LABEL = 40
-"""Characters of a row's label on the terminal, so that a long name leaves room for the figures."""
+MOST_LABEL, LONGEST_WORD = 40, 12
+"""Characters on the terminal: of a row's label, so that a long name leaves room for the figures; and of a word of
+another column, up to which it is not broken."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class Table:
         return replace(self, head=tuple(self.head[column] for column in columns), rows=tuple(map(of, self.rows)))
 
     def split(self) -> Iterator[tuple[str, "Table"]]:
-        """Each group as a table of its own, without caption and notes, after its heading."""
+        """Yield each group as a heading and a table without caption and notes."""
         begins = sorted(self.groups)
         for begin, end in zip(begins, [*begins[1:], len(self.rows)], strict=True):
             part = replace(self, rows=self.rows[begin:end], groups={}, caption="", notes=())
@@ -124,8 +125,10 @@ class Table:
         for number, (heading, words) in enumerate(zip(self.headings, self.words, strict=True)):
             widest = MOST_LABEL if self.numbers and not number else None
             style = "bold" if not number and not table.show_header else None
-            justify = "left" if words else "right"
-            table.add_column(text(heading), justify=justify, overflow="fold", max_width=widest, style=style)
+            words_of = " ".join([heading, *(row[number] for row in self.rows)]).split() if number else []
+            least = min(LONGEST_WORD, max(map(len, words_of), default=0))
+            how = {"overflow": "fold", "max_width": widest, "min_width": least or None, "style": style}
+            table.add_column(text(heading), justify="left" if words else "right", **how)
         for index, row in enumerate(self.rows):
             if index in self.groups:
                 table.add_row(text(self.groups[index], "bold"))

@@ -121,14 +121,12 @@ def test_a_job_done_before_the_horizon_counts_as_finished_on_the_way_home() -> N
     assert (only.outcome, only.finished_s, only.end_s, only.late_s) == ("finished", 90.0, 100.0, 12.0)
 
 
-def test_other_envs_and_other_kinds_are_left_out() -> None:
+def test_other_kinds_are_left_out() -> None:
     log = [
         Event(time_s=0.0, kind="release", job="a-1"),
-        Event(time_s=0.0, kind="award", arm="arm_0", job="a-1", env=1),
         Event(time_s=0.0, kind="lost", arm="arm_1", job="a-1"),
     ]
     assert schedule(log, ARMS, 100.0).assignments == ()
-    assert len(schedule(log, ARMS, 100.0, env=1).assignments) == 1
 
 
 @pytest.mark.parametrize(
@@ -157,12 +155,8 @@ shares = st.lists(st.floats(0.0, 1e6), min_size=1, max_size=12)
 
 
 @pytest.mark.parametrize("arms", [1, 2, 5, 64])
-def test_one_arm_with_everything_among_n_is_1_minus_1_over_n(arms) -> None:
+def test_one_arm_with_everything_among_n_is_1_minus_1_over_n_and_equal_shares_are_zero(arms) -> None:
     assert gini(np.eye(arms)[0]) == pytest.approx(1 - 1 / arms)
-
-
-@pytest.mark.parametrize("arms", [1, 2, 7])
-def test_all_alike_is_zero(arms) -> None:
     assert gini(np.full(arms, 3.7)) == pytest.approx(0.0)
     assert gini(np.zeros(arms)) == 0.0
 
@@ -173,12 +167,6 @@ def test_shares_1_to_n_have_the_closed_form() -> None:
         assert gini(np.arange(1, n + 1)) == pytest.approx((n - 1) / (3 * n))
 
 
-def test_an_exponential_fleet_is_near_a_half() -> None:
-    # The Gini coefficient of the exponential distribution is 1/2; its estimate has deviation about 0.29/√n.
-    drawn = np.random.default_rng(1).exponential(size=2000)
-    assert gini(drawn) == pytest.approx(0.5, abs=4 * 0.29 / np.sqrt(2000))
-
-
 @given(shares, st.floats(1e-3, 1e3), st.randoms())
 def test_it_knows_neither_unit_nor_order(values, scale, random) -> None:
     g = gini(np.array(values))
@@ -186,11 +174,6 @@ def test_it_knows_neither_unit_nor_order(values, scale, random) -> None:
     mixed = [scale * v for v in values]
     random.shuffle(mixed)
     assert gini(np.array(mixed)) == pytest.approx(g, abs=1e-9)
-
-
-@given(shares, st.floats(1.0, 1e6))
-def test_a_gift_to_all_makes_it_less(values, gift) -> None:
-    assert gini(np.array(values) + gift) <= gini(np.array(values)) + 1e-12
 
 
 @pytest.mark.parametrize(("values", "says"), [([1.0, -0.1], "must be >= 0"), ([], "at least one")])

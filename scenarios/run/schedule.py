@@ -24,7 +24,7 @@ SAME_MOMENT_DIGITS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Assignment:
+class JobSpan:
     """One arm on one job, from the award until it is at home or faults."""
 
     arm: str
@@ -68,17 +68,16 @@ class Outage:
 class Schedule:
     """Assignments and outages up to a horizon, in order of the arms, then of time."""
 
-    assignments: tuple[Assignment, ...]
+    assignments: tuple[JobSpan, ...]
     outages: tuple[Outage, ...]
     horizon_s: float
 
 
-def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float, *, env: int = 0) -> Schedule:
+def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float) -> Schedule:
     """Schedule of an event log; the order of events within the log does not matter.
 
     Args:
         horizon_s: End of the log; open assignments and outages last until then.
-        env: Index of one of several parallel shifts.
 
     Raises:
         ValueError: an arm that is not in the fleet, or an impossible sequence (an award to a busy arm, an arrival
@@ -86,12 +85,12 @@ def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float, *, 
     """
     own: dict[str, list[Event]] = {arm: [] for arm in arms}
     for event in events:
-        if event.env != env or event.kind not in _ORDER:
+        if event.kind not in _ORDER:
             continue
         if event.arm not in own:
             raise ValueError(f"No arm '{event.arm}' in this fleet{nearest(event.arm, own)}")
         own[event.arm].append(event)
-    assignments: list[Assignment] = []
+    assignments: list[JobSpan] = []
     outages: list[Outage] = []
     for arm, log in own.items():
         log.sort(key=lambda e: (round(e.time_s, SAME_MOMENT_DIGITS), _ORDER.index(e.kind)))
@@ -114,9 +113,9 @@ def payloads(telemetry: Telemetry, plan: Schedule, arms: Sequence[str], payload_
     return load_kg
 
 
-def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[Assignment]:
+def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[JobSpan]:
     """Assignments of one arm, from its events in order."""
-    out: list[Assignment] = []
+    out: list[JobSpan] = []
     award: Event | None = None
     finish: Event | None = None
     given_back: Event | None = None
@@ -158,8 +157,8 @@ def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[Assig
 
 def _assignment(
     award: Event, finish: Event | None, end_s: float, outcome: Outcome, returned: Event | None = None
-) -> Assignment:
-    return Assignment(
+) -> JobSpan:
+    return JobSpan(
         arm=award.arm,
         job=award.job,
         start_s=award.time_s,

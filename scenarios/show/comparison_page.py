@@ -1,6 +1,4 @@
-"""A comparison as text and as a page: one HTML file that opens offline, with verdict, intervals, charts and how to
-repeat.
-"""
+"""A comparison as text, and as one HTML file that opens offline: verdict, intervals, charts and its command."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from scenarios.evaluate.comparison import Comparison, Failed
-from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, Scores, ranked, score_cells, scores_of
+from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, SuiteScores, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, plain
@@ -37,28 +35,35 @@ WORST = -1.5
 """Scores below are cut in charts."""
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a8a8a", "#7a5195")
 """Of lines (Okabe & Ito, who are for colour-blind readers, and two more)."""
-DASHES = ("solid", "dash", "dot", "dashdot")
-WIDTH_PX, HEIGHT_PX, ROW_PX, LETTER_PX = 820, 400, 24, 7.0
-"""Of a chart, of a row of `spans`, and of a letter."""
+DASHES, SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "square", "diamond", "x")
+"""Of lines and points, which tell equal colours apart."""
+HEIGHT_PX, ROW_PX = 428, 24
+"""Of a chart with a legend, and of a row of `spans`."""
 MARGIN = {"l": 60, "r": 20, "t": 12, "b": 48}
+LEGEND_ABOVE: dict[str, Any] = {
+    "height": HEIGHT_PX,
+    "margin": MARGIN | {"t": 40},
+    "showlegend": True,
+    "legend": {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"},
+}
 NAME = 28
 """Most characters of a policy's name in a chart."""
 
 
-def score_table(scores: Scores, labels: Mapping[str, str] | None = None) -> Table:
+def score_table(scores: SuiteScores, labels: Mapping[str, str] | None = None) -> Table:
     """Normalised scores of all policies, the best first."""
     rows = [((labels or {}).get(name, label(name)), *score_cells(scores, name)) for name in ranked(scores)]
     return Table(head=HEADS, rows=tuple(rows))
 
 
-def narrow_score_tables(scores: Scores, labels: Mapping[str, str] | None = None) -> tuple[Table, Table]:
+def narrow_score_tables(scores: SuiteScores, labels: Mapping[str, str] | None = None) -> tuple[Table, Table]:
     """The table of scores in two parts, each narrow enough for 80 columns."""
     table = score_table(scores, labels)
     return table.select(0, 1, 2, 3, 7), table.select(0, 4, 5, 6)
 
 
 def failure_table(failures: Sequence[Failed]) -> Table:
-    """How often each policy failed, with its first failure."""
+    """Number of failed shifts of each policy, with the first one."""
     first = _first(failures)
     counts = {policy: sum(each.policy == policy for each in failures) for policy in first}
     rows = tuple((label(p), str(counts[p]), each.instance, str(each.seed)) for p, each in first.items())
@@ -112,9 +117,9 @@ class Judged:
     values: Normalised | None
     """Scores over all instances; None without references."""
     card: Mapping[str, Any]
-    """Of the study: hashes, versions and settings."""
+    """Hashes, versions and settings of the study."""
     command: str
-    """That repeats it."""
+    """Command that repeats it."""
 
     @property
     def baseline(self) -> str:
@@ -127,7 +132,7 @@ class Judged:
         return self.values if self.values and self.baseline in self.values.score else None
 
     @cached_property
-    def scores(self) -> Scores | None:
+    def scores(self) -> SuiteScores | None:
         """The figures of `scored`, which a single comparison has made."""
         if len(self.results) == 1:
             return self.results[0].scores
@@ -160,7 +165,7 @@ def comparison_page(judged: Judged) -> str:
 
 
 def verdict(judged: Judged) -> list[str]:
-    """What came out, in sentences: the best policy against the baseline, and against the next one.
+    """The best policy against the baseline and against the next one, in sentences.
 
     The best one is chosen by its figures, so p-values count as many differences as there are other policies
     (Bonferroni).
@@ -176,13 +181,13 @@ def verdict(judged: Judged) -> list[str]:
     others = {base: "the baseline "} if best != base else {}
     others |= {name: "the next one, " for name in [name for name in rest if name != base][:1]}
     compared = [_against(other, values.difference(best, other), role, len(rest)) for other, role in others.items()]
-    told = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
+    sentences = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
-    told.append(
+    sentences.append(
         f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies, where 0 is "
         f"random and 1 the best schedule known for each of {scores.instances} instances."
     )
-    return [*told, *last]
+    return [*sentences, *last]
 
 
 def _against(other: str, difference: Interval, role: str, tests: int) -> str:
@@ -277,7 +282,7 @@ def _heat_charts(judged: Judged) -> Iterator[Chart]:
         if rows:
             drawn = points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
             alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
-            yield Chart(key=f"heat_{number}", figure=drawn, alt=alt, shrinks=False)
+            yield Chart(key=f"heat_{number}", figure=drawn, alt=alt)
 
 
 def _figures(result: Comparison) -> dict[str, object]:
@@ -317,40 +322,29 @@ def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least:
     Args:
         rows: Name, value, low and high.
         title: Of the axis.
-        least: Intervals that reach below this are cut there, so that one bad row does not squeeze the others.
+        least: The axis begins here, so that one bad row does not squeeze the others; values below are written.
         marked: A name in bold.
     """
-    ends = np.array([row[1:] for row in rows])
-    ends = ends[np.isfinite(ends)]
+    names, values = [name for name, *_ in rows], np.array([row[1:] for row in rows])
+    ends = values[np.isfinite(values)]
     low, high = max(least, float(ends.min())), float(ends.max())
     room = 0.04 * (high - low or 1.0)
-    shown = [(y, *row) for y, row in enumerate(rows) if row[1] >= low - room]
-    error = {
-        "type": "data",
-        "symmetric": False,
-        "array": [_length(upper - value) for _, _, value, _, upper in shown],
-        "arrayminus": [_length(value - max(lower, low - room)) for _, _, value, lower, _ in shown],
-        "thickness": 3,
-        "width": 0,
-        "color": "rgba(0,114,178,.55)",
-    }
-    names = [plain(name, NAME) for name, *_ in rows]
-    bold = [f"<b>{name}</b>" if row[0] == marked else name for name, row in zip(names, rows, strict=True)]
-    dots = _dots([value for _, _, value, _, _ in shown], [y for y, *_ in shown], [name for _, name, *_ in shown])
+    labels = [f"<b>{plain(name, NAME)}</b>" if name == marked else plain(name, NAME) for name in names]
+    at = np.repeat(np.arange(len(rows))[:, None], 3, axis=1)
     cut = [
         {"text": f"◂ {value:.2f}", "x": low - room, "y": y, "xanchor": "left", "showarrow": False}
-        for y, (_, value, _, _) in enumerate(rows)
+        for y, value in enumerate(values[:, 0].tolist())
         if value < low - room
     ]
-    height = MARGIN["t"] + ROW_PX * len(rows) + MARGIN["b"]
     return {
-        "data": [dots | {"error_x": error}],
+        "data": [_dots(values, at, names, {"marker": {"color": COLOURS[0], "size": 9}})],
         "layout": LAYOUT
-        | {"height": height, "margin": MARGIN, "annotations": cut, "showlegend": False}
+        | {"height": MARGIN["t"] + ROW_PX * len(rows) + MARGIN["b"], "margin": MARGIN}
+        | {"annotations": cut, "showlegend": False}
         | {
             "xaxis": AXIS | {"range": [low - room, high + room], "title": {"text": title}},
             "yaxis": AXIS
-            | {"tickvals": list(range(len(rows))), "ticktext": bold, "range": [len(rows) - 0.5, -0.5]}
+            | {"tickvals": at[:, 0].tolist(), "ticktext": labels, "range": [len(rows) - 0.5, -0.5]}
             | {"automargin": True, "showgrid": False},
         },
     }
@@ -381,84 +375,39 @@ def lines(
         line = {"color": colour, "width": 2, "dash": dash}
         curve = {"x": x, "y": value.round(4).tolist(), "line": line}
         curves.append({"type": "scatter", "mode": "lines", "name": plain(name, NAME), **curve})
-    legend = {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"}
     return {
         "data": [*bands, *curves],
         "layout": LAYOUT
-        | {"height": HEIGHT_PX + 28, "margin": MARGIN | {"t": 40}, "showlegend": True, "legend": legend}
+        | LEGEND_ABOVE
         | {"xaxis": AXIS | {"range": [x[0], x[-1]], "title": {"text": x_title}}}
         | {"yaxis": AXIS | {"range": [0, 1.02], "title": {"text": y_title}}},
     }
 
 
 def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str) -> Figure:
-    """A point for each name with its intervals, and its name beside it where there is room.
+    """A point for each name, with its intervals.
 
     Args:
         rows: Name, x and y; each of the two with its lower and upper bound.
     """
-    ranges = np.array([row[1:] for row in rows])  # [name, axis, value and bounds]
-    ranges = np.where(np.isfinite(ranges), ranges, ranges[..., :1])
-    room = np.array([0.06, 0.08]) * np.maximum(np.ptp(ranges, axis=(0, 2)), 1e-9)
-    low, high = ranges.min(axis=(0, 2)) - room, ranges.max(axis=(0, 2)) + room
-    names = [name for name, *_ in rows]
-    size = np.array([WIDTH_PX - MARGIN["l"] - MARGIN["r"], HEIGHT_PX - MARGIN["t"] - MARGIN["b"]])
-    at = (ranges[..., 0] - low) / (high - low) * size
-    sides = _label_sides(at, [plain(name, NAME) for name in names], size)
-    texts = [plain(name, NAME) if side else "" for name, side in zip(names, sides, strict=True)]
-    dots = _dots(ranges[:, 0, 0].tolist(), ranges[:, 1, 0].tolist(), names)
-    dots |= {"mode": "markers+text", "text": texts, "textposition": [side or "top center" for side in sides]}
-    for axis, name in enumerate(("error_x", "error_y")):
-        value, lower, upper = ranges[:, axis].T
-        bounds = {"array": (upper - value).tolist(), "arrayminus": (value - lower).tolist()}
-        dots[name] = {"type": "data", "symmetric": False, "width": 0, "thickness": 1.5} | bounds
-        dots[name]["color"] = "rgba(0,114,178,.4)"
-    axes = {
-        f"{axis}axis": AXIS | {"range": [float(low[n]), float(high[n])], "title": {"text": title}}
-        for n, (axis, title) in enumerate((("x", x_title), ("y", y_title)))
-    }
-    layout = LAYOUT | {"height": HEIGHT_PX, "margin": MARGIN, "showlegend": False} | axes
-    return {"data": [dots], "layout": layout}
+    data = list[dict[str, Any]]()
+    for n, (name, x, y) in enumerate(rows):
+        marker = {"color": COLOURS[n % len(COLOURS)], "symbol": SYMBOLS[n // len(COLOURS) % len(SYMBOLS)], "size": 9}
+        data.append(_dots(np.array([x]), np.array([y]), [name], {"name": plain(name, NAME), "marker": marker}))
+    axes = {"xaxis": AXIS | {"title": {"text": x_title}}, "yaxis": AXIS | {"title": {"text": y_title}}}
+    return {"data": data, "layout": LAYOUT | LEGEND_ABOVE | axes}
 
 
-def _dots(x: list[float], y: list[float], names: Sequence[str]) -> dict[str, Any]:
-    """Markers with their names as hover texts."""
-    look = {"marker": {"color": COLOURS[0], "size": 9}, "hovertemplate": "%{customdata}: %{x:.3~f}<extra></extra>"}
-    return {"type": "scatter", "mode": "markers", "x": x, "y": y, "customdata": [plain(n) for n in names], **look}
-
-
-def _length(value: float) -> float:
-    """A part of an interval; 0 for one that is not known."""
-    return value if np.isfinite(value) else 0.0
-
-
-def _label_sides(at: Array, texts: Sequence[str], size: Array) -> list[str]:
-    """On which side of each point its label has room, as Plotly names it; "" for none.
+def _dots(x: Array, y: Array, names: Sequence[str], look: Mapping[str, Any]) -> dict[str, Any]:
+    """Markers with their intervals, and their names as hover texts.
 
     Args:
-        at: Points from the lower left corner, px, [point, axis].
-        size: Of the plot, px, [axis].
+        x, y: Value, low and high of each point, [point, 3]; NaN for an unknown end.
     """
-    taken = [(x - 5, y - 5, x + 5, y + 5) for x, y in at.tolist()]
-    sides: list[str] = []
-    for (x, y), text in zip(at.tolist(), texts, strict=True):
-        wide, half = LETTER_PX * len(text), LETTER_PX * len(text) / 2
-        boxes = {
-            "middle right": (x + 8, y - 7, x + 8 + wide, y + 7),
-            "middle left": (x - 8 - wide, y - 7, x - 8, y + 7),
-            "top center": (x - half, y + 6, x + half, y + 20),
-            "bottom center": (x - half, y - 20, x + half, y - 6),
-        }
-        side = next((name for name, box in boxes.items() if _fits(box, taken, size)), "")
-        if side:
-            taken.append(boxes[side])
-        sides.append(side)
-    return sides
-
-
-def _fits(box: tuple[float, ...], taken: Sequence[tuple[float, ...]], size: Array) -> bool:
-    """Whether a box (left, bottom, right, top) is inside the plot and overlaps no other."""
-    inside = box[0] >= 2 and box[1] >= 2 and box[2] <= size[0] - 2 and box[3] <= size[1] - 2
-    return inside and not any(
-        box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3] for other in taken
-    )
+    trace: dict[str, Any] = {"type": "scatter", "mode": "markers", "x": x[:, 0].tolist(), "y": y[:, 0].tolist()}
+    for axis, values in (("x", x), ("y", y)):
+        below, above = np.nan_to_num(np.abs(values[:, 1:] - values[:, :1]), posinf=0.0).T.tolist()
+        bars = {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1.5, "width": 0}
+        trace[f"error_{axis}"] = bars
+    hover = {"customdata": [plain(name) for name in names], "hovertemplate": "%{customdata}: %{x:.3~f}<extra></extra>"}
+    return trace | hover | look

@@ -1,7 +1,4 @@
-"""Layout of a cell: what each arm reaches, which works exclude each other, how many arms can work at once.
-
-Describe a scenario in sentences and tables.
-"""
+"""Layout of a cell (reach, tasks that exclude each other, arms at work at once), and a scenario in words and tables."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
@@ -80,7 +77,7 @@ class LayoutReport:
     excluded_share: float
     """Share of the pairs of plans of two arms that exclude each other."""
     at_once: tuple[ArmTask, ...]
-    """A largest set of works that different arms can do at the same time, each at its own stations."""
+    """A largest set of tasks that different arms can do at the same time, each at its own stations."""
     largest: bool
     """Whether no larger set exists; False if the search ended at its time limit."""
     problems: tuple[str, ...]
@@ -183,8 +180,7 @@ def _payload(payload_kg: float | None) -> str:
 
 def _reach(scenario: Scenario, arm: PlannedArm, place: str) -> Reach:
     name = arm.hardware.robot.name
-    works = [work for work in all_works(scenario) if place in work.stations]
-    able = [work.payload_kg for work in works if work in arm.plans]
+    able = [work.payload_kg for work in all_works(scenario) if place in work.stations and work in arm.plans]
     reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place)
     return Reach(arm=name, place=place, payload_kg=max(able, default=None), reason="; ".join(reasons))
 
@@ -243,8 +239,8 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
     )
     chosen = [] if result.x is None else first[result.x > 0.5].tolist()
     streams = _streams(scenario, plans)
-    works = (ArmTask(arm=plans[i].arm, job=streams[i], places=plans[i].work.stations) for i in chosen)
-    return tuple(works), result.status == 0
+    tasks = (ArmTask(arm=plans[i].arm, job=streams[i], places=plans[i].work.stations) for i in chosen)
+    return tuple(tasks), result.status == 0
 
 
 SEEDS = 5

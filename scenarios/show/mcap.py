@@ -56,7 +56,7 @@ ORIGIN = {"position": (0.0, 0.0, 0.0), "quaternion": (1.0, 0.0, 0.0, 0.0)}
 def write_mcap(path: Path, moments: Moments, progress: Progress = quiet) -> int:
     """Write a shift and return the number of messages; times count from the beginning of the shift."""
     with path.open("wb") as stream:
-        file = _File(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD), moments)
+        file = _McapFile(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD), moments)
         file.write_once()
         for done, (part, name) in enumerate(
             (
@@ -72,7 +72,7 @@ def write_mcap(path: Path, moments: Moments, progress: Progress = quiet) -> int:
         return file.count
 
 
-class _File:
+class _McapFile:
     def __init__(self, writer: Writer, moments: Moments) -> None:
         self.writer, self.moments, self.count = writer, moments, 0
         run = moments.run

@@ -1,4 +1,4 @@
-"""What every file of a recorded shift holds: which moments, poses of links, motors, payloads, and events in words."""
+"""A recorded shift for files of other viewers: moments, poses of links, motors, payloads, and events in words."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ def motor_spheres(temp_c: Array, limits: ThermalLimits) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Entry:
+class LogLine:
     """A line of the log."""
 
     time_s: float
@@ -99,15 +99,15 @@ class Moments:
                 names[begin:end] = [work.job] * (end - begin)
         return names
 
-    def log(self) -> Iterator[Entry]:
+    def log(self) -> Iterator[LogLine]:
         """Events in order of time; an award is followed by what each arm offered."""
         offers = {
             key: list(group) for key, group in groupby(self.run.offers, key=lambda offer: (offer.time_s, offer.job))
         }
         for event in sorted(self.run.events, key=lambda event: event.time_s):
-            yield Entry(event.time_s, SEVERITY.get(event.kind, "info"), event.arm, event_text(event))
+            yield LogLine(event.time_s, SEVERITY.get(event.kind, "info"), event.arm, event_text(event))
             if event.kind == "award" and (made := offers.get((event.time_s, event.job))):
-                yield Entry(event.time_s, "info", "", f"offers for {event.job}: {offers_text(made)}")
+                yield LogLine(event.time_s, "info", "", f"offers for {event.job}: {offers_text(made)}")
 
 
 def ahead(pose: Mapping[str, Any], distance_m: float) -> list[float]:

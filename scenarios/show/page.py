@@ -66,8 +66,6 @@ class Chart:
     figure: Figure
     alt: str
     """Text in place of the figure."""
-    shrinks: bool = True
-    """Whether it is readable on a phone; if not, it keeps its width there and is scrolled."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +86,7 @@ class Section:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Replay:
+class Playback:
     """A shift to be played in 3-D."""
 
     model: Mapping[str, Any]
@@ -108,7 +106,7 @@ class Page:
     content: Mapping[str, object]
     """Values of the template."""
     charts: Sequence[Chart] = ()
-    replay: Replay | None = None
+    replay: Playback | None = None
     narrow: bool = False
     """For text; the default width is for figures over a shift."""
 
@@ -116,10 +114,10 @@ class Page:
         """The whole file; the same page gives the same text."""
         data = self._data()
         policy = f"script-src 'unsafe-inline'; {_POLICY}" if data else _POLICY
-        own = {"title": self.title, "narrow": self.narrow, "policy": policy, "css": Markup(static("page.css"))}
-        held = {key: Markup(text) for key, text in data.items()}
+        head = {"title": self.title, "narrow": self.narrow, "policy": policy, "css": Markup(static("page.css"))}
+        texts = {key: Markup(text) for key, text in data.items()}
         code = Markup(self._code()) if data else ""
-        return str(render(self.template, **self.content, **own, data=held, code=code))
+        return str(render(self.template, **self.content, **head, data=texts, code=code))
 
     def _data(self) -> dict[str, str]:
         """What scripts read, by the id of the element that holds it."""
@@ -202,7 +200,7 @@ def packed(telemetry: Telemetry, payload_kg: Array | None = None) -> str:
     def body() -> Iterator[bytes]:
         for _, values, scale, stride in arrays:
             for arm in range(arms):  # one at a time, as large fleets have much
-                steps = np.clip(np.round(_held(values[::stride, arm]) / scale), -(2**15), 2**15 - 1)
+                steps = np.clip(np.round(_filled(values[::stride, arm]) / scale), -(2**15), 2**15 - 1)
                 yield np.diff(steps.astype(np.int32).T, axis=-1, prepend=0).astype("<i2").tobytes()
 
     return compressed(chain([json.dumps(listed, separators=(",", ":")).encode() + b"\n"], body()))
@@ -217,7 +215,7 @@ def compressed(content: Iterable[bytes]) -> str:
     return base64.b64encode(packed.getbuffer()).decode("ascii")
 
 
-def _held(values: Array) -> Array:
+def _filled(values: Array) -> Array:
     """Values along the first axis, NaN replaced by the last value before it, or the first after it."""
     values = np.array(values, dtype=float)
     if np.isfinite(values).all():
@@ -245,7 +243,7 @@ def three_js() -> str:
             page = packed.read("viewer.html.template").decode()
     except (ModuleNotFoundError, FileNotFoundError, KeyError) as error:
         raise FleetError(f"Pages in 3-D need trimesh: {install('report')} ({error}).") from error
-    found = _LIBRARY.search(page)
-    if found is None:
+    library = _LIBRARY.search(page)
+    if library is None:
         raise FleetError(f"This version of trimesh carries no three.js: {install('report')}.")
-    return found[1]
+    return library[1]

@@ -1,7 +1,4 @@
-"""What happened in a shift, in words.
-
-The report of a run, the two reports of a demo side by side, and a run in a notebook.
-"""
+"""The report of a shift in words, tables and figures; two shifts side by side; a run in a notebook."""
 
 import math
 from collections import Counter
@@ -14,14 +11,14 @@ from urllib.parse import quote
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import Offer, ShiftLog
-from scenarios.run.schedule import Assignment, Outage, Schedule
-from scenarios.show.page import Chart, Page, Replay, packed
+from scenarios.run.schedule import JobSpan, Outage, Schedule
+from scenarios.show.page import Chart, Page, Playback, packed
 from scenarios.show.timeline import figure, time_unit
 from scenarios.show.words import CANNOT, by_joint, clock, duration, kind_text, scores_text, value_text
 from scenarios.table import Moment, Table, render
 
 MOST_FAULTS = 2
-"""Faults with a sentence of their own."""
+"""Faults described in a sentence each."""
 MOST_NAMED_ARMS = 6
 """Arms that are named in one sentence."""
 MARGIN_K = 3.0
@@ -47,7 +44,7 @@ class Verdict:
 def verdict(log: ShiftLog) -> Verdict:
     """The outcome of a shift: its jobs, each fault with its cause, and what to look at.
 
-    What is missing in its card is left out; without offers nothing is said about other choices.
+    Missing figures of its card are left out; without offers there is no sentence about other choices.
     """
     metrics, plan, offers, faults = log.card.get("metrics") or {}, log.plan, log.offers, log.faults
     contacts = sum(event.kind == "contact" for event in log.events)
@@ -113,20 +110,20 @@ def _outage(outage: Outage | None) -> str:
     return f"out for {length}" if outage.recovered else f"out for the remaining {length}"
 
 
-def _award(fault: Event, plan: Schedule) -> Assignment | None:
+def _award(fault: Event, plan: Schedule) -> JobSpan | None:
     """The work in which an arm faulted."""
     same = (a for a in plan.assignments if (a.arm, a.job) == (fault.arm, fault.job))
     return next((a for a in same if a.start_s <= fault.time_s <= a.end_s), None)
 
 
-def _behind(award: Assignment, offers: Sequence[Offer]) -> list[Offer]:
+def _behind(award: JobSpan, offers: Sequence[Offer]) -> list[Offer]:
     """The offers behind an award; in a live fleet they are a little older than its start."""
     earlier = [offer for offer in offers if offer.job == award.job and offer.time_s <= award.start_s]
     last_s = max((offer.time_s for offer in earlier), default=0.0)
     return [offer for offer in earlier if offer.time_s == last_s]
 
 
-def _own_offer(award: Assignment, offers: Sequence[Offer]) -> Offer | None:
+def _own_offer(award: JobSpan, offers: Sequence[Offer]) -> Offer | None:
     """The offer that got the job; None if its scores are unknown."""
     own = next((o for o in _behind(award, offers) if o.awarded), None)
     return own if own is not None and own.peak_c is not None and own.p_saturation is not None else None
@@ -165,8 +162,8 @@ def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[st
     yield _avoidable(fault, own, _behind(award, offers), plan)
 
 
-def _begin(award: Assignment, work: Sequence[Assignment]) -> float:
-    """Begin of the work of an arm that led to an award without a pause."""
+def _begin(award: JobSpan, work: Sequence[JobSpan]) -> float:
+    """Start of the uninterrupted work of an arm before an award."""
     begin_s = award.start_s
     for a in sorted(work, key=lambda a: a.start_s, reverse=True):
         if a.start_s < begin_s <= a.end_s + PAUSE_S:
@@ -192,7 +189,7 @@ def _avoidable(fault: Event, own: Offer, offered: Sequence[Offer], plan: Schedul
 
 
 def _occupied(offer: Offer, plan: Schedule) -> str:
-    """Until when an arm could not have taken a job, or why."""
+    """Why an arm could not take a job, or until when."""
     if offer.state == "faulted":
         return "which was out after a fault"
     current = next(
@@ -240,21 +237,19 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
         model: `fleet.arm.cell.cell_model` with the same arms; without it nothing is shown in 3-D.
 
     Raises:
-        ValueError: the telemetry has another number of arms, or the events contradict each other.
+        ValueError: the events contradict each other.
     """
-    if log.readings.temp_c.shape[1] != len(log.arms):
-        raise ValueError(f"The telemetry has {log.readings.temp_c.shape[1]} arms, the fleet {len(log.arms)}.")
     log = replace(log, events=tuple(sorted(log.events, key=lambda e: (e.time_s, e.arm, e.kind, e.job))))
     card, replay, limits = log.card, None, log.limits
     if model is not None and len(log.readings.time_s):
         shown = {**model, "heat": heat_scale(limits.warning_c, limits.error_c)}
         unit_s = time_unit(log.plan.horizon_s)[1]
-        replay = Replay(model=shown, playback=packed(log.readings, log.load_kg), unit_s=unit_s)
+        replay = Playback(model=shown, playback=packed(log.readings, log.load_kg), unit_s=unit_s)
     scenario = card.get("scenario", {})
-    told = verdict(log)
-    moments = {sentence: _before(fault) for sentence, fault in told.faults.items()}
+    outcome = verdict(log)
+    moments = {sentence: _before(fault) for sentence, fault in outcome.faults.items()}
     content = {
-        "verdict": told,
+        "verdict": outcome,
         "moments": moments,
         "first": next(iter(moments.values()), None),
         "description": str(scenario.get("description") or ""),

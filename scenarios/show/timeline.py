@@ -14,14 +14,14 @@ from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry
 from scenarios.run.records import ShiftLog
-from scenarios.run.schedule import Assignment, Outage
+from scenarios.run.schedule import JobSpan, Outage
 from scenarios.show import page
 from scenarios.show.page import AXIS, INK, plain
 from scenarios.show.words import by_joint, clock
 
 Array = np.ndarray
 Trace = dict[str, Any]
-Span = TypeVar("Span", Assignment, Outage)
+Span = TypeVar("Span", JobSpan, Outage)
 
 STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
 FAULT, WARNING = "#cc2222", "#e08a00"
@@ -201,7 +201,7 @@ def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
     ]
 
 
-def _shape(a: Assignment) -> str:
+def _shape(a: JobSpan) -> str:
     """Pattern of a bar, for people who see no colours and for dark pages, which show no dark outline."""
     return "/" if a.outcome == "returned" else "." if a.late_s else ""
 
@@ -225,7 +225,7 @@ def _hover(texts: list[str]) -> Trace:
     return {"customdata": texts, "hovertemplate": "%{customdata}<extra></extra>"}
 
 
-def _assignment_text(a: Assignment) -> str:
+def _assignment_text(a: JobSpan) -> str:
     """Hover text of one assignment."""
     if a.outcome == "finished":
         end = "on time" if not a.late_s else f"late by {clock(a.late_s)}"
@@ -373,7 +373,7 @@ def _heading(text: str) -> dict[str, Any]:
 
 
 def _legend_height(bars: Sequence[Trace]) -> float:
-    """Height of the legend of the work, px; on a narrow page it has several lines, with columns of equal width."""
+    """Height of the upper legend, px; on a narrow page it has several lines, with columns of equal width."""
     wide = [45.0 + 6.5 * len(trace["name"]) for trace in bars]
     if sum(wide) <= NARROW_PX:
         return LEGEND_ROW_PX

@@ -12,17 +12,17 @@ from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import all_works
 from scenarios.spec.schema import Scenario
 from scenarios.table import Column, Table
-from twin.logs.recording import Recording, Stretch
+from twin.logs.recording import Recording
 from twin.vae.measures import Features, Measures
 from twin.vae.twin import Twin
 from twin.verdict import Rule, log_features, log_windows, word
 
 Array = np.ndarray
-Cell = str | float | None
-Row = dict[str, Cell]
+ScoreRow = dict[str, str | float | None]
 LOADED = 2
 """Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
 OMITTED = ("twin", "data", "log", "elbow", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+OMITTED_WITH_VERDICT = (f"d_{LOADED}", "latent", "d_cal")
 """Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
 
 
@@ -36,30 +36,41 @@ def jobs_of_arm(twin: Twin, scenario: Scenario, progress: Progress = quiet) -> l
     return [(plan, _repetitions(scenario, plan)) for plan in arm.all_plans]
 
 
-def job_rows(twin: Twin, jobs: Sequence[tuple[Plan, int]]) -> list[Row]:
+def job_rows(twin: Twin, jobs: Sequence[tuple[Plan, int]]) -> list[ScoreRow]:
     """One row of scores per job."""
-    return [_job_row(twin, plan, repetitions) for plan, repetitions in jobs]
+    rows = list[ScoreRow]()
+    for plan, repetitions in jobs:
+        measures = twin.measure(plan, repetitions)
+        begins: ScoreRow = {
+            "job": f"{plan.work.kind} {' → '.join(place.name for place in plan.work.places)}",
+            "payload_kg": plan.work.payload_kg,
+            "elbow": plan.elbow,
+            "speed": plan.speed,
+            "repetitions": repetitions,
+        }
+        d_cal = None if measures.calibrated is None else measures.calibrated.max()
+        rows.append(begins | _scores(twin, measures, d_cal=d_cal, p_value=measures.p_value))
+    return rows
 
 
-def log_rows(twin: Twin, recordings: Sequence[Recording]) -> list[Row]:
+def log_rows(twin: Twin, recordings: Sequence[Recording]) -> list[ScoreRow]:
     """One row of mean scores per recording.
 
     Raises:
         FleetError: as `twin.verdict.log_windows`.
     """
-    return [_log_row(twin, recording) for recording in recordings]
+    rows = list[ScoreRow]()
+    for recording in recordings:
+        measures = twin.measures_of(log_features(twin, recording))
+        hottest_c = None if recording.temp_c is None else recording.temp_c.max()
+        begins: ScoreRow = {"recording": recording.name, "minutes": recording.duration_s / 60}
+        rows.append(begins | _scores(twin, measures, p_value=measures.p_value, hottest_c=hottest_c))
+    return rows
 
 
-def _log_row(twin: Twin, recording: Recording) -> Row:
-    measures = twin.measures_of(log_features(twin, recording))
-    hottest_c = None if recording.temp_c is None else recording.temp_c.max()
-    begins: Row = {"recording": recording.name, "minutes": recording.duration_s / 60}
-    return begins | _scores(twin, measures, p_value=measures.p_value, hottest_c=hottest_c)
-
-
-def with_verdicts(rows: Sequence[Row], rule: Rule, features: Features) -> list[Row]:
+def with_verdicts(rows: Sequence[ScoreRow], rule: Rule, features: Features) -> list[ScoreRow]:
     """The rows with the p-value and the verdict of a rule on their features [row, joint] before the reasons."""
-    judged = list[Row]()
+    judged = list[ScoreRow]()
     for row, p in zip(rows, rule.p_value(features).tolist(), strict=True):
         ends = {name: row[name] for name in ("why", "twin", "data")}
         begins = {name: value for name, value in row.items() if name not in (*ends, "p_value")}
@@ -73,59 +84,45 @@ def _repetitions(scenario: Scenario, plan: Plan) -> int:
     return max(s.repetitions[1] for s in scenario.jobs if s.kind == plan.work.kind and tuple(s.places) == names)
 
 
-def _job_row(twin: Twin, plan: Plan, repetitions: int) -> Row:
-    measures = twin.measure(plan, repetitions)
-    calibrated = measures.calibrated
-    begins: Row = {
-        "job": f"{plan.work.kind} {' → '.join(place.name for place in plan.work.places)}",
-        "payload_kg": plan.work.payload_kg,
-        "elbow": plan.elbow,
-        "speed": plan.speed,
-        "repetitions": repetitions,
-    }
-    d_cal = None if calibrated is None else calibrated.max()
-    return begins | _scores(twin, measures, d_cal=d_cal, p_value=measures.p_value)
-
-
-def window_rows(twin: Twin, recording: Recording) -> list[Row]:
+def window_rows(twin: Twin, recording: Recording) -> list[ScoreRow]:
     """One row per window of a recording, without overlap, in order of time; gaps are left out.
 
     Raises:
         FleetError: the recording has another number of joints than the twin, or is shorter than one window.
     """
-    return [row for part in log_windows(twin, recording) for row in _stretch_rows(twin, *part)]
-
-
-def _stretch_rows(twin: Twin, stretch: Stretch, first: Array, features: Features) -> list[Row]:
-    window, measures, rows = twin.config.window, twin.measures_of(features), list[Row]()
-    for number, i in enumerate(first.tolist()):
-        start_s, end_s = stretch.time_s[[i, i + window - 1]].tolist()
-        hottest_c = None if stretch.temp_c is None else stretch.temp_c[i : i + window].max()
-        begins: Row = {"log": stretch.recording, "start_s": start_s, "end_s": end_s}
-        rows.append(begins | _scores(twin, measures.of_job(number), hottest_c=hottest_c))
+    window, rows = twin.config.window, list[ScoreRow]()
+    for stretch, first, features in log_windows(twin, recording):
+        measures = twin.measures_of(features)
+        for number, i in enumerate(first.tolist()):
+            start_s, end_s = stretch.time_s[[i, i + window - 1]].tolist()
+            hottest_c = None if stretch.temp_c is None else stretch.temp_c[i : i + window].max()
+            begins: ScoreRow = {"log": stretch.recording, "start_s": start_s, "end_s": end_s}
+            rows.append(begins | _scores(twin, measures.of_job(number), hottest_c=hottest_c))
     return rows
 
 
-def _scores(twin: Twin, measures: Measures, **more: float | Array | None) -> Row:
+def _scores(twin: Twin, measures: Measures, **more: float | Array | None) -> ScoreRow:
     """The scores of one job or window, further figures, and their origin."""
     figures = {"d": measures.total, **{f"d_{j + 1}": d for j, d in enumerate(measures.difficulty)}}
     figures |= {"load": measures.total_load, "latent": measures.total_latent, **more}
-    plain: Row = {name: None if value is None else float(value) for name, value in figures.items()}
+    plain: ScoreRow = {name: None if value is None else float(value) for name, value in figures.items()}
     return plain | {"why": measures.why(), "twin": twin.version, "data": twin.data_hash}
 
 
-def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
+def render(rows: Sequence[ScoreRow], how: str, *, caption: str) -> str | Table:
     """Rows as a table, or as CSV or JSON text that ends with a line break."""
     if how == "json":
         return json.dumps({"twin": caption, "rows": list(rows)}, indent=1, allow_nan=False) + "\n"
     heads = list(rows[0]) if rows else []
     if how == "csv":
-        return Table(head=tuple(heads), rows=tuple(tuple(map(_flat, row.values())) for row in rows)).csv()
-    shown = [head for head in heads if head not in OMITTED]
+        texts = (tuple(map(_csv_text, row.values())) for row in rows)
+        return Table(head=tuple(heads), rows=tuple(texts)).csv()
+    omitted = (*OMITTED, *OMITTED_WITH_VERDICT) if "verdict" in heads else OMITTED
+    shown = [head for head in heads if head not in omitted]
     return Table(
         head=tuple(Column(SHORT.get(head, head), words=isinstance(rows[0][head], str)) for head in shown),
         rows=tuple(tuple(_cell(row[head]) for head in shown) for row in rows),
-        notes=(f"{caption}; --format csv or --json for every joint",),
+        notes=(f"{caption}; --format csv or --json for every column",),
     )
 
 
@@ -133,11 +130,11 @@ SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c"
 """Short column heads of tables."""
 
 
-def _flat(value: Cell) -> str:
+def _csv_text(value: str | float | None) -> str:
     return f"{value:.6g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
-def _cell(value: Cell) -> str:
+def _cell(value: str | float | None) -> str:
     if value is None:
         return "–"
     return f"{value:.2f}" if isinstance(value, float) else str(value)

@@ -288,16 +288,17 @@ def test_without_references_the_verdict_is_of_rewards(study: Study):
 def test_charts_place_points_by_value():
     chart = spans([("a", 0.0, -0.5, 0.5), ("b", 1.0, 0.9, 1.1), ("c", -9.0, -9.9, 2.0)], "score", least=-1.0)
     (dots,) = chart["data"]
-    assert (dots["x"], dots["y"]) == ([0.0, 1.0], [0, 1])
-    assert dots["error_x"]["array"] == pytest.approx([0.5, 0.1])
-    assert dots["error_x"]["arrayminus"] == pytest.approx([0.5, 0.1])
-    assert [note["text"] for note in chart["layout"]["annotations"]] == ["◂ -9.00"]
+    assert (dots["x"], dots["y"]) == ([0.0, 1.0, -9.0], [0, 1, 2])
+    assert dots["error_x"]["array"] == pytest.approx([0.5, 0.1, 11.0])
+    assert dots["error_x"]["arrayminus"] == pytest.approx([0.5, 0.1, 0.9])
+    assert chart["layout"]["xaxis"]["range"][0] > -2.0
+    assert [(note["text"], note["y"]) for note in chart["layout"]["annotations"]] == [("◂ -9.00", 2)]
     unknown = float("nan")
-    near = points([("a", (1.0, 0.5, 2.5), (2.0, unknown, unknown)), ("b", (1.0, 1.0, 1.0), (2.0, 2.0, 2.0))], "x", "y")
-    (dots,) = near["data"]
-    assert (dots["error_x"]["array"], dots["error_x"]["arrayminus"]) == ([1.5, 0.0], [0.5, 0.0])
-    assert (dots["error_y"]["array"], dots["error_y"]["arrayminus"]) == ([0.0, 0.0], [0.0, 0.0])
-    assert len(set(dots["textposition"])) == 2  # labels of points at one place are apart
+    rows = [("a", (1.0, 0.5, 2.5), (2.0, unknown, unknown)), ("b", (1.0, 1.0, 1.0), (2.0, 2.0, 2.0))]
+    one, two = points(rows, "x", "y")["data"]
+    assert (one["name"], one["error_x"]["array"], one["error_x"]["arrayminus"]) == ("a", [1.5], [0.5])
+    assert (one["error_y"]["array"], two["error_y"]["arrayminus"]) == ([0.0], [0.0])
+    assert one["marker"] != two["marker"]
 
 
 def test_a_comparison_is_one_table_in_every_form(study: Study):
