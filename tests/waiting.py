@@ -1,12 +1,13 @@
-"""Waiting with a deadline for what other threads and processes bring about."""
+"""Waiting with a deadline for other threads and processes, and serving bus clients on a thread."""
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol, TypeVar
 
 PATIENCE_S = 120.0
-"""Seconds until a wait fails: so many that a slow, busy machine passes."""
+"""Seconds until a wait fails; long enough for a slow, busy machine."""
 PAUSE = threading.Event()
 """Never set: `PAUSE.wait(seconds)` passes time."""
 T = TypeVar("T")
@@ -40,9 +41,29 @@ def serve_until(condition: Callable[[], T], *links: Served, patience_s: float = 
     Raises:
         AssertionError: it is not true within `patience_s`.
     """
-    deadline_s = time.monotonic() + patience_s
-    while not (value := condition()):
-        assert time.monotonic() < deadline_s, "waited in vain"
+
+    def serve() -> None:
         for link in links:
             link.serve(time.monotonic() + 0.02)
-    return value
+
+    return wait_until(condition, serve, patience_s=patience_s)
+
+
+@contextmanager
+def serving(*links: Served, meanwhile: Callable[[], object] = lambda: None) -> Iterator[None]:
+    """Serve links on a thread until the end of the block; call `meanwhile` before each turn."""
+    stop = threading.Event()
+
+    def serve() -> None:
+        while not stop.is_set():
+            meanwhile()
+            for link in links:
+                link.serve(time.monotonic() + 0.02)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(PATIENCE_S)

@@ -2,9 +2,9 @@
 
 import json
 import socket
-import threading
 import time
 from contextlib import ExitStack, contextmanager
+from functools import partial
 
 import msgspec
 import pytest
@@ -20,7 +20,7 @@ from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 from scenarios.show.watch import space_line
 from tests import commands
-from tests.waiting import PATIENCE_S
+from tests.waiting import serving
 
 ASKED = ClockProbe(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)
 """The fleet's time is 5000 s at the real second 100.005."""
@@ -53,8 +53,8 @@ def faults(now, *probes, **more):
 
 
 def test_a_healthy_fleet_has_no_findings():
-    told, found = faults(fleet(arm()))
-    assert told == []
+    output, found = faults(fleet(arm()))
+    assert output == []
     assert found.healthy
     assert found.round_trip_s == pytest.approx(0.01)
     assert found.time_s == pytest.approx(5000.0 + 60.0 * 1.5)
@@ -76,9 +76,9 @@ def test_a_healthy_fleet_has_no_findings():
     ],
 )
 def test_each_fault_of_an_arm_is_one_finding(now, says):
-    told, found = faults(now)
-    assert len(told) == 1
-    assert says in told[0]
+    output, found = faults(now)
+    assert len(output) == 1
+    assert says in output[0]
     assert not found.healthy
 
 
@@ -91,9 +91,9 @@ def test_each_fault_of_an_arm_is_one_finding(now, says):
     ],
 )
 def test_each_fault_of_an_auctioneer_is_one_finding(probe, auctioneers, says):
-    told, _ = faults(fleet(arm(), auctioneers=auctioneers), probe)
-    assert len(told) == 1
-    assert says in told[0]
+    output, _ = faults(fleet(arm(), auctioneers=auctioneers), probe)
+    assert len(output) == 1
+    assert says in output[0]
 
 
 def test_a_fleet_that_needs_no_auctioneer_is_healthy_without_one():
@@ -102,22 +102,22 @@ def test_a_fleet_that_needs_no_auctioneer_is_healthy_without_one():
         "No auctioneer shows a token or answers: jobs are not awarded, and every arm keeps its own time. "
         "If this fleet needs none, give --no-auctioneer."
     ]
-    told, found = faults(fleet(arm(), auctioneers=()), silence, auctioneer=False)
-    assert (told, found.findings, found.time_s) == ([], (), None)
-    told, found = faults(fleet(arm()), auctioneer=False)
-    assert told == []
+    output, found = faults(fleet(arm(), auctioneers=()), silence, auctioneer=False)
+    assert (output, found.findings, found.time_s) == ([], (), None)
+    output, found = faults(fleet(arm()), auctioneer=False)
+    assert output == []
     assert "au is present, though" in found.findings[0].what
     assert "2 auctioneers" in faults(fleet(arm(), auctioneers=(*ALONE, *ALONE)), auctioneer=False)[0][0]
 
 
 def test_malformed_messages_are_a_fault_with_their_reason():
-    told, _ = faults(fleet(arm()), malformed=3, complaints=("under 'k': not JSON",))
-    assert told == ["3 malformed message(s), the last: under 'k': not JSON"]
+    output, _ = faults(fleet(arm()), malformed=3, complaints=("under 'k': not JSON",))
+    assert output == ["3 malformed message(s), the last: under 'k': not JSON"]
 
 
 def test_a_repeated_reason_is_reported_once():
-    told, _ = faults(fleet(arm()), malformed=3, complaints=["no JSON.", "no State.", "no JSON."])
-    assert told == ["3 malformed message(s), the last: no JSON.; no State."]
+    output, _ = faults(fleet(arm()), malformed=3, complaints=["no JSON.", "no State.", "no JSON."])
+    assert output == ["3 malformed message(s), the last: no JSON.; no State."]
 
 
 def test_an_arm_that_left_earlier_is_missing_only_if_expected():
@@ -130,8 +130,8 @@ def test_an_arm_that_left_earlier_is_missing_only_if_expected():
 def test_a_warning_is_no_fault():
     hot = arm(mode="faulted", hottest_c=76.0, joint=2)
     counts = {"unfinished": 1, "given_up": 2}
-    told, found = faults(fleet(hot, counts=counts), ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
-    assert told == []
+    output, found = faults(fleet(hot, counts=counts), ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
+    assert output == []
     warned = " ".join(finding.what for finding in found.findings)
     for word in ("joint 2 is at 76.0", "400 ms", "5 message(s)", "1 job(s) are unfinished", "2 job(s) are abandoned"):
         assert word in warned
@@ -158,35 +158,25 @@ def test_the_offset_of_a_clock_is_known_to_half_a_round_trip(delay_s, speed, ahe
 
 @contextmanager
 def participants(endpoint, *, states=True, clocks=1):
-    """One arm and so many auctioneers, on a thread of their own."""
-    stop = threading.Event()
+    """One arm, and `clocks` auctioneers, on a thread."""
+    began_s = time.monotonic()
+
+    def now_s():
+        return 10.0 * (time.monotonic() - began_s)
+
     with ExitStack() as stack:
-        arm_link = stack.enter_context(BusClient(endpoint, "f"))
-        arm_link.declare_token(keys.of_arm("f", "a", "alive"))
-        lines = [stack.enter_context(BusClient(endpoint, "f")) for _ in range(clocks)]
-        began_s = time.monotonic()
+        arm, *auctioneers = (stack.enter_context(BusClient(endpoint, "f")) for _ in range(1 + clocks))
+        arm.declare_token(keys.of_arm("f", "a", "alive"))
+        for number, link in enumerate(auctioneers):
+            link.declare_token(keys.of_auction("f", f"au{number}", "alive"))
+            link.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=now_s(), speed=10.0))
 
-        def now_s():
-            return 10.0 * (time.monotonic() - began_s)
+        def publish():
+            if states:
+                arm.publish(keys.of_arm("f", "a", "state"), State("a", 1, now_s(), "idle", (30.0,), 30.0))
 
-        for number, line in enumerate(lines):
-            line.declare_token(keys.of_auction("f", f"au{number}", "alive"))
-            line.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=now_s(), speed=10.0))
-
-        def live():
-            while not stop.is_set():
-                if states:
-                    arm_link.publish(keys.of_arm("f", "a", "state"), State("a", 1, now_s(), "idle", (30.0,), 30.0))
-                for line in (arm_link, *lines):
-                    line.serve(time.monotonic() + 0.03)
-
-        thread = threading.Thread(target=live)
-        thread.start()
-        try:
-            yield arm_link
-        finally:
-            stop.set()
-            thread.join(PATIENCE_S)
+        with serving(arm, *auctioneers, meanwhile=publish):
+            yield arm
 
 
 def doctor(endpoint, *options):
@@ -196,65 +186,57 @@ def doctor(endpoint, *options):
 
 def test_a_healthy_fleet_gives_exit_code_0():
     with Router() as router, participants(router.endpoint):
-        code, told = doctor(router.endpoint)
-        assert (code, "The fleet is healthy." in told) == (0, True), told
-        code, told = doctor(router.endpoint, "--json")
-    found = json.loads(told)
+        code, output = doctor(router.endpoint)
+        assert (code, "The fleet is healthy." in output) == (0, True), output
+        code, output = doctor(router.endpoint, "--json")
+    found = json.loads(output)
     assert (code, found["healthy"], found["findings"]) == (0, True, [])
     assert abs(found["offsets_s"]["a"]) < 1.0
 
 
 def test_an_unhealthy_fleet_gives_exit_code_1_and_all_reasons():
-    with Router() as router, participants(router.endpoint, states=False, clocks=2) as line:
-        stop = threading.Event()
-
-        def babble():
-            while not stop.wait(0.1):
-                line._session.put(keys.of_arm("f", "a", "state"), b"rubbish")
-
-        thread = threading.Thread(target=babble)
-        thread.start()
-        code, told = doctor(router.endpoint)
-        stop.set()
-        thread.join(PATIENCE_S)
+    with Router() as router, participants(router.endpoint, states=False, clocks=2) as arm:
+        rubbish = partial(arm._session.put, keys.of_arm("f", "a", "state"), b"rubbish")
+        with BusClient(router.endpoint, "f") as other, serving(other, meanwhile=rubbish):
+            code, output = doctor(router.endpoint)
     assert code == 1
     for says in ("a shows its token but publishes no state", "2 auctioneers", "No arm is present", "malformed message"):
-        assert says in told
+        assert says in output
 
 
 def test_the_option_no_auctioneer_expects_none():
     with Router() as router, participants(router.endpoint, clocks=0):
-        code, told = doctor(router.endpoint)
-        assert (code, "give --no-auctioneer" in told) == (1, True)
-        code, told = doctor(router.endpoint, "--no-auctioneer")
-    assert (code, "The fleet is healthy." in told, "time unknown" in told) == (0, True, True), told
+        code, output = doctor(router.endpoint)
+        assert (code, "give --no-auctioneer" in output) == (1, True)
+        code, output = doctor(router.endpoint, "--no-auctioneer")
+    assert (code, "The fleet is healthy." in output, "time unknown" in output) == (0, True, True), output
 
 
 def test_a_router_without_a_fleet_is_not_healthy():
     with Router() as router:
-        code, told = doctor(router.endpoint)
+        code, output = doctor(router.endpoint)
     assert code == 1
-    assert "replies. No fleet found" in told
+    assert "replies. No fleet found" in output
 
 
 def test_a_missing_router_gives_exit_code_2_and_the_command_to_start_one():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    code, told = doctor(f"tcp/127.0.0.1:{port}")
+    code, output = doctor(f"tcp/127.0.0.1:{port}")
     assert code == 2
-    assert f"thermofleet bus router --port {port}" in told
+    assert f"thermofleet bus router --port {port}" in output
 
 
 def test_another_server_at_the_port_is_recognised():
     with socket.create_server(("127.0.0.1", 0)) as other:
-        code, told = doctor(f"tcp/127.0.0.1:{other.getsockname()[1]}")
+        code, output = doctor(f"tcp/127.0.0.1:{other.getsockname()[1]}")
     assert code == 2
-    assert "no thermofleet router listens on it" in told
+    assert "no thermofleet router listens on it" in output
 
 
 @pytest.mark.parametrize("wrong", [["--endpoint", "http://x"], ["--seconds", "0"]])
 def test_invalid_options_give_exit_code_2(wrong):
-    code, told = doctor("tcp/127.0.0.1:1", *wrong)
+    code, output = doctor("tcp/127.0.0.1:1", *wrong)
     assert code == 2
-    assert "Error:" in told
+    assert "Error:" in output

@@ -3,7 +3,8 @@
 import pytest
 
 from fleet.bus.router import Router
-from tests.live.gateway.served import Served, StandIn
+from tests.live.gateway.moving_fleet import MovingFleet
+from tests.live.gateway.served import Served
 
 
 @pytest.fixture(scope="module")
@@ -14,8 +15,11 @@ def router():
 
 @pytest.fixture(scope="module")
 def arm(router):
-    with StandIn(router) as standing:
-        yield standing
+    """A paused fleet of one arm whose name has a character that keys escape."""
+    moving = MovingFleet(router, ("a+1",), fleet="f")
+    moving.temp_c["a+1"], moving.paused["*"] = 41.5, "ann"
+    with moving:
+        yield moving
 
 
 @pytest.fixture(scope="module")

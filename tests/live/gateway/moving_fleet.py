@@ -1,8 +1,8 @@
-"""A fleet that moves, warms and does the jobs it gets, on a thread: what a live page is tested with."""
+"""A fleet on a thread whose arms move, warm and do jobs."""
 
 import math
-import threading
 import time
+from contextlib import ExitStack
 
 from fleet.bus.client import BusClient, Refused
 from fleet.bus.protocol import auction as bus
@@ -23,19 +23,10 @@ from fleet.bus.protocol.operator import (
     Settle,
 )
 from fleet.job import BOUNDS
-from tests.waiting import PATIENCE_S
+from tests.waiting import serving
 
 WARNING_C, ERROR_C = 60.0, 75.0
 PLACES = ("conveyor", "pallet", "clamp")
-
-
-def until(condition):
-    """The first true value of a condition that other threads bring about."""
-    deadline_s, pause = time.monotonic() + PATIENCE_S, threading.Event()
-    while not (value := condition()):
-        assert time.monotonic() < deadline_s, "waited in vain"
-        pause.wait(0.02)
-    return value
 
 
 class MovingFleet:
@@ -55,7 +46,7 @@ class MovingFleet:
         self.mode = dict.fromkeys(arms, "idle")
         self.work = {}  # job by arm, and the real second at which its next cycle ends
         self.cycle_s, self.number, self.tick = cycle_s, 0, 0
-        self.stop, self.thread = threading.Event(), threading.Thread(target=self.serve)
+        self.due_s, self.thread = 0.0, ExitStack()
 
     def __enter__(self):
         link, fleet = self.link.open(), self.fleet
@@ -78,26 +69,21 @@ class MovingFleet:
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self.clear)
         link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, lambda _: self.cell())
         link.reply_to(keys.of_clock(fleet), bus.ClockRequest, lambda _: bus.Clock(self.now(), 1.0))
-        self.thread.start()
+        self.thread.enter_context(serving(link, meanwhile=self.move))
         return self
 
     def __exit__(self, *_):
-        self.stop.set()
-        self.thread.join()
+        self.thread.close()
         self.link.close()
 
     def now(self):
         return time.monotonic() - self.start_s
 
-    def serve(self):
-        while not self.stop.is_set():
-            until_s = time.monotonic() + 1.0 / self.rate_hz
-            self.move()
-            while time.monotonic() < until_s:
-                self.link.serve(until_s)
-
     def move(self):
-        """Publish where every arm is, and get on with the jobs."""
+        """Publish the state of every arm, and continue the jobs, if the time has come."""
+        if time.monotonic() < self.due_s:
+            return
+        self.due_s = time.monotonic() + 1.0 / self.rate_hz
         self.tick += 1
         now_s = self.now()
         for i, arm in enumerate(self.arms):
@@ -157,8 +143,13 @@ class MovingFleet:
         self.results(bus.Result("auctioneer", self.number, self.now(), status, by=by, **scores))
 
     def post(self, call):
-        """Have the fleet's own thread call."""
+        """Call on the thread of the fleet."""
         self.link.post(call)
+
+    def happens(self, number, reason=""):
+        """Publish an event of the first arm."""
+        arm = self.arms[0]
+        self.events[arm](bus.ArmEvent(arm=arm, number=number, time_s=1.0, kind="warning", joint=2, reason=reason))
 
     # Requests
 
@@ -181,6 +172,8 @@ class MovingFleet:
         return bus.Quote(arm, request.auction, "", 3.0, "t", self.now(), self.mode[arm], 20.0, 1, offers)
 
     def submit(self, request):
+        if request.by == "disk full":
+            raise Refused("The journal has no room.")
         self.requests.append(request)
         for job in request.jobs:
             self.set(job.name, request.by, state="waiting", repetitions=job.repetitions)

@@ -1,4 +1,4 @@
-"""A gateway in this process, the fleet behind it, and what a reader gets from its streams."""
+"""A gateway in this process, and the events of its streams."""
 
 import asyncio
 import http.client
@@ -8,76 +8,10 @@ import threading
 import time
 from contextlib import contextmanager
 
-from docs.bus_contract import EXAMPLES
-from fleet.bus.client import BusClient, Refused
-from fleet.bus.protocol import auction as bus
-from fleet.bus.protocol import keys
-from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.messages import DifficultyScores, State
-from fleet.bus.protocol.operator import Controlled, ControlRequest
+from fleet.bus.client import BusClient
 from fleet.live.monitor.async_bridge import AsyncBridge
 from scenarios.live.gateway import Readers, Server, application, listen
 from tests.waiting import PATIENCE_S
-
-CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
-
-
-class StandIn:
-    """A fleet of one arm `a+1` and an auctioneer, on a thread of its own."""
-
-    def __init__(self, endpoint):
-        self.link, self.stop, self.asked = BusClient(endpoint, "f"), threading.Event(), []
-        self.thread = threading.Thread(target=self.serve)
-
-    def __enter__(self):
-        link = self.link.open()
-        link.reply_to(keys.of_arm("f", "a+1", "quote"), bus.QuoteRequest, self.quote)
-        link.declare_token(keys.of_arm("f", "a+1", "alive"))
-        self.event = link.publisher(keys.of_arm("f", "a+1", "event"), bus.ArmEvent)
-        link.reply_to(keys.of_jobs("f", "submit"), bus.Submission, self.submit)
-        link.reply_to(keys.of_jobs("f", "status"), bus.StatusRequest, self.status)
-        link.reply_to(keys.of_jobs("f", "cell"), CellRequest, lambda _: EXAMPLES[Cell])
-        link.reply_to(keys.of_jobs("f", "control"), ControlRequest, self.control)
-        self.thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self.stop.set()
-        self.thread.join()
-        self.link.close()
-
-    def serve(self):
-        while not self.stop.is_set():
-            self.link.serve(time.monotonic() + 0.05)
-
-    def quote(self, request):
-        assert request.dry_run
-        offers = tuple(bus.JobEstimate(job.name, (bus.PlanQuote(difficulty=0.25),)) for job in request.jobs)
-        return bus.Quote("a+1", request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
-
-    def submit(self, word):
-        if word.by == "disk full":
-            raise Refused("The journal has no room.")
-        self.asked.append(word)
-        return bus.SubmissionReply("au", tuple(bus.Admission(job.name, True) for job in word.jobs))
-
-    def control(self, request):
-        self.asked.append(request)
-        return Controlled("au", request.request, changed=True)
-
-    def status(self, word):
-        return bus.Status("au", 9.0, (bus.JobStatus("crate 1", "waiting"),))
-
-    def state(self, tick, arm="a+1"):
-        word = State(arm=arm, tick=tick, time_s=float(tick), mode="idle", temp_c=(30.0, 41.5), headroom_k=18.5)
-        self.link.publish(keys.of_arm("f", arm, "state"), word)
-
-    def difficulty(self):
-        word = DifficultyScores("a+1", 1, 1.0, "t", ("crate 1",), (0.5,), (None,))
-        self.link.publish(keys.of_arm("f", "a+1", "difficulty"), word)
-
-    def happens(self, number, reason=""):
-        self.event(bus.ArmEvent(arm="a+1", number=number, time_s=1.0, kind="warning", joint=2, reason=reason))
 
 
 class Served:
@@ -92,7 +26,7 @@ class Served:
     async def run(self):
         stuck_s = self.options.get("stuck_s", 10.0)
         with listen("127.0.0.1", self.port, stuck_s) as bound, BusClient(self.endpoint, "f") as link:
-            async with AsyncBridge(link, self.readers.put) as self.gateway:
+            async with AsyncBridge(link, self.readers.wake) as self.gateway:
                 self.server = Server(application(self.gateway, self.readers, **self.options), self.readers)
                 self.port = bound.getsockname()[1]
                 self.started.set()

@@ -15,8 +15,9 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, Pause, ResetRequest, Settle
 from fleet.bus.router import Router
 from scenarios.live.gateway import LivePage
-from tests.live.gateway.moving_fleet import MovingFleet, until
+from tests.live.gateway.moving_fleet import MovingFleet
 from tests.live.gateway.served import Served
+from tests.waiting import wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
@@ -102,7 +103,7 @@ def test_the_arms_are_shown_and_move(served, fleet, open_page):
     expect(rows.nth(1)).to_contain_text("41.0 °C, joint 2")
     before = canvas(page)
     assert len(np.unique(before.reshape(-1, 3), axis=0)) > 50
-    assert until(lambda: (np.abs(canvas(page) - before).max(axis=2) > 60).sum() > 100)
+    assert wait_until(lambda: (np.abs(canvas(page) - before).max(axis=2) > 60).sum() > 100)
     counted = page.evaluate("({...dashboard})")
     page.wait_for_timeout(2000)
     assert page.evaluate("dashboard.states") - counted["states"] >= 30  # of 40 that are published
@@ -156,7 +157,7 @@ def test_a_job_is_cancelled_and_the_fleet_paused_with_the_name_of_the_person(ser
 def test_a_job_is_changed_and_settled_and_the_space_of_an_absent_arm_freed(served, fleet, router, open_page):
     with BusClient(router, "f") as other:  # an arm that leaves
         other.declare_token(keys.of_arm("f", "gone", "alive"))
-        until(lambda: any(arm["arm"] == "gone" for arm in served.ask("GET", "/v4/fleet")[2]["arms"]))
+        wait_until(lambda: any(arm["arm"] == "gone" for arm in served.ask("GET", "/v4/fleet")[2]["arms"]))
     fleet.paused["*"] = "ann"
     for name, state in (("late", "waiting"), ("lost", "unfinished")):
         fleet.post(lambda name=name, state=state: fleet.set(name, state=state, repetitions=3, cycles=2))
@@ -214,7 +215,7 @@ def test_the_keyboard_is_enough(served, fleet, open_page):
     before = canvas(page)
     for _ in range(4):
         page.keyboard.press("ArrowRight")
-    assert until(lambda: (np.abs(canvas(page) - before).max(axis=2) > 60).sum() > 300)
+    assert wait_until(lambda: (np.abs(canvas(page) - before).max(axis=2) > 60).sum() > 300)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
