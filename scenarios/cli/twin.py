@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 KNOWN_TWINS = option("A folder of twins; default: the scenario's own, from the cache.", None, flag="--twins")
 SEED = option("Random seed.", 0, low=0, high=MAX_SEED)
-FORMAT = option("parquet or csv.", "parquet", flag="--format")
-Format = Literal["parquet", "csv"]
 _VERDICT = "Verdicts"
 
 
@@ -100,7 +98,6 @@ def generate_command(
         "Perturbation in posterior standard deviations; 0 reconstructs.", 1.0, flag="--s", low=0, high=100
     ),
     seed: int = SEED,
-    format_: Format = FORMAT,
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
 ) -> None:
@@ -119,9 +116,9 @@ def generate_command(
         how: Any = {"verification": known.verification, "fixtures": chosen.fixtures, "seed": seed}
         how |= {"s": strength, "count": count, "progress": partial(progress, "generating")}
         made = generate(known.twin, known.arm, known.sources, **how)
-    save_generated(made, out, format=format_, overwrite=overwrite)
+    save_generated(made, out, overwrite=overwrite)
     if as_json:
-        print_json({"out": str(out), **generated_summary(made, format_)})
+        print_json({"out": str(out), **generated_summary(made)})
         return
     reasons = ", ".join(f"{reason} {times}" for reason, times in made.rejected.items()) or "none"
     cool = f"{made.truly_cool:.1%} truly stay below {made.verification.cool_c:g} °C"
@@ -142,7 +139,6 @@ def recover_command(
         "Remaining time to hold, s.", 600.0, flag="--hold", low=0, high=BOUNDS["dwell_s"].high, above=True
     ),
     seed: int = SEED,
-    format_: Format = FORMAT,
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
 ) -> None:
@@ -159,15 +155,14 @@ def recover_command(
     model = ArmModel(spec.robot())
     q = recover.parse_posture(posture, model.position_range)
     check_free(out, recover.RECOVERY, overwrite=overwrite)
-    recover.check_hold(model, q, payload)  # before the training
-    recover.check_hold_time(hold_s, recover.Nearby())
+    recover.check_hold(model, q, payload, hold_s, recover.Nearby())  # before the training
     with progress_bar() as progress:
         known = recover.known_arm(chosen, spec.name, twin=twin_of(twins, spec.name), progress=progress)
         progress("recovering", 0.0)
         start_c = recover.hold_until(known.arm, q, payload, ambient_c=known.verification.ambient_c, until_c=warm)
         how: Any = {"verification": known.verification, "fixtures": chosen.fixtures, "seed": seed}
         found = recover.recover(known.twin, known.arm, q, payload, start_c=start_c, hold_s=hold_s, **how)
-    recover.save_recovery(found, out, format=format_, overwrite=overwrite)
+    recover.save_recovery(found, out, overwrite=overwrite)
     if as_json:
         print_json({"out": str(out), **recover.recovery_summary(found)})
         return

@@ -3,7 +3,7 @@
 The twin proposes (`twin.vae.generate`), and inverse dynamics gives the torque. Limits, clearance and the predicted
 temperatures are checked first; then the motion is performed in closed loop in MuJoCo. Rejected motions are counted.
 
-Verification uses what an arm can know: nominal or identified motors and thermal network. `Motion.peak_c` of its true
+Verification uses what an arm can know: nominal or identified motors and thermal network. The peak of its true
 motors is only reported.
 """
 
@@ -165,7 +165,7 @@ class Verification:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class GeneratedMotion:
     """One verified motion, its source, and its measurements."""
 
     plan: Plan
@@ -192,7 +192,7 @@ class Generated:
     seed: int
     asked: int
     verification: Verification
-    motions: tuple[Motion, ...]
+    motions: tuple[GeneratedMotion, ...]
     rejected: Mapping[str, int]
     """Count by reason: joint limit, torque, collision, heat (predicted), tracking, torque clip."""
 
@@ -251,7 +251,7 @@ def generate(
         check_source(plan, s)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     model, rejected = ArmModel(arm.robot, fixtures), Counter[str]()
-    clearance, motions, order = CollisionChecker(model), list[Motion](), list[int]()
+    clearance, motions, order = CollisionChecker(model), list[GeneratedMotion](), list[int]()
     while len(motions) < count and len(motions) + rejected.total() < MOST_DRAWS * count:
         order = order or rng.permutation(len(usable)).tolist()
         source = usable[order.pop()]
@@ -271,7 +271,7 @@ def generate(
 
 def _verified(
     made: Variation, source: Plan, arm: Arm, model: ArmModel, clearance: CollisionChecker, asked: Verification
-) -> Motion:
+) -> GeneratedMotion:
     """The verified motion of a variation; raises Rejected if a check fails."""
     plan = planned(made, source, model)
     every = round(CLEARANCE_STEP_S * RATE_HZ)
@@ -291,7 +291,7 @@ def _verified(
     predicted_c = asked.peak_c(measured)
     if predicted_c.max() > allowed_c:
         raise Rejected("heat")
-    return Motion(
+    return GeneratedMotion(
         plan=plan,
         source=source,
         distance_rad=made.distance_rad,

@@ -24,14 +24,9 @@ TITLE_CHARACTERS = 63
 
 
 def verdict_png(rule: Rule, features: Features) -> bytes:
-    """`verdict_map` as PNG; the same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    verdict_map(rule, features).savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    return buffer.getvalue()
-
-
-def verdict_map(rule: Rule, features: Features) -> Figure:
     """Mean latent of each job [job, joint] by verdict, over the cool jobs that calibrated the twin and their cluster.
+
+    The same figure gives the same bytes.
 
     Raises:
         FleetError: the twin has one latent unit.
@@ -57,7 +52,9 @@ def verdict_map(rule: Rule, features: Features) -> Figure:
     axes.set(xlabel=f"μ₁ of joint {joint + 1}", ylabel=f"μ₂ of joint {joint + 1}")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
-    return figure
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def _ellipse(centre: Array, covariance: Array, radius: float) -> Ellipse:

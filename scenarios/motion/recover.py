@@ -1,23 +1,17 @@
 """Posture recovery: a warm arm that holds a payload moves to a nearby posture that its twin rates as easier.
 
-Candidates are drawn near the latent of the hold (decoded to positions) and near the posture in joint space, then again
-around the best of them. They are ranked by the twin's one-sided torque error of the hottest measured motor. That score
-was chosen among nine by rank correlation (Spearman) with the true temperature after ten minutes, over candidates near
-ten holds of two arms:
-
-- the one-sided torque error of the hottest motor .95 to 1.00,
-- the paper's d of that motor .29 to .96,
-- the paper's d, the sum over all joints, −.34 to .52: most of it is novelty of the posture,
-- the largest torque over nominal 1.00: this baseline without a twin is better than every score of the twin.
+Candidates are sampled near the latent of the hold (decoded to positions) and near the posture in joint space, then
+again around the best of them. They are ranked by the twin's one-sided torque error of the hottest measured motor: of
+nine scores its rank correlation with the true temperature after ten minutes was highest (.95 to 1.00 over ten holds of
+two arms; the paper's d of that motor .29 to .96). The largest torque over nominal, without a twin, reached 1.00.
 
 The thermal model then accepts a posture only if the hottest motor is predicted to cool, and no motor to become as warm
-as it was. The prediction needs housing temperatures, which have no sensor. If they equal the winding temperatures
-(`twin.thermal.thermal_twin.RcTwin.likely_start`), every posture is rejected. If all heat of a winding flows into its
-housing, they are 3 to 5 K too low, and some recoveries end warmer. Therefore the arm first measures for half a minute
-how fast its windings warm, which determines that heat flow.
+as it was. The prediction needs housing temperatures, which have no sensor: the arm first measures for half a minute how
+fast its windings warm, which determines the heat flow into the housings (`housing_estimate`).
 
-In `recover` MuJoCo performs the posture found, and the same hold without recovery from the same temperatures. In both
-the arm first observes its motors for `Nearby.watch_s`."""
+MuJoCo performs the posture found, and the same hold without recovery from the same temperatures. In both the arm first
+observes its motors for `Nearby.watch_s`.
+"""
 
 import json
 from collections import Counter
@@ -25,12 +19,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import repeat
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal  # Any: values of the JSON card
+from typing import Any  # Any: values of the JSON card
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
 from fleet.arm.model import ArmModel
@@ -121,19 +115,6 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class SearchResult:
-    """Result of a search."""
-
-    candidate: Candidate
-    plan: Plan
-    """From home to the old posture while watching, to the new one for the rest of the time, and back."""
-    passed_over: dict[str, int]
-    """Easier candidates that were rejected, by reason."""
-    best_error: dict[str, float]
-    """Smallest one-sided torque error of the hottest motor by origin, in the first search."""
-
-
-@dataclass(frozen=True, eq=False)
 class Search:
     """Search for one arm that holds a payload."""
 
@@ -157,25 +138,30 @@ class Search:
         """The hottest motor, index 0..6."""
         return int(np.argmax(self.winding_c))
 
-    def best(self, rng: np.random.Generator) -> SearchResult:
+    def best(self, rng: np.random.Generator) -> tuple[Candidate, Plan, dict[str, int], dict[str, float]]:
         """The easiest candidate that passes every check.
+
+        Returns:
+            The candidate; its plan: from home to the old posture while observing, to the new one for the rest of the
+            time, and back; easier candidates that were rejected, by reason; and the smallest error by origin.
 
         Raises:
             RecoveryError: no candidate passes.
         """
         now = float(holding(self.twin, self.model, self.q[None], self.payload_kg).one_sided[0, self.hottest])
-        first = self._candidates(self._decoded(rng), "latent")
+        latent = self._candidates(self._decoded(rng), "latent")
         around = self.q + self.near.joint_rad * rng.uniform(-1.0, 1.0, (self.near.candidates, JOINTS))
-        first += self._candidates(around, "joint space")
-        leaders = sorted(first, key=lambda candidate: candidate.error)[:BEST]
-        ranked = sorted(first + self._refined(leaders, rng), key=lambda candidate: candidate.error)
+        joint_space = self._candidates(around, "joint space")
+        first = sorted(latent + joint_space, key=attrgetter("error"))
+        ranked = sorted(first + self._refined(first[:BEST], rng), key=attrgetter("error"))
+        best_error = {some[0].origin: min(c.error for c in some) for some in (latent, joint_space) if some}
         passed_over = Counter[str]()
         for candidate in ranked:
             if candidate.error >= now:
                 break
             plan = self._plan_or_reason(candidate.q)
             if isinstance(plan, Plan):
-                return SearchResult(candidate, plan, dict(passed_over), _best_by_origin(first))
+                return candidate, plan, dict(passed_over), best_error
             passed_over[plan] += 1
         raise RecoveryError(self._failure(len(ranked), passed_over))
 
@@ -267,11 +253,6 @@ class Search:
             self.before_c, self.winding_c, self.near.watch_s, tau, known.motors, known.thermal, known.ambient_c
         )
         return np.concatenate([self.winding_c, housing_c])
-
-
-def _best_by_origin(candidates: list[Candidate]) -> dict[str, float]:
-    origins = dict.fromkeys(candidate.origin for candidate in candidates)
-    return {origin: min(c.error for c in candidates if c.origin == origin) for origin in origins}
 
 
 def holding(twin: Twin, model: ArmModel, q: Array, payload_kg: float) -> Features:
@@ -403,8 +384,7 @@ def recover(
     """
     near = nearby or Nearby()
     model = ArmModel(arm.robot, fixtures)
-    check_hold(model, q, payload_kg)
-    check_hold_time(hold_s, near)
+    check_hold(model, q, payload_kg, hold_s, near)
     try:
         stay = plan_motion(model, np.stack([q]), dwell_s=[hold_s], payload_kg=payload_kg, speed=near.speed, name="hold")
     except InfeasibleJob as error:
@@ -416,21 +396,21 @@ def recover(
     search = Search(
         twin, model, verification, near, np.asarray(q, dtype=float), payload_kg, before_c, now_c, hold_s - near.watch_s
     )
-    result = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
-    recovered = on(result.plan)
+    found, plan, passed_over, best_error = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
+    recovered = on(plan)
     return Recovery(
         arm=arm.robot.name,
         twin_version=twin.version,
         payload_kg=payload_kg,
         q_before=search.q,
-        q_after=result.candidate.q,
-        origin=result.candidate.origin,
+        q_after=found.q,
+        origin=found.origin,
         hottest=search.hottest,
         difficulty_before=holding(twin, model, search.q[None], payload_kg).load[0],
-        difficulty_after=holding(twin, model, result.candidate.q[None], payload_kg).load[0],
-        tool_m=result.candidate.tool_m,
-        passed_over=result.passed_over,
-        best_error=result.best_error,
+        difficulty_after=holding(twin, model, found.q[None], payload_kg).load[0],
+        tool_m=found.tool_m,
+        passed_over=passed_over,
+        best_error=best_error,
         time_s=time_s,
         without_c=_held(stayed, time_s),
         with_c=_held(recovered, time_s),
@@ -444,8 +424,8 @@ def _held(run: Performance, time_s: Array) -> Array:
     return np.stack([np.interp(time_s, since_s, temp_c) for temp_c in run.temp_c.T], axis=1)
 
 
-def check_hold(model: ArmModel, q: Array, payload_kg: float) -> None:
-    """Raise RecoveryError if the payload or the posture is out of range."""
+def check_hold(model: ArmModel, q: Array, payload_kg: float, hold_s: float, near: Nearby) -> None:
+    """Raise RecoveryError if the payload, the posture or the remaining time of a hold is out of range."""
     if not 0 <= payload_kg <= MOST_PAYLOAD_KG:
         raise RecoveryError(f"A Gen3 is rated for a payload of 0 … {MOST_PAYLOAD_KG:g} kg (got {payload_kg:g}).")
     posture = np.asarray(q, dtype=float)
@@ -456,10 +436,6 @@ def check_hold(model: ArmModel, q: Array, payload_kg: float) -> None:
         raise RecoveryError(
             f"Joint {j + 1} turns from {low[j]:.2f} to {high[j]:.2f} rad, so the arm cannot hold at {posture[j]:.2f}."
         )
-
-
-def check_hold_time(hold_s: float, near: Nearby) -> None:
-    """Raise RecoveryError if the remaining time of a hold is out of range."""
     if not hold_s - near.watch_s >= LEAST_REST_S:
         raise RecoveryError(
             f"The arm observes its motors for {near.watch_s:g} s before it moves, so the hold must be longer by "
@@ -475,11 +451,10 @@ def hold_until(
     """True temperatures when the hottest motor reaches `until_c` in a hold from a cold start, °C, [node].
 
     Raises:
-        RecoveryError: it stays cooler, or the hold is out of range.
+        RecoveryError: it stays cooler.
     """
-    model, temp_c = ArmModel(arm.robot), np.full(NODES, float(ambient_c))
-    check_hold(model, q, payload_kg)
-    load = static_drive(model.gravity_torque(q, payload_kg), arm.motors)
+    temp_c = np.full(NODES, float(ambient_c))
+    load = static_drive(ArmModel(arm.robot).gravity_torque(q, payload_kg), arm.motors)
     alike = {"motors": arm.motors, "thermal": arm.thermal, "start_c": temp_c, "ambient_c": ambient_c}
     for temp_c in temperature_steps(repeat(load, round(most_s / TICK_S)), TICK_S, **alike):
         if temp_c[WINDING].max() >= until_c:
@@ -561,19 +536,13 @@ def known_arm(
     return KnownArm(bare_arm(robot, motors, thermal), twin, sources, verification)
 
 
-Format = Literal["parquet", "csv"]
-
-GENERATED = ResultKind(
-    name="generation", card="generated.json", files=("generated.json", "motion_*.parquet", "motion_*.csv")
-)
+GENERATED = ResultKind(name="generation", card="generated.json", files=("generated.json", "motion_*.parquet"))
 """One table per motion, and a card with sources and rejections."""
-RECOVERY = ResultKind(
-    name="recovery", card="recovery.json", files=("recovery.json", "recovery.parquet", "recovery.csv")
-)
+RECOVERY = ResultKind(name="recovery", card="recovery.json", files=("recovery.json", "recovery.parquet"))
 """Temperatures with and without recovery, and a card with the postures."""
 
 
-def save_generated(made: Generated, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
+def save_generated(made: Generated, out: Path, *, overwrite: bool = False) -> None:
     """Write `motion_000` and so on, and `generated.json`.
 
     Raises:
@@ -581,18 +550,22 @@ def save_generated(made: Generated, out: Path, *, format: Format = "parquet", ov
     """
     with new_folder(out, GENERATED, overwrite=overwrite) as folder:
         for i, motion in enumerate(made.motions):
-            _write(motion_table(motion.plan), folder / f"motion_{i:03d}.{format}")
-        _write_card(generated_summary(made, format), folder / GENERATED.card)
+            pq.write_table(motion_table(motion.plan), folder / f"motion_{i:03d}.parquet")
+        _write_card(generated_summary(made), folder / GENERATED.card)
 
 
-def save_recovery(recovery: Recovery, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
-    """Write `recovery.parquet` (or .csv) and `recovery.json`.
+def save_recovery(recovery: Recovery, out: Path, *, overwrite: bool = False) -> None:
+    """Write `recovery.parquet` and `recovery.json`.
 
     Raises:
         FleetError: `out` cannot be written, or holds something that is not ours to replace.
     """
     with new_folder(out, RECOVERY, overwrite=overwrite) as folder:
-        _write(recovery_table(recovery), folder / f"recovery.{format}")
+        temperatures = {
+            **_columns("without", "_c", recovery.without_c),
+            **_columns("with", "_c", recovery.with_c),
+        }
+        pq.write_table(pa.table({"time_s": recovery.time_s, **temperatures}), folder / "recovery.parquet")
         _write_card(recovery_summary(recovery), folder / RECOVERY.card)
 
 
@@ -605,25 +578,19 @@ def motion_table(plan: Plan) -> pa.Table:
             "time_s": np.arange(len(profile)) / RATE_HZ,
             "phase": np.repeat(PHASES, lengths),
             "payload_kg": np.concatenate([phase.payload_kg for phase in plan.phases]),
-            **_by_joint("q", "_rad", profile[:, 0]),
-            **_by_joint("qd", "_rad_s", profile[:, 1]),
-            **_by_joint("tau", "_nm", profile[:, 2]),
+            **_columns("q", "_rad", profile[:, 0]),
+            **_columns("qd", "_rad_s", profile[:, 1]),
+            **_columns("tau", "_nm", profile[:, 2]),
         }
     )
 
 
-def recovery_table(recovery: Recovery) -> pa.Table:
-    """Winding temperatures as one row per moment: time_s, without_1_c …, with_1_c …"""
-    temperatures = {**_by_joint("without", "_c", recovery.without_c), **_by_joint("with", "_c", recovery.with_c)}
-    return pa.table({"time_s": recovery.time_s, **temperatures})
-
-
-def _by_joint(name: str, unit: str, values: Array) -> dict[str, Array]:
+def _columns(name: str, unit: str, values: Array) -> dict[str, Array]:
     """Columns `name_1unit` … of values [row, joint]."""
     return {f"{name}_{j + 1}{unit}": values[:, j] for j in range(JOINTS)}
 
 
-def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, Any]:
+def generated_summary(made: Generated) -> dict[str, Any]:
     """Motions, sources and rejections as plain values."""
     return {
         "status": "finished",
@@ -639,7 +606,7 @@ def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, 
         "rate_hz": RATE_HZ,
         "motions": [
             {
-                "file": f"motion_{i:03d}.{format}",
+                "file": f"motion_{i:03d}.parquet",
                 "source": {
                     "kind": motion.source.work.kind,
                     "places": list(motion.source.work.stations),
@@ -683,13 +650,6 @@ def recovery_summary(recovery: Recovery) -> dict[str, Any]:
         "spared_k": recovery.spared_k,
         "tracking_error_rad": recovery.error_rad,
     }
-
-
-def _write(table: pa.Table, path: Path) -> None:
-    if path.suffix == ".csv":
-        pc.write_csv(table, path)
-    else:
-        pq.write_table(table, path)
 
 
 def _write_card(card: dict[str, Any], path: Path) -> None:

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pyarrow.csv as pc
 import pyarrow.parquet as pq
 import pytest
 
@@ -126,12 +125,6 @@ def test_nonsense_is_refused(subject, asked):
         generate(subject.twin, subject.arm, [replace(subject.jobs[0], work=press)], verification=asked)
 
 
-@pytest.fixture(scope="module")
-def made_files(subject):
-    asked = Verification.nominal(subject.arm.robot, 23.0)
-    return generate(subject.twin, subject.arm, subject.jobs, s=0.5, count=2, verification=asked)
-
-
 @pytest.fixture
 def found():
     time_s = np.arange(0.0, 6.0, 2.0)
@@ -156,15 +149,13 @@ def found():
     )
 
 
-@pytest.mark.parametrize("format", ["parquet", "csv"])
-def test_motion_is_read_back_with_its_units(made_files, tmp_path, format):
-    save_generated(made_files, tmp_path / "out", format=format)
+def test_motion_is_read_back_with_its_units(made, tmp_path):
+    save_generated(made, tmp_path / "out")
     card = json.loads((tmp_path / "out" / "generated.json").read_text(encoding="utf-8"))
-    assert card["handed_out"] == len(card["motions"]) == 2
-    assert card["rejected"] == made_files.rejected
-    for entry, motion in zip(card["motions"], made_files.motions, strict=True):
-        path = tmp_path / "out" / entry["file"]
-        table = pq.read_table(path) if format == "parquet" else pc.read_csv(path)
+    assert card["handed_out"] == len(card["motions"]) == 6
+    assert card["rejected"] == made.rejected
+    for entry, motion in zip(card["motions"], made.motions, strict=True):
+        table = pq.read_table(tmp_path / "out" / entry["file"])
         whole = np.concatenate([phase.profile for phase in motion.plan.phases])
         for channel, pattern in enumerate(("q_{}_rad", "qd_{}_rad_s", "tau_{}_nm")):
             columns = np.stack([table[pattern.format(j + 1)].to_numpy() for j in range(7)], axis=1)
@@ -197,14 +188,14 @@ def test_a_failed_write_leaves_nothing(found, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_only_its_like_is_replaced_and_only_when_asked(found, made_files, tmp_path):
+def test_only_its_like_is_replaced_and_only_when_asked(found, made, tmp_path):
     save_recovery(found, tmp_path / "out")
     with pytest.raises(FleetError, match="holds a finished recovery"):
         save_recovery(found, tmp_path / "out")
     with pytest.raises(FleetError, match="holds other files"):
-        save_generated(made_files, tmp_path / "out", overwrite=True)
-    save_recovery(found, tmp_path / "out", format="csv", overwrite=True)
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["recovery.csv", "recovery.json"]
+        save_generated(made, tmp_path / "out", overwrite=True)
+    save_recovery(replace(found, payload_kg=2.0), tmp_path / "out", overwrite=True)
+    assert json.loads((tmp_path / "out" / "recovery.json").read_text(encoding="utf-8"))["payload_kg"] == 2.0
 
 
 ROBOT = Robot(name="arm", tool_kg=0.9)

@@ -18,7 +18,6 @@ from fleet.heat.thermal import (
     drive_heat,
     gen3_network,
     simulate_temperatures,
-    steady_state,
     thermal_model,
 )
 from fleet.job import Fixture
@@ -166,14 +165,6 @@ def simulated(start_c, tau, motors, thermal, seconds):
     drive = static_drive(tau, motors)
     done = simulate_temperatures(drive, [seconds], motors=motors, thermal=thermal, start_c=start_c, ambient_c=23.0)
     return done.end_c[0, WINDING]
-
-
-def test_a_long_hold_ends_where_it_settles():
-    tau = np.array([0.0, -30.0, 0.0, 15.0, 0.0, 5.0, 0.0])
-    temps = simulated(np.full(14, 23.0), tau, MOTORS, THERMAL, 40 * 3600.0)
-    end_c = steady_state(THERMAL, reference_current(tau, np.zeros(7), MOTORS) ** 2, np.zeros(7), MOTORS, 23.0)
-    assert end_c is not None
-    np.testing.assert_allclose(temps, end_c[WINDING], atol=0.05)
 
 
 def held(temp_c, tau, seconds):
