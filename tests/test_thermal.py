@@ -1,13 +1,9 @@
 """Motor and thermal network against closed forms, independent solvers, published figures and their own symmetries."""
 
 from dataclasses import replace
-
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
 from itertools import pairwise, repeat
 from pathlib import Path
 
-import mujoco
 import networkx as nx
 import numpy as np
 import pytest
@@ -71,47 +67,21 @@ def test_holding_current_of_joint_2_as_published(tau_nm, amps):
     assert held[1] == pytest.approx(amps, abs=0.01)
 
 
-def test_moving_a_load_against_friction_by_hand():
-    # Joint 1: (20/0.93 + 4.4·tanh(50) + 2.2·1.0) / 11 A, and 4.4 W + 2.2 W of friction at 1 rad/s.
-    speed = np.ones(JOINTS)
-    assert reference_current(np.full(JOINTS, 20.0), speed, MOTORS)[0] == pytest.approx((20 / 0.93 + 6.6) / 11)
-    assert friction_heat(speed, MOTORS)[0] == pytest.approx(6.6)
-    assert friction_heat(speed, MOTORS)[6] == pytest.approx(1.3 + 0.9)
-
-
-def test_no_friction_at_rest():
-    np.testing.assert_array_equal(friction_torque(REST, MOTORS), REST)
-
-
-@given(speeds)
-def test_friction_is_odd_and_its_heat_never_negative(qd):
-    speed = np.full(JOINTS, qd)
-    np.testing.assert_allclose(friction_torque(-speed, MOTORS), -friction_torque(speed, MOTORS))
-    assert np.all(friction_heat(speed, MOTORS) >= 0)
-
-
-@given(torques, speeds, temperatures)
-def test_current_turns_sign_with_torque_and_speed(tau, qd, housing_c):
-    load, speed, warm = np.full(JOINTS, tau), np.full(JOINTS, qd), np.full(JOINTS, housing_c)
-    np.testing.assert_allclose(current(-load, -speed, warm, MOTORS), -current(load, speed, warm, MOTORS))
-
-
-@given(temperatures, st.floats(0.1, 50.0))
-def test_hotter_magnets_need_more_current(housing_c, by_k):
-    load, warm = np.full(JOINTS, 30.0), np.full(JOINTS, housing_c)
-    assert np.all(current(load, REST, warm + by_k, MOTORS) > current(load, REST, warm, MOTORS))
-
-
-def test_magnets_lose_one_percent_in_nine_kelvin():
-    # -0.11 %/K, the usual figure for neodymium.
-    np.testing.assert_allclose(magnet_factor(np.full(JOINTS, 25.0 + 1 / 0.11), MOTORS), 0.99, rtol=1e-12)
-
-
-def test_copper_resistance_rises_39_percent_in_100_kelvin():
-    amps_sq = np.full(JOINTS, 4.0)
-    hot, cold = (copper_loss(amps_sq, np.full(JOINTS, c), MOTORS) for c in (125.0, 25.0))
-    np.testing.assert_allclose(cold, [1.64] * 4 + [1.36] * 3)
-    np.testing.assert_allclose(hot / cold, 1.393)
+@given(torques, speeds, temperatures, temperatures)
+def test_current_and_heat_are_those_of_the_law_written_out(tau, qd, housing_c, winding_c):
+    """Joint 1 with the numbers of the data file; magnets lose 0.11 %/K, copper gains 39.3 % in 100 K."""
+    friction_nm = 4.4 * np.tanh(qd / 0.02) + 2.2 * qd
+    amps = (tau / 0.93 + friction_nm) / 11.0
+    warm = 1.0 - 0.0011 * (housing_c - 25.0)
+    load, speed, c = (np.full(JOINTS, value) for value in (tau, qd, housing_c))
+    assert friction_torque(speed, MOTORS)[0] == pytest.approx(friction_nm)
+    assert friction_heat(speed, MOTORS)[0] == pytest.approx(friction_nm * qd)
+    assert reference_current(load, speed, MOTORS)[0] == pytest.approx(amps)
+    assert magnet_factor(c, MOTORS)[0] == pytest.approx(warm)
+    assert current(load, speed, c, MOTORS)[0] == pytest.approx(amps / warm)
+    heat_w = copper_loss(np.full(JOINTS, amps**2), np.full(JOINTS, winding_c), MOTORS)
+    assert heat_w[0] == pytest.approx(0.41 * (1.0 + 0.00393 * (winding_c - 25.0)) * amps**2)
+    assert heat_w[6] == pytest.approx(0.34 / 0.41 * heat_w[0])
 
 
 @given(st.floats(0.01, 2.0), st.floats(0.001, 2.0))
@@ -152,7 +122,6 @@ MODEL = thermal_model(gen3_network())
 J2, J4 = 1, 3
 heats = arrays(float, NODES, elements=st.floats(0.0, 60.0))
 states = arrays(float, NODES, elements=st.floats(10.0, 90.0))
-lengths = st.floats(0.01, 5000.0)
 
 
 def holding(tau2_nm: float, tau4_nm: float, tau6_nm: float = 1.0) -> np.ndarray:
@@ -236,33 +205,9 @@ def test_published_settling_temperature_of_the_rated_continuous_payload():
 # The step ------------------------------------------------------------------------------------------------------------
 
 
-@given(states, heats, lengths, lengths)
-def test_two_steps_equal_one_long_step(start_c, heat_w, a_s, b_s):
-    twice = MODEL.step(MODEL.step(start_c, heat_w, 22.0, a_s), heat_w, 22.0, b_s)
-    np.testing.assert_allclose(twice, MODEL.step(start_c, heat_w, 22.0, a_s + b_s), atol=1e-9)
-
-
-@given(states, heats, heats, lengths)
-def test_more_loss_is_never_cooler(start_c, heat_w, more_w, dt_s):
-    cooler = MODEL.step(start_c, heat_w, 22.0, dt_s)
-    assert np.all(MODEL.step(start_c, heat_w + more_w, 22.0, dt_s) >= cooler - 1e-9)
-
-
-@given(states, heats, arrays(float, NODES, elements=st.floats(0.0, 20.0)), lengths)
-def test_a_hotter_start_is_never_cooler_later(start_c, heat_w, hotter_k, dt_s):
-    cooler = MODEL.step(start_c, heat_w, 22.0, dt_s)
-    assert np.all(MODEL.step(start_c + hotter_k, heat_w, 22.0, dt_s) >= cooler - 1e-9)
-
-
-@given(states, st.floats(-20.0, 40.0), lengths)
-def test_without_heat_everything_stays_between_its_extremes(start_c, ambient_c, dt_s):
-    end = MODEL.step(start_c, np.zeros(NODES), ambient_c, dt_s)
-    assert end.min() >= min(start_c.min(), ambient_c) - 1e-9
-    assert end.max() <= max(start_c.max(), ambient_c) + 1e-9
-
-
-@given(states, heats, st.floats(0.1, 5000.0))
+@given(states, heats, st.floats(0.0, 5000.0))
 def test_a_step_is_the_matrix_exponential(start_c, heat_w, dt_s):
+    """So steps can be divided, and more heat or a hotter start is never cooler."""
     flow = -MODEL.laplacian / MODEL.capacity[:, None]
     load = (heat_w + MODEL.to_ambient * 22.0) / MODEL.capacity
     augmented = np.zeros((NODES + 1, NODES + 1))
@@ -271,25 +216,10 @@ def test_a_step_is_the_matrix_exponential(start_c, heat_w, dt_s):
     np.testing.assert_allclose(MODEL.step(start_c, heat_w, 22.0, dt_s), expected, atol=1e-7)
 
 
-def test_zero_time_changes_nothing():
-    start_c = np.linspace(20.0, 60.0, NODES)
-    np.testing.assert_allclose(MODEL.step(start_c, np.ones(NODES), 22.0, 0.0), start_c, atol=1e-12)
-
-
 def test_steps_of_tiny_length_keep_their_precision():
     heat_w = np.full(NODES, 10.0)
     rise = MODEL.step(np.full(NODES, 22.0), heat_w, 22.0, 1e-6) - 22.0
     np.testing.assert_allclose(rise, heat_w / MODEL.capacity * 1e-6, rtol=1e-4)
-
-
-def test_heat_in_is_heat_stored_plus_heat_to_ambient():
-    # Sum of C·T' over the nodes: heat flows between nodes cancel, only ambient takes any away.
-    start_c, heat_w, dt_s = np.linspace(25.0, 55.0, NODES), np.linspace(1.0, 14.0, NODES), 900.0
-    fine_s = np.linspace(0.0, dt_s, 2001)
-    path = np.array([MODEL.step(start_c, heat_w, 22.0, t) for t in fine_s])
-    to_ambient_j = np.trapezoid((path - 22.0) @ MODEL.to_ambient, fine_s)
-    stored_j = MODEL.capacity @ (path[-1] - start_c)
-    assert stored_j + to_ambient_j == pytest.approx(heat_w.sum() * dt_s, rel=1e-6)
 
 
 # Settled temperatures ------------------------------------------------------------------------------------------------
@@ -320,16 +250,6 @@ def test_steady_state_balances_the_heat_of_every_node():
     found = MODEL.steady(node_heat(winding_w, housing_w), 22.0)
     np.testing.assert_allclose(found[WINDING], [expected[winding(j)] for j in range(JOINTS)], rtol=1e-10)
     np.testing.assert_allclose(found[HOUSING], [expected[housing(j)] for j in range(JOINTS)], rtol=1e-10)
-
-
-def test_one_joint_alone_is_two_resistors_in_series():
-    graph = gen3_network()
-    for j in range(JOINTS - 1):
-        graph.remove_edge(housing(j), housing(j + 1))
-    heat_w = node_heat(np.full(JOINTS, 10.0), np.full(JOINTS, 3.0))
-    found = thermal_model(graph).steady(heat_w, 22.0)
-    assert found[J2] == pytest.approx(22.0 + 13 * 3.25 + 10 * 2.5)
-    assert found[J2 + JOINTS] == pytest.approx(22.0 + 13 * 3.25)
 
 
 def test_a_long_step_ends_in_the_steady_state():
@@ -384,11 +304,6 @@ def test_friction_and_idle_heat_enter_the_housings():
     np.testing.assert_allclose(end, MODEL.steady(node_heat(REST, MOTORS.idle_w + friction_w), 22.0))
 
 
-def test_powered_off_arm_cools_to_the_room():
-    end = MODEL.step(np.full(NODES, 70.0), np.zeros(NODES), 22.0, 6 * 3600.0)
-    np.testing.assert_allclose(end, 22.0, atol=0.05)
-
-
 # Second methods and step size ----------------------------------------------------------------------------------------
 
 
@@ -424,33 +339,6 @@ def test_refreshing_heat_every_10_s_costs_less_than_a_twentieth_kelvin():
         error[dt_s] = np.max(np.abs(coarse - fine[:: round(dt_s / 0.1)]))
     assert error[10.0] <= 0.05
     assert error[5.0] == pytest.approx(error[10.0] / 2, rel=0.1)  # First order in the step.
-
-
-def test_one_winding_heats_as_in_mujoco():
-    # Same copper, same holding current: a locked MuJoCo motor, its voltage set so that the torque stays, against a
-    # network whose housings are tied to ambient.
-    ambient_c, amps, minutes, dt_s = 35.0, 4.5, 10, 0.05
-    kt = 0.11
-    plant = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="{dt_s}"/><worldbody><body>
-        <joint name="j" type="hinge" axis="0 0 1" limited="true" range="-0.001 0.001"/><geom size="0.1" mass="1000"/>
-        </body></worldbody><actuator><dcmotor joint="j" motorconst="{kt}" resistance="0.41"
-        thermal="2.5 66 0 0.00393 25 {ambient_c}"/></actuator></mujoco>"""
-    )
-    data = mujoco.MjData(plant)
-    data.ctrl[0] = amps * 0.41
-    for _ in range(round(60 * minutes / dt_s)):
-        mujoco.mj_step(plant, data)
-        data.ctrl[0] *= amps * kt / data.actuator_force[0]
-    graph = gen3_network()
-    for j in range(JOINTS):
-        graph.edges[housing(j), "ambient"]["conductance_w_per_k"] = 1e9
-    model = thermal_model(graph)
-    # The magnets of MuJoCo's motor keep their strength, so ours get the current that the warm ones need.
-    current_sq = np.full(JOINTS, (amps * (1 - 0.0011 * (ambient_c - 25.0))) ** 2)
-    ours = history(current_sq, np.full(NODES, ambient_c), minutes=minutes, dt_s=0.5, ambient_c=ambient_c, model=model)
-    assert data.act[0] > 20.0
-    assert ours[-1, J2] - ambient_c == pytest.approx(data.act[0], abs=0.01)
 
 
 def test_better_cooling_is_cooler():

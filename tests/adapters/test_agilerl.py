@@ -5,8 +5,16 @@ import random
 import numpy as np
 import pytest
 
+from tests.adapters.training import (  # noqa: F401 -- the tests of every trainer
+    Parameters,
+    test_a_seed_repeats_the_training_and_another_does_not,
+    test_it_trains_and_sends_no_illegal_action,
+    test_the_hash_seed_changes_nothing,
+)
+
 pytestmark = [pytest.mark.adapter, pytest.mark.filterwarnings("default")]
-Parameters = dict[str, np.ndarray]
+CHANGED_SHARE = 0.5
+"""Of the parameters; some actors of a group learn nothing in a short training."""
 
 
 def parameters(agent) -> Parameters:
@@ -53,27 +61,6 @@ def session(request, small_workshop):
     """A training, what it left, and what reached the environments."""
     workshop = small_workshop()
     return workshop.log, *trained(workshop, 0, *request.param)
-
-
-def test_it_trains_and_sends_no_illegal_action(session) -> None:
-    log, before, after = session
-    assert log.steps >= 120
-    assert log.claims > 50
-    assert log.illegal == 0
-    assert all(np.isfinite(value).all() for value in after.values())
-    assert sum((before[name] != after[name]).any() for name in before) > len(before) / 2
-    assert log.orders == {("arm_0", "arm_1", "arm_2")}
-
-
-def test_a_seed_repeats_the_training_and_another_does_not(small_workshop) -> None:
-    (before, after), again, other = (trained(small_workshop(), seed) for seed in (0, 0, 1))
-    for name in before:
-        np.testing.assert_array_equal(again[1][name], after[name])
-    assert any((other[1][name] != after[name]).any() for name in before)
-
-
-def test_the_hash_seed_changes_nothing(elsewhere) -> None:
-    assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
 
 
 @pytest.mark.parametrize("masks", ["list", "array"])

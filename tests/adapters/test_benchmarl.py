@@ -7,6 +7,14 @@ import numpy as np
 import pytest
 from pettingzoo.utils import BaseParallelWrapper
 
+from tests.adapters.training import (  # noqa: F401 -- the tests of every trainer
+    Parameters,
+    parameters,
+    test_a_seed_repeats_the_training_and_another_does_not,
+    test_it_trains_and_sends_no_illegal_action,
+    test_the_hash_seed_changes_nothing,
+)
+
 pytestmark = [
     pytest.mark.adapter,
     pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested using"),
@@ -14,12 +22,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:size_average and reduce args will be deprecated"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
 ]
-
-Parameters = dict[str, np.ndarray]
-
-
-def parameters(module) -> Parameters:
-    return {name: value.detach().numpy().copy() for name, value in module.named_parameters()}
 
 
 def trained(workshop, seed: int, algorithm: str = "Mappo") -> tuple[Parameters, Parameters]:
@@ -59,27 +61,6 @@ def session(request, small_workshop):
     """A training, what it left, and what reached the environments."""
     workshop = small_workshop()
     return workshop.log, *trained(workshop, 0, request.param)
-
-
-def test_it_trains_and_sends_no_illegal_action(session) -> None:
-    log, before, after = session
-    assert log.steps >= 120
-    assert log.claims > 50
-    assert log.illegal == 0
-    assert all(np.isfinite(value).all() for value in after.values())
-    assert all((before[name] != after[name]).any() for name in before)
-    assert log.orders == {("arm_0", "arm_1", "arm_2")}
-
-
-def test_a_seed_repeats_the_training_and_another_does_not(small_workshop) -> None:
-    (before, after), again, other = (trained(small_workshop(), seed) for seed in (0, 0, 1))
-    for name in before:
-        np.testing.assert_array_equal(again[1][name], after[name])
-    assert any((other[1][name] != after[name]).any() for name in before)
-
-
-def test_the_hash_seed_changes_nothing(elsewhere) -> None:
-    assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
 
 
 def test_a_rollout_is_the_episode_of_the_environment(small_workshop, by_hand, ending) -> None:

@@ -58,17 +58,6 @@ def test_the_dispatcher_is_the_environment_itself(small_workshop, alone, shift) 
     assert (terminated, truncated) == (shift is BRIEF, shift is not BRIEF)
 
 
-def test_samples_under_the_mask_of_the_infos_are_legal(small_workshop) -> None:
-    workshop = small_workshop(ticks=60, jobs=30)
-    env = DispatcherEnv(workshop())
-    _, info = env.reset(seed=0)
-    env.action_space.seed(0)
-    for _ in range(60):
-        _, _, _, _, info = env.step(env.action_space.sample(mask=info["action_mask"]))
-    assert (workshop.log.steps, workshop.log.illegal) == (60, 0)
-    assert workshop.log.claims > 20
-
-
 @pytest.mark.parametrize("action", [0, [0, 0], np.zeros((3, 1), int)], ids=str)
 def test_an_action_of_another_shape_says_what_is_wanted(alone, action) -> None:
     env = alone()
@@ -127,16 +116,6 @@ def test_what_it_cannot_take_is_refused(small, small_batch, small_workshop) -> N
 def test_nothing_is_legal_before_a_reset(many) -> None:
     with pytest.raises(RuntimeError, match=r"Call reset\(\) before legal_sample\(\)"):
         many().legal_sample()
-
-
-def test_reward_terms_sum_to_the_reward(many) -> None:
-    vector = many(4, jobs=40, ticks=60)
-    vector.reset(seed=1)
-    for _ in range(60):
-        _, reward, _, _, info = vector.step(vector.legal_sample())
-        terms = sum(values for name, values in info.items() if name.startswith("reward_"))
-        np.testing.assert_allclose(terms, reward, rtol=1e-9, atol=1e-12)
-    assert reward.any()
 
 
 def test_gymnasium_counts_the_episodes(many) -> None:

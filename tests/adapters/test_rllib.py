@@ -6,6 +6,13 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from tests.adapters.training import (  # noqa: F401 -- the tests of every trainer
+    Parameters,
+    test_a_seed_repeats_the_training_and_another_does_not,
+    test_it_trains_and_sends_no_illegal_action,
+    test_the_hash_seed_changes_nothing,
+)
+
 pytestmark = [
     pytest.mark.adapter,
     # Its vectors of environments are closed twice and complain in __del__.
@@ -13,8 +20,6 @@ pytestmark = [
     # It registers its one Gymnasium id anew for every algorithm.
     pytest.mark.filterwarnings("ignore:.*Overriding environment rllib-multi-agent-env-v0"),
 ]
-
-Parameters = dict[str, np.ndarray]
 
 
 def parameters(algo) -> Parameters:
@@ -68,28 +73,6 @@ def session(small_workshop):
     """A training, what it left, and what reached the environments."""
     workshop = small_workshop()
     return workshop.log, *trained(workshop, seed=0)
-
-
-def test_it_trains_and_sends_no_illegal_action(session) -> None:
-    log, before, after = session
-    assert log.steps == 120
-    assert log.claims > 50
-    assert log.illegal == 0
-    assert all(np.isfinite(value).all() for value in after.values())
-    assert all((before[name] != after[name]).any() for name in before)
-    assert log.orders == {("arm_0", "arm_1", "arm_2")}
-
-
-def test_a_seed_repeats_the_training_and_another_does_not(session, small_workshop) -> None:
-    _, before, after = session
-    again, other = trained(small_workshop(), seed=0), trained(small_workshop(), seed=1)
-    for name in before:
-        np.testing.assert_array_equal(again[1][name], after[name])
-    assert any((other[1][name] != after[name]).any() for name in before)
-
-
-def test_the_hash_seed_changes_nothing(elsewhere) -> None:
-    assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
 
 
 def test_an_episode_ends_as_the_environment_says(small_workshop, ending) -> None:

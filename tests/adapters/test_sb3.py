@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from tests.adapters.training import parameters, test_the_hash_seed_changes_nothing  # noqa: F401
+
 pytestmark = pytest.mark.adapter
 ARMS, ENVS, TICKS = 3, 4, 15
 BRIEF = {"jobs": 1, "ambient_c": 20.0, "ticks": 30}
@@ -52,10 +54,6 @@ def trained(workshop, seed: int, *, observation: str = "vector", algo: str = "Ma
     return before, parameters(agent.policy)
 
 
-def parameters(module) -> dict[str, np.ndarray]:
-    return {name: value.detach().numpy().copy() for name, value in module.state_dict().items()}
-
-
 @pytest.fixture(scope="module", params=["vector", "dict"])
 def session(request, small_workshop):
     """A training, what it left, and what reached the batch."""
@@ -87,10 +85,6 @@ def test_a_seed_repeats_the_training_and_another_does_not(session, small_worksho
     for name in after:
         np.testing.assert_array_equal(again[name], after[name])
     assert any((other[name] != after[name]).any() for name in after)
-
-
-def test_the_hash_seed_changes_nothing(elsewhere) -> None:
-    assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
 
 
 def test_ppo_without_masks_trains_and_its_illegal_actions_are_counted(small_workshop) -> None:

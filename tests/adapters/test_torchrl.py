@@ -52,14 +52,6 @@ def test_torchrl_finds_the_specs_kept(make, envs, switches) -> None:
     check_env_specs(make(envs, **switches), break_when_any_done=False)
 
 
-def test_what_it_tells_lies_in_its_specs(make) -> None:
-    env = make(4, state=True, infos=True)
-    frames = rolled(env, 40)
-    for at in range(40):
-        assert env.observation_spec.is_in(frames[:, at].select(*env.observation_spec.keys(True, True)))
-        assert env.observation_spec.is_in(frames["next"][:, at].select(*env.observation_spec.keys(True, True)))
-
-
 @pytest.mark.parametrize("shift", [{"hard_due": 0.0}, BRIEF], ids=["cut", "brief"])
 def test_a_rollout_is_the_batch_stepped_by_hand(make, shift) -> None:
     """The second way: a batch that begins new shifts by itself, given the same claims."""
@@ -256,12 +248,9 @@ def test_a_collector_with_a_masked_policy_sends_no_illegal_action(make, compact)
     assert not same(batches[0], batches[1])
 
 
-def test_it_is_said_which_arms_are_in_the_group(make) -> None:
-    assert make().group_map == {"arms": ["arm_0", "arm_1", "arm_2"]}
-
-
-def test_it_closes_once(make) -> None:
+def test_all_arms_are_one_group_and_it_closes_once(make) -> None:
     env = make()
+    assert env.group_map == {"arms": ["arm_0", "arm_1", "arm_2"]}
     env.close()
     assert env.is_closed
 

@@ -1,11 +1,9 @@
 """Shifts played with given actions."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from fleet.engine.shift import Stepped, step
-from fleet.engine.state import World, initial
+from fleet.engine.state import initial
 from fleet.events import Event
 
 DT_S = 10.0
@@ -22,11 +20,6 @@ def play(world, plant, actions, log=None, state=None) -> list[Stepped]:
         steps.append(step(world, state, chosen, plant, log))
         state = steps[-1].state
     return steps
-
-
-def with_random_difficulty(world: World, rng: np.random.Generator) -> World:
-    """Return the world with other difficulties, which decide between claims."""
-    return replace(world, offers=replace(world.offers, difficulty=rng.random(world.offers.difficulty.shape)))
 
 
 def times(log: list[Event], kind: str) -> list[float]:

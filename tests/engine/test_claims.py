@@ -109,7 +109,10 @@ def test_awards_equal_the_reference(small, data) -> None:
                     clear = may and not any(touches(a, j, option, other) for other in away)
                     assert mask[0, a, 1 + 2 * slot + option] == clear
         won, lost, illegal = referee(slot_job[0], mask[0], stations, actions, difficulty, busy, touches, away)
+        before = state.copy()
         after = step(world, state, actions[None], plant, compiled=False).state
+        for name, values in before._asdict().items():
+            np.testing.assert_array_equal(getattr(state, name), values, err_msg=f"{name} of the state before")
         assert (after.illegal - state.illegal)[0].tolist() == illegal
         assert (after.last_award[0] == -1).tolist() == lost
         assert (after.last_award[0] == 1).tolist() == [job != -1 for job in won]

@@ -148,31 +148,6 @@ def test_recovery_waits_for_every_motor_and_the_clearing_time(small, power_off) 
     assert lost == pytest.approx(recover.time_s - fault.time_s, abs=1e-6)
 
 
-def test_an_arm_switched_off_cools_faster(small) -> None:
-    ends = {}
-    for off in (True, False):
-        world, plant = hot_shop(small, limits=ThermalLimits(power_off_on_fault=off), ticks=80)
-        log: list[Event] = []
-        steps = work_on(world, plant, log)
-        last = steps[int(one(log, "fault").time_s // DT_S) + 5]
-        assert last.state.mode[0, 0] == FAULTED
-        ends[off] = last.state.temp_c[0, 0]
-    # Both had the same heat up to the fault; the difference is the idle heat only.
-    assert (ends[True] < ends[False]).all()
-
-
-def test_a_faulted_arm_may_only_wait(small) -> None:
-    world, plant = hot_shop(small, arms=2, ticks=200)
-    count = 0
-    for s in work_on(world, plant, []):
-        faulted = s.state.mode[0] == FAULTED
-        mask = open_jobs(world, s.state)[1][0]
-        count += faulted.sum()
-        assert (mask[:, 0] == 1).all()
-        assert not mask[faulted, 1:].any()
-    assert count > 10
-
-
 def test_a_returned_job_keeps_its_complete_cycles(small) -> None:
     world, plant = hot_shop(small, repetitions=22, limits=ThermalLimits(restart_c=28.0), ticks=1200)
     log: list[Event] = []

@@ -1,8 +1,5 @@
 """One step of a shift: moments of events, heat, and what is conserved, whatever the actions."""
 
-import math
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,14 +7,13 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from fleet.engine.shift import open_jobs, step
-from fleet.engine.state import DONE, GIVEN_UP, RUNNING, WAITING, State, World, initial
+from fleet.engine.state import World, initial
 from fleet.events import Event
 from fleet.heat.motor import gen3_motors, thermal_data
 from fleet.heat.thermal import WINDING, gen3_network, thermal_model
 from fleet.robot import JOINTS, ThermalLimits
-from fleet.telemetry import FAULTED, IDLE, WORKING
-from tests.engine.play import DT_S, play, times, with_random_difficulty
+from fleet.telemetry import IDLE
+from tests.engine.play import DT_S, play, times
 from tests.profiles import examples
 
 
@@ -56,7 +52,8 @@ def test_an_arm_that_is_home_at_the_end_of_a_step_is_free_in_the_next(small) -> 
     assert play(world, plant, [[1]])[0].state.mode[0, 0] == IDLE
 
 
-def test_a_job_waits_for_its_release_and_its_predecessors(small) -> None:
+def test_a_release_is_an_event_at_its_time(small) -> None:
+    """Also of a job that still waits for another."""
     first, second = small.work("bench"), small.work("rack")
     jobs = [
         small.job("late", second, release_s=31.0),
@@ -65,211 +62,8 @@ def test_a_job_waits_for_its_release_and_its_predecessors(small) -> None:
     ]
     world, plant = small.shop([jobs], ticks=12)
     log: list[Event] = []
-    state = initial(world)
-    offered: list[set[str]] = []
-    for _ in range(world.ticks):
-        now = open_jobs(world, state)[0][0]
-        offered.append({world.jobs.names[0][j] for j in now.tolist() if j >= 0})
-        claim = now.tolist().index(2) + 1 if 2 in now.tolist() else 0
-        state = step(world, state, np.array([[claim, 0]]), plant, log).state
-    # first: 3 s approach and three cycles of 10 s; ticks begin every 10 s.
-    assert [("late" in o, "next" in o, "first" in o) for o in offered[:6]] == [
-        (False, False, True),
-        (False, False, False),
-        (False, False, False),
-        (False, False, False),
-        (True, True, False),
-        (True, True, False),
-    ]
-    assert times(log, "finish") == [33.0]
+    play(world, plant, [], log)
     assert sorted((e.job, e.time_s) for e in log if e.kind == "release") == [("first", 0), ("late", 31), ("next", 0)]
-
-
-def test_arms_stay_idle_in_a_shift_without_jobs(small) -> None:
-    content = small.work()
-    world, plant = small.shop([[]], arms=[small.arm(0, [content]), small.arm(1, [content])], ticks=30)
-    last = play(world, plant, [[1, 2]])[-1].state
-    assert (last.mode == IDLE).all()
-    assert (last.busy_s == 0).all()
-    assert last.illegal.tolist() == [[1, 1]]
-
-
-# Rows and arms
-
-
-@pytest.mark.parametrize("envs", [2, 5])
-def test_a_row_does_not_depend_on_the_number_of_rows(small, envs) -> None:
-    works = [small.work(p, kg) for p in ("bench", "rack") for kg in (small.LIGHT, small.HOT)]
-    shifts = [
-        [small.job(f"j{i}", works[(i + e) % 4], repetitions=50 + i, release_s=20.0 * i) for i in range(3 + e)]
-        for e in range(envs)
-    ]
-    arms = [small.arm(i, works) for i in range(3)]
-    together, plant = small.shop(shifts, arms=arms, ticks=120)
-    rng = np.random.default_rng(3)
-    actions = rng.integers(0, 5, (120, envs, 3))
-    together = with_random_difficulty(together, rng)
-    many = initial(together)
-    ones = []
-    for e, jobs in enumerate(shifts):
-        world, own = small.shop([jobs], arms=arms, ticks=120)
-        difficulty = together.offers.difficulty[e : e + 1, :, : len(jobs)]
-        ones.append((replace(world, offers=replace(world.offers, difficulty=difficulty)), own))
-    states = [initial(world) for world, _ in ones]
-    for tick in range(120):
-        many = step(together, many, actions[tick], plant).state
-        for e, (world, own) in enumerate(ones):
-            states[e] = step(world, states[e], actions[tick, e : e + 1], own).state
-    assert many.faults.sum() > 0
-    for e, state in enumerate(states):
-        for name in State._fields:
-            if name == "plan":
-                continue  # rows of other tables
-            row, one = getattr(many, name)[e], getattr(state, name)[0]
-            np.testing.assert_array_equal(row[: len(one)] if one.shape else row, one, err_msg=name)
-
-
-def test_relabelling_the_arms_relabels_the_shift(small) -> None:
-    works = [small.work(p, kg) for p in ("bench", "rack", "press") for kg in (small.LIGHT, small.HOT)]
-    jobs = [small.job(f"j{i}", works[i], repetitions=20) for i in range(6)]
-    # Two different motors, so that the arms differ.
-    kinds = [small.arm(i, works, times=small.Times(3, 8 + i, 2)) for i in range(3)]
-    order = [2, 0, 1]
-    straight, plant = small.shop([jobs], arms=kinds)
-    turned, turned_plant = small.shop([jobs], arms=[kinds[i] for i in order])
-    rng = np.random.default_rng(8)
-    straight = with_random_difficulty(straight, rng)
-    turned = replace(turned, offers=replace(turned.offers, difficulty=straight.offers.difficulty[:, order]))
-    one, other = initial(straight), initial(turned)
-    for _ in range(straight.ticks):
-        actions = rng.integers(0, 5, (1, 3))
-        one = step(straight, one, actions, plant).state
-        other = step(turned, other, actions[:, order], turned_plant).state
-    assert one.faults.sum() > 0
-    for name in State._fields:
-        mine, theirs = getattr(one, name), getattr(other, name)
-        if name in ("plan", "failed_arm"):
-            continue  # rows and arms by other numbers
-        per_arm = mine.shape[:2] == (1, 3) and name not in ("status", "queued_s", "cycles", "returns", "finished_s")
-        np.testing.assert_allclose(mine[:, order] if per_arm else mine, theirs, rtol=1e-12, err_msg=name)
-
-
-@st.composite
-def shifts(draw):
-    """Draw a small shift, and a seed for legal and illegal actions."""
-    arms, jobs = draw(st.integers(1, 3)), draw(st.integers(0, 6))
-    rows = [
-        (
-            draw(st.sampled_from(["bench", "rack", "press"])),
-            draw(st.sampled_from([0.0, 4.0, 8.0, 10.0])),
-            draw(st.integers(1, 12)),
-            draw(st.sampled_from([0.0, 5.0, 50.0, 1e4])),
-            draw(st.booleans()) and i > 0,
-        )
-        for i in range(jobs)
-    ]
-    ticks = draw(st.integers(1, 60))
-    actions = draw(st.integers(0, 2**32 - 1))
-    narrow = draw(st.booleans())
-    crowded = draw(st.sampled_from([0.0, 0.3, 0.9]))
-    return arms, rows, ticks, actions, narrow, crowded
-
-
-@examples(60)
-@given(shifts())
-def test_jobs_and_time_are_conserved(small, shift) -> None:
-    arms, rows, ticks, seed, narrow, crowded = shift
-    works = [small.work(place, payload) for place, payload, *_ in rows]
-    jobs = [
-        small.job(f"j{i}", works[i], repetitions=n, release_s=release, due_s=2e4, after=(f"j{i - 1}",) if after else ())
-        for i, (_, _, n, release, after) in enumerate(rows)
-    ]
-    near = ThermalLimits(warning_c=40.0, error_c=42.0, restart_c=39.9, clear_s=7.0, power_off_on_fault=False)
-    fleet = [small.arm(i, dict.fromkeys(works) or [small.work()], times=small.Times(3, 7 + i, 2)) for i in range(arms)]
-    world, plant = small.shop(
-        [jobs], arms=fleet, ticks=ticks, slots=3, ambient_c=30.0, limits=near if narrow else ThermalLimits()
-    )
-    rng = np.random.default_rng(seed)
-    world = with_random_difficulty(world, rng)
-    conflicts = np.triu(rng.random((len(world.plans.volume),) * 2) < crowded, 1)
-    conflicts |= conflicts.T
-    world = replace(world, plans=replace(world.plans, volume=np.arange(len(conflicts))), conflicts=conflicts)
-    log: list[Event] = []
-    state = initial(world)
-    for tick in range(ticks):
-        actions = rng.choice([-7, 0, 1, 1, 2, 3, 4, 99], size=(1, arms))
-        before = state.copy()
-        _, mask = open_jobs(world, state)
-        after = step(world, state, actions, plant, log).state
-        for name, value in before._asdict().items():
-            np.testing.assert_array_equal(getattr(state, name), value, err_msg=f"{name} of the state before")
-        inside = (actions >= 0) & (actions <= 4)
-        chosen = np.take_along_axis(mask, np.where(inside, actions, 0)[..., None], axis=2)[..., 0]
-        allowed = inside & (chosen == 1)
-        np.testing.assert_array_equal(after.illegal - state.illegal, ~allowed)
-        state = after
-        table, time_s = world.jobs, (tick + 1) * DT_S
-        assert np.isin(state.status, [WAITING, RUNNING, DONE, GIVEN_UP]).all()
-        assert (state.cycles <= table.repetitions).all()
-        assert (state.cycles >= 0).all()
-        held = [j for j in state.job[0].tolist() if j >= 0]
-        running = np.flatnonzero(state.status[0] == RUNNING).tolist()
-        assert len(held) == len(set(held))
-        assert set(running) <= set(held)
-        given_back = {e.job for e in log if e.kind == "give_back"}
-        assert all(state.status[0, j] in (RUNNING, DONE) or f"j{j}" in given_back for j in held)
-        assert (state.mode[0][state.job[0] >= 0] == WORKING).all()
-        assert (state.plan[0][state.mode[0] == WORKING] >= 0).all()
-        assert (state.plan[0][state.mode[0] == IDLE] < 0).all()
-        places = [p for j in held for p in table.stations[0, j].tolist() if p >= 0]
-        assert len(places) == len(set(places)), "two arms at one station"
-        away = state.plan[0][state.plan[0] >= 0]
-        assert not conflicts[np.ix_(away, away)].any(), "two arms whose plans touch"
-        for j in held:
-            assert all(state.status[0, p] == DONE for p in table.after[0, j].tolist() if p >= 0)
-            assert table.release_s[0, j] <= time_s
-        assert ((state.status == DONE) == ~np.isnan(state.finished_s)).all()
-        assert (state.cycles[state.status == DONE] == table.repetitions[state.status == DONE]).all()
-        # Seconds busy, lost and idle.
-        assert (state.busy_s >= -1e-9).all()
-        assert (state.lost_s >= -1e-9).all()
-        assert (state.busy_s + state.lost_s <= time_s + 1e-6).all()
-        assert (state.above_warning_s <= time_s + 1e-6).all()
-    counts = {
-        kind: len(times(log, kind))
-        for kind in ("award", "finish", "return", "give_up", "fault", "recover", "give_back")
-    }
-    ended = counts["finish"] + counts["return"] + counts["give_up"] + counts["give_back"]
-    assert counts["award"] == ended + int((state.status == RUNNING).sum())
-    assert counts["fault"] == int(state.faults.sum())
-    assert counts["return"] + counts["give_up"] == int(state.returns.sum())
-    assert counts["fault"] == counts["recover"] + int((state.mode == FAULTED).sum())
-    _check_seconds(world, state, log)
-
-
-def _check_seconds(world, state, log) -> None:
-    """Compute busy and lost time from the event log."""
-    for a, name in enumerate(world.arms):
-        busy = lost = 0.0
-        since_award, since_fault, away = None, None, False
-        for e in sorted((e for e in log if e.arm == name), key=lambda e: e.time_s):
-            if e.kind == "award":
-                since_award = e.time_s
-            elif e.kind in ("home", "fault") and since_award is not None:
-                busy, since_award, away = busy + e.time_s - since_award, None, e.kind == "fault"
-            if e.kind == "fault":
-                since_fault = e.time_s
-            elif e.kind == "moved":
-                away = False
-            elif e.kind == "recover":
-                assert since_fault is not None
-                lost, since_fault = lost + e.time_s - since_fault, None
-                if away:  # it goes home from the beginning of the next step
-                    since_award = math.ceil(e.time_s / DT_S - 1e-9) * DT_S
-        busy += 0.0 if since_award is None else world.horizon_s - since_award
-        lost += 0.0 if since_fault is None else world.horizon_s - since_fault
-        assert state.busy_s[0, a] == pytest.approx(busy, abs=1e-6)
-        assert state.lost_s[0, a] == pytest.approx(lost, abs=1e-6)
 
 
 def rhs(temp_c, current_sq, friction_w, ambient_c, powered=True):

@@ -11,6 +11,7 @@ from fleet.errors import ScenarioError
 from scenarios.prepare.batch import make_batch
 from scenarios.prepare.fleet import Randomisation, make_env
 
+MAKERS = (make_env, lambda scenario, **options: make_batch(scenario, 2, **options))
 NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array([1, 2]), np.array(3.0))
 
 
@@ -147,6 +148,7 @@ def test_actions_may_have_any_integer_type_and_memory_order(batch, play, kind) -
     actions = np.array([[1, 2, 0], [0, 3, 100]])
     given = [env.step(np.asfortranarray(actions.astype(kind))), other.step(actions.tolist())]
     play.same(play.rows(given[0], range(2)), play.rows(given[1], range(2)))
+    assert given[0][-1]["illegal"][1, 2] == given[1][-1]["illegal"][1, 2] == 1
 
 
 def test_batch_errors_before_reset_and_after_the_end_name_the_call_to_make(batch) -> None:
@@ -189,6 +191,7 @@ def test_seeds_count_up_past_the_largest_integer_of_their_type(batch, play, seed
         env.reset()
     nobody = np.zeros((2, 3), int)
     play.same(play.rows(counted.step(nobody), range(2)), play.rows(listed.step(nobody), range(2)))
+    assert counted.state.temp_c.tolist() == listed.state.temp_c.tolist()
 
 
 @pytest.mark.parametrize("rows", [[2], [-1], [0, 1, 2], 1, "x", [[0]], [0.5], np.array([True]), {0}])
@@ -224,13 +227,13 @@ def beyond(cell) -> dict[str, Any]:
 
 def test_jobs_that_no_arm_can_do_are_refused_with_a_remedy(cell, plans) -> None:
     message = r"jobs\[1\]\.places: no arm can do 'sort' with 0\.2 or 0\.5 kg \(left at 'shelf': .+\); move the places"
-    for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
+    for make in MAKERS:
         with pytest.raises(ScenarioError, match=message):
             make(cell, difficulty="blind", cache=plans, **beyond(cell))
 
 
 def test_unknown_scenarios_and_fields_are_refused(cell, plans) -> None:
-    for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
+    for make in MAKERS:
         with pytest.raises(ScenarioError, match="No scenario 'quickstrat'; did you mean 'quickstart'"):
             make("quickstrat")
         with pytest.raises(ScenarioError, match=r"There is no scenario file '.*none\.toml'"):
@@ -279,7 +282,7 @@ def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, plans) -> N
     none: Any = None
     with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.exchange\.channel\.Channel \(got 0\.3\)"):
         make_env(cell, difficulty="blind", cache=plans, channel=wrong)
-    for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
+    for make in MAKERS:
         with pytest.raises(ScenarioError, match=r"cache must be the path of a folder \(got 0\.3\)"):
             make(cell, difficulty="blind", cache=wrong)
         with pytest.raises(ScenarioError, match=r"progress must be a function of .* \(got 0\.3\)"):
@@ -338,7 +341,6 @@ def test_invalid_ambient_temperatures_are_refused(cell, plans, warmer_k) -> None
         ({"arrivals": (0.0, 1.0)}, r"Randomisation\.arrivals must be > 0"),
         ({"ambient_k": (0.0, float("inf"))}, r"Randomisation\.ambient_k must be two finite numbers"),
         ({"ambient_k": 3.0}, r"Randomisation\.ambient_k must be two finite numbers, .* \(got 3\.0\)"),
-        ({"arrivals": (1.0, 2.0, 3.0)}, r"Randomisation\.arrivals must be two finite numbers"),
         ({"arrivals": (float("nan"), 1.0)}, r"Randomisation\.arrivals must be two finite numbers"),
         (
             {"arrivals": (1.0, 1e9)},
@@ -346,10 +348,7 @@ def test_invalid_ambient_temperatures_are_refused(cell, plans, warmer_k) -> None
         ),
         ({"arrivals": None}, r"Randomisation\.arrivals must be two finite numbers, .* \(got None\)"),
         ({"ambient_k": ("a", "b")}, r"Randomisation\.ambient_k must be two finite numbers, .* \(got \('a', 'b'\)\)"),
-        ({"ambient_k": (None, 1.0)}, r"Randomisation\.ambient_k must be two finite numbers, .* \(got \(None, 1\.0\)\)"),
-        ({"ambient_k": (1j, 1.0)}, r"Randomisation\.ambient_k must be two finite numbers"),
         ({"variants": 3}, r"Randomisation\.variants must be a list of dictionaries, .+ \(got 3\)"),
-        ({"variants": [3]}, r"Randomisation\.variants must be a list of dictionaries"),
         ({"variants": {"spread": {"seed": 1}}}, r"Randomisation\.variants must be a list of dictionaries"),
     ],
 )

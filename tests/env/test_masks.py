@@ -4,9 +4,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import pytest
 
-from fleet.env.allocation_v1 import Episode, parallel_env
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
@@ -67,36 +65,6 @@ def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batc
     assert min(counts.values()) > 10, counts
 
 
-def test_legal_claims_are_won_or_lost_and_illegal_ones_only_counted(make) -> None:
-    env = make({"jobs": 12, "ticks": 80})
-    env.reset(seed=5)
-    rng, counts = np.random.default_rng(5), {"won": 0, "lost": 0, "illegal": 0}
-    while env.agents:
-        before, masks = env.truth, {a: o.action_mask for a, o in env.knowledge().items()}
-        actions = {arm: int(rng.integers(env.world.slots + 1)) for arm in env.possible_agents}
-        _, _, _, _, infos = env.step(actions)
-        for a, arm in enumerate(env.possible_agents):
-            legal = masks[arm][actions[arm]] == 1
-            assert infos[arm]["illegal"] - before.illegal[0, a] == (not legal)
-            award = env.truth.last_award[0, a]
-            assert award == 0 if not legal or actions[arm] == 0 else award in (1, -1)
-            counts["won"] += award == 1
-            counts["lost"] += award == -1
-            counts["illegal"] += not legal
-    assert min(counts.values()) > 0
-
-
-@pytest.mark.parametrize("winner", [0, 1, 2])
-def test_the_claim_of_lower_shared_difficulty_wins(small, winner) -> None:
-    content = small.work()
-    arms = [small.arm(i, [content], model=small.ByPayload(1.0 if i == winner else 2.0)) for i in range(3)]
-    world, plant = small.shop([[small.job("a", content)]], arms=arms)
-    env = parallel_env(lambda seed: Episode(world, plant, ("by payload",) * 3, seed))
-    env.reset(seed=0)
-    env.step(dict.fromkeys(env.possible_agents, 1))
-    assert env.truth.last_award[0].tolist() == [1 if i == winner else -1 for i in range(3)]
-
-
 def test_illegal_and_missing_actions_equal_a_wait(make, play) -> None:
     options = {"keep_events": True}
     for envs in ([make(), make(), make()], [make(**options), make(**options), make(**options)]):
@@ -112,17 +80,3 @@ def test_illegal_and_missing_actions_equal_a_wait(make, play) -> None:
                 for info in step[-1].values():
                     del info["illegal"]
             assert given[0] == given[1] == given[2]
-
-
-def test_a_faulted_arm_remains_an_agent_and_may_only_wait(make, play) -> None:
-    limits = ThermalLimits(warning_c=40.0, error_c=45.0, restart_c=38.0, clear_s=10.0)
-    env = make({"jobs": 20, "ticks": 80, "limits": limits})
-    observations, _ = env.reset(seed=4)
-    rng, faulted = np.random.default_rng(4), 0
-    while env.agents:
-        observations, *_ = env.step(play.wild(env, rng))
-        for a, arm in enumerate(env.possible_agents):
-            if env.truth.mode[0, a] == FAULTED:
-                faulted += 1
-                assert observations[arm]["action_mask"].tolist() == [1, 0, 0, 0, 0, 0]
-    assert faulted > 3

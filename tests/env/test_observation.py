@@ -11,17 +11,14 @@ from scipy.special import expit
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import UNHEARD, Exchange, PeerView
-from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.profile_plant import sensor_noise
 from fleet.engine.shift import Episode, ShiftRunner, broadcast, write_peers
 from fleet.engine.state import State, World, initial
 from fleet.engine.tables import tables_of
 from fleet.env.allocation_v1 import parallel_env
-from fleet.env.vector import BatchEnv
 from fleet.errors import ScenarioError
 from fleet.heat.motor import gen3_motors
-from fleet.motion import Plan
 from fleet.observation import FIELDS, LONG_S, Layout, Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
@@ -29,6 +26,7 @@ from scenarios.cell_layout import cell_of, near_of
 from scenarios.prepare.batch import make_batch
 from scenarios.prepare.fleet import make_env
 from scenarios.spec.load import load
+from tests.env.drafts import drafts, world_of
 from tests.profiles import examples
 
 
@@ -228,21 +226,14 @@ def compare_with_reference(play, episode: Episode, seed: int) -> tuple[State, in
         runner.step(play.chosen(runner.mask, rng.random((len(world.arms), 2))))
 
 
-@examples(25)
-@given(
-    seed=st.integers(0, 2**31), arms=st.integers(1, 4), jobs=st.integers(0, 9), slots=st.integers(1, 5),
-    ambient_c=st.sampled_from([20.0, 45.0, 58.0]), power_off=st.booleans(), share=st.sampled_from([0.0, 0.2, 1.0]),
-    two_plans=st.booleans(),
-)  # fmt: skip
-def test_vectors_equal_the_reference(
-    small, play, seed, arms, jobs, slots, ambient_c, power_off, share, two_plans
-) -> None:
-    limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0, power_off_on_fault=power_off)
-    make = small.Shifts(arms=arms, jobs=jobs, slots=slots, ticks=60, ambient_c=ambient_c, limits=limits, crowding=share)
-    episode = make(np.random.SeedSequence(seed))
+@examples(40)
+@given(draft=drafts(), two_plans=st.booleans())
+def test_vectors_equal_the_reference(small, play, draft, two_plans) -> None:
+    world, plant = world_of(small, draft)
     if two_plans:
-        episode = replace(episode, world=with_second_plans(episode.world, np.random.default_rng(seed)))
-    compare_with_reference(play, episode, seed)
+        world = with_second_plans(world, np.random.default_rng(draft.seed))
+    episode = Episode(world, plant, ("t",) * len(world.arms), np.random.SeedSequence(draft.seed))
+    compare_with_reference(play, episode, draft.seed)
 
 
 def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(small, play) -> None:
@@ -387,27 +378,6 @@ def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     assert observed.action_mask[0].tolist() == [[1, 1, 1, 0, 0], [1, 1, 0, 0, 0]]
 
 
-def test_busy_time_counts_down_to_home(small) -> None:
-    world, plant = small.shop([[small.job("a")]], arms=2)
-    env, left = parallel_env(lambda seed: Episode(world, plant, ("t",) * 2, seed)), []
-    env.reset(seed=0)
-    for tick in range(4):
-        terminated = env.step({"arm_0": int(tick == 0)})[2]["arm_0"]
-        observed = env.knowledge()
-        left.append(float(observed["arm_0"].busy_s))
-        assert observed["arm_1"].busy_s == 0.0
-        assert (observed["arm_0"].working, observed["arm_1"].idle) == (left[-1] > 0, True)
-    assert left == [25.0, 15.0, 5.0, 0.0]  # 3 + 3 · 10 + 2 s
-    assert terminated
-
-
-def test_a_returned_job_takes_only_its_remaining_time(small) -> None:
-    world, _ = small.shop([[small.job("a", repetitions=10)]], arms=1, slots=2)
-    state = initial(world)
-    state.cycles[0, 0] = 7
-    assert observe(world, state).duration_s.tolist() == [[[3.0 + 3 * 10.0 + 2.0, 0.0]]]
-
-
 def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     content = small.work()
     arms = [small.arm(i, [content], motors=NO_NOISE) for i in range(2)]
@@ -428,97 +398,7 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     assert np.isnan(message.p_saturation[:, 1:]).all()
 
 
-def test_headrooms_are_to_both_limits_and_time_is_left_until_the_horizon(small) -> None:
-    content = small.work()
-    arms = [small.arm(i, [content], motors=NO_NOISE) for i in range(2)]
-    near = ThermalLimits(warning_c=60.0, error_c=67.0)
-    world, _ = small.shop([[small.job("a")]], arms=arms, ticks=50, limits=near)
-    state = initial(world)
-    state.temp_c[0, :, :7] = np.arange(14.0).reshape(2, 7) + 55.0  # hottest 61 and 68 °C
-    state.tick[:] = 12
-    observed = observe(world, state)
-    assert observed.headroom_k[0].tolist() == [-1.0, -8.0]
-    assert observed.error_headroom_k[0].tolist() == [6.0, -1.0]
-    assert observed.left_s[0].tolist() == [380.0, 380.0]  # of 50 · 10 s
-    late, _ = small.shop([[small.job("a")]], arms=arms, ticks=20_000, limits=near)
-    assert observe(late, initial(late)).left_s[0].tolist() == [LONG_S, LONG_S]
-
-
-def test_in_a_batch_the_time_left_falls_by_that_of_each_step(small) -> None:
-    batch = BatchEnv(small.Shifts(ticks=60).library(), 3, seed=1, autoreset=False, decisions="events")
-    obs, _ = batch.reset()
-    spent_s, over = np.zeros(3), np.zeros(3, bool)
-    while not over.any():
-        seen = batch.layout.read(obs["observation"], obs["action_mask"])
-        np.testing.assert_array_equal(seen.left_s, np.tile(600.0 - spent_s[:, None], batch.layout.arms))
-        np.testing.assert_allclose(seen.error_headroom_k - seen.headroom_k, 75.0 - 60.0, rtol=1e-6)
-        obs, _, terminated, truncated, info = batch.step(obs["action_mask"][..., 1:-1].argmax(axis=-1) + 1)
-        spent_s += info["elapsed_s"]
-        over = terminated | truncated
-    assert len(set(spent_s.tolist())) > 1, "rows at different times"
-
-
-class SecondJointDecides:
-    """P is one half if joint 2 is at 50 °C minus 0.5 K per repetition."""
-
-    version = "second joint decides"
-
-    def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        risk = Forecast(np.array([0.2 * (0.5 * repetitions - 50.0)]), 0.2 * np.eye(KNOWN)[1:2])
-        return Difficulty(np.full(7, 0.1), risk=risk)
-
-
-def test_p_saturation_follows_the_present_temperatures(small) -> None:
-    bench, rack = small.work("bench"), small.work("rack")
-    arms = [
-        small.arm(0, [bench], motors=NO_NOISE),
-        small.arm(1, [bench, rack], model=SecondJointDecides(), motors=NO_NOISE),
-    ]
-    jobs = [
-        [small.job("a", bench, repetitions=4), small.job("b", rack, repetitions=8)],
-        [small.job("a", bench, repetitions=20)],
-    ]
-    world, _ = small.shop(jobs, arms=arms, slots=3)
-    state = initial(world)
-    state.temp_c[..., :7] = 25.0
-    state.temp_c[0, 1, 1], state.temp_c[1, 1, 1] = 46.0, 35.0
-    p = observe(world, state).p_saturation
-    # Joint 2 at 46 and 35 °C. P is 0.5 at 48 °C (4 repetitions), 46 °C (8) and 40 °C (20), and where it is unknown.
-    assert p[0, 1] == pytest.approx([1 / (1 + np.exp(0.4)), 0.5, 0.5])
-    assert p[1, 1] == pytest.approx([1 / (1 + np.exp(1.0)), 0.5, 0.5])
-    # The model of the other arm ignores the temperatures, and it cannot do the second job.
-    fixed = arms[0].model.score(arms[0].plans[bench][0], 4)
-    assert fixed is not None
-    assert p[0, 0] == pytest.approx([fixed.p_saturation, 0.5, 0.5])
-    engine, vectors = engine_at(world, state)
-    message = broadcast(engine, vectors[0], world.jobs.names[0], ("x", "y"))
-    assert message.p_saturation[1] == pytest.approx([1 / (1 + np.exp(0.4)), 0.5, np.nan], nan_ok=True)
-    assert message.p_saturation[0] == pytest.approx([fixed.p_saturation, np.nan, np.nan], nan_ok=True)
-    state.temp_c[..., :7] += 1.0
-    assert (observe(world, state).p_saturation[0, 1, :2] > p[0, 1, :2]).all()
-
-
 # Peers and sensors in an episode
-
-
-def test_peers_observe_what_the_arm_observes_of_itself(small) -> None:
-    env = parallel_env(small.Shifts(arms=3, jobs=10))
-    env.reset(seed=3)
-    rng = np.random.default_rng(0)
-    while env.agents:
-        observed = env.knowledge()
-        for me, arm in enumerate(env.possible_agents):
-            peers = [p for p in range(3) if p != me]
-            for row, peer in enumerate(peers):
-                other = observed[env.possible_agents[peer]]
-                assert observed[arm].peer_age_s[row] == 0.0
-                assert observed[arm].peer_headroom_k[row] == other.headroom_k
-                assert observed[arm].peer_busy_s[row] == other.busy_s
-                assert observed[arm].peer_working[row] == other.working
-                assert observed[arm].peer_faulted[row] == other.faulted
-                np.testing.assert_array_equal(observed[arm].peer_difficulty[row], other.difficulty)
-                np.testing.assert_array_equal(observed[arm].peer_known[row], other.known)
-        env.step({a: int(rng.choice(np.flatnonzero(o.action_mask))) for a, o in observed.items()})
 
 
 def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:

@@ -1,120 +1,41 @@
 """Invariants of random shifts of random fleets: no job is lost, done twice, or in two places, and no arms touch."""
 
-from dataclasses import dataclass
+import math
+from collections import Counter
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import event, given
-from hypothesis import strategies as st
 
 from fleet.engine.state import DONE, EXPIRED, RUNNING, WAITING, State
 from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
-from fleet.job import MOST_FAULTS, Job
+from fleet.job import MOST_FAULTS
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
+from tests.env.drafts import DT_S, Draft, drafts, world_of
 from tests.profiles import examples
-
-TICKS, DT_S = 45, 10.0
-PLACES = ("bench", "press", "rack")
-
-
-@dataclass(frozen=True)
-class Draft:
-    """A random scenario."""
-
-    works: tuple[tuple[str, str | None, float], ...]
-    """From, to (None for a hold), kg."""
-    able: tuple[frozenset[int], ...]
-    """Works that each arm can do."""
-    jobs: tuple[tuple[int, int, float, frozenset[int]], ...]
-    """Work, repetitions, release and predecessors."""
-    slots: int
-    error_c: float
-    ambient_c: float
-    start_warm: bool
-    power_off: bool
-    touching: float
-    """Share of the pairs of plans of two arms that exclude each other."""
-    move_home_s: float
-    seed: int
-
-
-@st.composite
-def drafts(draw: Any) -> Draft:
-    """Draw small scenarios; some arm can do every work."""
-    payload = st.sampled_from([8.0, 4.0, 0.0])
-    pair = st.tuples(st.sampled_from(PLACES), st.none() | st.sampled_from(PLACES), payload)
-    works = draw(st.lists(pair.filter(lambda w: w[0] != w[1]), min_size=1, max_size=4, unique=True))
-    arms = draw(st.integers(1, 4))
-    numbers = st.just(frozenset(range(len(works)))) | st.frozensets(st.integers(0, len(works) - 1))
-    able = [draw(numbers) for _ in range(arms)]
-    able[0] |= set(range(len(works))) - frozenset().union(*able)
-    jobs = []
-    for j in range(draw(st.integers(0, 10))):
-        before = draw(st.frozensets(st.integers(0, j - 1), max_size=2)) if j else frozenset[int]()
-        release = draw(st.just(0.0) | st.floats(0.0, TICKS * DT_S, allow_nan=False))
-        jobs.append((draw(st.integers(0, len(works) - 1)), draw(st.integers(1, 5)), release, before))
-    return Draft(
-        works=tuple(works),
-        able=tuple(able),
-        jobs=tuple(jobs),
-        slots=draw(st.integers(1, 5)),
-        error_c=draw(st.sampled_from([44.0, 50.0, 75.0])),
-        ambient_c=draw(st.sampled_from([38.0, 25.0, -10.0])),
-        start_warm=draw(st.booleans()),
-        power_off=draw(st.booleans()),
-        touching=draw(st.sampled_from([0.0, 0.3, 1.0])),
-        move_home_s=draw(st.sampled_from([900.0, 60.0, 0.0])),
-        seed=draw(st.integers(0, 2**32)),
-    )
 
 
 def env_of(small, draft: Draft, **options: Any) -> AllocationEnv:
     """Return the environment of a draft."""
-    works = [small.work(place, kg, to=to) for place, to, kg in draft.works]
-    arms = [
-        small.arm(i, [works[w] for w in sorted(able)], times=small.Times(3.0 + i, 7.0 + 2 * i, 2.0))
-        for i, able in enumerate(draft.able)
-    ]
-    jobs: list[Job] = [
-        small.job(
-            f"j{j}",
-            works[w],
-            repetitions=n,
-            release_s=s,
-            due_s=s + 60.0,
-            value=1.0 + j,
-            after=tuple(f"j{k}" for k in sorted(before)),
-        )
-        for j, (w, n, s, before) in enumerate(draft.jobs)
-    ]
-    e = draft.error_c
-    limits = ThermalLimits(
-        warning_c=e - 4, error_c=e, restart_c=e - 6, clear_s=25.0, power_off_on_fault=draft.power_off,
-        move_home_s=draft.move_home_s,
-    )  # fmt: skip
-    world, plant = small.shop(
-        [jobs], arms=arms, limits=limits, ticks=TICKS, slots=draft.slots, ambient_c=draft.ambient_c, dt_s=DT_S,
-        start_warm=draft.start_warm, space=small.crowded(draft.touching),
-    )  # fmt: skip
-    return parallel_env(lambda seed: Episode(world, plant, ("t",) * len(arms), seed), **options)
+    world, plant = world_of(small, draft)
+    return parallel_env(lambda seed: Episode(world, plant, ("t",) * len(world.arms), seed), **options)
 
 
 @examples(100)
 @given(draft=drafts())
 def test_invariants_of_a_shift(small, play, draft) -> None:
-    env, rng = env_of(small, draft), np.random.default_rng(draft.seed)
+    env, rng = env_of(small, draft, keep_events=True), np.random.default_rng(draft.seed)
     observed, infos = env.reset(seed=draft.seed)
     before, value = env.truth, 0.0
-    check_observations(env, observed, play)
+    assert all(env.observation_space(arm).contains(seen) for arm, seen in observed.items())
     while env.agents:
-        check_offers(env)
         observed, rewards, terminated, truncated, infos = env.step(play.wild(env, rng))
         now = env.truth
         check_state(env, now)
         check_progress(env, before, now)
-        check_observations(env, observed, play)
+        assert all(env.observation_space(arm).contains(seen) for arm, seen in observed.items())
         assert np.isfinite(list(rewards.values())).all()
         value += infos["arm_0"]["reward_finished_value"]
         before = now
@@ -125,6 +46,7 @@ def test_invariants_of_a_shift(small, play, draft) -> None:
     assert truncated["arm_0"] == (not terminated["arm_0"])
     assert infos["arm_0"]["jobs_done"] == done.sum()
     assert value == np.float64(jobs.value[0][jobs.exists[0]][done].sum())
+    check_events(env, before)
     event(
         f"faults: {min(int(before.faults.sum()), 2)}, done: {'all' if done.all() else 'some' if done.any() else 'none'}"
     )
@@ -143,7 +65,7 @@ def test_arms_of_a_crowded_cell_do_not_touch(small, play, seed) -> None:
         now = env.truth
         check_state(env, now)
         check_progress(env, before, now)
-        check_observations(env, observed, play)
+        assert all(env.observation_space(arm).contains(seen) for arm, seen in observed.items())
         stopped += int(((now.mode == FAULTED) & (now.plan >= 0)).sum())
         kept_apart += sum(int((seen.feasible > seen.space_free).sum()) for seen in env.knowledge().values())
         before = now
@@ -226,44 +148,36 @@ def check_progress(env: AllocationEnv, before: State, now: State) -> None:
         assert j not in others.tolist() or now.faults[0, a] > before.faults[0, a]
 
 
-def check_observations(env: AllocationEnv, observed: dict[str, Any], play: Any) -> None:
-    """Check masks and offers by the rules, and the observation."""
-    world, now, known = env.world, env.truth, env.knowledge()
-    slot_job = play.slots_of(world, now)
-    taken = {s for j in now.job[0].tolist() if j >= 0 for s in world.jobs.stations[0, j].tolist()} - {-1}
-    volume = world.plans.volume
-    for a, arm in enumerate(env.possible_agents):
-        own, mask = known[arm], observed[arm]["action_mask"]
-        assert env.observation_space(arm).contains(observed[arm])
-        assert mask[0] == 1
-        for k, j in enumerate(slot_job):
-            plan = world.offers.plan[0, a, j, 0] if j >= 0 else -1
-            able = plan >= 0
-            free = j >= 0 and not taken & set(world.jobs.stations[0, j].tolist())
-            others = np.delete(now.plan[0], a)
-            clear = able and not world.conflicts[volume[plan], volume[others[others >= 0]]].any()
-            assert mask[k + 1] == (able and free and clear and now.mode[0, a] == IDLE)
-            assert own.offered[k] == (j >= 0)
-            assert own.station_free[k] == free
-            assert own.space_free[k] == clear
-            assert own.feasible[k] == able
-            assert own.known[k] == able
-        assert [own.idle, own.working, own.faulted] == [now.mode[0, a] == m for m in (IDLE, WORKING, FAULTED)]
-        filled = own.offered == 1
-        assert (np.diff(filled.astype(int)) <= 0).all()  # no gaps between filled slots
-        assert (np.diff(own.age_s[filled]) <= 1e-3).all()  # in order of age
-        assert own.last_award == now.last_award[0, a]
-        assert (own.busy_s > 0) == (now.mode[0, a] == WORKING)
-
-
-def check_offers(env: AllocationEnv) -> None:
-    """Check that slots hold the jobs that are released, wait, and have finished predecessors."""
-    world, now = env.world, env.truth
-    after, done = world.jobs.after[0], now.status[0] == DONE
-    ready = world.jobs.exists[0] & (now.status[0] == WAITING)
-    ready &= (world.jobs.release_s[0] <= now.tick[0] * world.dt_s) & (done[after] | (after < 0)).all(axis=1)
-    for observed in env.knowledge().values():
-        assert observed.offered.sum() == min(ready.sum(), world.slots)
+def check_events(env: AllocationEnv, end: State) -> None:
+    """Check the event log of a shift against its last state: numbers of events, and seconds busy and lost."""
+    counts = Counter(e.kind for e in env.events)
+    running = int((end.status == RUNNING).sum())
+    over = counts["finish"] + counts["return"] + counts["give_back"]
+    given_up_at_work = int(end.returns.sum()) - counts["return"]
+    assert counts["award"] == over + given_up_at_work + running
+    assert counts["fault"] == end.faults.sum() == counts["recover"] + (end.mode == FAULTED).sum()
+    elapsed_s = float(end.tick[0]) * DT_S
+    for a, name in enumerate(env.possible_agents):
+        busy = lost = 0.0
+        since_award, since_fault, away = None, None, False
+        for e in sorted((e for e in env.events if e.arm == name), key=lambda e: e.time_s):
+            if e.kind == "award":
+                since_award = e.time_s
+            elif e.kind in ("home", "fault") and since_award is not None:
+                busy, since_award, away = busy + e.time_s - since_award, None, e.kind == "fault"
+            if e.kind == "fault":
+                since_fault = e.time_s
+            elif e.kind == "moved":
+                away = False
+            elif e.kind == "recover":
+                assert since_fault is not None
+                lost, since_fault = lost + e.time_s - since_fault, None
+                if away:  # it goes home from the beginning of the next step
+                    since_award = math.ceil(e.time_s / DT_S - 1e-9) * DT_S
+        busy += 0.0 if since_award is None else max(0.0, elapsed_s - since_award)
+        lost += 0.0 if since_fault is None else elapsed_s - since_fault
+        assert end.busy_s[0, a] == pytest.approx(busy, abs=1e-6)
+        assert end.lost_s[0, a] == pytest.approx(lost, abs=1e-6)
 
 
 def test_the_state_has_as_many_jobs_as_the_world(small) -> None:

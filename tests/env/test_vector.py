@@ -239,18 +239,6 @@ def test_resetting_some_rows_does_not_change_the_others(library, play, chosen, a
         play.same(play.rows(here, rest), play.rows(there, rest))
 
 
-def test_a_reset_clears_the_previous_shift(batch, play) -> None:
-    used, fresh = batch(8, SHIFT, seed=5), batch(8, SHIFT, seed=5)
-    one, rng = used.reset(), np.random.default_rng(0)
-    for _ in range(37):
-        one = used.step(play.chosen(one[0]["action_mask"], rng.random((8, 3, 2))))
-    one, other = used.reset(seed=21), fresh.reset(seed=21)
-    for _ in range(40):
-        play.same(play.rows(one, range(8)), play.rows(other, range(8)))
-        actions = play.chosen(one[0]["action_mask"], rng.random((8, 3, 2)))
-        one, other = used.step(actions), fresh.step(actions)
-
-
 def test_growing_the_job_arrays_changes_no_result(small, library, play) -> None:
     """A row with many jobs enlarges the arrays of all rows."""
     few, lots = library.draw, small.Shifts(**{**SHIFT, "jobs": 23}).library().draw
@@ -269,15 +257,6 @@ def test_max_cycles_end_a_shift_earlier(batch) -> None:
     env.reset()
     ends = [env.step(np.zeros((3, 3), int))[3].tolist() for _ in range(11)]
     assert [all(end) for end in ends] == [False] * 4 + [True] + [False] * 4 + [True, False]
-
-
-def test_knowledge_of_a_batch_equals_that_of_its_rows(batch, make, play) -> None:
-    env, one = batch(3, SHIFT, seed=8), make(SHIFT)
-    env.reset()
-    one.reset(seed=9)
-    known = vars(env.knowledge())
-    for a, observed in enumerate(one.knowledge().values()):
-        play.same({name: values[1, a] for name, values in known.items()}, vars(observed))
 
 
 def test_staggered_envs_end_their_first_shifts_one_after_the_other(small) -> None:

@@ -63,17 +63,11 @@ def test_it_leaves_home_cycles_and_comes_home_without_a_jump(arm):
     q = np.concatenate([part[:, 0] for part in (approach, cycle, cycle, retreat)])
     step = np.abs(np.diff(q, axis=0)).max(axis=0)
     assert (step <= 0.6 * np.array(GEN3.velocity) / RATE_HZ + 1e-6).all()
+    moved, qd = cycle[:, 0], cycle[:, 1]
+    assert np.diff(moved, axis=0) * RATE_HZ == pytest.approx((qd[1:] + qd[:-1]) / 2, abs=0.01)
     assert approach[0, 0] == pytest.approx(ROBOT.home_q(), abs=1e-6)
     assert cycle[0, 0] == pytest.approx(NEAR, abs=1e-6)
     assert retreat[0, 0] == pytest.approx(NEAR, abs=1e-6)
-
-
-def test_the_profile_keeps_the_limits_of_its_speed_and_moves_as_it_says(arm):
-    """Second method: the differences of the sampled positions."""
-    plan = plan_motion(arm, np.stack([NEAR, FAR]), dwell_s=0.3, payload_kg=0.0, speed=0.4)
-    q, qd, _ = plan.cycle.profile.transpose(1, 0, 2)
-    assert (np.abs(qd).max(axis=0) <= 0.4 * np.array(GEN3.velocity) + 1e-6).all()
-    assert np.diff(q, axis=0) * RATE_HZ == pytest.approx((qd[1:] + qd[:-1]) / 2, abs=0.01)
 
 
 def test_the_torque_is_that_of_the_motion_with_its_payload(arm):
