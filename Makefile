@@ -15,7 +15,7 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo leaderboard test test-slow test-ci-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
+.PHONY: demo leaderboard test test-slow test-ci-slow test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
 	fuzz docs pictures clean install
 
 demo: $(DEMO_STAMP)
@@ -35,10 +35,6 @@ test-slow: $(STAMP)
 # The slow tests that CI runs: whole demos, notebooks, tutorials, builds.
 test-ci-slow: $(STAMP)
 	@$(BIN)/python -m pytest -n 2 --dist worksteal -m ci_slow
-
-# Random message loss, crashes and full disks: fresh seeds, ten times the examples of `make test`.
-storm: $(STAMP)
-	@HYPOTHESIS_PROFILE=storm $(BIN)/python -m pytest -n 2 --dist load -m 'not adapter' tests/live -k storm
 
 ifneq ($(filter $(ADAPTER),$(ADAPTERS)),)
 test-adapter: test-adapter-$(ADAPTER)

@@ -12,7 +12,6 @@ FEW = 20
 settings.register_profile("thermofleet", deadline=None, max_examples=FEW)
 settings.register_profile("ci", deadline=None, max_examples=FEW, derandomize=True, print_blob=True)
 settings.register_profile("full", deadline=None, print_blob=True)
-settings.register_profile("storm", deadline=None, derandomize=False, print_blob=True, max_examples=1000)
 PROFILE = os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.environ.get("CI") else "thermofleet")
 settings.load_profile(PROFILE)
 

@@ -1,26 +1,16 @@
 """One simulated life of a fleet: jobs and faults by one seed, rules after every event, and all settled at the end.
 
-The rules: the last cycle of a job is done at most once; no two arms have one job; no two arms are away from home on
-plans that exclude each other; an accepted job stays known; after the faults every job is finished, given up for the
-reasons that the product names, or unfinished because an arm stopped in its last cycle; every wait ends; requests of
-people have their effect (`steering`); the recording has every result once (`recording`).
+Besides the rules of `fleet`: after the faults every job is finished, given up for the reasons that the product names,
+or unfinished because an arm stopped in its last cycle; every wait ends; requests of people have their effect
+(`steering`); the recording has every result once (`recording`).
 """
 
 from collections.abc import Mapping
-from random import Random
 from typing import Any
 
-from benchmarks.simulation.bus import Bus
-from benchmarks.simulation.participants import (
-    AUCTIONEER,
-    CLIENT,
-    ArmProcess,
-    Submitter,
-    Watch,
-    auctioneer_process,
-    simulated_system,
-)
-from benchmarks.simulation.recording import RECORDER, Sent, recorder_process
+from benchmarks.simulation.fleet import FIRST, Fleet, random_conflicts
+from benchmarks.simulation.participants import AUCTIONEER, CLIENT, Watch, simulated_system
+from benchmarks.simulation.recording import RECORDER
 from benchmarks.simulation.steering import check_steering
 from benchmarks.simulation.world import Process, Violation, World
 from fleet.bus.protocol import keys
@@ -30,8 +20,6 @@ from fleet.bus.protocol.operator import (
     Action,
     Cancel,
     Change,
-    Cleared,
-    ClearRequest,
     Controlled,
     ControlRequest,
     Pause,
@@ -39,18 +27,12 @@ from fleet.bus.protocol.operator import (
     Settle,
 )
 from fleet.job import reason_to_give_up
-from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.rounds import Assignment, Timing
-from fleet.live.consensus.participant import Membership
-from fleet.live.space import ANYWHERE, Excludes
-from fleet.robot import ThermalLimits
+from fleet.live.auction.rounds import Timing
 
 LONGEST_WRITES = 60
 """Changing disk calls until a planned crash, at most."""
 SPEEDS = (1.0, 10.0, 60.0, 120.0, 120.0, 240.0)
 """Fleet seconds per real second."""
-FIRST = "arm_0"
-"""Can do every job."""
 MEAN_JOB_S = 150.0
 """Mean duration of a job, fleet s."""
 MOST_JOBS = 60
@@ -63,91 +45,31 @@ SETTLE_S = 240.0
 """True seconds after the faults in which all jobs must be settled, besides the time that they take."""
 
 
-def first_come(bidding: Any) -> Mapping[str, Assignment]:
-    """Give each job to the first free arm with an open plan."""
-    out: dict[str, Assignment] = {}
-    busy: set[str] = set()
-    for job in bidding.jobs:
-        for arm in sorted(bidding.quotes):
-            plans = bidding.plans(arm, job.name)
-            if plans and arm not in busy:
-                out[job.name] = Assignment(arm, min(plans))
-                busy.add(arm)
-                break
-    return out
-
-
-def first_legal(observation: Any, arm: int) -> int:
-    """Claim the first job that the arm may claim."""
-    legal = observation.action_mask[1:-1].nonzero()[0].tolist()
-    return 1 + legal[0] if legal else 0
-
-
-def random_conflicts(seed: int, share: float) -> Excludes:
-    """Return a symmetric relation in which this share of all plans exclude each other, and unknown ones all others."""
-    known: dict[tuple[str, str], bool] = {}
-
-    def excludes(arm: str, space: str, other: str, other_space: str) -> bool:
-        if ANYWHERE in (space, other_space):
-            return True
-        pair = (space, other_space) if space < other_space else (other_space, space)
-        if pair not in known:
-            known[pair] = Random(f"{seed} {pair}").random() < share
-        return known[pair]
-
-    return excludes
-
-
-class Shift:
-    """A fleet and its world.
-
-    Attributes:
-        accepted: Jobs that were accepted, by name.
-        finished: How many times the last cycle of a job ended.
-    """
+class Shift(Fleet):
+    """A random fleet with random jobs and faults."""
 
     def __init__(self, seed: int, *, trace: bool = False) -> None:
-        self.seed = seed
-        self.world = world = World(seed, trace=trace)
+        world = World(seed, trace=trace)
         rng = self.rng = world.rng
-        self.arms = (FIRST, *(f"arm_{i}" for i in range(1, rng.choice([2, 3, 3, 4]))))
-        self.speed = rng.choice(SPEEDS)
-        self.alone = rng.random() < 0.4 and len(self.arms) > 2
-        """Without an auctioneer."""
-        self.job_gap_s = rng.choice([0.8, 2.0, 5.0, 20.0]) * MEAN_JOB_S / self.speed / len(self.arms)
+        arms = (FIRST, *(f"arm_{i}" for i in range(1, rng.choice([2, 3, 3, 4]))))
+        speed = rng.choice(SPEEDS)
+        alone = rng.random() < 0.4 and len(arms) > 2
+        self.job_gap_s = rng.choice([0.8, 2.0, 5.0, 20.0]) * MEAN_JOB_S / speed / len(arms)
         self.faulty_s = max(60.0, min(rng.uniform(60.0, 900.0), MOST_JOBS * self.job_gap_s))
         self.fault_gap_s = rng.choice([4.0, 10.0, 30.0, 60.0])
         self.possible = tuple(fault for fault in FAULTS if rng.random() < 0.4) or FAULTS
         """Faults of this shift: few kinds often meet what all kinds together rarely do."""
-        self.excludes = random_conflicts(seed, rng.choice([0.0, 0.5, 0.5, 1.0]))
-        self.begun: dict[str, int] = {}
-        self.finished: dict[str, int] = {}
-        self.away: dict[str, str] = {}
+        excludes = random_conflicts(seed, rng.choice([0.0, 0.5, 0.5, 1.0]))
         self.faults: dict[str, list[str]] = {}
-        self.unsure: set[str] = set()
         self.cancelled: set[str] = set()
         """Jobs that a person has asked to cancel."""
         self.work_s = 0.0
         self.healed = False
         self.jobs: list[JobSpec] = []
         timing = Timing(lease_s=rng.choice([3.0, 6.0]), max_jobs=8)
-        membership: Membership | None = None
-        if self.alone:
-            live = LiveFleet(arms=self.arms, limits=ThermalLimits(warning_c=80.0, error_c=95.0))
-            membership = Membership(fleet=live, choose=first_legal, slots=4, excludes=self.excludes, timing=timing)
-        world.bus = Bus(world)
         rate_hz, capacity = rng.choice([0.5, 1.0]), rng.choice([1, 1, 2])
-        self.builders = {name: ArmProcess(self, FIRST, self.speed, rate_hz, capacity, membership) for name in self.arms}
-        for name in self.arms:
-            Process(world, name, self.builders[name])
-        if not self.alone:
-            build = auctioneer_process(self.arms, self.speed, first_come, timing, self.excludes)
-            Process(world, AUCTIONEER, build)
-        self.sent = Sent(world.bus)
-        Process(world, RECORDER, recorder_process(rng.choice([5.0, 20.0, 60.0])))
-        self.names = tuple(world.processes)
-        Process(world, CLIENT, Submitter)
-        world.after_run, world.after_exit = self._after_run, self._after_exit
+        options: dict[str, Any] = {"rate_hz": rate_hz, "capacity": capacity}
+        super().__init__(world, arms, alone=alone, speed=speed, excludes=excludes, timing=timing, **options)
 
     def run(self) -> None:
         """Live through faults, heal, and settle.
@@ -173,15 +95,6 @@ class Shift:
             self._settle()
             self._end_recording()
 
-    @property
-    def submitter(self) -> Submitter:
-        node: Any = self.world.processes[CLIENT].node
-        return node
-
-    def node(self, name: str) -> Any:
-        """Node of a process; None while it is down."""
-        return self.world.processes[name].node
-
     def _submit(self) -> None:
         rng, names = self.rng, [job.name for job in self.jobs]
         after = tuple(rng.sample(names[-5:], int(bool(names) and rng.random() < 0.15)))
@@ -199,77 +112,12 @@ class Shift:
         )
         self.jobs.append(spec)
         self.work_s += (20.0 + spec.repetitions * (spec.dwell_s + 10.0)) / self.speed
-        self.submitter.waiting.append(spec)
-        self.world.processes[CLIENT].wake(self.world.now_s)
+        self.submit(spec)
 
     def _fault(self) -> None:
         fault = self.rng.choice(self.possible)
         self.world.log("fault", fault.__name__)
         fault(self)
-
-    # Deeds of the arms
-
-    def departs(self, arm: str, space: str) -> None:
-        """Note that an arm leaves home, and check that no other arm is in its way."""
-        self.world.log(arm, f"leaves home on {space}")
-        for other, taken in self.away.items():
-            if other != arm and self.excludes(arm, space, other, taken):
-                raise Violation(f"'{arm}' leaves home on {space} while '{other}' is away on {taken}.")
-        self.away[arm] = space
-
-    def is_home(self, arm: str) -> None:
-        """Note that an arm is at home."""
-        if self.away.pop(arm, None):
-            self.world.log(arm, "is at home")
-
-    def begins_last_cycle(self, arm: str, job: str) -> None:
-        """Check that the last cycle of a job is begun once."""
-        self.world.log(arm, f"begins the last cycle of '{job}'")
-        self.begun[job] = self.begun.get(job, 0) + 1
-        if self.begun[job] > 1:
-            raise Violation(f"'{arm}' begins the last cycle of '{job}' a second time.")
-
-    def breaks_last_cycle_off(self, arm: str, job: str) -> None:
-        """Note that a last cycle was certainly not done."""
-        self.begun[job] -= 1
-
-    def finishes(self, arm: str, job: str) -> None:
-        """Note that a job is done."""
-        self.world.log(arm, f"has done '{job}'")
-        self.finished[job] = self.finished.get(job, 0) + 1
-
-    # Rules
-
-    def _after_run(self, process: Process) -> None:
-        if process.name in self.builders:
-            self._check_holders()
-        elif process.name == AUCTIONEER and process.node is not None:
-            self._check_known()
-
-    def _check_holders(self) -> None:
-        holders: dict[str, str] = {}
-        for name in self.arms:
-            process = self.world.processes[name]
-            node: Any = process.node
-            if node is None:
-                continue
-            for active in node.executor.active:
-                if active.may_commit or process.real_s < active.lease_end_s:
-                    if active.job in holders:
-                        raise Violation(f"'{name}' and '{holders[active.job]}' both have '{active.job}'.")
-                    holders[active.job] = name
-
-    def _check_known(self) -> None:
-        ledger = self.node(AUCTIONEER).auctioneer.ledger
-        if len(self.submitter.accepted) > len(ledger.jobs) + len(ledger.past):
-            lost = [name for name in self.submitter.accepted if name not in ledger.jobs and name not in ledger.past]
-            raise Violation(f"The auctioneer does not know '{lost[0]}', which it accepted.")
-
-    def _after_exit(self, process: Process) -> None:
-        if process.name in self.builders:
-            machine = self.builders[process.name].machine
-            if machine is not None and machine.job in self.begun and self.begun[machine.job]:
-                self.unsure.add(machine.job)
 
     # The end
 
@@ -525,20 +373,10 @@ def move_home(shift: Shift) -> None:
 
 
 def clear(shift: Shift, arm: str) -> None:
-    """Have a person move an arm home, and free its space unless that is refused."""
+    """Have a person move an arm home and free its space, unless the person sees on the bus that it is there."""
     process = shift.world.processes[arm]
-    if process.up and process.group == 0:
-        return  # a person sees on the bus that it is there
-    node: Any = process.node
-    machine = shift.builders[arm].machine
-    shift.world.log("person", f"moves '{arm}' home, and asks to free its space")
-    if node is not None and machine is not None:
-        shift.unsure |= {active.job for active in node.executor.active if active.may_commit}
-        machine.move_home()
-        machine.set_time(node.clock.now_s(process.real_s))  # it does nothing in the time before, either
-    shift.is_home(arm)
-    link: Any = shift.world.processes[CLIENT].client
-    link.query(keys.of_jobs("f", "clear"), ClearRequest(arm, "a person"), Cleared, lambda _: None, timeout_s=2.0)
+    if not process.up or process.group:
+        shift.clear(arm)
 
 
 def steer(shift: Shift) -> None:

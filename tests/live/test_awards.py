@@ -260,13 +260,15 @@ def test_with_a_full_disk_no_work_is_taken_and_a_finished_job_is_reported_later(
 
 
 def test_a_faulted_arm_returns_all_awards():
-    executor, _ = shop(capacity=2)
+    executor, disk = shop(capacity=2)
     quote = quoted(executor, JOB, OTHER)
     for job in (JOB, OTHER):
         executor.answer_award(award_on(quote, job), 0.0)
     executor.record_progress(1, 9.0)
-    executor.return_all(5.0, 1.0, "too hot")
-    assert [(r.job, r.cycles, r.unsure) for _, r in executor.due_reports(1.0)] == [("j", 1, False), ("k", 0, False)]
+    executor.return_all(5.0, 1.0, "too hot", faulted=True)
+    for each in (executor, shop(disk)[0]):  # the fault counts for the current job alone, also after a restart
+        reports = [(r.job, r.cycles, r.unsure, r.faulted) for _, r in each.due_reports(1.0)]
+        assert reports == [("j", 1, False, True), ("k", 0, False, False)]
 
 
 @pytest.mark.parametrize(

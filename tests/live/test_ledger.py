@@ -1,13 +1,15 @@
 """Which jobs are accepted, which are ready, and that a replay of the journal gives the same ledger."""
 
 import graphlib
+from collections.abc import Mapping
 from dataclasses import replace
 
 import msgspec
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.auction import JobSpec, Quote
 from fleet.live.auction.job_rules import admit
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import (
@@ -19,7 +21,8 @@ from fleet.live.auction.records import (
     PastJobs,
     ShiftEnded,
 )
-from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted
+from fleet.live.auction.rounds import Round, stated_spaces
+from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted, SpaceTaken
 from tests.profiles import examples
 
 
@@ -169,6 +172,29 @@ def test_a_late_report_of_a_finished_job_closes_a_newer_award():
     assert not book.open
     assert book.apply(Closed("1:a", "finished", 4, 7.0)) == []
     assert book.status()[0].finished_s == 6.0
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_a_quote_says_nothing_about_an_award_that_was_closed_after_the_request(before):
+    """The arm quotes before the award arrives, leaves home for it, and faults, all within one round.
+
+    Args:
+        before: It took the same space for an earlier award, which was closed before that round.
+    """
+    book = ledger(spec("a"))
+    if before:
+        book.apply(SpaceTaken("arm_0", ("s",)))
+    book.apply(Awarded("0:a", "r", "a", "arm_0", "q", 0, 1.0, space="s"))
+    at_home = Quote("arm_0", "r", "q", 5.0, "", 0.0, "idle", 9.0, 1, (), ())
+
+    def changes(requested: Mapping[str, frozenset[str]]) -> list[SpaceTaken]:
+        closing = Round("r", (), frozenset(["arm_0"]), 0.0, requested, {"arm_0": at_home})
+        return stated_spaces(book, closing, 3.0)
+
+    requested = book.closed_space()
+    book.apply(Closed("0:a", "returned", 0, 2.0))
+    assert changes(requested) == []
+    assert changes(book.closed_space()) == [SpaceTaken("arm_0", (), 3.0)]
 
 
 def test_after_the_end_of_the_shift_no_job_is_ready():

@@ -1,5 +1,6 @@
 """Every policy live: the same choice from the same observation as in simulation, and a shift that is completed."""
 
+import logging
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from fleet.observation import FIELDS, LONG_S, Observation
 from fleet.offered_plans import PLANS
 from fleet.robot import ThermalLimits
 from scenarios.live.auctioneer import CentralAllocation
+from tests.live.simulated import job
 from tests.profiles import examples
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central" and not rule.plans]
@@ -239,17 +241,14 @@ def test_every_central_policy_awards_jobs_with_a_bid_once(name, seed) -> None:
 
 
 @pytest.mark.parametrize("name", CENTRAL)
-def test_every_central_policy_completes_the_jobs_of_an_auctioneer(live, name) -> None:
-    rule = CentralAllocation(fresh(name), LiveFleet(arms=("arm_0", "arm_1", "arm_2")))
-    fleet = live.Fleet([live.Arm(f"arm_{i}") for i in range(3)], allocate=rule)
-    fleet.submit(*(JobSpec(name=f"j{i}", kind="hold", places=("xyz"[i % 3],), repetitions=2) for i in range(7)))
-    for _ in range(40):
-        fleet.run_without_faults(1.0)
-        fleet.check()
-    fleet.check_settled()
+def test_every_central_policy_completes_the_jobs_of_an_auctioneer(fleet_of, name) -> None:
+    allocate = CentralAllocation(fresh(name), LiveFleet(arms=("arm_0", "arm_1", "arm_2")))
+    fleet, names = fleet_of(alone=False, allocate=allocate), [f"j{i}" for i in range(7)]
+    fleet.submit(*(job(each, 2, place="xyz"[i % 3]) for i, each in enumerate(names)))
+    fleet.until(lambda: fleet.finished == dict.fromkeys(names, 1))
 
 
-def test_without_a_policy_in_another_process_nothing_is_awarded_until_it_replies(live, caplog) -> None:
+def test_without_a_policy_in_another_process_nothing_is_awarded_until_it_replies(fleet_of, caplog) -> None:
     class Returns:
         scope = "central"
         asked = 0
@@ -261,12 +260,12 @@ def test_without_a_policy_in_another_process_nothing_is_awarded_until_it_replies
             return fresh("matching").act(observations)
 
     policy = Returns()
-    fleet = live.Fleet([live.Arm("arm_0")], allocate=CentralAllocation(policy, LiveFleet(arms=("arm_0",))))
-    fleet.submit(*(JobSpec(name=f"j{i}", kind="hold", places=("x",), repetitions=2) for i in range(3)))
-    for _ in range(40):
-        fleet.run_without_faults(1.0)
-        fleet.check()
-    fleet.check_settled()
+    fleet = fleet_of(alone=False, arms=1, allocate=CentralAllocation(policy, LiveFleet(arms=("arm_0",))))
+    logging.getLogger("fleet").addHandler(caplog.handler)
+    logging.getLogger("scenarios").addHandler(caplog.handler)
+    logging.disable(logging.NOTSET)
+    fleet.submit(*(job(f"j{i}", 2, place="x") for i in range(3)))
+    fleet.until(lambda: len(fleet.finished) == 3)
     assert policy.asked > 6
     assert caplog.text.count("Nothing is awarded until the policy replies: No process serves it.") == 2
     assert caplog.text.count("The policy replies again.") == 2

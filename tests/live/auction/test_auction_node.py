@@ -1,8 +1,6 @@
 """An auctioneer over a real router: awards, requests of people, restarts, rivals and lost journals."""
 
-import errno
 import json
-import os
 import re
 import threading
 import time
@@ -83,20 +81,6 @@ def test_a_late_subscriber_gets_the_last_results(bus):
     assert rounds[0].jobs == ("a",)
 
 
-def test_no_job_is_lost_while_the_auctioneer_is_stopped(bus):
-    first = bus.auctioneer()
-    first.submit(Submission(bus.jobs("a", "b")))
-    arm = bus.arm("arm_0")
-    bus.until(lambda: "awarded" in bus.states(first))
-    time_s = first.time_s
-    bus.kill(first)
-    second = bus.auctioneer()
-    assert second.time_s >= time_s
-    bus.until(lambda: bus.states(second) == ["finished", "finished"])
-    assert sorted(arm.done) == ["a", "b"]
-    assert len({award.award for award in arm.awards}) == 2
-
-
 def test_fleet_time_runs_at_its_speed(bus):
     bus.auctioneer(speed=1000.0)
     (one,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages.values()
@@ -111,25 +95,6 @@ def test_an_arm_with_a_token_but_without_a_state_is_not_present(bus):
     silent.declare_token(keys.of_arm("f", "silent", "alive"))
     bus.arm("arm_0")
     bus.until(lambda: node.present == {"arm_0"} and "silent" in node._tokens)
-
-
-def test_with_a_full_disk_jobs_are_refused_and_the_auctioneer_continues(bus):
-    full = []
-
-    def sync(file):
-        if full:
-            raise OSError(full.pop(), "No space left on device")
-        os.fsync(file)
-
-    node = bus.auctioneer(sync=sync)
-    full.append(errno.ENOSPC)
-    replies = bus.ask(keys.of_jobs("f", "submit"), Submission(bus.jobs("a")), SubmissionReply)
-    assert "no space left" in next(iter(replies.refused.values()))
-    full.append(errno.ENOSPC)
-    with pytest.raises(JournalFull):
-        node.submit(Submission(bus.jobs("a")))
-    assert bus.ask(keys.of_jobs("f", "submit"), Submission(bus.jobs("a")), SubmissionReply).messages
-    assert bus.states(node) == ["waiting"]
 
 
 def test_the_journal_is_compacted_at_the_start_and_when_it_has_grown(bus, monkeypatch):
@@ -212,58 +177,6 @@ def test_a_state_without_a_token_takes_no_space_unless_the_arm_is_of_the_cell(bu
     bus.until(lambda: "nobody" in node.auctioneer.ledger.taken_space())
 
 
-def control(bus, name, action):
-    """Return the reply to a request and the reason of a refusal."""
-    replies = bus.ask(keys.of_jobs("f", "control"), ControlRequest(name, action, "ann"), Controlled)
-    return next(iter(replies.messages.values()), None), next(iter(replies.refused.values()), "")
-
-
-def test_every_request_is_answered_published_and_kept_over_a_restart(bus):
-    node, arm = bus.auctioneer(), bus.arm("arm_0")
-    operations, results = [], []
-    watcher = bus.link()
-    watcher.subscribe(keys.of_every_auction("f", "operation"), Operation, lambda _, each: operations.append(each))
-    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, each: results.append(each))
-    arm.commits = False
-    bus.until(lambda: node.present)
-    assert control(bus, "1", Pause())[0].paused == {"*": "ann"}
-    node.submit(Submission((*bus.jobs("a"), *bus.jobs("b", place="bin")), "bob"))
-    reply, _ = control(bus, "2", Cancel("a"))
-    assert (reply.changed, reply.job.state) == (True, "cancelled")
-    reply, _ = control(bus, "3", Change("b", due_s=900.0, value=2.0))
-    assert (reply.changed, reply.job.state) == (True, "waiting")
-    bus.kill(node)
-    node = bus.auctioneer()
-    assert node.auctioneer.ledger.jobs["b"].spec.due_s == 900.0
-    assert not control(bus, "2", Cancel("a"))[0].changed
-    bus.serve_for(1.0)
-    assert bus.states(node) == ["cancelled", "waiting"]
-    assert control(bus, "4", Resume("*"))[0].paused == {}
-    bus.until(lambda: bus.states(node) == ["cancelled", "awarded"])
-    assert control(bus, "5", Settle("b", "done")) == (None, "'b' is awarded; only an unfinished job can be settled.")
-    assert control(bus, "6", Cancel("unknown")) == (None, "There is no job 'unknown'.")
-    bus.until(lambda: any(each.number == 3 for each in operations))  # the first ones come again after the restart
-    numbered = {(each.epoch, each.number): each.request.request for each in operations}
-    assert numbered == {(node.epoch, number): str(number + 1) for number in range(4)}
-    assert {each.request.by for each in operations} == {"ann"}
-    assert {each.by for each in results if each.status.state == "cancelled"} == {"ann"}
-    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).messages.values()
-    assert [job.repetitions for job in status.jobs] == [1, 1]
-
-
-def test_an_unfinished_job_is_settled(bus):
-    node, arm = bus.auctioneer(), bus.arm("arm_0")
-    node.submit(Submission(bus.jobs("a")))
-    arm.apply_lease = lambda _: None  # it may commit, and says nothing more
-    bus.until(lambda: bus.states(node) == ["finishing"])
-    node.end()
-    assert bus.states(node) == ["unfinished"]
-    assert "over" in control(bus, "1", Settle("a", "redo"))[1]
-    assert control(bus, "2", Settle("a", "done"))[0].job.state == "finished"
-    bus.kill(node)
-    assert bus.states(bus.auctioneer()) == ["finished"]
-
-
 def test_an_auctioneer_with_a_poisonous_job_goes_on_reports_it_and_has_it_settled(bus):
     """Its journal has a number that was allowed in an earlier version; the job is awarded and finished elsewhere."""
     node = bus.auctioneer()
@@ -293,7 +206,8 @@ def test_an_auctioneer_with_a_poisonous_job_goes_on_reports_it_and_has_it_settle
     assert "60000" in path.with_suffix(".aside").read_text()
     node = bus.auctioneer()
     bus.until(lambda: any(each.job == "poison" and each.state == "unfinished" for each in results))
-    assert control(bus, "1", Settle("poison", "redo"))[0].changed
+    request = ControlRequest("1", Settle("poison", "redo"), "ann")
+    assert bus.ask(keys.of_jobs("f", "control"), request, Controlled).first("control").changed
     assert node.submit(Submission(bus.jobs("poison", place="bin"))).jobs[0].accepted
     bus.until(lambda: arm.done == ["good", "poison"])
 

@@ -1,0 +1,203 @@
+"""A simulated fleet: its processes, what its arms do, and the rules that hold at every moment.
+
+The last cycle of a job is done at most once; no two arms have one job; no two arms are away from home on plans that
+exclude each other; an accepted job stays known.
+"""
+
+from collections.abc import Mapping
+from random import Random
+from typing import Any
+
+from benchmarks.simulation.bus import Bus
+from benchmarks.simulation.participants import AUCTIONEER, CLIENT, ArmProcess, Submitter, auctioneer_process
+from benchmarks.simulation.recording import RECORDER, Sent, recorder_process
+from benchmarks.simulation.world import Process, Violation, World
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.live.auction.knowledge import LiveFleet
+from fleet.live.auction.rounds import Allocate, Assignment, Timing
+from fleet.live.consensus.participant import Choose, Membership
+from fleet.live.space import ANYWHERE, Excludes
+from fleet.robot import ThermalLimits
+
+FIRST = "arm_0"
+"""Can do every job."""
+
+
+def first_come(bidding: Any) -> Mapping[str, Assignment]:
+    """Give each job to the first free arm with an open plan."""
+    out: dict[str, Assignment] = {}
+    busy: set[str] = set()
+    for job in bidding.jobs:
+        for arm in sorted(bidding.quotes):
+            plans = bidding.plans(arm, job.name)
+            if plans and arm not in busy:
+                out[job.name] = Assignment(arm, min(plans))
+                busy.add(arm)
+                break
+    return out
+
+
+def first_legal(observation: Any, arm: int) -> int:
+    """Claim the first job that the arm may claim."""
+    legal = observation.action_mask[1:-1].nonzero()[0].tolist()
+    return 1 + legal[0] if legal else 0
+
+
+def random_conflicts(seed: int, share: float) -> Excludes:
+    """Return a symmetric relation in which this share of all plans exclude each other, and unknown ones all others."""
+    known: dict[tuple[str, str], bool] = {}
+
+    def excludes(arm: str, space: str, other: str, other_space: str) -> bool:
+        if ANYWHERE in (space, other_space):
+            return True
+        pair = (space, other_space) if space < other_space else (other_space, space)
+        if pair not in known:
+            known[pair] = Random(f"{seed} {pair}").random() < share
+        return known[pair]
+
+    return excludes
+
+
+class Fleet:
+    """Arms, maybe an auctioneer, a recorder and a client, each a process of one world.
+
+    Attributes:
+        alone: Without an auctioneer.
+        begun: How many times the last cycle of a job was begun and not broken off.
+        finished: How many times the last cycle of a job ended.
+        away: Plan of each arm that is away from home.
+        unsure: Jobs whose arm stopped in the last cycle.
+        sent: What the participants have published.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        arms: tuple[str, ...],
+        *,
+        alone: bool,
+        speed: float,
+        excludes: Excludes,
+        timing: Timing,
+        rate_hz: float = 1.0,
+        capacity: int = 1,
+        allocate: Allocate = first_come,
+        choose: Choose = first_legal,
+    ) -> None:
+        self.world, self.arms, self.alone, self.speed, self.excludes = world, arms, alone, speed, excludes
+        self.begun: dict[str, int] = {}
+        self.finished: dict[str, int] = {}
+        self.away: dict[str, str] = {}
+        self.unsure: set[str] = set()
+        membership: Membership | None = None
+        if alone:
+            live = LiveFleet(arms=arms, limits=ThermalLimits(warning_c=80.0, error_c=95.0))
+            membership = Membership(fleet=live, choose=choose, slots=4, excludes=excludes, timing=timing)
+        world.bus = Bus(world)
+        self.builders = {name: ArmProcess(self, FIRST, speed, rate_hz, capacity, membership) for name in arms}
+        for name in arms:
+            Process(world, name, self.builders[name])
+        if not alone:
+            Process(world, AUCTIONEER, auctioneer_process(arms, speed, allocate, timing, excludes))
+        self.sent = Sent(world.bus)
+        Process(world, RECORDER, recorder_process(world.rng.choice([5.0, 20.0, 60.0])))
+        self.names = tuple(world.processes)
+        """Processes of the fleet; the client is not one of them."""
+        Process(world, CLIENT, Submitter)
+        world.after_run, world.after_exit = self._after_run, self._after_exit
+
+    @property
+    def submitter(self) -> Submitter:
+        node: Any = self.world.processes[CLIENT].node
+        return node
+
+    def node(self, name: str) -> Any:
+        """Node of a process; None while it is down."""
+        return self.world.processes[name].node
+
+    def submit(self, job: JobSpec) -> None:
+        """Have the client submit a job until there is a reply."""
+        self.submitter.waiting.append(job)
+        self.world.processes[CLIENT].wake(self.world.now_s)
+
+    def clear(self, arm: str) -> None:
+        """Have a person move an absent arm home, and free its space unless that is refused."""
+        self.move_home(arm)
+        link: Any = self.world.processes[CLIENT].client
+        link.query(keys.of_jobs("f", "clear"), ClearRequest(arm, "a person"), Cleared, lambda _: None, timeout_s=2.0)
+
+    def move_home(self, arm: str) -> None:
+        """Have a person move an arm home; its process lives on."""
+        process, node, machine = self.world.processes[arm], self.node(arm), self.builders[arm].machine
+        self.world.log("person", f"moves '{arm}' home, and asks to free its space")
+        if node is not None and machine is not None:
+            self.unsure |= {active.job for active in node.executor.active if active.may_commit}
+            machine.move_home()
+            machine.set_time(node.clock.now_s(process.real_s))  # it does nothing in the time before, either
+        self.is_home(arm)
+
+    # Deeds of the arms
+
+    def departs(self, arm: str, space: str) -> None:
+        """Note that an arm leaves home, and check that no other arm is in its way."""
+        self.world.log(arm, f"leaves home on {space}")
+        for other, taken in self.away.items():
+            if other != arm and self.excludes(arm, space, other, taken):
+                raise Violation(f"'{arm}' leaves home on {space} while '{other}' is away on {taken}.")
+        self.away[arm] = space
+
+    def is_home(self, arm: str) -> None:
+        """Note that an arm is at home."""
+        if self.away.pop(arm, None):
+            self.world.log(arm, "is at home")
+
+    def begins_last_cycle(self, arm: str, job: str) -> None:
+        """Check that the last cycle of a job is begun once."""
+        self.world.log(arm, f"begins the last cycle of '{job}'")
+        self.begun[job] = self.begun.get(job, 0) + 1
+        if self.begun[job] > 1:
+            raise Violation(f"'{arm}' begins the last cycle of '{job}' a second time.")
+
+    def breaks_last_cycle_off(self, arm: str, job: str) -> None:
+        """Note that a last cycle was certainly not done."""
+        self.begun[job] -= 1
+
+    def finishes(self, arm: str, job: str) -> None:
+        """Note that a job is done."""
+        self.world.log(arm, f"has done '{job}'")
+        self.finished[job] = self.finished.get(job, 0) + 1
+
+    # Rules
+
+    def _after_run(self, process: Process) -> None:
+        if process.name in self.builders:
+            self._check_holders()
+        elif process.name == AUCTIONEER and process.node is not None:
+            self._check_known()
+
+    def _check_holders(self) -> None:
+        holders: dict[str, str] = {}
+        for name in self.arms:
+            process = self.world.processes[name]
+            node: Any = process.node
+            if node is None:
+                continue
+            for active in node.executor.active:
+                if active.may_commit or process.real_s < active.lease_end_s:
+                    if active.job in holders:
+                        raise Violation(f"'{name}' and '{holders[active.job]}' both have '{active.job}'.")
+                    holders[active.job] = name
+
+    def _check_known(self) -> None:
+        ledger = self.node(AUCTIONEER).auctioneer.ledger
+        if len(self.submitter.accepted) > len(ledger.jobs) + len(ledger.past):
+            lost = [name for name in self.submitter.accepted if name not in ledger.jobs and name not in ledger.past]
+            raise Violation(f"The auctioneer does not know '{lost[0]}', which it accepted.")
+
+    def _after_exit(self, process: Process) -> None:
+        if process.name in self.builders:
+            machine = self.builders[process.name].machine
+            if machine is not None and machine.job in self.begun and self.begun[machine.job]:
+                self.unsure.add(machine.job)
