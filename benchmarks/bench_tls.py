@@ -21,7 +21,7 @@ import zenoh
 
 from benchmarks.harness import cells, in_turns, options, quantiles
 from fleet.bus.protocol import keys
-from fleet.bus.router import Limits, Router, open_client
+from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import of_arms
 from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
@@ -46,10 +46,10 @@ class PingPong:
         def send_back(sample: zenoh.Sample) -> None:
             answer.put(sample.payload)
 
-        heard = zenoh.handlers.Callback(send_back, indirect=False)
-        ended = zenoh.handlers.Callback(lambda _: self._came.put(None), indirect=False)
-        self._kept = (other.declare_subscriber(there, heard), one.declare_subscriber(back, ended))
-        for session in (one, other):  # replies come in order, so the router knows the declarations
+        on_ping = zenoh.handlers.Callback(send_back, indirect=False)
+        on_pong = zenoh.handlers.Callback(lambda _: self._came.put(None), indirect=False)
+        self._kept = (other.declare_subscriber(there, on_ping), one.declare_subscriber(back, on_pong))
+        for session in (one, other):  # replies come in order, so the router has the declarations
             list(session.get(keys.caches_of("thermofleet/v4/bench/arm/nobody"), timeout=PATIENT_S))
 
     def round_trip(self) -> None:
@@ -102,10 +102,9 @@ def main() -> None:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "keys"
         make(folder, of_arms("bench", ARMS), days=30)
-        limits = Limits(state_hz=100.0)
         bare = bare_router(stack)
-        plain = stack.enter_context(Router(limits=limits)).endpoint
-        secure = stack.enter_context(Router(tls=Tls(folder, "router"), limits=limits)).endpoint
+        plain = stack.enter_context(Router(state_hz=100.0)).endpoint
+        secure = stack.enter_context(Router(tls=Tls(folder, "router"), state_hz=100.0)).endpoint
         sides: dict[str, Callable[[str], zenoh.Session]] = {
             "bare Zenoh, TCP": lambda _: bare_client(bare),
             "ours, TCP, limits": lambda _: open_client(plain, timeout_s=PATIENT_S),

@@ -12,7 +12,6 @@ from fleet.bus.protocol import messages
 from fleet.bus.protocol.auction import MOST_JOBS, ArmEvent
 from fleet.bus.protocol.keys import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, BusChannel, MessageType
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
-from fleet.bus.router import Limits
 from fleet.engine.batch import RewardWeights
 from fleet.events import MEANINGS
 from fleet.job import BOUNDS, LONGEST_GRASP_S, LONGEST_JOB_S
@@ -184,7 +183,7 @@ def _limit_table() -> str:
     longest = schemas()["JobSpec"]["properties"]["name"]["maxLength"]
     rows = [
         (
-            f"{Limits().message_bytes:,} bytes",
+            f"{messages.MOST_BYTES:,} bytes",
             "any other message with its attachment; the router drops larger ones silently",
         ),
         (f"{MOST_REQUEST_BYTES:,} bytes", "a request to `policy/{policy}/act`"),

@@ -9,7 +9,6 @@ import json
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Self
 
 import zenoh
@@ -21,68 +20,6 @@ from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.security.access_control import ROSTER, Roster, access_control, read_roster
 from fleet.bus.security.tls import Tls, identified, why_not
 from fleet.errors import BusError, NoRouter
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """What a router forwards from each session; the rest is dropped silently."""
-
-    message_bytes: int = MOST_BYTES
-    """Largest payload with its attachment, of a publication, a request or a reply. A request to a policy, or with a
-    wildcard or an unknown role in its key, may have `MOST_REQUEST_BYTES` with plain TCP or a policy in the roster."""
-    state_hz: float | None = None
-    """Telemetry messages a second, real time, of each session, or with TLS of each arm; None for any number. A steady
-    stream needs a limit of twice its rate, as Zenoh limits the gap between two messages, which varies."""
-
-    def __post_init__(self) -> None:
-        if self.message_bytes < 1:
-            raise ValueError(f"Limits.message_bytes must be >= 1 (got {self.message_bytes}).")
-        if self.state_hz is not None and not 0 < self.state_hz < 1e6:
-            raise ValueError(f"Limits.state_hz must be > 0, or None (got {self.state_hz}).")
-
-    def settings(self, roster: Roster | None = None) -> dict[str, Any]:
-        """Settings for Zenoh's configuration.
-
-        Args:
-            roster: Participants, if each is held to its own keys. The rate is then limited by key: one session, that of
-                a linked router, may carry the telemetry of many arms.
-        """
-        all_keys = ["**", keys.caches_of("**")]
-        # Of two filters that apply, the smaller one counts; only requests to policies may be larger.
-        others = [f"{keys.PREFIX}/*/{role}/**" for role in keys.TOPICS if role != "policy"]
-        # Of two limits of one key expression the last one counts, so each has one.
-        sizes = [
-            _size(["put", "delete", "reply"], all_keys, self.message_bytes),
-            _size(["query"], [*others, keys.caches_of("**")], self.message_bytes),
-            _size(["query"], ["**"], self._request_bytes(roster)),
-        ]
-        if self.state_hz is None:
-            return {"low_pass_filter": sizes}
-        limited = (
-            [keys.STATES]
-            if roster is None
-            else [keys.of_arm(roster.fleet, arm, "state") for arm in roster.of_role("arm")]
-        )
-        rate = {
-            "flows": ["ingress"],
-            "messages": ["put", "delete"],
-            "rules": [{"key_expr": key, "freq": self.state_hz} for key in limited],
-        }
-        return {"low_pass_filter": sizes, "downsampling": [rate]}
-
-    def assembled_bytes(self, roster: Roster | None = None) -> int:
-        """Largest fragmented message that the router assembles in memory before it checks its size."""
-        return max(2 * self.message_bytes, self._request_bytes(roster)) + MOST_BYTES
-
-    def _request_bytes(self, roster: Roster | None) -> int:
-        """Largest request to a policy, if there may be one."""
-        without = roster is not None and not roster.of_role("policy")
-        return self.message_bytes if without else max(self.message_bytes, MOST_REQUEST_BYTES)
-
-
-def _size(messages: list[str], expressions: list[str], most_bytes: int) -> dict[str, Any]:
-    return {"flows": ["ingress"], "messages": messages, "key_exprs": expressions, "size_limit": most_bytes}
-
 
 _LOG = logging.getLogger(__name__)
 
@@ -234,7 +171,7 @@ class Router:
         *,
         host: str = "127.0.0.1",
         tls: Tls | None = None,
-        limits: Limits | None = None,
+        state_hz: float | None = None,
         connect: Sequence[str] = (),
     ) -> None:
         """Prepare a router.
@@ -243,6 +180,9 @@ class Router:
             port: TCP port; 0 lets the system choose a free one.
             host: Address to listen on; without TLS one of loopback.
             tls: The router's certificate; the roster of its folder sets the access control. None for plain TCP.
+            state_hz: Telemetry messages a second, real time, forwarded of each session, or with TLS of each arm; None
+                for any number. A steady stream needs a limit of twice its rate, as Zenoh limits the gap between two
+                messages, which varies.
             connect: Endpoints of other routers of the fleet, `tls/HOST:PORT`. A link that is not there, or is lost, is
                 tried again every second at most.
 
@@ -251,10 +191,12 @@ class Router:
         """
         if not 0 <= port <= 65535:
             raise ValueError(f"A port is 0..65535 (got {port}).")
+        if state_hz is not None and not 0 < state_hz < 1e6:
+            raise ValueError(f"state_hz must be > 0, or None (got {state_hz}).")
         self._host = f"[{host.strip('[]')}]" if ":" in host else host
         self._port = port
         self._tls = tls
-        self._limits = limits or Limits()
+        self._state_hz = state_hz
         self._listen = f"{'tcp' if tls is None else 'tls'}/{self._host}:{port}"
         if tls is None:
             loopback(self._listen)
@@ -350,9 +292,9 @@ class Router:
             "connect": {"endpoints": self._connect, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
             # The admin space holds the port that the system chose.
             "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
-            **self._limits.settings(roster),
+            **limits(roster, self._state_hz),
         }
-        link = {"tx": _SENDING, "rx": {"max_message_size": self._limits.assembled_bytes(roster)}}
+        link = {"tx": _SENDING, "rx": {"max_message_size": assembled_bytes(roster)}}
         if self._tls is not None and roster is not None:
             link["tls"] = self._tls.link(serves=True)
             if self._connect:
@@ -370,6 +312,53 @@ class Router:
             if len(ports) == 1:
                 return f"{self._listen[:3]}/{reached_at(self._host)}:{ports.pop()}"
         raise BusError("The router opened, but its port is unknown.")
+
+
+def limits(roster: Roster | None = None, state_hz: float | None = None) -> dict[str, Any]:
+    """What a router forwards from each session, as Zenoh's configuration; the rest is dropped silently.
+
+    Payload and attachment of a message may have `MOST_BYTES`. A request to a policy, or with a wildcard or an unknown
+    role in its key, may have `MOST_REQUEST_BYTES` with plain TCP or a policy in the roster.
+
+    Args:
+        roster: Participants, if each is held to its own keys. The rate is then limited by key: one session, that of a
+            linked router, may carry the telemetry of many arms.
+        state_hz: As of `Router`.
+    """
+    all_keys = ["**", keys.caches_of("**")]
+    # Of two filters that apply, the smaller one counts; only requests to policies may be larger.
+    others = [f"{keys.PREFIX}/*/{role}/**" for role in keys.TOPICS if role != "policy"]
+    # Of two limits of one key expression the last one counts, so each has one.
+    sizes = [
+        _size(["put", "delete", "reply"], all_keys, MOST_BYTES),
+        _size(["query"], [*others, keys.caches_of("**")], MOST_BYTES),
+        _size(["query"], ["**"], _largest_request(roster)),
+    ]
+    if state_hz is None:
+        return {"low_pass_filter": sizes}
+    if roster is None:
+        limited = [keys.STATES]
+    else:
+        limited = [keys.of_arm(roster.fleet, arm, "state") for arm in roster.of_role("arm")]
+    rate = {
+        "flows": ["ingress"],
+        "messages": ["put", "delete"],
+        "rules": [{"key_expr": key, "freq": state_hz} for key in limited],
+    }
+    return {"low_pass_filter": sizes, "downsampling": [rate]}
+
+
+def assembled_bytes(roster: Roster | None = None) -> int:
+    """Largest fragmented message that the router assembles in memory before it checks its size."""
+    return max(2 * MOST_BYTES, _largest_request(roster)) + MOST_BYTES
+
+
+def _largest_request(roster: Roster | None) -> int:
+    return MOST_BYTES if roster is not None and not roster.of_role("policy") else MOST_REQUEST_BYTES
+
+
+def _size(messages: list[str], expressions: list[str], most_bytes: int) -> dict[str, Any]:
+    return {"flows": ["ingress"], "messages": messages, "key_exprs": expressions, "size_limit": most_bytes}
 
 
 def _config(own: Mapping[str, Any], link: Mapping[str, Any]) -> zenoh.Config:

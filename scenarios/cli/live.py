@@ -119,7 +119,7 @@ def router_command(
     ),
 ) -> None:
     """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; its endpoint is printed once it listens."""
-    from fleet.bus.router import Limits, Router
+    from fleet.bus.router import Router
     from fleet.bus.security.tls import Tls
     from scenarios.signals import until_stopped
 
@@ -127,8 +127,8 @@ def router_command(
         from scenarios.live.fleet_processes import check_roster
 
         check_roster(tls, scenario)
-    limits = Limits(state_hz=state_hz or None)
-    router = Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits, connect=connect or ())
+    own = Tls(tls, name) if tls else None
+    router = Router(port, host=host, tls=own, state_hz=state_hz or None, connect=connect or ())
     with until_stopped() as stop, router:
         echo(router.endpoint)  # flushed: a supervisor reads this line
         stop.wait()

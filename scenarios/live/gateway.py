@@ -1,8 +1,8 @@
 """The bus over HTTP: the fleet as JSON, messages as server-sent events, job requests, and a page for browsers.
 
-The bus is served on a thread of its own (`fleet.live.monitor.async_bridge`); feed and reader buffers are used on the
-event loop only. Errors are problem details (RFC 9457). The files of the page need no token, as they contain nothing of
-a fleet; the page asks for one and sends it with each request.
+The bus is served on a thread (`fleet.live.monitor.async_bridge`); feed and reader buffers are used on the event loop
+only. Errors are problem details (RFC 9457). The files of the page contain no data of a fleet and need no token; the
+page asks for one and sends it with each request.
 """
 
 import asyncio
@@ -55,7 +55,7 @@ from fleet.bus.protocol.operator import (
 )
 from fleet.env.render.heat import heat_scale
 from fleet.errors import NAME_RULE, BusError, FleetError, Refused, is_name, nearest
-from fleet.live.monitor.async_bridge import AsyncBridge, Entry, EventFeed, ReaderBuffer
+from fleet.live.monitor.async_bridge import AsyncBridge, EventFeed, FeedEntry
 from fleet.live.monitor.snapshot import MAX_JOBS
 from scenarios.cli.options import the_fleet
 from scenarios.signals import until_stopped
@@ -66,20 +66,20 @@ _LOG = logging.getLogger(__name__)
 
 Role = Literal["monitor", "submitter", "operator"]
 ROLES: tuple[Role, ...] = get_args(Role)
-"""Each role may do what the ones before it may."""
+"""Each role has the rights of the ones before it."""
 TOKEN = "THERMOFLEET_TOKEN"
 """Environment variable of the operator's token."""
 MIN_TOKEN = 16
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
 RATE_HZ, BURST = 50.0, 100.0
-"""Requests per real second of one token, or without tokens of one address; and requests at once after a pause."""
+"""Requests per real second of one token (without tokens: of one address), and size of a burst after a pause."""
 MAX_SENDERS = 4096
-"""Tokens and addresses whose rate is kept."""
+"""Maximum number of tokens and addresses whose rate is kept."""
 MAX_BYTES = 60_000
-"""Of a body: what the router forwards, less the overhead of a message."""
+"""Size of a body: the limit of the router, less the overhead of a message."""
 MAX_READERS, MAX_REQUESTS = 64, 16
 BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
-"""Real seconds: for a body to arrive; for a reader to take what was sent; between two heartbeats."""
+"""Real seconds for a body to arrive, for a reader to receive, and between two heartbeats."""
 MAX_CONNECTIONS = 1000
 MAX_WAITING = 128
 """Connections without a complete request; the next one closes the oldest."""
@@ -165,7 +165,7 @@ NO_TOKENS: Mapping[str, Role] = {}
 
 
 class HttpProblem(Exception):
-    """An HTTP error with a sentence that says what is wrong."""
+    """An HTTP error with its explanation."""
 
     def __init__(self, status: HTTPStatus, detail: str) -> None:
         super().__init__(detail)
@@ -205,12 +205,12 @@ def read_tokens(path: Path) -> dict[str, Role]:
             raise FleetError(f"{path}, line {number}: no role '{name}'{nearest(name, ROLES)}")
         tokens[check_token(token.strip())] = role
     if not tokens:
-        raise FleetError(f"'{path}' holds no tokens; a line is ROLE TOKEN. Roles: {', '.join(ROLES)}.")
+        raise FleetError(f"'{path}' has no tokens. Write ROLE TOKEN in each line; roles: {', '.join(ROLES)}.")
     return tokens
 
 
 class AccessCheck:
-    """Passes requests that show a token, at a limited rate; without tokens, requests to this machine's local names.
+    """Passes requests with a token, at a limited rate; without tokens, requests to the local names of this machine.
 
     The host name is checked because a page of another site could otherwise send requests under its own host name (DNS
     rebinding). A `public` request needs no token.
@@ -221,7 +221,7 @@ class AccessCheck:
     ) -> None:
         self.app, self.tokens, self.public = app, {token.encode(): role for token, role in tokens.items()}, public
         self._senders: dict[bytes, tuple[float, float]] = {}
-        """Requests that each may still send, and the loop's time at which that was counted."""
+        """Remaining requests of each sender, and the loop time of that count."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse the request or pass it on, with its role."""
@@ -270,7 +270,7 @@ def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str]
 
 
 class AskBody(msgspec.Struct, frozen=True):
-    """Body of /v4/ask: jobs to be quoted, not done."""
+    """Body of /v4/ask: jobs for quotes."""
 
     jobs: tuple[JobSpec, ...]
 
@@ -284,30 +284,22 @@ class ResetBody(msgspec.Struct, frozen=True):
 
 
 @dataclass(eq=False)
-class Reader(ReaderBuffer):
-    """One reader of the event stream."""
-
-    wake: asyncio.Event = field(default_factory=asyncio.Event)
-
-
-@dataclass(eq=False)
 class Readers:
     """All readers of the event stream; used on the event loop only."""
 
-    connected: set[Reader] = field(default_factory=set[Reader])
+    connected: set[asyncio.Event] = field(default_factory=set[asyncio.Event])
+    """Each reader waits for its event."""
     closed: bool = False
 
-    def put(self, entry: Entry) -> None:
-        """Pass an entry to every reader."""
+    def wake(self) -> None:
+        """Have every reader look for new entries."""
         for reader in self.connected:
-            reader.put(entry)
-            reader.wake.set()
+            reader.set()
 
     def close(self) -> None:
         """End every stream."""
         self.closed = True
-        for reader in self.connected:
-            reader.wake.set()
+        self.wake()
 
 
 def application(
@@ -402,8 +394,8 @@ def application(
         ("GET", "/v4/events", "monitor", events, "Every message as server-sent events."),
         ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
         ("POST", "/v4/jobs", "submitter", submit, "Submit jobs: a Submission."),
-        ("GET", "/v4/cell", "monitor", get_cell, "Places, arms, kinds of jobs and limits: all that a job may name."),
-        ("GET", "/v4/scene", "monitor", get_scene, "Arms, places and colours in three dimensions, as the page draws."),
+        ("GET", "/v4/cell", "monitor", get_cell, "Places, arms, kinds of jobs and limits."),
+        ("GET", "/v4/scene", "monitor", get_scene, "Arms, places and colours in three dimensions."),
         ("POST", "/v4/control", "operator", control, "Cancel, settle, change, pause, resume: a ControlRequest."),
         ("POST", "/v4/clear", "operator", clear, "Free the space of an absent arm: a ClearRequest."),
         ("POST", "/v4/reset", "operator", post_reset, 'Clear the fault of an arm: {"arm": …, "by": …}.'),
@@ -425,7 +417,7 @@ class EventStream(StreamingResponse):
     ) -> None:
         super().__init__(self._text(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
         self._feed, self._readers, self._boot, self._last_event = feed, readers, boot, last_event
-        self._heartbeat_s, self._stuck_s, self._reader = heartbeat_s, stuck_s, Reader()
+        self._heartbeat_s, self._stuck_s, self._woken = heartbeat_s, stuck_s, asyncio.Event()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Write the stream."""
@@ -433,34 +425,36 @@ class EventStream(StreamingResponse):
         async def send_in_time(message: Message) -> None:
             await asyncio.wait_for(send(message), self._stuck_s)
 
-        self._readers.connected.add(self._reader)
+        self._readers.connected.add(self._woken)
         try:
             await super().__call__(scope, receive, send_in_time)
         except TimeoutError:
             pass  # the reader is stuck: the server closes the connection of an unfinished stream
         finally:
-            self._readers.connected.discard(self._reader)
+            self._readers.connected.discard(self._woken)
 
     async def _text(self) -> AsyncIterator[str]:
-        reader = self._reader
         last_boot, _, number = self._last_event.partition("-")
         seen = int(number) if last_boot == self._boot and number.isdecimal() and len(number) < 20 else 0
-        missed, gap = self._feed.since(seen)
+        entries, gap = self._feed.since(seen)
         gap_text = "event: gap\ndata: {}\n\n" if gap and self._last_event else ""
-        yield "retry: 1000\n\n" + gap_text + "".join(map(self._event, missed))
-        seen = missed[-1].number if missed else 0
-        while not (self._readers.closed or reader.full):
+        yield "retry: 1000\n\n" + gap_text + "".join(map(self._event, entries))
+        seen = entries[-1].number if entries else 0
+        while not self._readers.closed:
             try:
-                await asyncio.wait_for(reader.wake.wait(), self._heartbeat_s)
+                await asyncio.wait_for(self._woken.wait(), self._heartbeat_s)
             except TimeoutError:
                 yield ": heartbeat\n\n"
                 continue
-            reader.wake.clear()
-            entries = [entry for entry in reader.take() if entry.number > seen]
-            if entries and not reader.full:
+            self._woken.clear()
+            entries, gap = self._feed.since(seen)
+            if gap:
+                break  # it has missed events: it reconnects, and is told of the gap
+            if entries:
+                seen = entries[-1].number
                 yield "".join(map(self._event, entries))
 
-    def _event(self, entry: Entry) -> str:
+    def _event(self, entry: FeedEntry) -> str:
         name = msgspec.json.encode(entry.name).decode()
         data = f'{{"name":{name},"message":{entry.data}}}'
         return f"id: {self._boot}-{entry.number}\nevent: {entry.topic}\ndata: {data}\n\n"
@@ -551,7 +545,7 @@ def run_gateway(
 
 
 def check(host: str, endpoint: str, has_tokens: bool) -> None:
-    """Refuse to pass on requests without a token of those that could not send them to the router themselves.
+    """Require a token from users who could not reach the router themselves.
 
     Raises:
         FleetError: an option is wrong or missing.
@@ -576,7 +570,7 @@ def check(host: str, endpoint: str, has_tokens: bool) -> None:
 
 
 def listen(host: str, port: int, stuck_s: float) -> socket.socket:
-    """Socket on which the system drops connections whose reader takes nothing for `stuck_s`.
+    """Listening socket; the system closes connections whose reader receives nothing for `stuck_s`.
 
     Raises:
         FleetError: the address is not of this machine, or the port is in use.
@@ -618,13 +612,13 @@ class Server(uvicorn.Server):
         yield
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End the event streams, which have no end of their own, and shut down."""
+        """End the event streams, and shut down."""
         self._readers.close()
         await super().shutdown(sockets)
 
 
 def _protocol() -> type[H11Protocol]:
-    """HTTP of one server, which does not let connections wait without a complete request."""
+    """HTTP protocol that closes connections without a complete request."""
     waiting: dict[H11Protocol, Callable[[], None]] = {}
 
     class Protocol(H11Protocol):
@@ -655,7 +649,7 @@ def _protocol() -> type[H11Protocol]:
 async def serve(link: BusClient, bound: socket.socket, tokens: Mapping[str, Role], page: LivePage | None = None) -> int:
     """Serve until a signal arrives; return its number."""
     readers, received = Readers(), [0]
-    async with AsyncBridge(link, readers.put) as bridge:
+    async with AsyncBridge(link, readers.wake) as bridge:
         server = Server(application(bridge, readers, tokens=tokens, page=page), readers)
 
         def stop(number: int) -> None:

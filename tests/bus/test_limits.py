@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from fleet.bus.protocol import keys
-from fleet.bus.router import Limits, Router, open_client
+from fleet.bus.router import Router, assembled_bytes, limits, open_client
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
@@ -28,9 +28,8 @@ def connect(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     secure = request.param == "tls"
     if secure:
         make(folder, of_arms("f", ["arm_0", "arm_1"]), days=1)
-    limits = Limits(state_hz=STATE_HZ)
     with ExitStack() as stack:
-        router = stack.enter_context(Router(tls=Tls(folder, "router") if secure else None, limits=limits))
+        router = stack.enter_context(Router(tls=Tls(folder, "router") if secure else None, state_hz=STATE_HZ))
         sessions: dict[str, zenoh.Session] = {}
 
         def session(name: str) -> zenoh.Session:
@@ -148,8 +147,7 @@ def test_without_a_policy_in_the_roster_no_request_may_be_large():
     """Only of parameters does the router not know the size: it does not assemble them."""
     without, policy = of_arms("f", ["arm_0"]), of_arms("f", ["arm_0"], [RosterEntry("mine", "policy")])
     largest = [
-        (max(size["size_limit"] for size in limits.settings(roster)["low_pass_filter"]), limits.assembled_bytes(roster))
-        for limits in [Limits()]
+        (max(size["size_limit"] for size in limits(roster)["low_pass_filter"]), assembled_bytes(roster))
         for roster in (without, policy, None)
     ]
     assert largest == [(LIMIT, 3 * LIMIT), *2 * [(64 * LIMIT, 65 * LIMIT)]]
@@ -217,9 +215,7 @@ def test_without_a_rate_every_word_passes():
         listener.undeclare()
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"message_bytes": 0}, {"state_hz": 0.0}, {"state_hz": -1.0}, {"state_hz": float("nan")}]
-)
-def test_limits_that_cannot_be_are_refused(wrong):
-    with pytest.raises(ValueError, match=rf"Limits\.{next(iter(wrong))}"):
-        Limits(**wrong)
+@pytest.mark.parametrize("wrong", [0.0, -1.0, float("nan")])
+def test_a_rate_that_cannot_be_is_refused(wrong):
+    with pytest.raises(ValueError, match="state_hz must be > 0"):
+        Router(state_hz=wrong)

@@ -16,9 +16,9 @@ from jsonschema import Draft202012Validator
 
 from docs.bus_contract import EXAMPLES
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.messages import decode, encoding
+from fleet.bus.protocol.messages import MOST_BYTES, decode, encoding
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES, ActReply, ActRequest
-from fleet.bus.router import Limits, Router, open_client
+from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
@@ -69,7 +69,7 @@ class Server:
 
 @pytest.fixture(scope="module")
 def router() -> Iterator[Router]:
-    with Router(limits=Limits()) as router:
+    with Router() as router:
         yield router
 
 
@@ -147,8 +147,10 @@ def test_shifts_have_different_names_and_the_same_seed_and_count_their_decisions
 )
 def test_a_reply_that_cannot_be_used_is_an_error_within_the_limit(router, served, payload, sent_as, said):
     served(payload, sent_as)
+    policy = client(router, LIMIT_S if payload is None else PATIENCE_S)
     with refused(said):
-        client(router, LIMIT_S if payload is None else PATIENCE_S).act(seen())
+        policy.act(seen())
+    assert policy._client._session is None  # a failed decision ends the connection
 
 
 def test_a_flood_of_replies_is_not_waited_for(router):
@@ -163,6 +165,7 @@ def test_a_flood_of_replies_is_not_waited_for(router):
         impostor.declare_queryable(KEY, flood, complete=True)
         with refused("Several processes reply as policy 'mine'"):
             client(router).act(seen())
+    assert len(held) == 1
 
 
 def test_a_decision_without_a_valid_reply_is_requested_again(router, served):
@@ -180,10 +183,10 @@ def test_a_decision_without_a_valid_reply_is_requested_again(router, served):
 def test_nobody_two_and_no_router_are_told_apart_at_once(router, served):
     with refused(f"No process serves the policy 'mine' at tcp/.*: start it; .* '{KEY}'"):
         client(router).act(seen())
-    for _ in range(2):
-        served('{"actions": {}}')
+    servers = [served('{"actions": {}}') for _ in range(2)]
     with refused("Several processes reply as policy 'mine' at tcp/.*: stop all but one"):
         client(router).act(seen())
+    assert [server.requests.qsize() for server in servers] == [1, 1]
     nowhere = PolicyClient("mine", fleet="f", endpoint="tcp/127.0.0.1:1", limit_s=PATIENCE_S)
     with refused("No router answered at tcp/127.0.0.1:1 .* start a router with thermofleet bus router"):
         nowhere.act(seen())
@@ -204,7 +207,7 @@ def test_large_fleets_fit_and_larger_ones_are_told_to(router, served):
     server = served('{"actions": {}}')
     assert client(router).act(seen(16, 50, np.random.default_rng(2))) == {}
     size = len(server.requests.get(timeout=PATIENCE_S)[2])
-    assert Limits().message_bytes < size < MOST_REQUEST_BYTES
+    assert MOST_BYTES < size < MOST_REQUEST_BYTES
     with refused("observations of 48 arms have .* bytes, and a request to a policy at most 4,194,304"):
         client(router, LIMIT_S).act(seen(48, 256))
 
@@ -215,11 +218,11 @@ def test_what_goes_to_others_is_not_larger_than_before(router):
         open_client(router.endpoint, timeout_s=PATIENCE_S) as other,
     ):
         server = Server(one, "{}", key="thermofleet/v4/f/arm/arm_0/quote")
-        for size in (Limits().message_bytes + 1, Limits().message_bytes):
+        for size in (MOST_BYTES + 1, MOST_BYTES):
             for key in (keys.of_arm("f", "arm_0", "quote"), keys.of_every_arm("f", "quote")):
                 list(other.get(key, payload=b"x" * size, timeout=PATIENCE_S))
         sizes = [len(server.requests.get(timeout=PATIENCE_S)[2]) for _ in range(2)]
-        assert sizes == [Limits().message_bytes] * 2
+        assert sizes == [MOST_BYTES] * 2
         assert server.requests.empty()
 
 

@@ -204,8 +204,10 @@ def test_lists_that_do_not_fit_the_names_are_refused(lengths, field):
 @given(st.binary(max_size=200) | st.binary(max_size=200).map(lambda rest: HEADER + rest))
 def test_random_bytes_raise_nothing_else(payload):
     for read in (read_joints, read_diagnostics):
+        message = None
         with suppress(MalformedMessage):
-            read(payload)
+            message = read(payload)
+        assert message is None or isinstance(message, Joints | tuple)
 
 
 @pytest.mark.parametrize("count", [MAX_ITEMS, MAX_ITEMS + 1])
@@ -441,7 +443,8 @@ def test_a_domain_that_ros_does_not_allow_is_refused(number):
 @examples(50)
 @given(st.text(max_size=20))
 def test_any_name_becomes_part_of_a_topic(name):
-    Topic(f"/{plain_name(name)}/joint_states", STRING, NO_HASH)
+    part = plain_name(name)
+    assert Topic(f"/{part}/joint_states", STRING, NO_HASH).key.startswith(f"0/{part}/joint_states/")
 
 
 @examples(50)

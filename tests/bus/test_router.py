@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import State
-from fleet.bus.router import Limits, Router, loopback, open_client, reachable
+from fleet.bus.router import Router, loopback, open_client, reachable
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls, identified
@@ -65,7 +65,8 @@ def test_lines_that_nobody_opens_keep_nobody_out():
         host, port = router.endpoint.removeprefix("tcp/").split(":")
         for _ in range(150):
             stack.enter_context(socket.create_connection((host, int(port)), timeout=PATIENCE_S))
-        open_client(router.endpoint, timeout_s=PATIENCE_S).close()
+        with open_client(router.endpoint, timeout_s=PATIENCE_S) as session:
+            assert len(session.info.routers_zid()) == 1
 
 
 def test_no_router_is_said_within_the_time_given():
@@ -270,10 +271,10 @@ def test_missed_messages_are_fetched_when_a_router_is_back(place):
 
 def test_the_rate_limit_counts_each_arm_and_not_the_link(place):
     """Four arms of 25 messages a second are as many as one arm may send; behind a link they are one session."""
-    limits, each = Limits(state_hz=50.0), 20
+    each = 20
     with (
-        Router(tls=Tls(place, "router"), limits=limits) as near,
-        Router(tls=Tls(place, FAR.name), connect=[near.endpoint], limits=limits) as far,
+        Router(tls=Tls(place, "router"), state_hz=50.0) as near,
+        Router(tls=Tls(place, FAR.name), connect=[near.endpoint], state_hz=50.0) as far,
         ExitStack() as stack,
     ):
         wait_until(lambda: near.linked() == far.linked() == 1)

@@ -6,13 +6,11 @@ import msgspec
 import pytest
 
 from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, Submission
-from fleet.bus.protocol.messages import MalformedMessage, decode, encode
+from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
-from fleet.bus.router import Limits
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.ledger import Ledger
 
-MAX_BYTES = Limits().message_bytes
 SOON_S = 2.0
 """Of the processor: far below the 6 s after which an arm loses its lease, and far above what a slow one takes."""
 
@@ -70,9 +68,9 @@ def test_why_jobs_are_not_accepted_fits_into_one_message(auctioneer, jobs):
     first = Submission(tuple(msgspec.structs.replace(each, after=()) for each in long_names()))
     auctioneer.submit(first, 0.0, 0.0)
     request = Submission(tuple(msgspec.structs.replace(each, dwell_s=7.0) for each in jobs))
-    assert len(encode(request)) <= MAX_BYTES
+    assert len(encode(request)) <= MOST_BYTES
     reply = auctioneer.submit(request, 0.0, 0.0)
-    assert len(encode(reply)) <= MAX_BYTES
+    assert len(encode(reply)) <= MOST_BYTES
     assert not any(each.accepted for each in reply.jobs)
 
 

@@ -1,8 +1,8 @@
 """Bridge between an event loop and the bus: a thread that serves the bus, and requests that can be awaited.
 
-Messages are numbered for slow readers, with a bounded buffer for each. A slow reader misses telemetry (the newest
-message of each arm replaces the one before) and never delays the others. A reader that falls so far behind that events
-would be lost is dropped; it reconnects with the last number it has seen.
+Messages are numbered: a reader asks for those after the last number that it has seen. A slow reader misses telemetry,
+as the newest message of each arm replaces the one before, and never delays the others. A reader that falls so far
+behind that it has missed events is dropped, and reconnects.
 """
 
 import asyncio
@@ -11,7 +11,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import takewhile
 from typing import Self, TypeVar
 
 import msgspec
@@ -31,16 +32,14 @@ REPLY_S, QUOTE_S, TURN_S = 5.0, 1.0, 0.2
 """Real seconds: for the auctioneer to reply; for all arms to quote; between two checks whether to stop."""
 
 HISTORY = 1024
-"""Events and results that a reader can still get after it reconnects."""
+"""Events and results that are kept for slow readers, and for those that reconnect."""
 MAX_NAMES = 4096
-MAX_WAITING = 256
-"""Events and results that wait for one reader."""
 NEWEST_ONLY = ("state", "difficulty", "info", "bid", "presence", "announce")
 """Topics of which only the newest message of each name counts; of all others every message does."""
 
 
 @dataclass(frozen=True)
-class Entry:
+class FeedEntry:
     """One message of the stream."""
 
     number: int
@@ -52,66 +51,33 @@ class Entry:
     """JSON on one line."""
 
 
-def _newest() -> "Recent[tuple[str, str], Entry]":
-    """The newest entry of each topic and name."""
-    return Recent(MAX_NAMES)
-
-
-@dataclass
 class EventFeed:
     """The newest message of each name and topic, and the last events and results."""
 
-    number: int = 0
-    _newest: "Recent[tuple[str, str], Entry]" = field(default_factory=_newest)
-    _events: "deque[Entry]" = field(default_factory=lambda: deque[Entry](maxlen=HISTORY))
-    _dropped: int = 0
-    """Number of the last event or result that is no longer kept."""
+    def __init__(self) -> None:
+        self._number = 0
+        self._newest: Recent[tuple[str, str], FeedEntry] = Recent(MAX_NAMES)
+        self._events: deque[FeedEntry] = deque(maxlen=HISTORY)
+        self._dropped = 0
+        """Number of the last event or result that is no longer kept."""
 
-    def add(self, topic: str, name: str, data: str) -> Entry:
+    def add(self, topic: str, name: str, data: str) -> None:
         """Number a message and keep it."""
-        self.number += 1
-        entry = Entry(self.number, topic, name, data)
+        self._number += 1
+        entry = FeedEntry(self._number, topic, name, data)
         if topic in NEWEST_ONLY:
             self._newest[topic, name] = entry
-        else:
-            if len(self._events) == HISTORY:
-                self._dropped = self._events[0].number
-            self._events.append(entry)
-        return entry
-
-    def since(self, number: int) -> tuple[list[Entry], bool]:
-        """Return the entries after a number, in order, and whether events between them were dropped."""
-        entries = [entry for entry in (*self._newest.values(), *self._events) if entry.number > number]
-        return sorted(entries, key=lambda entry: entry.number), number < self._dropped
-
-
-@dataclass(eq=False)
-class ReaderBuffer:
-    """Entries that wait for one reader."""
-
-    full: bool = False
-    """Events were lost, and the reader must be disconnected."""
-    _newest: "Recent[tuple[str, str], Entry]" = field(default_factory=_newest)
-    _events: list[Entry] = field(default_factory=list[Entry])
-
-    def put(self, entry: Entry) -> None:
-        """Add an entry; once full, do nothing."""
-        if self.full:
             return
-        if entry.topic in NEWEST_ONLY:
-            self._newest[entry.topic, entry.name] = entry
-        elif len(self._events) < MAX_WAITING:
-            self._events.append(entry)
-        else:
-            self.full = True
-            self.take()
+        if len(self._events) == HISTORY:
+            self._dropped = self._events[0].number
+        self._events.append(entry)
 
-    def take(self) -> list[Entry]:
-        """Remove and return all waiting entries, in order."""
-        entries = sorted((*self._newest.values(), *self._events), key=lambda entry: entry.number)
-        self._newest.clear()
-        self._events.clear()
-        return entries
+    def since(self, number: int) -> tuple[list[FeedEntry], bool]:
+        """Return the entries after a number, in order, and whether events between them were dropped."""
+        entries: list[FeedEntry] = []
+        for kept in (self._newest.values(), self._events):
+            entries += takewhile(lambda entry: entry.number > number, reversed(kept))
+        return sorted(entries, key=lambda entry: entry.number), number < self._dropped
 
 
 class Quotes(msgspec.Struct, frozen=True):
@@ -123,18 +89,18 @@ class Quotes(msgspec.Struct, frozen=True):
 
 
 class AsyncBridge:
-    """`async with AsyncBridge(link, on_entry) as bridge:` serves the bus on a thread until the end of the block.
+    """`async with AsyncBridge(link, on_message) as bridge:` serves the bus on a thread until the end of the block.
 
     Attributes:
         fleet: Name of the fleet.
         feed: Numbered messages; used on the event loop only.
     """
 
-    def __init__(self, link: BusClient, on_entry: Callable[[Entry], None]) -> None:
-        """Prepare; `link` is open, and `on_entry` is called with every message, on the event loop."""
+    def __init__(self, link: BusClient, on_message: Callable[[], None]) -> None:
+        """Prepare; `link` is open, and `on_message` is called for every message in `feed`, on the event loop."""
         self.feed = EventFeed()
         self.fleet = link.fleet
-        self._link, self._on_entry = link, on_entry
+        self._link, self._on_message = link, on_message
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="bus", daemon=True)
         self._listener = FleetListener(link, on_message=self._message, on_presence=self._presence)
@@ -203,12 +169,15 @@ class AsyncBridge:
             self._listener.serve(time.monotonic() + TURN_S)
 
     def _message(self, topic: str, name: str, message: msgspec.Struct) -> None:
-        data = encode(message).decode()
-        self._on_loop(lambda: self._on_entry(self.feed.add(topic, name, data)))
+        self._on_loop(lambda: self._add(topic, name, encode(message)))
 
     def _presence(self, role: Role, name: str, present: bool) -> None:
-        data = msgspec.json.encode({"role": role, "name": name, "there": present}).decode()
-        self._on_loop(lambda: self._on_entry(self.feed.add("presence", f"{role}/{name}", data)))
+        data = msgspec.json.encode({"role": role, "name": name, "there": present})
+        self._on_loop(lambda: self._add("presence", f"{role}/{name}", data))
+
+    def _add(self, topic: str, name: str, data: bytes) -> None:
+        self.feed.add(topic, name, data.decode())
+        self._on_message()
 
     def _on_loop(self, call: Callable[[], None]) -> None:
         """Run `call` on the event loop, if that still runs."""

@@ -13,7 +13,7 @@ from fleet.bus.protocol.messages import DifficultyScores
 from fleet.bus.router import Router
 from fleet.live.monitor import snapshot as listener_module
 from fleet.live.monitor import snapshot as snapshot_module
-from fleet.live.monitor.async_bridge import HISTORY, MAX_WAITING, NEWEST_ONLY, EventFeed, ReaderBuffer
+from fleet.live.monitor.async_bridge import HISTORY, NEWEST_ONLY, EventFeed
 from fleet.live.monitor.snapshot import FRESH_S, FleetListener, FleetView, JobScore
 from tests.live.monitor.messages import result, stands, state
 from tests.waiting import serve_until, wait_until
@@ -133,44 +133,31 @@ def test_too_many_names_drop_the_oldest(monkeypatch):
     st.integers(0, 60),
 )
 def test_a_reader_gets_every_event_once_and_the_newest_state(said, after):
-    """Taken in two helpings or one, in order: the letter box and the feed tell the same."""
-    feed, box, got = EventFeed(), ReaderBuffer(), []
+    """Read in two parts or in one, in order."""
+    feed, got = EventFeed(), []
     for count, (topic, name) in enumerate(said):
-        box.put(feed.add(topic, name, str(count)))
+        feed.add(topic, name, str(count))
         if count == after:
-            got += box.take()
-    got += box.take()
+            got += feed.since(0)[0]
+    got += feed.since(got[-1].number if got else 0)[0]
     numbers = [entry.number for entry in got]
     assert numbers == sorted(set(numbers))
     events = [number for number, (topic, _) in enumerate(said, 1) if topic not in NEWEST_ONLY]
     assert [entry.number for entry in got if entry.topic not in NEWEST_ONLY] == events
     last = {where: number for number, where in enumerate(said, 1) if where[0] in NEWEST_ONLY}
     assert {(entry.topic, entry.name): entry.number for entry in got if entry.topic in NEWEST_ONLY} == last
-    missed, gap = feed.since(0)
+    entries, gap = feed.since(0)
     assert not gap
-    assert {entry.number for entry in missed} == {*events, *last.values()}
+    assert {entry.number for entry in entries} == {*events, *last.values()}
 
 
-def test_bids_drop_no_event():
-    feed, box = EventFeed(), ReaderBuffer()
-    for topic in ("event", *["bid"] * (HISTORY + 1), "event"):
-        box.put(feed.add(topic, "a", "{}"))
-    missed, gap = feed.since(0)
+def test_telemetry_and_bids_drop_no_event():
+    feed = EventFeed()
+    for topic in ("event", *["bid", "state"] * (HISTORY + 1), "event"):
+        feed.add(topic, "a", "{}")
+    entries, gap = feed.since(0)
     assert not gap
-    assert [entry.topic for entry in missed] == [entry.topic for entry in box.take()] == ["event", "bid", "event"]
-
-
-def test_a_full_reader_buffer_is_empty_and_telemetry_never_fills_it():
-    feed, box = EventFeed(), ReaderBuffer()
-    for _ in range(MAX_WAITING + 1):
-        box.put(feed.add("event", "a", "{}"))
-    assert box.full
-    assert box.take() == []
-    feed, box = EventFeed(), ReaderBuffer()
-    for number in range(10 * MAX_WAITING):
-        box.put(feed.add("state", f"arm {number % 5}", "{}"))
-    assert not box.full
-    assert len(box.take()) == 5
+    assert [entry.topic for entry in entries] == ["event", "bid", "state", "event"]
 
 
 def test_dropped_events_leave_a_gap():
