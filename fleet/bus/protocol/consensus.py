@@ -84,7 +84,7 @@ class JobOutcome(FiniteStruct, frozen=True):
     cycles: Count
     time_s: Number
     reason: str = ""
-    faults: Faults = msgspec.field(default_factory=dict[str, str])
+    faults: Faults = {}  # noqa: RUF012 - msgspec copies it
 
 
 class Claim(msgspec.Struct, frozen=True):

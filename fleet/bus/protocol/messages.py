@@ -38,9 +38,8 @@ class FiniteStruct(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         for name in _float_fields(type(self)):
-            value = getattr(self, name)
-            numbers: tuple[float | None, ...] = value if isinstance(value, tuple) else (value,)
-            for number in numbers:
+            value: float | tuple[float | None, ...] | None = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
                 if number is not None and not isfinite(number):
                     raise ValueError(f"{type(self).__name__}.{name} must be finite (got {number}).")
 
