@@ -13,7 +13,7 @@ from scenarios.prepare.fleet import prepare, world_of
 from scenarios.prepare.load_factor import load_factor
 from scenarios.spec.jobs import works_of
 from scenarios.spec.schema import SPLITS, JobStream
-from scenarios.suite.instances import CELLS, TRADES, Axes, Cell, scenario_of
+from scenarios.suite.instances import CELLS, TRADES, Axes, SuiteCell, scenario_of
 from scenarios.suite.splits import drawn_rows, line_of
 
 FOLDER = Path(__file__).parents[1] / "scenarios" / "suite"
@@ -22,7 +22,7 @@ PLAIN = Axes(
 )
 
 
-def time_loads_of(cell: Cell) -> tuple[float, float]:
+def time_loads_of(cell: SuiteCell) -> tuple[float, float]:
     """Time load of one job of each stream and payload, of the tasks that heat and of the others."""
     scenario = scenario_of(cell.name, cell, PLAIN, 0, (1.0, 1.0))
     fleet = prepare(scenario, difficulty="blind")

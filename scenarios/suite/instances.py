@@ -3,13 +3,12 @@
 A *group* of stations lies between two neighbouring arms. Its station `a` is nearer to one, `b` to the other, `c` to
 neither. The dimensions keep arms at home apart, and let each arm work in a group while its neighbour works in the next.
 
-Masses, forces and times of the tasks are engineering estimates within the rating of the Gen3.
-
 A cell determines all that is prepared: plans, space and twins. Many instances share a cell; no two splits do. Instances
 of a cell differ in jobs, ambient temperature, faults and bus.
 """
 
 import json
+import tomllib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache
@@ -17,7 +16,7 @@ from importlib import resources
 from itertools import pairwise
 from math import ceil, cos, degrees, pi, sin
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -50,7 +49,7 @@ SIDE_M = 0.15
 
 
 @dataclass(frozen=True)
-class Layout:
+class CellLayout:
     """Mounted arms and groups of stations."""
 
     arms: tuple[ArmSpec, ...]
@@ -63,7 +62,9 @@ class Layout:
         return tuple(place for group in self.groups for place in group)
 
 
-def layout_of(name: LayoutName, arms: int, stations: int = 2, *, pitch_m: float = 0.8, front_m: float = 0.4) -> Layout:
+def layout_of(
+    name: LayoutName, arms: int, stations: int = 2, *, pitch_m: float = 0.8, front_m: float = 0.4
+) -> CellLayout:
     """The layout of this name.
 
     Args:
@@ -71,30 +72,21 @@ def layout_of(name: LayoutName, arms: int, stations: int = 2, *, pitch_m: float 
         stations: In each group, 2 or 3.
         pitch_m: Distance between neighbours.
         front_m: Distance of the stations in front of the line between two neighbours.
-
-    Raises:
-        ValueError: the layout does not exist for this number of arms or stations.
     """
-    least = 4 if name in ("bench", "ring") else 2
-    if arms < least or (name == "bench" and arms % 2):
-        even = ", an even number" if name == "bench" else ""
-        raise ValueError(f"A {name} has at least {least} arms{even} (got {arms}).")
-    if stations not in (2, 3):
-        raise ValueError(f"stations must be 2 or 3 (got {stations}).")
     return _LAYOUTS[name](arms, stations, pitch_m, front_m)
 
 
-def _line(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
+def _line(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
     """Arms on the floor in rows; the stations are in front of them."""
     rows = ceil(arms / MOST_IN_ROW)
     lengths = [arms // rows + (row < arms % rows) for row in range(rows)]
     spots = [(x, APART_M * (row - (rows - 1) / 2)) for row, n in enumerate(lengths) for x in _along(n, pitch_m)]
     mounted = tuple(_arm(i, (x, y, 0.0), (0.0, 0.0, 90.0)) for i, (x, y) in enumerate(spots))
     middles = [((x + next_x) / 2, y + front_m) for (x, y), (next_x, next_y) in pairwise(spots) if y == next_y]
-    return Layout(mounted, tuple(_group(i, at, 0.0, 0.25, stations) for i, at in enumerate(middles)))
+    return CellLayout(mounted, tuple(_group(i, at, 0.0, 0.25, stations) for i, at in enumerate(middles)))
 
 
-def _bench(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
+def _bench(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
     """Two rows of arms facing each other across a bench; each group has stations on both sides of its middle."""
     across_m, columns = front_m + 0.15, arms // 2
     mounted = [
@@ -107,10 +99,10 @@ def _bench(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
         for i, (x, next_x) in enumerate(pairwise(_along(columns, pitch_m)))
         for row, side in enumerate((-1.0, 1.0))
     ]
-    return Layout(tuple(mounted), tuple(groups))
+    return CellLayout(tuple(mounted), tuple(groups))
 
 
-def _ring(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
+def _ring(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
     """Arms in a circle, facing outwards; the stations are around it."""
     radius_m = pitch_m / 2 / sin(pi / arms)
     around = [2 * pi * i / arms for i in range(arms)]
@@ -119,28 +111,28 @@ def _ring(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
     out_m = radius_m * cos(pi / arms) + front_m
     between = [a + pi / arms for a in around]
     groups = [_group(i, (out_m * cos(a), out_m * sin(a)), a - pi / 2, 0.25, stations) for i, a in enumerate(between)]
-    return Layout(tuple(mounted), tuple(groups))
+    return CellLayout(tuple(mounted), tuple(groups))
 
 
-def _gantry(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
+def _gantry(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
     """Arms hanging from a beam in a row; the stations are below, in front of it."""
     along = _along(arms, pitch_m)
     mounted = tuple(_arm(i, (x, 0.0, 1.2), (180.0, 0.0, 90.0)) for i, x in enumerate(along))
     middles = [((x + next_x) / 2, front_m - 0.08) for x, next_x in pairwise(along)]
-    return Layout(mounted, tuple(_group(i, at, 0.0, 0.45, stations) for i, at in enumerate(middles)))
+    return CellLayout(mounted, tuple(_group(i, at, 0.0, 0.45, stations) for i, at in enumerate(middles)))
 
 
-def _wall_ceiling(arms: int, stations: int, pitch_m: float, front_m: float) -> Layout:
+def _wall_ceiling(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
     """Arms alternately on a wall and on the ceiling; the stations are between wall and beam."""
     wall, ceiling = ((1.0, 0.5), (90.0, 0.0, 0.0)), ((0.1, 1.2), (180.0, 0.0, 90.0))
     along = _along(arms, pitch_m)
     mounts = [(x, *(wall, ceiling)[i % 2]) for i, x in enumerate(along)]
     mounted = tuple(_arm(i, (x, y, z), tilt) for i, (x, (y, z), tilt) in enumerate(mounts))
     middles = [((x + next_x) / 2, front_m) for x, next_x in pairwise(along)]
-    return Layout(mounted, tuple(_group(i, at, 0.0, 0.45, stations) for i, at in enumerate(middles)))
+    return CellLayout(mounted, tuple(_group(i, at, 0.0, 0.45, stations) for i, at in enumerate(middles)))
 
 
-_LAYOUTS: dict[LayoutName, Callable[[int, int, float, float], Layout]] = {
+_LAYOUTS: dict[LayoutName, Callable[[int, int, float, float], CellLayout]] = {
     "bench": _bench,
     "line": _line,
     "ring": _ring,
@@ -173,19 +165,13 @@ def _rounded(x: float, y: float, z: float) -> tuple[float, float, float]:
     return (round(x, DIGITS) + 0.0, round(y, DIGITS) + 0.0, round(z, DIGITS) + 0.0)
 
 
-TradeName = Literal[
-    "machine_tending", "palletising", "screwdriving", "gluing", "polishing", "kitting", "inspection", "assembly"
-]
-Letter = Literal["a", "b", "c"]
-
-
 @dataclass(frozen=True, kw_only=True)
-class Task:
+class SuiteTask:
     """One task type at a group of stations."""
 
     name: str
     kind: Kind
-    at: tuple[Letter, ...]
+    at: tuple[Literal["a", "b", "c"], ...]
     """Stations of the group; c stands for b in a group of two."""
     payload_kg: tuple[float, ...] = (0.0,)
     repetitions: tuple[int, int]
@@ -199,81 +185,6 @@ class Task:
     """With precedence: the task whose job of the same number must be finished first."""
 
 
-def _hold(name: str, at: Letter, kg: tuple[float, ...], minutes: tuple[int, int], after: str = "") -> Task:
-    return Task(
-        name=name, kind="hold", at=(at,), payload_kg=kg, repetitions=minutes, dwell_s=60.0, value=4.0, due_s=2400.0,
-        heats=True, after=after,
-    )  # fmt: skip
-
-
-def _press(name: str, at: Letter, force_n: float, dwell_s: float, times: tuple[int, int], after: str = "") -> Task:
-    return Task(
-        name=name, kind="press", at=(at,), repetitions=times, dwell_s=dwell_s, force_n=force_n, value=3.0,
-        due_s=1800.0, heats=True, after=after,
-    )  # fmt: skip
-
-
-def _move(
-    name: str, at: tuple[Letter, Letter], kg: tuple[float, ...], times: tuple[int, int], after: str = "",
-    *, heats: bool = False, value: float = 2.0,
-) -> Task:  # fmt: skip
-    return Task(
-        name=name, kind="pick_place", at=at, payload_kg=kg, repetitions=times, value=value, due_s=1500.0, heats=heats,
-        after=after,
-    )  # fmt: skip
-
-
-def _sort(name: str, at: tuple[Letter, Letter], kg: tuple[float, ...], times: tuple[int, int], after: str = "") -> Task:
-    return Task(
-        name=name, kind="sort", at=at, payload_kg=kg, repetitions=times, dwell_s=0.2, value=1.0, due_s=1200.0,
-        after=after,
-    )  # fmt: skip
-
-
-TRADES: dict[TradeName, tuple[Task, ...]] = {
-    "machine_tending": (
-        _move("load", ("a", "b"), (1.0, 2.0), (15, 40)),
-        _hold("steady", "c", (2.0,), (6, 14), "load"),
-        _move("unload", ("b", "a"), (1.0,), (15, 40), "load"),
-    ),
-    "palletising": (
-        _sort("feed", ("b", "a"), (0.3,), (40, 120)),
-        _move("stack", ("a", "b"), (2.0, 3.0), (40, 100), "feed", heats=True, value=3.0),
-        _hold("hold_sheet", "c", (2.0,), (5, 12), "stack"),
-    ),
-    "screwdriving": (
-        _move("place", ("a", "b"), (0.5,), (15, 40)),
-        _press("screw_a", "a", 80.0, 15.0, (20, 50), "place"),
-        _press("screw_b", "b", 80.0, 15.0, (20, 50), "place"),
-    ),
-    "gluing": (
-        _move("lay_out", ("a", "b"), (1.0,), (15, 40)),
-        _hold("glue_a", "a", (2.0, 3.0), (8, 18), "lay_out"),
-        _hold("glue_c", "c", (2.0,), (8, 18), "lay_out"),
-    ),
-    "polishing": (
-        _move("load", ("b", "a"), (1.0,), (15, 40)),
-        _press("polish_a", "a", 90.0, 20.0, (15, 40), "load"),
-        _press("polish_c", "c", 80.0, 20.0, (15, 40), "load"),
-    ),
-    "kitting": (
-        _sort("pick_small", ("a", "b"), (0.2,), (30, 90)),
-        _move("pick_large", ("b", "a"), (1.0, 2.0), (15, 50)),
-        _hold("hold_tray", "c", (1.5,), (6, 14), "pick_small"),
-    ),
-    "inspection": (
-        _hold("show_a", "a", (1.0, 3.0), (6, 15)),
-        _hold("show_b", "b", (2.0,), (6, 15)),
-        _sort("sort_out", ("a", "b"), (0.3,), (30, 90), "show_a"),
-    ),
-    "assembly": (
-        _move("feed", ("a", "b"), (1.0,), (15, 40)),
-        _hold("hold_part", "c", (2.0,), (6, 14), "feed"),
-        _press("join", "a", 80.0, 20.0, (8, 25), "hold_part"),
-    ),
-}
-
-
 JUDGED = SPLITS[1:]
 """Splits whose results are reported."""
 Unlike = Literal["alike", "usual", "mixed"]
@@ -282,14 +193,14 @@ SPREAD: dict[Unlike, float] = {"alike": 0.2, "usual": 0.7, "mixed": 0.7}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
+class SuiteCell:
     """A cell and the number of its instances."""
 
     name: str
     split: SplitName
     layout: LayoutName
     arms: int
-    trade: TradeName
+    trade: str
     stations: int = 2
     """Number of stations in each group."""
     unlike: Unlike = "usual"
@@ -301,7 +212,7 @@ class Cell:
     slots: int = 24
     instances: int = 17
     seed: int = 0
-    """Seed of the arms' deviations, with which every idle arm stays near or below the warning limit."""
+    """Seed of the arms' deviations."""
 
     @property
     def stations_per_arm(self) -> float:
@@ -309,8 +220,23 @@ class Cell:
         return len(layout(self).places) / self.arms
 
 
+def _read_suite() -> tuple[dict[str, tuple[SuiteTask, ...]], tuple[SuiteCell, ...]]:
+    """Tasks by trade, and cells."""
+    content = tomllib.loads(resources.files("scenarios").joinpath("suite/cells.toml").read_text(encoding="utf-8"))
+    cells = [
+        each | {"split": split, "name": f"{each['layout']}_{each['arms']}_{each['trade']}"}
+        for split, own in content["cells"].items()
+        for each in own
+    ]
+    trades = msgspec.convert(content["trades"], dict[str, tuple[SuiteTask, ...]])
+    return trades, msgspec.convert(cells, tuple[SuiteCell, ...])
+
+
+TRADES, CELLS = _read_suite()
+
+
 @lru_cache(maxsize=64)
-def layout(cell: Cell) -> Layout:
+def layout(cell: SuiteCell) -> CellLayout:
     """Arms and stations of a cell."""
     plain = layout_of(cell.layout, cell.arms, cell.stations, pitch_m=cell.pitch_m, front_m=cell.front_m)
     if cell.unlike != "mixed":
@@ -333,70 +259,6 @@ def _altered(arm: ArmSpec, number: int) -> ArmSpec:
             return arm
 
 
-def _cells(split: SplitName, *cells: Cell) -> tuple[Cell, ...]:
-    return tuple(replace(cell, split=split) for cell in cells)
-
-
-def _of(layout: LayoutName, arms: int, trade: TradeName, **more: object) -> Cell:
-    return Cell(name=f"{layout}_{arms}_{trade}", split="train", layout=layout, arms=arms, trade=trade, **more)  # pyright: ignore[reportArgumentType]
-
-
-CELLS: tuple[Cell, ...] = (
-    *_cells(
-        "train",
-        _of("bench", 4, "screwdriving", seed=1100),
-        _of("line", 4, "palletising", seed=101, unlike="mixed"),
-        _of("ring", 4, "gluing", seed=102, stations=3),
-        _of("gantry", 4, "machine_tending", seed=103),
-        _of("wall_ceiling", 4, "polishing", seed=2104, unlike="mixed"),
-        _of("line", 2, "inspection", seed=3105),
-        _of("ring", 6, "kitting", seed=4106, stations=3, unlike="mixed"),
-        _of("bench", 6, "gluing", seed=107, stations=3, unlike="alike"),
-        _of("line", 8, "machine_tending", seed=108, unlike="mixed"),
-        _of("gantry", 3, "assembly", seed=109, stations=3),
-        _of("wall_ceiling", 6, "inspection", seed=5110),
-        _of("ring", 16, "assembly", seed=35111, hours=1.0, slots=48, instances=13, unlike="mixed"),
-    ),
-    *_cells(
-        "validation",
-        _of("bench", 4, "assembly", seed=200, stations=3, pitch_m=0.82, instances=38),
-        _of("line", 6, "gluing", seed=20201, pitch_m=0.78, unlike="mixed", instances=38),
-        _of("ring", 5, "machine_tending", seed=10202, stations=3, unlike="mixed", instances=38),
-        _of("gantry", 4, "palletising", seed=203, pitch_m=0.78, instances=38),
-        _of("wall_ceiling", 4, "kitting", seed=204, stations=3, unlike="alike", instances=38),
-        _of("line", 16, "polishing", seed=5205, hours=1.0, slots=48, instances=10),
-    ),
-    *_cells(
-        "test",
-        _of("bench", 4, "polishing", seed=3300, stations=3, pitch_m=0.78, unlike="mixed", instances=30),
-        _of("line", 5, "assembly", seed=301, pitch_m=0.79, stations=3, instances=30),
-        _of("ring", 6, "gluing", seed=28302, pitch_m=0.82, unlike="mixed", instances=30),
-        _of("gantry", 5, "inspection", seed=9303, pitch_m=0.79, unlike="mixed", instances=30),
-        _of("wall_ceiling", 4, "machine_tending", seed=304, front_m=0.42, instances=30),
-        _of("bench", 8, "palletising", seed=3305, pitch_m=0.79, stations=3, instances=24),
-        _of("line", 16, "kitting", seed=29306, pitch_m=0.79, hours=1.0, slots=48, unlike="mixed", instances=12),
-        _of("ring", 32, "gluing", seed=4307, pitch_m=0.82, hours=1.0, slots=64, unlike="mixed", instances=8),
-        _of("line", 64, "screwdriving", seed=29308, pitch_m=0.79, hours=1.0, slots=96, instances=6),
-    ),
-    # Sizes that no other split has.
-    *_cells(
-        "sizes",
-        _of("line", 7, "gluing", seed=400, instances=4),
-        _of("ring", 7, "palletising", seed=5401, stations=3, instances=4),
-        _of("gantry", 9, "machine_tending", seed=60402, unlike="mixed", instances=4),
-        _of("wall_ceiling", 9, "screwdriving", seed=1403, instances=4),
-        _of("bench", 10, "kitting", seed=76404, hours=1.0, slots=48, unlike="mixed", instances=4),
-        _of("line", 11, "polishing", seed=9405, hours=1.0, slots=48, instances=4),
-        _of("ring", 12, "inspection", seed=6406, hours=1.0, slots=48, instances=4),
-        _of("gantry", 12, "assembly", seed=9407, stations=3, hours=1.0, slots=48, instances=4),
-        _of("wall_ceiling", 14, "palletising", seed=3408, hours=1.0, slots=48, instances=4),
-        _of("line", 20, "machine_tending", seed=356409, hours=1.0, slots=64, unlike="mixed", instances=4),
-        _of("bench", 20, "gluing", seed=11410, stations=3, hours=1.0, slots=64, instances=4),
-        _of("ring", 24, "polishing", seed=6411, hours=1.0, slots=64, instances=4),
-    ),
-)
-
-
 Heat = Literal["mild", "warm", "hot", "severe"]
 Due = Literal["loose", "usual", "tight", "hard"]
 Arriving = Literal["poisson", "batch", "trace", "rush"]
@@ -406,21 +268,14 @@ Faults = Literal["attended", "unattended", "noisy"]
 Bus = Literal["perfect", "late", "lossy", "ring", "cut"]
 
 
-class Severity(NamedTuple):
-    """Time loads of the expected jobs by heat severity (`scenarios.prepare.load_factor`)."""
-
-    heating: float
-    """Time load of the tasks that heat."""
-    rest: float
-
-
-SEVERITY: dict[Heat, Severity] = {
-    "mild": Severity(0.4, 0.55),
-    "warm": Severity(0.55, 0.55),
-    "hot": Severity(0.75, 0.55),
-    "severe": Severity(1.0, 0.55),
+SEVERITY: dict[Heat, tuple[float, float]] = {
+    "mild": (0.4, 0.55),
+    "warm": (0.55, 0.55),
+    "hot": (0.75, 0.55),
+    "severe": (1.0, 0.55),
 }
-"""The resulting thermal load factor depends on cell and ambient temperature; `thermofleet show` prints it."""
+"""Time loads (`scenarios.prepare.load_factor`) of the expected jobs that heat, and of the others. The resulting thermal
+load factor depends on cell and ambient temperature; `thermofleet show` prints it."""
 LEAST_JOBS = 0.25
 """Fewest expected jobs of a stream and payload, so that every task occurs."""
 DUE: dict[Due, float] = {"loose": 2.0, "usual": 1.0, "tight": 0.5, "hard": 0.75}
@@ -491,13 +346,13 @@ def time_loads() -> dict[str, tuple[float, float]]:
     return json.loads(text)
 
 
-def expected_jobs(cell: Cell, heat: Heat) -> tuple[float, float]:
+def expected_jobs(cell: SuiteCell, heat: Heat) -> tuple[float, float]:
     """Expected number of jobs of each stream and payload in a shift: of tasks that heat, of the others."""
     heating, rest = (wanted / one for wanted, one in zip(SEVERITY[heat], time_loads()[cell.name], strict=True))
     return max(LEAST_JOBS, heating), max(LEAST_JOBS, rest)
 
 
-def scenario_of(name: str, cell: Cell, axes: Axes, seed: int, jobs: tuple[float, float] | None = None) -> Scenario:
+def scenario_of(name: str, cell: SuiteCell, axes: Axes, seed: int, jobs: tuple[float, float] | None = None) -> Scenario:
     """Scenario of a cell at these values, checked like a file.
 
     Args:
@@ -537,7 +392,7 @@ def scenario_of(name: str, cell: Cell, axes: Axes, seed: int, jobs: tuple[float,
     return parse_scenario(msgspec.to_builtins(scenario), Path(f"{name}.toml"))
 
 
-def describe(cell: Cell, axes: Axes) -> str:
+def describe(cell: SuiteCell, axes: Axes) -> str:
     """Description of an instance in a sentence."""
     values = ", ".join(f"{name} {value}" for name, value in asdict(axes).items())
     return f"{cell.trade.replace('_', ' ')} by {cell.arms} {cell.unlike} arms ({cell.layout}): {values}."
@@ -552,7 +407,7 @@ def _bus(quality: Bus, arms: list[str], horizon_s: float) -> BusSpec:
 
 
 def _streams(
-    cell: Cell, axes: Axes, group: int, task: Task, expected: float, rng: np.random.Generator
+    cell: SuiteCell, axes: Axes, group: int, task: SuiteTask, expected: float, rng: np.random.Generator
 ) -> list[JobStream]:
     """The stream of a task at a group of stations; with a rush, a second one for it."""
     spots = {place.name[0]: place.name for place in layout(cell).groups[group]}

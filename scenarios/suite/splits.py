@@ -14,7 +14,7 @@ from fleet.seeding import shift_seeds
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.parse import choose, hash_of, scenario_hash
 from scenarios.spec.schema import SPLITS, Scenario, SplitName
-from scenarios.suite.instances import CELLS, Axes, Cell, draw_axes, scenario_of
+from scenarios.suite.instances import CELLS, Axes, SuiteCell, draw_axes, scenario_of
 
 SUITE = 17
 """Seed of all draws of the suite."""
@@ -86,7 +86,7 @@ def manifest(name: str) -> tuple[ManifestLine, ...]:
     return tuple(ManifestLine(**{**line, "axes": Axes(**line["axes"])}) for line in lines)
 
 
-def cell_of_instance(row: ManifestLine) -> Cell:
+def cell_of_instance(row: ManifestLine) -> SuiteCell:
     """The cell of a line of a manifest."""
     return next(cell for cell in CELLS if cell.name == row.cell)
 

@@ -16,7 +16,7 @@ from scenarios.spec.jobs import all_works
 from scenarios.spec.load import load
 from scenarios.spec.parse import scenario_content
 from scenarios.spec.schema import SPLITS, BusSpec, Scenario
-from scenarios.suite.instances import BUSES, CELLS, DUE, Axes, layout, layout_of, scenario_of
+from scenarios.suite.instances import BUSES, CELLS, DUE, Axes, layout, scenario_of
 from scenarios.suite.splits import cell_of_instance, drawn_rows, instance, manifest, split
 
 PLAIN = Axes(
@@ -104,12 +104,6 @@ def test_an_instance_is_loaded_by_name() -> None:
         load("test/9999")
     with pytest.raises(ScenarioError, match="split"):
         split("exam")
-
-
-def test_a_layout_refuses_numbers_that_it_cannot_have() -> None:
-    for name, arms, stations in (("bench", 5, 2), ("ring", 3, 2), ("line", 1, 2), ("line", 4, 4)):
-        with pytest.raises(ValueError, match=r"\(got \d\)"):
-            layout_of(name, arms, stations)
 
 
 @pytest.mark.slow
