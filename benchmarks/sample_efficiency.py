@@ -107,10 +107,10 @@ def train_here(algorithm: Any, seed: int, warm_start: str = "") -> Training:
     from scenarios.train.networks import DEMONSTRATIONS, STEPS, TEACHERS, imitate_rule, trainer_of
 
     config = PpoConfig(algorithm=algorithm, envs=30, steps=20, warm_start=warm_start, seed=seed)
-    cells, curve, hours = [cell()[1:]], Curve(), 0.0
-    trainer = trainer_of(cells, config)
+    (_, library, weights), curve, hours = cell(), Curve(), 0.0
+    trainer = trainer_of(library, weights, config)
     if warm_start:
-        imitate_rule(trainer, cells)
+        imitate_rule(trainer, library, weights)
     rng = np.random.default_rng(np.random.SeedSequence([seed, SHIFTS[0]]))
 
     def act(obs: Obs, _: Array) -> Array:

@@ -85,7 +85,7 @@ class PpoConfig:
     minibatch: int = 128
     """Choices in one optimiser step of the actor."""
     learning_rate: float = option(
-        "Learning rate; default: 0.0003, with --algo pairs 0.08.",
+        "Learning rate; default: 0.0003, with --suite 0.08.",
         3e-4,
         low=0,
         high=10,
@@ -106,7 +106,7 @@ class PpoConfig:
     """Horizon of the trace: lambda of a step is exp(-elapsed_s / trace_s). Longer than most jobs, so that the return of
     a claim contains the reward of its job."""
     clip: float = 0.2
-    entropy: float = option("Weight of the entropy bonus; not with --algo pairs.", 0.002, low=0, high=10)
+    entropy: float = option("Weight of the entropy bonus; not with --suite.", 0.002, low=0, high=10)
     max_gradient: float = 0.5
     reward_scale: float = 0.1
     warm_start: str = option("Rule that the network imitates first, for example wspt; default: none.", "")

@@ -1,26 +1,28 @@
 """Train scores of arm–job pairs over a split of the suite by evolution, with validation on another split."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from agents.learned.config import TrainingLength
-from agents.learned.evolution import CURVE, Evolution, EvolutionConfig, TrainingLog, read_log
-from agents.pairs import PARAMETERS, first_parameters, save_pairs
-from fleet.files import atomic_path
-from scenarios.train.instances import (
-    PAIRS_STATE,
-    Trained,
-    TrainingInstance,
-    check_folder,
-    holds_training,
-    rewards,
-    skip_complete,
-    write_card,
-)
+from agents.learned.evolution import Evolution, EvolutionConfig
+from agents.pairs import PARAMETERS, first_parameters, save_pairs, scores
+from agents.policy import WAIT
+from agents.rules import matched_options
+from fleet.engine.batch import RewardWeights
+from fleet.env.vector import BatchEnv, Library, Obs
+from scenarios.evaluate.rollout import rollout
+from scenarios.prepare.batch import library_of
+from scenarios.prepare.fleet import prepare
+from scenarios.progress import Count, Progress, quiet
+from scenarios.spec.jobs import weights_of
+from scenarios.spec.options import RISK, DifficultyName, RiskName
+from scenarios.suite.splits import Instance
+from scenarios.train.training import PAIRS_STATE, Trained, check_folder, run_training
 
 Array = np.ndarray
 
@@ -28,6 +30,84 @@ LEAST_SPAN = 0.04
 """Shortest span of an instance in training, as a share of the value of its jobs."""
 MOST_LOSS = 1.0
 """A sample loses at most this much to the best one in a shift, so that one shift does not decide an iteration."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingInstance:
+    """One instance, ready for batches of its shifts."""
+
+    name: str
+    seed: int
+    """Of the instance itself."""
+    library: Library
+    weights: RewardWeights
+    random: float = 0.0
+    """Mean reward of the policy `random` in the shift of its own seed; 0 without a reference."""
+    span: float | None = None
+    """Reward of the hindsight of that shift less `random`; None without a reference."""
+
+    @property
+    def arms(self) -> int:
+        return len(self.library.arms)
+
+    @property
+    def value(self) -> float:
+        """Value of all jobs of its own shift."""
+        shift = self.library.draw(np.random.SeedSequence(self.seed))
+        return max(float(self.library.tables.value[shift.fleet, shift.kind].sum()), 1.0)
+
+    @property
+    def unit(self) -> float:
+        """What rewards of its shifts are divided by: the span, or the value of all jobs without a reference."""
+        return self.value if self.span is None else self.span
+
+
+def training_instances(
+    instances: Sequence[Instance],
+    *,
+    difficulty: DifficultyName = "oracle",
+    risk: RiskName = RISK,
+    known: Mapping[tuple[str, int], tuple[float, float]] | None = None,
+    progress: Progress = quiet,
+) -> list[TrainingInstance]:
+    """Prepare instances; a cell is planned once.
+
+    Args:
+        known: Rewards of random and of the hindsight, by instance and seed, as far as there are references.
+    """
+    prepared: list[TrainingInstance] = []
+    for instance in instances:
+        progress(f"preparing {instance.name}", Count(len(prepared), len(instances)))
+        fleet = prepare(instance.scenario, difficulty=difficulty, risk=risk)
+        random, hindsight = (known or {}).get((instance.name, instance.seed), (0.0, None))
+        span = None if hindsight is None else hindsight - random
+        library, weights = library_of(fleet), weights_of(instance.scenario)
+        prepared.append(TrainingInstance(instance.name, instance.seed, library, weights, random, span))
+    return prepared
+
+
+def rewards(instance: TrainingInstance, parameters: Array, seeds: Sequence[int]) -> Array:
+    """Reward of one shift for each row of parameters and its seed, [row].
+
+    Perfect and immediate messages; decisions are asked for by events, which changes no result of a central policy.
+
+    Args:
+        parameters: [row, parameter] of `agents.pairs`.
+    """
+    env = BatchEnv(instance.library, len(seeds), weights=instance.weights, decisions="events")
+
+    def act(obs: Obs, running: Array) -> Array:
+        actions = np.full((len(seeds), instance.arms), WAIT)
+        asked = np.flatnonzero(running & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
+        if len(asked):
+            seen = env.layout.read(obs["observation"][asked], obs["action_mask"][asked])
+            score = scores(seen, parameters[asked])
+            for k in np.flatnonzero(np.isfinite(score).any(axis=(1, 2))).tolist():
+                for arm, option in matched_options(-score[k], env.layout.plans):
+                    actions[asked[k], arm] = 1 + option
+        return actions
+
+    return rollout(env, env.reset(seed=list(seeds))[0], act)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +120,8 @@ class PairPlan(TrainingLength):
 
 
 def train_pairs(
-    grounds: Sequence[TrainingInstance],
-    judges: Sequence[TrainingInstance],
+    training: Sequence[TrainingInstance],
+    validation: Sequence[TrainingInstance],
     config: EvolutionConfig,
     out: Path,
     plan: PairPlan,
@@ -50,13 +130,11 @@ def train_pairs(
     resume: bool = False,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Trained:
-    """Write into a folder the parameters with the best validation as a policy, the last state, and the curves.
+    """Train over instances, as `run_training` says; the best parameters are a policy.
 
-    Iteration 0 is `agents.pairs.first_parameters`, the teacher is `wsept`. Ctrl-C ends the training early and
-    keeps its result; before the end of the validation of iteration 0 there is none.
+    Iteration 0 is `agents.pairs.first_parameters`, the teacher is `wsept`.
 
     Args:
-        grounds, judges: Instances of training and of validation.
         card: What else `pairs.json` and `training.json` say; a resume must have the same.
 
     Raises:
@@ -65,95 +143,77 @@ def train_pairs(
     """
     card = {**card, "config": asdict(config), "instances": plan.instances}
     check_folder(out, card, PAIRS_STATE, resume=resume)
-    search = Evolution(first_parameters(), config)
-    teacher, best, before_s, interrupted = np.nan, -np.inf, 0.0, False
-    if resume:
-        numbers = search.load(out / PAIRS_STATE)
-        teacher, best, before_s = numbers["teacher"], numbers["best"], numbers.get("seconds", 0.0)
-    began_s = time.monotonic() - before_s  # as if the sessions had followed each other
-
-    def result() -> Trained:
-        return Trained(search.done, best, time.monotonic() - began_s, interrupted)
-
-    if resume and skip_complete(out, plan, search.done, before_s, tell):
-        return result()
-    out.mkdir(parents=True, exist_ok=True)
-    log = TrainingLog(out)
-
-    def validate() -> None:
-        nonlocal best
-        found = validation(judges, search.average)
-        if not holds_training(out):
-            search.save(out / PAIRS_STATE, teacher=teacher, best=best)  # without a policy yet
-            write_card(out, card)
-        if found > best:
-            best = found
-            save_pairs(search.average, out, **card, iterations=search.done, validation=best, teacher=teacher)
-        search.save(out / PAIRS_STATE, teacher=teacher, best=best, seconds=time.monotonic() - began_s)
-        log.add(search.done, {"iteration": search.done, "validation": found, "teacher": teacher})
-        tell(f"Iteration {search.done}: {found:.4f}, best {best:.4f}, wsept {teacher:.4f}.")
-
-    if not resume:
-        teacher = validation(judges, np.zeros(PARAMETERS))
-    if best == -np.inf:
-        validate()
-    validated = search.done
-    try:
-        while plan.share(search.done, time.monotonic() - began_s, before_s) < 1.0:
-            began_iteration_s = time.monotonic()
-            fitness = _fitness(grounds, search, plan.instances)
-            search.tell(fitness)
-            row = {"number": search.done, "fitness": float(fitness.mean()), "spread": float(fitness.std())}
-            log.add(search.done, {**row, "seconds": time.monotonic() - began_iteration_s})
-            if search.done % plan.validate_every == 0:
-                validate()
-                validated = search.done
-    except KeyboardInterrupt:
-        interrupted = True
-    if validated < search.done:
-        validate()
-    draw_curves([out], out / CURVE)
-    return result()
+    learner = PairLearner(Evolution(first_parameters(), config), training, validation, plan.instances)
+    return run_training(learner, out, plan, card, validate_every=plan.validate_every, resume=resume, tell=tell)
 
 
-def validation(judges: Sequence[TrainingInstance], parameters: Array) -> float:
-    """Mean normalised score of the shifts of the judges' own seeds."""
-    scores = [(rewards(judge, parameters[None], [judge.seed])[0] - judge.random) / judge.unit for judge in judges]
-    return float(np.mean(scores))
+class PairLearner:
+    """Parameters of scores of pairs.
 
-
-def _fitness(grounds: Sequence[TrainingInstance], search: Evolution, count: int) -> Array:
-    """Mean reward of every sample over the span of the instance, on shifts that all samples share, [sample].
-
-    Large fleets are drawn less often, as their shifts take longer.
+    Args:
+        count: Instances of an iteration.
     """
-    rng = np.random.default_rng(np.random.SeedSequence([search.config.seed, 2, search.done]))
-    weights = np.array([max(ground.arms, 4.0) ** -2 for ground in grounds])
-    chosen = rng.choice(len(grounds), size=min(count, len(grounds)), replace=False, p=weights / weights.sum())
-    samples, total = search.ask(), np.zeros(search.config.samples)
-    for index in chosen.tolist():
-        ground, seed = grounds[index], int(rng.integers(2**31))
-        unit = max(ground.unit, LEAST_SPAN * ground.value(ground.seed))
-        scores = rewards(ground, samples, [seed] * len(samples)) / unit
-        total += np.maximum(scores, scores.max() - MOST_LOSS)
-    return total / len(chosen)
+
+    state_file, unit, curves = PAIRS_STATE, "normalised score", ()
+
+    def __init__(
+        self,
+        search: Evolution,
+        training: Sequence[TrainingInstance],
+        validation: Sequence[TrainingInstance],
+        count: int,
+    ) -> None:
+        self.search, self.training, self.validation, self.count = search, training, validation, count
+
+    @property
+    def done(self) -> int:
+        return self.search.done
+
+    def validate(self) -> float:
+        """Score of the running average."""
+        return validation_score(self.validation, self.search.average)
+
+    def validate_teacher(self) -> float:
+        """That of `wsept`."""
+        return validation_score(self.validation, np.zeros(PARAMETERS))
+
+    def iterate(self) -> Iterator[dict[str, Any]]:
+        while True:
+            began_s = time.monotonic()
+            fitness = self.fitness()
+            self.search.tell(fitness)
+            row = {"number": self.done, "fitness": float(fitness.mean()), "spread": float(fitness.std())}
+            yield row | {"seconds": time.monotonic() - began_s}
+
+    def fitness(self) -> Array:
+        """Mean reward of every sample over the span of the instance, on shifts that all samples share, [sample].
+
+        Large fleets are drawn less often, as their shifts take longer.
+        """
+        search = self.search
+        rng = np.random.default_rng(np.random.SeedSequence([search.config.seed, 2, search.done]))
+        weights = np.array([max(each.arms, 4.0) ** -2 for each in self.training])
+        count = min(self.count, len(self.training))
+        chosen = rng.choice(len(self.training), size=count, replace=False, p=weights / weights.sum())
+        samples, total = search.ask(), np.zeros(search.config.samples)
+        for index in chosen.tolist():
+            instance, seed = self.training[index], int(rng.integers(2**31))
+            unit = max(instance.unit, LEAST_SPAN * instance.value)
+            scores = rewards(instance, samples, [seed] * len(samples)) / unit
+            total += np.maximum(scores, scores.max() - MOST_LOSS)
+        return total / len(chosen)
+
+    def save(self, path: Path, **numbers: float) -> None:
+        self.search.save(path, **numbers)
+
+    def load(self, path: Path) -> Mapping[str, float]:
+        return self.search.load(path)
+
+    def save_policy(self, out: Path, validation: float, **details: Any) -> None:
+        save_pairs(self.search.average, out, **details, iterations=self.done, validation=validation)
 
 
-def draw_curves(folders: Sequence[Path], picture: Path) -> None:
-    """Plot the validation of trainings against the iteration, with the line of their teacher."""
-    from matplotlib.figure import Figure  # without a display
-
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    axes = figure.subplots()
-    teacher = 0.0
-    for folder in folders:
-        judged = [row for row in read_log(folder) if "validation" in row]
-        teacher = judged[0]["teacher"]
-        axes.plot([r["iteration"] for r in judged], [r["validation"] for r in judged], "o-", ms=3, label=folder.name)
-    axes.axhline(teacher, color="k", lw=1, ls="--", label="wsept")
-    axes.set_xlabel("iteration")
-    axes.set_ylabel("normalised score, validation")
-    axes.legend(frameon=False)
-    axes.grid(alpha=0.3)
-    with atomic_path(picture) as draft:
-        figure.savefig(draft, dpi=120, format="png")
+def validation_score(instances: Sequence[TrainingInstance], parameters: Array) -> float:
+    """Mean normalised score of parameters on the shift of each instance's own seed."""
+    found = [(rewards(each, parameters[None], [each.seed])[0] - each.random) / each.unit for each in instances]
+    return float(np.mean(found))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents.learned.config import TrainingLength
-from agents.learned.evolution import LOG, EvolutionConfig
+from agents.learned.evolution import CURVE, LOG, EvolutionConfig
 from agents.learned.policy import load_policy
 from agents.learned.ppo import PpoConfig
 from agents.pairs import PAIRS_CARD, PARAMETERS, Worth, first_parameters
@@ -20,11 +20,10 @@ from scenarios.prepare.fleet import prepare
 from scenarios.spec.load import load
 from scenarios.spec.parse import override
 from scenarios.suite.splits import Instance, instance
-from scenarios.train import instances as suite_batches
-from scenarios.train import networks, pairs
-from scenarios.train.instances import NETWORK_STATE, PAIRS_STATE, TRAINING, holds_training, rewards, training_instance
-from scenarios.train.networks import VALIDATION_SEED, TrainingPlan, Validation, train, train_on_split
-from scenarios.train.pairs import CURVE, PairPlan, train_pairs, validation
+from scenarios.train import pairs, training
+from scenarios.train.networks import VALIDATION_SEED, TrainingPlan, train
+from scenarios.train.pairs import PairLearner, PairPlan, rewards, train_pairs, training_instances, validation_score
+from scenarios.train.training import NETWORK_STATE, PAIRS_STATE, TRAINING, holds_training
 
 SMALL = {"horizon_s": 300.0}
 
@@ -35,7 +34,7 @@ def small_config(**changes) -> PpoConfig:
 
 def trained(out, cache, *, iterations: int = 2, resume: bool = False, **changes):
     told: list[str] = []
-    plan = TrainingPlan(minutes=5.0, iterations=iterations, validate_every=1, validation_envs=2)
+    plan = TrainingPlan(minutes=100_000.0, iterations=iterations, validate_every=1, validation_envs=2)
     scenario = override(load("quickstart"), **SMALL)
     done = train(
         scenario, small_config(**changes), out, plan, difficulty="blind", resume=resume, cache=cache, tell=told.append
@@ -54,10 +53,10 @@ def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> N
     assert (done.iterations, done.interrupted) == (2, False)
     assert len(told) == 3, "of iteration 0, too"
     rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
-    judged = [row["validation_reward"] for row in rows if "validation_reward" in row]
+    judged = [row["validation"] for row in rows if "validation" in row]
     assert done.best == max(judged)
     assert [(row["number"], row["env_steps"]) for row in rows if "number" in row] == [(1, 4 * 16), (2, 2 * 4 * 16)]
-    assert (out / networks.CURVE).read_bytes().startswith(b"\x89PNG")
+    assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
     assert type(policy_of(str(out))) is type(load_policy(out))
     assert label(str(out)) == "learned"
     with pytest.raises(FleetError, match="holds a training already"):
@@ -77,7 +76,7 @@ def test_validation_seeds_are_nobody_elses() -> None:
 
 
 WRONG = {
-    "quickstart --out none --algo dqn": "No algorithm 'dqn'. Allowed: ippo, mappo, pairs.",
+    "quickstart --out none --algo dqn": "No algorithm 'dqn'. Allowed: ippo, mappo.",
     "quickstart --out none --minutes 0": "minutes must be > 0",
     "quickstart --out none --envs 0": "--envs must be 1 to 65536 (got 0).",
     "quickstart --out none --threads 0": "--threads must be 1 to 1024 (got 0).",
@@ -88,9 +87,8 @@ WRONG = {
     "quickstart --suite train": "Give either a scenario or --suite SPLIT.",
     "--suite trian": "No training split 'trian'; did you mean 'train'?",
     "--suite validation": "No training split 'validation'. Allowed: train.",
-    "--suite test --algo mappo": "No training split 'test'. Allowed: train.",
     "test/0017": "No training split 'test'. Allowed: train.",
-    "quickstart --algo pairs": "give --suite, not a scenario",
+    "--suite train --algo mappo": "--algo needs a scenario",
     "quickstart --seeds 2 --out x": "leave --out away",
     "quickstart --lr 0": "--lr must be > 0 and at most 10 (got 0).",
     "--suite train --minutes 0": "minutes must be > 0",
@@ -108,7 +106,7 @@ def test_what_cannot_be_trained_is_refused(thermofleet, tmp_path, monkeypatch, w
 @pytest.fixture(scope="module")
 def ground():
     scenario = override(load("quickstart"), horizon_s=1200.0)
-    return training_instance(Instance("train/9999", scenario, 3), difficulty="oracle")
+    return training_instances([Instance("train/9999", scenario, 3)])[0]
 
 
 def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
@@ -128,10 +126,10 @@ def test_validation_is_the_normalised_score_of_the_shift_of_the_benchmark(ground
     (reward,) = rewards(ground, np.zeros((1, PARAMETERS)), [ground.seed])
     half = replace(ground, random=reward - 5.0, span=10.0)
     none = replace(ground, random=reward, span=20.0)
-    assert validation([half, none], np.zeros(PARAMETERS)) == pytest.approx(0.25)
-    assert validation([ground], np.zeros(PARAMETERS)) == pytest.approx(reward / ground.value(ground.seed))
+    assert validation_score([half, none], np.zeros(PARAMETERS)) == pytest.approx(0.25)
+    assert validation_score([ground], np.zeros(PARAMETERS)) == pytest.approx(reward / ground.value)
     own = replace(instance("train/0005"), name="x", seed=3)
-    made = training_instance(own, known={("x", 3): (40.0, 60.0), ("x", 4): (0.0, 1.0)})
+    (made,) = training_instances([own], known={("x", 3): (40.0, 60.0), ("x", 4): (0.0, 1.0)})
     assert (made.random, made.unit) == (40.0, 20.0)
 
 
@@ -139,7 +137,7 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
     out, told = tmp_path / "pairs", list[str]()
 
     def trained(iterations: int, *, resume: bool = False, samples: int = 4):
-        plan = PairPlan(minutes=5.0, iterations=iterations, validate_every=1)
+        plan = PairPlan(minutes=100_000.0, iterations=iterations, validate_every=1)
         config = EvolutionConfig(samples=samples)
         card: dict[str, object] = {"suite": "train"}
         return train_pairs([ground], [ground], config, out, plan, card=card, resume=resume, tell=told.append)
@@ -191,12 +189,14 @@ def test_a_killed_training_blocks_nothing(tmp_path, ground, monkeypatch, calls) 
         return call
 
     def trained(*, resume: bool):
-        plan = PairPlan(minutes=5.0, iterations=1)
+        plan = PairPlan(minutes=100_000.0, iterations=1)
         return train_pairs([ground], [ground], EvolutionConfig(samples=2), out, plan, card={}, resume=resume)
 
     with monkeypatch.context() as patch:
-        for name in ("validation", "write_card", "save_pairs", "_fitness"):
-            patch.setattr(pairs, name, mortal(getattr(pairs, name)))
+        for where, name in (
+            (pairs, "validation_score"), (training, "_write_card"), (pairs, "save_pairs"), (PairLearner, "fitness"),
+        ):  # fmt: skip
+            patch.setattr(where, name, mortal(getattr(where, name)))
         with pytest.raises(Killed):
             trained(resume=False)
     assert holds_training(out) == (calls >= 3)
@@ -208,53 +208,32 @@ def test_a_killed_training_blocks_nothing(tmp_path, ground, monkeypatch, calls) 
     assert [row["iteration"] for row in rows if "iteration" in row] == [0, 1]
 
 
-def test_a_split_is_trained_by_ppo_in_turns_of_its_cells(tmp_path, ground) -> None:
-    small = replace(ground, name="train/9998", seed=5)
-    config = PpoConfig(envs=2, steps=8, epochs=1)
-    plan = TrainingPlan(minutes=5.0, iterations=2, validate_every=2)
-    card: dict[str, object] = {"suite": "train"}
-    done = train_on_split([ground, small], [ground], config, tmp_path / "ppo", plan, card=card)
-    assert done.iterations == 2
-    rows = [json.loads(line) for line in (tmp_path / "ppo" / LOG).read_text().splitlines()]
-    assert [row["env_steps"] for row in rows if "env_steps" in row] == [16, 32]
-    judged = {row["iteration"]: row["validation_reward"] for row in rows if "validation_reward" in row}
-    assert list(judged) == [0, 2]
-    assert done.best == max(judged.values())
-    assert 0.0 < max(judged.values()) < 1.0, "shares of the value of all jobs"
-    with pytest.raises(FleetError, match="has 2 iterations: --iterations must be more"):
-        train_on_split([ground, small], [ground], config, tmp_path / "ppo", plan, card=card, resume=True)
-    told: list[str] = []
-    series, out = replace(plan, in_total=True), tmp_path / "ppo"
-    again = train_on_split([ground, small], [ground], config, out, series, card=card, resume=True, tell=told.append)
-    assert (again.iterations, again.best) == (2, done.best)
-    assert told == [f"Skipped the training in '{out}', because it is complete."]
-
-
-def test_ctrl_c_before_the_first_state_of_ppo_leaves_no_training(tmp_path, ground, monkeypatch) -> None:
-    out, plan = tmp_path / "ppo", TrainingPlan(minutes=5.0, iterations=1)
+def test_ctrl_c_before_the_first_state_leaves_no_training(tmp_path, cache, monkeypatch) -> None:
+    out = tmp_path / "ppo"
 
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    def trained(*, resume: bool = False):
-        config = PpoConfig(envs=2, steps=8, epochs=1, warm_start="wspt")
-        return train_on_split([ground], [ground], config, out, plan, card={}, resume=resume)
+    def trained_after(**more):
+        return trained(out, cache, iterations=1, warm_start="wspt", **more)[0]
 
     monkeypatch.setattr("scenarios.train.networks.imitate_rule", lambda *args: None)
     with monkeypatch.context() as patch:
-        rewards_of = iter([0.5])  # of the teacher, and then an interruption
-        patch.setattr(Validation, "reward", lambda *args: next(rewards_of, None) or interrupt())
+        patch.setattr("scenarios.train.networks.Trainer.act", interrupt)  # after the validation of the teacher
         with pytest.raises(KeyboardInterrupt):
-            trained()
+            trained_after()
     assert not (out / TRAINING).exists()
     with pytest.raises(FleetError, match="holds no training to resume"):
-        trained(resume=True)
+        trained_after(resume=True)
     with monkeypatch.context() as patch:
         patch.setattr("scenarios.train.networks.Trainer.iterate", interrupt)
-        done = trained()
+        done = trained_after()
     assert (done.iterations, done.interrupted) == (0, True)
-    assert trained(resume=True).iterations == 1
-    assert sum("teacher" in row for row in map(json.loads, (out / LOG).read_text().splitlines())) == 1
+    assert trained_after(resume=True).iterations == 1
+    rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
+    judged = [row for row in rows if "validation" in row]
+    assert [row["iteration"] for row in judged] == [0, 1]
+    assert len({row["teacher"] for row in judged}) == 1
 
 
 def test_time_of_a_session_or_in_total() -> None:
@@ -266,7 +245,7 @@ def test_time_of_a_session_or_in_total() -> None:
 
 def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(suite_batches, "training_instances", lambda *args, **options: [ground])
+    monkeypatch.setattr(pairs, "training_instances", lambda *args, **options: [ground])
     monkeypatch.setattr("scenarios.evaluate.scores.references_of", lambda cases: {})
     words = ["--suite", "train", "--difficulty", "oracle", "--instances", "1", "--validation-instances", "1"]
 
