@@ -48,15 +48,14 @@ from fleet.errors import FleetError
 from scenarios.evaluate.leaderboard import (
     BASELINE,
     SOURCE,
-    Submission,
+    BoardResult,
     board_of,
-    board_text,
     read_all,
     split_references,
 )
 from scenarios.evaluate.references import load_references, reference_table
-from scenarios.evaluate.rollout import KINDS
-from scenarios.evaluate.scores import Normalised, Scores, normalised, ranked, scores_of
+from scenarios.evaluate.rollout import FIGURES, KINDS
+from scenarios.evaluate.scores import Normalised, SuiteScores, normalised, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import Interval, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
@@ -168,14 +167,42 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
         results: docs/results.
     """
 
-    def board(split: str) -> str:
-        return board_text(board_of(split, read_all(results / "leaderboard", split)), split)
-
     return {
-        "bounds": lambda: reference_table(load_references(results / "bounds_library.jsonl")),
+        "bounds": lambda: reference_table(load_references(results / "bounds_library.jsonl")).markdown(),
         "references": references_text,
-        **{f"leaderboard_{split}": partial(board, split) for split in JUDGED},
+        **{f"leaderboard_{split}": partial(board_text, results / "leaderboard", split) for split in JUDGED},
     }
+
+
+BOARD = ("", "policy", "predictions", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound",
+         "faults", "failed", "by", "code")  # fmt: skip
+
+
+def board_text(folder: Path, split: str) -> str:
+    """The leaderboard of a split: what is best of each scope, the table, and what must be known."""
+    board = board_of(split, read_all(folder, split))
+    if board is None:
+        return f"No results on the split {split}."
+    rows: list[tuple[str, ...]] = []
+    for place, name in enumerate(board.order, start=1):
+        entry, (mean, difference_, stars, *rest) = board.entries[name], score_cells(board.scores, name)
+        card, stars = entry.card, stars.replace("*", "\\*")
+        cells = (title(entry), card.difficulty, card.scope, mean, f"{difference_} {stars}".strip(), *rest)
+        more = (f"{mean_of(entry, 'faults'):.2f}", str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
+        rows.append((str(place), *cells, *more))
+    return "\n\n".join([board.summary, table(BOARD, rows), board.remark])
+
+
+def title(entry: BoardResult) -> str:
+    """The policy of a result."""
+    more = f", {entry.card.trainings} trainings" if entry.card.trainings > 1 else ""
+    return f"`{entry.card.policy}`{more}"
+
+
+def mean_of(entry: BoardResult, figure: str) -> float:
+    """Mean of a figure over the shifts of a result that did not fail."""
+    index = FIGURES.index(figure)
+    return sum(row.figures[index] for row in entry.rows if row.figures) / max(1, len(entry.rows) - entry.failures)
 
 
 ABLATED = ("heat_wave", "active_waiting")
@@ -282,7 +309,7 @@ def trainings_table(folder: Path) -> str:
     return table(("training", "iterations", "first parameters", "best", "`wsept`"), rows)
 
 
-def scored(folder: Path, split: str) -> tuple[dict[str, Submission], Normalised]:
+def scored(folder: Path, split: str) -> tuple[dict[str, BoardResult], Normalised]:
     """The results on a split by policy, and their scores."""
     found = {each.card.policy: each for each in read_all(folder, split) if each.card.difficulty == SOURCE}
     values = normalised(
@@ -301,7 +328,7 @@ def gain(folder: Path) -> str:
         for name in LEARNED:
             if name in found:
                 cells = [shown(values.difference(name, base)) for base in bases]
-                rows.append((f"{split}: {found[name].title}", f"{found[name].mean('faults'):.3f}", *cells))
+                rows.append((f"{split}: {title(found[name])}", f"{mean_of(found[name], 'faults'):.3f}", *cells))
     return table(("split and policy", "faults per shift", *(f"score less that of `{base}`" for base in bases)), rows)
 
 
@@ -314,16 +341,16 @@ def by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Arr
     """Differences of normalised scores to the best rule on a split: on all instances, and by numbers of arms."""
     found, values = scored(folder, split)
     arms = np.array([len(instance(name).scenario.arms) for name in values.instances])
-    parts: dict[str, Scores] = {}
+    parts: dict[str, SuiteScores] = {}
     for name, chosen in {"all instances": np.ones_like, **groups}.items():
         own = values.only(chosen(arms).astype(bool))
         parts[f"{name} ({len(own.instances)} in {len(set(own.cells))} cells)"] = scores_of(own, BASELINE)
     rows: list[tuple[str, ...]] = []
     for name in ranked(next(iter(parts.values()))):
-        cells = [found[name].title]
+        cells = [title(found[name])]
         for scores in parts.values():
             cells.append("" if name == BASELINE else shown(scores.policies[name].difference))
-        rows.append((*cells, f"{found[name].mean('faults'):.2f}"))
+        rows.append((*cells, f"{mean_of(found[name], 'faults'):.2f}"))
     return table(("policy", *parts, "faults"), rows)
 
 

@@ -1,6 +1,6 @@
-"""Policies by name: one of `agents.registry`, your own as `FILE.py:OBJECT` or `MODULE:OBJECT`, one in another process
-as `bus:NAME` or `bus:NAME@ENDPOINT`, the folder of a trained one, or any of these in a wrapper, as `WRAPPER:POLICY`. An
-object is a class or a function that returns a new policy."""
+"""Policies by name: one of `agents.registry`, a user-defined one as `FILE.py:OBJECT` or `MODULE:OBJECT`, one in another
+process as `bus:NAME` or `bus:NAME@ENDPOINT`, the folder of a trained one, or any of these in a wrapper, as
+`WRAPPER:POLICY`. An object is a class or a function that returns a new policy."""
 
 import importlib
 import importlib.util
@@ -8,17 +8,19 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from traceback import extract_tb
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from agents.heat import guarded
 from agents.pairs import PAIRS, load_pairs
 from agents.policy import SCOPES, ArmPolicy, Local, PlanningPolicy, Policy, for_all_arms, no_simulator
-from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
+from agents.registry import RULES, WRAPPERS, rule_of
 from fleet.errors import NAME_RULE, FleetError, is_name, nearest, printable
 from fleet.seeding import child
 from scenarios.spec.options import ENDPOINT
@@ -56,7 +58,7 @@ class Unusable(FleetError):
 
 
 class PolicyFailed(FleetError):
-    """A policy of one's own that raised an exception or returned no action."""
+    """A user-defined policy raised an exception or returned no action."""
 
 
 def failure(name: str, error: BaseException, where: str) -> BaseException:
@@ -128,8 +130,7 @@ def scope_of(name: str) -> str:
     Raises:
         FleetError: as `policy_of`.
     """
-    if wrapped := _wrapped(name):
-        return scope_of(wrapped[1])
+    _, name = _unwrapped(name)
     if is_on_bus(name):
         return "central"
     if has_trainings(name):
@@ -167,31 +168,27 @@ def plans(name: str) -> bool:
     Raises:
         FleetError: as `policy_of`.
     """
-    if wrapped := _wrapped(name):
-        return plans(wrapped[1])
+    _, name = _unwrapped(name)
     return not (is_on_bus(name) or has_trainings(name) or _is_folder(name)) and hasattr(_made_by(name)[0], "plan_in")
 
 
 def is_built_in(name: str) -> bool:
     """Whether a name is that of a rule, perhaps in wrappers; no code is loaded for it."""
-    wrapped = _wrapped(name)
-    return is_built_in(wrapped[1]) if wrapped else name in RULES
+    return _unwrapped(name)[1] in RULES
 
 
 def is_on_bus(name: str) -> bool:
     """Whether a policy runs in another process, perhaps in wrappers."""
-    wrapped = _wrapped(name)
-    return is_on_bus(wrapped[1]) if wrapped else name.startswith(BUS)
+    return _unwrapped(name)[1].startswith(BUS)
 
 
 def source_of(name: str) -> Path | None:
-    """The file or folder of a policy of one's own; None for a rule, and for one in another process.
+    """The file or folder of a user-defined policy; None for a rule, and for one in another process.
 
     Raises:
         FleetError: there is no such module.
     """
-    if wrapped := _wrapped(name):
-        return source_of(wrapped[1])
+    _, name = _unwrapped(name)
     if is_on_bus(name):
         return None
     if _is_folder(name):
@@ -209,15 +206,14 @@ def trainings_of(name: str) -> tuple[str, ...]:
     Raises:
         FleetError: no folder has such a name.
     """
-    if wrapped := _wrapped(name):
-        return tuple(f"{name.partition(':')[0]}:{each}" for each in trainings_of(wrapped[1]))
     if not has_trainings(name):
         return (name,)
-    path = Path(name)
-    found = [str(each) for each in path.parent.glob(path.name) if each.is_dir()]
-    if not found:
-        raise FleetError(f"There is no folder '{name}': it must match the folders of `thermofleet train --seeds K`.")
-    return tuple(sorted(found, key=lambda each: (len(each), each)))  # 2 before 10
+    wrappers, pattern = _unwrapped(name)
+    path = Path(pattern)
+    folders = [str(each) for each in path.parent.glob(path.name) if each.is_dir()]
+    if not folders:
+        raise FleetError(f"There is no folder '{pattern}': it must match the folders of `thermofleet train --seeds K`.")
+    return tuple(":".join((*wrappers, each)) for each in sorted(folders, key=lambda each: (len(each), each)))  # 2 < 10
 
 
 def has_trainings(name: str) -> bool:
@@ -226,20 +222,26 @@ def has_trainings(name: str) -> bool:
 
 
 def label(name: str) -> str:
-    """What a table calls a policy: the rule, the class, or the last folder, after its wrapper."""
-    if wrapped := _wrapped(name):
-        return f"{name.partition(':')[0]}:{label(wrapped[1])}"
+    """What a table calls a policy: the rule, the class, or the last folder, after its wrappers."""
+    wrappers, name = _unwrapped(name)
     if is_on_bus(name):
-        return name.partition("@")[0]
-    if _is_folder(name) or has_trainings(name):
-        return Path(os.path.abspath(name)).name
-    return name.rpartition(":")[2]
+        name = name.partition("@")[0]
+    elif _is_folder(name) or has_trainings(name):
+        name = Path(os.path.abspath(name)).name
+    else:
+        name = name.rpartition(":")[2]
+    return ":".join((*wrappers, name))
 
 
-def _wrapped(name: str) -> tuple[Wrapper, str] | None:
-    """A wrapper, and the name of the policy in it; None if there is no wrapper."""
-    wrapper, colon, policy = name.partition(":")
-    return (WRAPPERS[wrapper], policy) if colon and wrapper in WRAPPERS else None
+def _unwrapped(name: str) -> tuple[list[str], str]:
+    """The wrappers of a name, the outermost first, and the name of the policy in them."""
+    wrappers: list[str] = []
+    first, colon, rest = name.partition(":")
+    while colon and first in WRAPPERS:
+        wrappers.append(first)
+        name = rest
+        first, colon, rest = name.partition(":")
+    return wrappers, name
 
 
 def _is_folder(name: str) -> bool:
@@ -250,30 +252,33 @@ def _has_pairs(name: str) -> bool:
     return (Path(name) / PAIRS).is_file()
 
 
-def _maker(name: str, bus: OnBus, depth: int = 0) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
-    if depth > MOST_WRAPPERS:
+def _maker(name: str, bus: OnBus) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
+    wrappers, inner = _unwrapped(name)
+    if len(wrappers) > MOST_WRAPPERS:
         raise FleetError(f"A policy has at most {MOST_WRAPPERS} wrappers round it ({', '.join(WRAPPERS)}).")
-    if wrapped := _wrapped(name):
-        wrapper, inner = wrapped[0], _maker(wrapped[1], bus, depth + 1)
-        return lambda: guarded(wrapper.kind, inner())  # pyright: ignore[reportReturnType]  # as the policy in it
-    if is_on_bus(name):
-        return _client_maker(name, bus)
+    make: Callable[[], Any] = _maker_of(inner, bus)
+    for wrapper in reversed(wrappers):
+        make = partial(lambda kind, make: guarded(kind, make()), WRAPPERS[wrapper].kind, make)
+    return make
+
+
+def _maker_of(name: str, bus: OnBus) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
     if _is_folder(name) and _has_pairs(name):
-        return lambda: load_pairs(Path(name))
+        return partial(load_pairs, Path(name))
     if _is_folder(name):
         from agents.learned.policy import load_policy
 
-        return lambda: load_policy(Path(name))
-    return _made_by(name)[0]
-
-
-def _client_maker(name: str, bus: OnBus) -> Callable[[], Policy]:
+        return partial(load_policy, Path(name))
+    if not is_on_bus(name):
+        return _made_by(name)[0]
     policy, at, endpoint = name.removeprefix(BUS).partition("@")
     if not is_name(policy):
         raise FleetError(f"After '{BUS}' the name of a policy must have {NAME_RULE}, no @ (got '{printable(policy)}').")
     from fleet.live.policy_client import PolicyClient  # loads zenoh
 
-    return lambda: PolicyClient(policy, fleet=bus.fleet, endpoint=endpoint if at else bus.endpoint, limit_s=bus.limit_s)
+    return partial(
+        PolicyClient, policy, fleet=bus.fleet, endpoint=endpoint if at else bus.endpoint, limit_s=bus.limit_s
+    )
 
 
 def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy], str]:

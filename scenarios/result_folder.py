@@ -128,16 +128,6 @@ def check_file(out: Path, endings: Sequence[str], overwrite: bool, option: str =
     check_overwrite(out, overwrite, option=option)
 
 
-def check_writable(out: Path) -> None:
-    """Make the folder of `out`, and raise a FleetError unless a file can be written there."""
-    with disk_errors(out):
-        if out.is_dir():
-            raise FleetError(f"Cannot write to '{out}': it is a folder.")
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(out.parent, os.W_OK):
-            raise FleetError(f"Cannot write to '{out}': permission denied.")
-
-
 def _status(card: Path) -> str | None:
     """The status on a card; None if there is no card or it is not one of ours."""
     try:

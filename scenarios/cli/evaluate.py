@@ -1,8 +1,6 @@
 """Commands that evaluate and train policies: compare, bounds, leaderboard and train."""
 
-import json
 from dataclasses import asdict
-from itertools import chain
 from math import inf
 from os import cpu_count
 from pathlib import Path
@@ -19,20 +17,19 @@ from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
 from scenarios.result_folder import disk_errors
 from scenarios.spec.options import Budget, RunSpec, StudySpec
-from scenarios.table import Table
 from scenarios.terminal import KEPT, echo, out_console, print_json, progress_bar, say
 
 if TYPE_CHECKING:
-    from scenarios.evaluate.leaderboard import Submission
+    from scenarios.evaluate.leaderboard import BoardResult
 
 
-Algorithm = Literal["mappo", "ippo", "pairs"]
+Algorithm = Literal["mappo", "ippo"]
 TrainingSplit = Literal["train"]
 """The other splits are for validation and for results."""
 PAGE = "index.html"
 _SUBMIT = "Check a result and write the file to send"
 FOLDER = Path("docs/results/leaderboard")
-"""Of the results in a checkout."""
+"""Folder of the results in a checkout."""
 
 
 def train_command(
@@ -42,34 +39,27 @@ def train_command(
     length: Annotated[Given, From(TrainingLength, "minutes", "iterations")],
     models: Annotated[Given, From(RunSpec, "difficulty", "risk")],
     suite: str | None = option(
-        "Split of the suite to train over, which must be train; validation is on the split validation.", None
+        "Split of the suite to train scores of arm-job pairs over by evolution; must be train. Validation is on the "
+        "split validation.",
+        None,
     ),
     algo: Algorithm | None = option(
-        "mappo (one critic for the whole fleet), ippo (one critic per arm), or pairs (scores of arm-job pairs "
-        "by evolution, only with --suite); default: mappo, with --suite pairs.",
+        "With a scenario: mappo (one critic for the whole fleet; default) or ippo (one critic per arm).",
         None,
         noun="algorithm",
     ),
     discount_hours: float = option(
-        "Horizon of the discount: a reward this much later counts 1/e.", 2.0, low=0.01, high=1000
+        "Time constant of the discount, h: a reward this much later counts 1/e.", 2.0, low=0.01, high=1000
     ),
-    instances: int | None = option(
-        "With --suite: number of training instances; default: 12, with --algo pairs 36.", None, low=1, high=200
-    ),
-    validation_instances: int | None = option(
-        "With --suite: number of validation instances; default: 24, four shifts each, with --algo pairs 60, the "
-        "shift of the benchmark each.",
-        None,
-        low=1,
-        high=200,
-    ),
-    seeds: int = option("Number of trainings, one after another, with seeds from --seed on.", 1, low=1, high=100),
+    instances: int = option("With --suite: number of training instances.", 36, low=1, high=200),
+    validation_instances: int = option("With --suite: number of validation instances.", 60, low=1, high=200),
+    seeds: int = option("Number of trainings, one after another; the first has --seed.", 1, low=1, high=100),
     out: Path | None = option(
-        "Folder of the policy; default: runs/SCENARIO-ALGO-SEED or runs/SPLIT-ALGO-SEED. Not with --seeds.", None
+        "Folder of the policy; default: runs/SCENARIO-ALGO-SEED or runs/SPLIT-pairs-SEED. Not with --seeds.", None
     ),
     resume: bool = option(
-        "Continue the training in --out. With --seeds: continue trainings that have begun, skip complete "
-        "ones, begin the others.",
+        "Continue the training in --out. With --seeds: continue unfinished trainings, skip complete ones, and "
+        "start the others.",
         False,
     ),
     threads: int = option("Threads of the network's computations.", 1, low=1, high=1024),
@@ -96,69 +86,65 @@ def train_command(
         )
     varied = options.parse_randomisation(randomise)
     if seeds > 1 and out is not None:
-        raise FleetError("--seeds makes several trainings: they go to runs/, leave --out away.")
+        raise FleetError(f"--seeds {seeds} trains into folders of runs/: leave --out out (got {out}).")
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
         choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
+    if suite is not None and algo is not None:
+        raise FleetError("--algo needs a scenario: --suite trains scores of arm-job pairs.")
     from agents.learned.evolution import CURVE
-    from scenarios.train.instances import holds_training
+    from scenarios.train.training import Trained, holds_training
 
     spec, seed = RunSpec(**models), given.pop("seed", 0)
     sources: Any = {"difficulty": spec.difficulty, "risk": spec.risk}
-    algorithm = algo or ("mappo" if suite is None else "pairs")
-    if algorithm == "pairs" and suite is None:
-        raise FleetError("--algo pairs trains over a split: give --suite, not a scenario.")
-    chosen = load(scenario) if scenario is not None else None
     if teacher := given.get("warm_start"):
         without_simulator(teacher, policy_of(teacher))
-    places = [
-        out or Path("runs") / f"{suite if chosen is None else chosen.name}-{algorithm}-{seed + k}" for k in range(seeds)
-    ]
     length["in_total"] = seeds > 1
-    grounds, judging, card = [], [], {"suite": suite, **sources}
-    if algorithm != "pairs":
-        require_extra("learn")
     if suite is not None:
+        from agents.learned.evolution import EvolutionConfig
         from scenarios.evaluate.scores import references_of
         from scenarios.evaluate.study import suite_of
         from scenarios.suite.splits import split
-        from scenarios.train.instances import training_instances
+        from scenarios.train.pairs import PairPlan, train_pairs, training_instances
 
-        usual = (36, 60) if algorithm == "pairs" else (12, 24)
-        train = split(suite)[: instances or usual[0]]
-        validation = split("validation")[: validation_instances or usual[1]]
-        cases = [*suite_of(suite, 1)[: len(train)], *suite_of("validation", 1)[: len(validation)]]
+        name = f"{suite}-pairs"
+        chosen = [split(suite)[:instances], split("validation")[:validation_instances]]
+        cases = [*suite_of(suite, 1)[:instances], *suite_of("validation", 1)[:validation_instances]]
         known = {shift: (each.random, each.hindsight) for shift, each in references_of(cases).items()}
         with progress_bar() as progress:
-            grounds = training_instances(train, **sources, known=known, progress=progress)
-            judging = training_instances(validation, **sources, known=known, progress=progress)
-        card |= {"prepared": len(grounds), "judges": len(judging)}
-    for k, where in enumerate(places):
-        goes_on = resume and (seeds == 1 or holds_training(where))
-        if algorithm == "pairs":
-            from agents.learned.evolution import EvolutionConfig
-            from scenarios.train.pairs import PairPlan, train_pairs
+            training, validation = (
+                training_instances(each, **sources, known=known, progress=progress) for each in chosen
+            )
+        card = {"suite": suite, **sources, "prepared": len(training), "judges": len(validation)}
+        rate = {field: value for field, value in given.items() if field == "learning_rate"}
 
-            rate = {name: value for name, value in given.items() if name == "learning_rate"}
-            search = EvolutionConfig(seed=seed + k, **rate)
-            plan = PairPlan(**length)
-            done = train_pairs(grounds, judging, search, where, plan, card=card, resume=goes_on, tell=say)
-        else:
-            from agents.learned.ppo import use_threads
-            from scenarios.train.networks import TrainingPlan, train, train_on_split
+        def train_one(where: Path, seed: int, resume: bool) -> Trained:
+            config, plan = EvolutionConfig(seed=seed, **rate), PairPlan(**length)
+            return train_pairs(training, validation, config, where, plan, card=card, resume=resume, tell=say)
+    else:
+        require_extra("learn")
+        from agents.learned.ppo import use_threads
+        from scenarios.train.networks import TrainingPlan, train
 
-            use_threads(threads)
-            discount_s, plan = 3600.0 * discount_hours, TrainingPlan(**length)
-            config = PpoConfig(algorithm=algorithm, discount_s=discount_s, seed=seed + k, **given)
+        use_threads(threads)
+        scenario_ = load(scenario or "")
+        algorithm = algo or "mappo"
+        name = f"{scenario_.name}-{algorithm}"
+
+        def train_one(where: Path, seed: int, resume: bool) -> Trained:
+            config = PpoConfig(algorithm=algorithm, discount_s=3600.0 * discount_hours, seed=seed, **given)
+            plan: Any = TrainingPlan(**length)
             with progress_bar() as progress:
-                common: Any = {"resume": goes_on, "progress": progress, "tell": say}
-                if chosen is not None:
-                    done = train(chosen, config, where, plan, randomise=varied, **sources, **common)
-                else:
-                    done = train_on_split(grounds, judging, config, where, plan, card=card, **common)
-        unit = "" if algorithm == "pairs" else " a shift" if chosen else " of the value of all jobs"
+                return train(
+                    scenario_, config, where, plan, randomise=varied, **sources, resume=resume, progress=progress,
+                    tell=say,
+                )  # fmt: skip
+
+    for k in range(seeds):
+        where = out or Path("runs") / f"{name}-{seed + k}"
+        done = train_one(where, seed + k, resume and (seeds == 1 or holds_training(where)))
         say(
             f"{'Interrupted after' if done.interrupted else 'Trained'} {done.iterations} iterations, {done.seconds:.0f}"
-            f" s; best {'score' if algorithm == 'pairs' else 'reward'} in validation {done.best:.4g}{unit}.",
+            f" s; best {'score' if suite else 'reward'} in validation {done.best:.4g}{'' if suite else ' a shift'}.",
             out_console,
         )
         target = scenario if suite is None else "--suite test"  # the split validation chose the best of the training
@@ -183,8 +169,8 @@ def compare_command(
         shown="",
     ),
     suite: str | None = option(
-        "Instances that are judged together: train, validation, test or sizes; or instances of a split "
-        "(test/0017), library names and .toml files, separated by commas.",
+        "Instances for one joint table: a split (train, validation, test or sizes); or instances (test/0017), "
+        "library names and .toml files, separated by commas.",
         None,
     ),
     seeds: int | None = option(
@@ -214,7 +200,6 @@ def compare_command(
     ),
     workers: int | None = options.WORKERS,
     ray: str | None = option("Run on a Ray cluster: its address, `auto` for the one of this machine.", None),
-    marl_eval: bool = option("With --out: also write marl_eval.json, which marl-eval reads.", False),
     as_json: bool = options.JSON,
     channel: Annotated[Given, From(Channel)],
 ) -> None:
@@ -224,21 +209,18 @@ def compare_command(
     The first failure of a policy is reported with instance, seed and traceback;
     the other policies and shifts continue.
     """
-    from scenarios.evaluate.comparison import check_baseline, comparisons, rows_without_failures, scores_over_all
-    from scenarios.evaluate.rollout import FIGURES
+    from scenarios.evaluate.comparison import check_baseline, comparisons, scores_over_all
     from scenarios.evaluate.runner import run_study
-    from scenarios.evaluate.scores import references_of, to_marl_eval
-    from scenarios.evaluate.study import Study, cases_of, columns, suite_label, suite_of
+    from scenarios.evaluate.scores import references_of
+    from scenarios.evaluate.study import Study, cases_of, suite_label, suite_of
     from scenarios.show.comparison_page import Judged, comparison_page, result_text, verdict
 
     if bool(scenario) == bool(suite):
         raise FleetError("Give either scenarios or --suite.")
     if workers is not None and ray is not None:
         raise FleetError("Give either --workers or --ray.")
-    if marl_eval and out is None:
-        raise FleetError("--marl-eval needs --out, the folder that it writes to.")
     if references is not None and not references.is_file():
-        raise FleetError(f"There is no file of references '{references}'; make it with `thermofleet bounds`.")
+        raise FleetError(f"There is no file of references '{references}'. Make it with `thermofleet bounds`.")
     varied = options.parse_randomisation(randomise)
     if references is not None and varied:
         raise FleetError("Give either --references or --randomise: references are of shifts without randomisation.")
@@ -266,10 +248,6 @@ def compare_command(
     if out:
         with disk_errors(out):
             (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")
-            if marl_eval:
-                whole = chain.from_iterable(rows_without_failures(study, rows).values())
-                table = to_marl_eval(map(columns, whole), FIGURES)
-                (out / "marl_eval.json").write_text(json.dumps(table) + "\n", encoding="utf-8")
     if as_json:
         print_json(results[0] if len(results) == 1 else results)
         return
@@ -300,7 +278,6 @@ def bounds_command(
     models: Annotated[Given, From(RunSpec, "difficulty", difficulty="oracle")],
     out: Path = option("File of the rows; finished ones are not computed again.", Path("runs/bounds.jsonl")),
     show_only: bool = option("Compute nothing: print all rows of the file.", False, flag="--show"),
-    markdown: bool = option("Print the table in Markdown.", False),
     as_json: bool = options.JSON,
 ) -> None:
     """Bound the best possible reward of shifts from both sides.
@@ -316,11 +293,11 @@ def bounds_command(
 
     if show_only:
         if not out.is_file():
-            raise FleetError(f"--show prints a file of this command, and there is no file '{out}'.")
+            raise FleetError(f"There is no file '{out}' to --show. Compute it first, or give another --out.")
         found = bounds.load_references(out)
     else:
         if bool(scenarios) == bool(suite):
-            raise FleetError("Give either scenarios or --suite.")
+            raise FleetError(f"Give either scenarios or --suite (got {'both' if suite else 'neither'}).")
         tasks = bounds.tasks_of(suite or scenarios or "", seeds, first_seed)
         if "evaluations" in budget:
             budget["seconds"] = inf
@@ -333,11 +310,7 @@ def bounds_command(
     if as_json:
         print_json([asdict(each) | {"gap": each.gap, "rule_score": each.normalised(each.best_rule)} for each in found])
         return
-    if markdown:
-        echo(bounds.reference_table(found))
-        return
-    head = bounds.heads_of(found)
-    out_console.print(Table(head=head, rows=tuple(bounds.cells(each)[: len(head)] for each in found)))
+    out_console.print(bounds.reference_table(found))
     if not show_only:
         say(f"Written to {out}.")
 
@@ -346,11 +319,11 @@ def leaderboard_command(
     folder: Path = argument("Folder of results, one file for each policy.", FOLDER),
     split: str = option("Split of the suite: test, sizes or validation.", "test"),
     verify: int = option("Number of shifts to repeat of each result of a built-in policy.", 0, low=0, high=200),
-    markdown: bool = option("Print the table as docs/leaderboard.md has it.", False),
+    markdown: bool = option("Print the table in Markdown.", False),
     as_json: bool = options.JSON,
     submit: Path | None = option("Folder of `thermofleet compare --suite test --out`.", None, panel=_SUBMIT),
-    author: str = option("--submit: name of the person who sends the result.", "", panel=_SUBMIT),
-    about: str = option("--submit: what the policy is, and where to get it; one sentence.", "", panel=_SUBMIT),
+    author: str = option("--submit: name of the author.", "", panel=_SUBMIT),
+    about: str = option("--submit: description and source of the policy, one sentence.", "", panel=_SUBMIT),
     policies: str | None = option(
         "--submit: policies of the folder, separated by commas; default: all.", None, panel=_SUBMIT
     ),
@@ -359,17 +332,17 @@ def leaderboard_command(
     """Print the leaderboard: normalised scores of all results on a split.
 
     Every file is checked as by --submit. A failed shift counts as the mean of random.
-    With --verify, repeated shifts must give equal figures. With --submit the results
-    of a comparison on a whole split are checked, and one file per policy is written.
+    With --submit the results of a comparison on a whole split are checked, and one
+    file per policy is written.
     """
     if submit is not None:
         if not author:
-            raise FleetError("--submit needs --author, the name of the person who sends the result.")
+            raise FleetError("--submit needs --author NAME.")
         submit_results(submit, author, about, policies, out)
         return
     if author or about or policies is not None:
         raise FleetError("--author, --about and --policies are for --submit: leave them out.")
-    from scenarios.evaluate.leaderboard import best_text, board_of, board_text, read_all, remark_text
+    from scenarios.evaluate.leaderboard import board_of, read_all
     from scenarios.evaluate.statistics import LEGEND
     from scenarios.show.comparison_page import narrow_score_tables
     from scenarios.spec.parse import choose
@@ -377,19 +350,12 @@ def leaderboard_command(
 
     split = choose("split", split, SplitName)
     if not folder.is_dir():
-        raise FleetError(f"'{folder}' is no folder; give the folder of the results.")
-    found = read_all(folder, split)
-    if verify:
-        from scenarios.evaluate.leaderboard import check_repeated
-
-        with progress_bar() as progress:
-            for each in found:
-                say(check_repeated(each, verify, progress))
-    board = board_of(split, found)
+        raise FleetError(f"'{folder}' is no folder. Give the folder of the results.")
+    board = board_of(split, read_all(folder, split))
     if as_json:
         print_json(board.scores if board else None)
-    elif board is None or markdown:
-        echo(board_text(board, split))
+    elif board is None:
+        echo(f"No results on the split {split}.")
     else:
         sources = sorted({each.card.difficulty for each in board.entries.values()})
         labels = {
@@ -399,9 +365,7 @@ def leaderboard_command(
             for name, each in board.entries.items()
         }
         about = f"Predictions: {', '.join(sources)}. (arm): scope arm, others central. {LEGEND}."
-        out_console.print(
-            best_text(board), about, *narrow_score_tables(board.scores, labels), remark_text(board), sep="\n"
-        )
+        out_console.print(board.summary, about, *narrow_score_tables(board.scores, labels), board.remark, sep="\n")
 
 
 def submit_results(results: Path, author: str, about: str, policies: str | None, out: Path) -> None:
@@ -418,7 +382,7 @@ def submit_results(results: Path, author: str, about: str, policies: str | None,
     from scenarios.policy_loader import label
 
     try:
-        made: list[Submission] = submissions_of(read_card(results), read_rows(results), author, about)
+        made: list[BoardResult] = submissions_of(read_card(results), read_rows(results), author, about)
     except (KeyError, TypeError, AttributeError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else f"has a value of another type ({error})"
         raise FleetError(f"'{results}' is damaged: its study.json {what}. Run the comparison again.") from error

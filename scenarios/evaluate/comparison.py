@@ -10,9 +10,9 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
-from scenarios.evaluate.scores import Normalised, Scores, Shift, and_trainings, normalised, scores_of
+from scenarios.evaluate.scores import Normalised, Shift, SuiteScores, and_trainings, normalised, scores_of
 from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, fewest, figure_rows, figures_of, remarks, unit
-from scenarios.evaluate.study import Row, Study, suite_label
+from scenarios.evaluate.study import Case, Row, Study, suite_label
 from scenarios.policy_loader import has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
@@ -22,7 +22,7 @@ from scenarios.spec.schema import Scenario
 from scenarios.table import Table
 
 if TYPE_CHECKING:  # slow to import
-    from scenarios.evaluate.references import Reference
+    from scenarios.evaluate.references import ShiftReference
 
 Array = np.ndarray
 
@@ -63,7 +63,7 @@ class Comparison:
     """By policy: illegal actions in all its shifts."""
     failures: tuple[Failed, ...] = ()
     """Shifts in which a policy failed. A policy with one has no figures."""
-    scores: Scores | None = None
+    scores: SuiteScores | None = None
     """Normalised scores; None without references of the shifts."""
     randomise: Randomisation = field(default_factory=Randomisation)
     """Of every shift, the same for every policy."""
@@ -132,7 +132,6 @@ def compare(
             them.
     """
     from scenarios.evaluate.runner import run_study
-    from scenarios.evaluate.study import Case, Study
 
     chosen = scenario_with(scenario, {}, compare)
     if not policies or not seeds:
@@ -175,14 +174,31 @@ def figures_of_shifts(
 
 
 def check_baseline(study: Study, baseline: str) -> None:
-    """Check that the baseline is compared.
-
-    Raises:
-        FleetError: it is not; names what is.
-    """
+    """Raise a FleetError, which names what is compared, if the baseline is not."""
     names = study.competitors.values()
     if baseline not in names:
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(names)}.")
+
+
+def comparisons(
+    study: Study,
+    rows: Sequence[Row],
+    baseline: str,
+    suite: str | None = None,
+    references: "Mapping[Shift, ShiftReference] | None" = None,
+) -> list[Comparison]:
+    """One comparison of all instances of a suite, or one for each instance.
+
+    Args:
+        rows: In the order of the study.
+        baseline: One of `Study.competitors`.
+        references: Of the shifts, for normalised scores.
+    """
+    check_baseline(study, baseline)
+    if suite:
+        return [comparison_of(study, rows, baseline, suite_label(suite), references)]
+    of = {case.name: [row for row in rows if row.key.instance == case.name] for case in study.cases}
+    return [comparison_of(study, own, baseline, references=references) for own in of.values()]
 
 
 def comparison_of(
@@ -190,28 +206,27 @@ def comparison_of(
     rows: Sequence[Row],
     baseline: str,
     name: str | None = None,
-    references: "Mapping[Shift, Reference] | None" = None,
+    references: "Mapping[Shift, ShiftReference] | None" = None,
 ) -> Comparison:
-    """The figures of each policy over the fleets, trainings and seeds of all instances of the rows, and its differences
-    to the baseline.
+    """One comparison of all instances of the rows.
 
     Args:
-        rows: In the order of the study.
-        baseline: One of `Study.competitors`.
         name: Of the instances together; default: that of the only one.
-        references: Of the shifts, for normalised scores.
     """
-    names, shifts = study.competitors, rows_of_competitors(study, rows)
+    shifts = rows_by_competitor(study, rows)
     failures = [
-        Failed(each, k.instance, k.fleet, k.training, k.seed, row.error, row.trace or "")
-        for each, of in shifts.items()
-        for row in of
+        Failed(each, row.key.instance, row.key.fleet, row.key.training, row.key.seed, row.error, row.trace or "")
+        for each, own in shifts.items()
+        for row in own
         if row.error is not None
-        for k in [row.key]
     ]
     failed, count = {each.policy for each in failures}, len({row.key.instance for row in rows})
-    whole = {each: repeated(study, of) for each, of in shifts.items() if each not in failed}
-    values = _scores(study, {each: shifts[each] for each in whole}, references) if baseline in whole else None
+    figures, scores = {}, None
+    if baseline not in failed:
+        whole = {each: _repeated(study, own) for each, own in shifts.items() if each not in failed}
+        figures = figures_of_shifts(whole, baseline, (count, *study.shape))
+        values = scores_over_all(study, rows, references or {})
+        scores = scores_of(values, baseline) if values else None
     fleets, trainings, per_fleet = study.shape
     several = (count, study.most_trainings) if count > 1 else (fleets if fleets > 1 else trainings, per_fleet)
     return Comparison(
@@ -220,70 +235,46 @@ def comparison_of(
         unit=unit(study.shape) if count == 1 else f"{count} instances{and_trainings(study.most_trainings)}",
         draws=fewest(several),
         baseline=baseline,
-        figures=figures_of_shifts(whole, baseline, (count, *study.shape)) if baseline in whole else {},
-        scopes={names[p, d]: scope_of(p) if names[p, d] in whole else "failed" for p, d in names},
+        figures=figures,
+        scopes={each: "failed" if each in failed else scope_of(p) for (p, _), each in study.competitors.items()},
         channel=study.channel.described(),
         channel_text=study.channel_text,
-        illegal={each: sum(row.illegal for row in of) for each, of in shifts.items()},
+        illegal={each: sum(row.illegal for row in own) for each, own in shifts.items()},
         failures=tuple(failures),
-        scores=scores_of(values, baseline) if values else None,
+        scores=scores,
         randomise=study.randomise or Randomisation(),
     )
 
 
-def rows_of_competitors(study: Study, rows: Iterable[Row]) -> dict[str, list[Row]]:
+def rows_by_competitor(study: Study, rows: Iterable[Row]) -> dict[str, list[Row]]:
     """The rows of each of `Study.competitors`, in their order."""
-    names = study.competitors
-    shifts: dict[str, list[Row]] = {each: [] for each in names.values()}
+    shifts: dict[str, list[Row]] = {each: [] for each in study.competitors.values()}
     for row in rows:
-        shifts[names[row.key.policy, row.key.difficulty]].append(row)
+        shifts[study.competitors[row.key.policy, row.key.difficulty]].append(row)
     return shifts
 
 
-def scores_over_all(study: Study, rows: Sequence[Row], references: "Mapping[Shift, Reference]") -> Normalised | None:
-    """Scores of the policies without a failure over all instances; None without references of the shifts."""
-    return _scores(study, rows_without_failures(study, rows), references)
-
-
-def _scores(
-    study: Study, by_policy: Mapping[str, Sequence[Row]], references: "Mapping[Shift, Reference] | None"
+def scores_over_all(
+    study: Study, rows: Sequence[Row], references: "Mapping[Shift, ShiftReference]"
 ) -> Normalised | None:
-    """As `normalised`; None with a randomisation, because references are of the shifts without one."""
-    return None if study.randomise else normalised(by_policy, references or {})
+    """Scores of the policies without a failure over all instances; None without references of the shifts, or with a
+    randomisation, because references are of the shifts without one."""
+    shifts = rows_by_competitor(study, rows)
+    whole = {each: own for each, own in shifts.items() if not any(row.error is not None for row in own)}
+    return None if study.randomise else normalised(whole, references)
 
 
-def rows_without_failures(study: Study, rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """The rows of those competitors that failed in no shift."""
-    shifts = rows_of_competitors(study, rows)
-    return {each: of for each, of in shifts.items() if not any(row.error is not None for row in of)}
-
-
-def repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:
+def _repeated(study: Study, rows: Iterable[Row]) -> list[Outcome]:
     """The outcomes of one policy, those without trainings once for each training: in the order of `Study.shape`."""
-    of: dict[tuple[str, int, int], list[Outcome]] = {}
+    by_training: dict[tuple[str, int, int], list[Outcome]] = {}
     for row in rows:
         assert row.outcome is not None
-        of.setdefault((row.key.instance, row.key.fleet, row.key.training), []).append(row.outcome)
-    found: list[Outcome] = []
-    for instance, fleet in dict.fromkeys((instance, fleet) for instance, fleet, _ in of):
+        by_training.setdefault((row.key.instance, row.key.fleet, row.key.training), []).append(row.outcome)
+    outcomes: list[Outcome] = []
+    for instance, fleet in dict.fromkeys((instance, fleet) for instance, fleet, _ in by_training):
         for training in range(study.shape[1]):
-            own = of.get((instance, fleet, training))
-            if own is None and (instance, fleet, 1) in of:
+            own = by_training.get((instance, fleet, training))
+            if own is None and (instance, fleet, 1) in by_training:
                 raise FleetError(f"A training of the rows is missing: {training} of instance {instance}.")
-            found += own or of[instance, fleet, 0]
-    return found
-
-
-def comparisons(
-    study: Study,
-    rows: Sequence[Row],
-    baseline: str,
-    suite: str | None = None,
-    references: "Mapping[Shift, Reference] | None" = None,
-) -> list[Comparison]:
-    """One comparison of all instances of a suite, or one for each instance."""
-    check_baseline(study, baseline)
-    if suite:
-        return [comparison_of(study, rows, baseline, suite_label(suite), references)]
-    of = {case.name: [row for row in rows if row.key.instance == case.name] for case in study.cases}
-    return [comparison_of(study, own, baseline, references=references) for own in of.values()]
+            outcomes += own or by_training[instance, fleet, 0]
+    return outcomes

@@ -43,7 +43,6 @@ class Simulated:
 
 
 def joined(results: Sequence[Simulated]) -> Simulated:
-    """Several results of the same shift as one."""
     names = ("reward", "start_s", "arm", "option")
     arrays = (np.concatenate([getattr(each, name) for each in results]) for name in names)
     return Simulated(*arrays, claims=[claims for each in results for claims in each.claims])
@@ -81,7 +80,6 @@ class ShiftSimulator:
         self._vectors = np.zeros((rows, self._layout.arms, self._layout.size), np.float32)
 
     def changes(self, rng: np.random.Generator) -> Changes:
-        """Changes of its schedules."""
         tables, jobs = self._engine.tables, self.jobs
         can = tables.work["plan"][0, :, :jobs] >= 0
         return Changes(
@@ -141,7 +139,6 @@ class ShiftSimulator:
         return Simulated(reward[:given], start_s[:given], arm_of[:given], option_of[:given], claims[:given])
 
     def _actions(self, policies: Sequence[Policy], asked: Array, limit: DecisionLimit) -> Array:
-        """The actions of the policies that are asked, int64 [row, arm]; the others wait."""
         names, mask = self.world.arms, self._engine.mask
         actions = np.full((self.rows, len(names)), WAIT, np.int64)
         for e in np.flatnonzero(asked).tolist():
@@ -152,14 +149,14 @@ class ShiftSimulator:
 
 
 def without_scores(world: World) -> World:
-    """The same world without predictions, which only policies read; awards do not change."""
+    """Remove the predictions from a world, which only policies read; awards do not change."""
     unknown = np.full_like(world.offers.risk, -1)
     offers = replace(world.offers, risk=unknown, peak=unknown, forecasts=None)
     return replace(world, offers=offers)
 
 
 @dataclass
-class Replay:
+class ScheduleReplay:
     """A policy that repeats the claims of a schedule; in the shift that it was made for, it has the same result."""
 
     claims: Sequence[Claim]
@@ -167,7 +164,6 @@ class Replay:
     _interval: int = field(default=0, init=False)
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Begin the shift."""
         self._interval = 0
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
@@ -198,7 +194,7 @@ class Hindsight:
     start: float
     """Reward of the best start."""
     claims: list[Claim]
-    """For `Replay`."""
+    """For `ScheduleReplay`."""
     evaluations: int
     seconds: float
     """CPU time of the search after its first simulation."""

@@ -1,37 +1,31 @@
-"""The leaderboard: results of policies on a whole split, one file each, their check, repetition and table."""
+"""The leaderboard: results of policies on a whole split, one file each, their check and their scores."""
 
 import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from math import isclose
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT
 from fleet.engine.observe import PEAK_HIGH_C, PEAK_LOW_C
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
-from scenarios.evaluate.references import Reference
+from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
-from scenarios.evaluate.runner import run_study
-from scenarios.evaluate.scores import Scores, Shift, normalised, ranked, references_of, score_cells, scores_of
-from scenarios.evaluate.study import CARD, Case, Key, Row, Study, suite_of
+from scenarios.evaluate.scores import Shift, SuiteScores, normalised, ranked, references_of, scores_of
+from scenarios.evaluate.study import CARD, Row, RowKey, suite_of
 from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.progress import Progress, quiet
 from scenarios.result_folder import disk_errors
 from scenarios.spec.options import DECISION_LIMIT_S, RiskName
 from scenarios.spec.schema import SplitName
 from scenarios.suite.instances import JUDGED
-from scenarios.suite.splits import ManifestLine, cell_of_instance, instance, line_of, manifest
-from scenarios.table import markdown_table as table
+from scenarios.suite.splits import ManifestLine, cell_of_instance, line_of, manifest
 
-FORMAT = 1
 DIGITS = 10
 """Significant digits of figures in a file."""
 MOST_BYTES = 1_000_000
@@ -45,10 +39,8 @@ MOST_LOSS = 100.0
 """Least possible reward: this many times the way from random to the upper bound, below random."""
 SHOWN = 3
 """Problems that an error names."""
-Text = Annotated[str, msgspec.Meta(max_length=200)]
 PLAIN = r"^[^\x00-\x1f\x7f-\x9f|<>`\u2028\u2029\ud800-\udfff]*$"
 """Text of a table: no control characters, and no | < > `."""
-Name = Annotated[str, msgspec.Meta(max_length=200, pattern=PLAIN)]
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
 
 
@@ -63,7 +55,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     trainings: Annotated[int, msgspec.Meta(ge=1, le=MOST_TRAININGS)]
     """Trainings of the policy, or else of the twins; each has a row for every instance."""
     author: Annotated[str, msgspec.Meta(min_length=1, max_length=200, pattern=PLAIN)]
-    about: Name
+    about: Annotated[str, msgspec.Meta(max_length=200, pattern=PLAIN)]
     """What the policy is, and where it can be had."""
     manifest: Hash
     """Of the split."""
@@ -85,10 +77,10 @@ class ResultLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     figures: list[float] | None
     """In the order of `FIGURES`; None if the policy failed, which counts as the mean of random."""
     illegal: Annotated[int, msgspec.Meta(ge=0)]
-    error: Text | None = None
+    error: Annotated[str, msgspec.Meta(max_length=200)] | None = None
 
 
-class Submission(msgspec.Struct, frozen=True, kw_only=True):
+class BoardResult(msgspec.Struct, frozen=True, kw_only=True):
     """A result file."""
 
     card: Card
@@ -101,26 +93,15 @@ class Submission(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.card.split}-{plain}-{self.card.difficulty}"
 
     @property
-    def title(self) -> str:
-        """Its policy in a table, as Markdown."""
-        more = f", {self.card.trainings} trainings" if self.card.trainings > 1 else ""
-        return f"`{self.card.policy}`{more}"
-
-    @property
     def failures(self) -> int:
         """Shifts in which the policy failed."""
         return sum(row.figures is None for row in self.rows)
-
-    def mean(self, figure: str) -> float:
-        """Mean of a figure over the shifts that did not fail."""
-        place = FIGURES.index(figure)
-        return sum(row.figures[place] for row in self.rows if row.figures) / max(1, len(self.rows) - self.failures)
 
     def study_rows(self) -> list[Row]:
         """As a study has them."""
         return [
             Row(
-                Key(self.card.policy, row.instance, 0, row.training, self.card.difficulty, row.seed),
+                RowKey(self.card.policy, row.instance, 0, row.training, self.card.difficulty, row.seed),
                 None if row.figures is None else Outcome(**dict(zip(FIGURES, row.figures, strict=True))),
                 row.illegal,
                 row.error,
@@ -134,7 +115,7 @@ def manifest_hash(split: str) -> str:
     return hashlib.sha256("\n".join(map(line_of, manifest(split))).encode()).hexdigest()[:16]
 
 
-def split_references(split: str) -> dict[Shift, Reference]:
+def split_references(split: str) -> dict[Shift, ShiftReference]:
     """The references of a split that come with the package."""
     return references_of(suite_of(split, 1))
 
@@ -156,14 +137,23 @@ def result_line(row: Row, scenario: str) -> ResultLine:
     )
 
 
-def problems(submission: Submission, references: Mapping[Shift, Reference]) -> Iterator[str]:
-    """What is wrong with a result, in sentences; nothing if it can be accepted.
+def check(submission: BoardResult, references: Mapping[Shift, ShiftReference]) -> None:
+    """Check a result.
 
     Args:
         references: Of its split: no reward exceeds an upper bound.
+
+    Raises:
+        FleetError: what is wrong.
     """
-    card, rows = submission.card, submission.rows
-    lines = {line.name: line for line in manifest(card.split)}
+    wrong = [*_problems_of_card(submission), *_problems_of_shifts(submission, references)]
+    if wrong:
+        more = f"; and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        raise FleetError(f"The result '{submission.name}' is refused: {'; '.join(wrong[:SHOWN])}{more}.")
+
+
+def _problems_of_card(submission: BoardResult) -> Iterator[str]:
+    card = submission.card
     if (is_built_in(card.policy) or is_on_bus(card.policy)) == bool(card.policy_hash):
         yield (
             f"its policy '{card.policy}' must be built-in and have no hash, or have another name and one "
@@ -174,22 +164,26 @@ def problems(submission: Submission, references: Mapping[Shift, Reference]) -> I
     missing = [name for name in NEEDED if not card.versions.get(name)]
     if missing:
         yield f"it does not state the versions of {', '.join(missing)}"
-    found = {(row.instance, row.training) for row in rows}
-    wanted = {(name, training) for name in lines for training in range(card.trainings)}
-    if len(found) < len(rows):
-        yield f"{len(rows) - len(found)} shifts are given twice"
-    if wanted - found:
-        name, training = min(wanted - found)
-        yield f"{len(wanted - found)} of {len(wanted)} shifts are missing, the first {name}, training {training}"
-    if found - wanted:
-        yield f"{len(found - wanted)} shifts are not of the split {card.split}, the first {min(found - wanted)[0]}"
-    for row in rows:
-        line = lines.get(row.instance)
-        if line:
-            yield from (f"{row.instance} {what}" for what in _of_shift(row, line, references))
 
 
-def _of_shift(row: ResultLine, line: ManifestLine, references: Mapping[Shift, Reference]) -> Iterator[str]:
+def _problems_of_shifts(submission: BoardResult, references: Mapping[Shift, ShiftReference]) -> Iterator[str]:
+    split, lines = submission.card.split, {line.name: line for line in manifest(submission.card.split)}
+    given = {(row.instance, row.training) for row in submission.rows}
+    wanted = {(name, training) for name in lines for training in range(submission.card.trainings)}
+    if len(given) < len(submission.rows):
+        yield f"{len(submission.rows) - len(given)} shifts are given twice"
+    if wanted - given:
+        name, training = min(wanted - given)
+        yield f"{len(wanted - given)} of {len(wanted)} shifts are missing, the first {name}, training {training}"
+    if given - wanted:
+        yield f"{len(given - wanted)} shifts are not of the split {split}, the first {min(given - wanted)[0]}"
+    for row in submission.rows:
+        if line := lines.get(row.instance):
+            problems = _problems_of_shift(row, line, references.get((row.instance, line.seed)))
+            yield from (f"{row.instance} {what}" for what in problems)
+
+
+def _problems_of_shift(row: ResultLine, line: ManifestLine, known: ShiftReference | None) -> Iterator[str]:
     if row.scenario != line.scenario:
         yield f"was another scenario (hash {row.scenario}, in the manifest {line.scenario})"
     if row.seed != line.seed:
@@ -202,41 +196,28 @@ def _of_shift(row: ResultLine, line: ManifestLine, references: Mapping[Shift, Re
         yield f"needs {len(FIGURES)} figures of at most {MOST_FIGURE:g}"
         return
     own = dict(zip(FIGURES, row.figures, strict=True))
+    counts = [name for name, kind in KINDS.items() if kind.is_count]
+    cell = cell_of_instance(line)
+    longest_min, reward = 60.0 * cell.hours * cell.arms, own["reward"]
     if not 0 <= own["on_time"] <= own["finished"] <= line.count:
         yield f"has {own['finished']:g} finished jobs, {own['on_time']:g} on time, of {line.count}"
-    if min(value for name, value in own.items() if name not in ("reward", "peak_c")) < 0 or own["availability"] > 1:
+    if any(value < KINDS[name].least or value > KINDS[name].most for name, value in own.items()):
         yield "has a figure below 0, or an availability above 1"
-    counts = [name for name, kind in KINDS.items() if kind.is_count]
     if any(own[name] % 1 for name in counts):
         yield f"has counts that are no whole numbers ({', '.join(counts)})"
-    cell = cell_of_instance(line)
-    longest_min = 60.0 * cell.hours * cell.arms
     if max(own["above_warning_min"], own["hot_surface_min"]) > longest_min + SLACK:
         yield f"has more minutes above a limit than its arms work ({longest_min:g})"
     if not PEAK_LOW_C <= own["peak_c"] <= PEAK_HIGH_C:
         yield f"has a hottest motor of {own['peak_c']:g} °C, not within {PEAK_LOW_C:g} to {PEAK_HIGH_C:g}"
-    if own["reward"] > own["value"] + SLACK * (1 + own["value"]):
-        yield f"has a reward of {own['reward']:.4g}, above the finished value {own['value']:.4g}: all else is a cost"
-    known = references.get((row.instance, line.seed))
-    if known and own["reward"] < (least := known.random - MOST_LOSS * (known.upper - known.random)):
-        yield f"has a reward of {own['reward']:.4g}, below what the worst policy could lose ({least:.4g})"
-    if known and own["reward"] > known.upper + SLACK * (1 + abs(known.upper)):
-        yield f"has a reward of {own['reward']:.4g}, above the upper bound {known.upper:.4g}, which no policy exceeds"
+    if reward > own["value"] + SLACK * (1 + own["value"]):
+        yield f"has a reward of {reward:.4g}, above the finished value {own['value']:.4g}: all else is a cost"
+    if known and reward < (least := known.random - MOST_LOSS * (known.upper - known.random)):
+        yield f"has a reward of {reward:.4g}, below what the worst policy could lose ({least:.4g})"
+    if known and reward > known.upper + SLACK * (1 + abs(known.upper)):
+        yield f"has a reward of {reward:.4g}, above the upper bound {known.upper:.4g}, which no policy exceeds"
 
 
-def check(submission: Submission, references: Mapping[Shift, Reference]) -> None:
-    """Check a result.
-
-    Raises:
-        FleetError: what is wrong.
-    """
-    wrong = list(problems(submission, references))
-    if wrong:
-        more = f"; and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
-        raise FleetError(f"The result '{submission.name}' is refused: {'; '.join(wrong[:SHOWN])}{more}.")
-
-
-def write(submission: Submission, folder: Path) -> Path:
+def write(submission: BoardResult, folder: Path) -> Path:
     """Write the file of a result, and return its path.
 
     Raises:
@@ -256,7 +237,7 @@ def write(submission: Submission, folder: Path) -> Path:
     return path
 
 
-def read(path: Path) -> Submission:
+def read(path: Path) -> BoardResult:
     """A result file; `check` tells whether it is one that counts.
 
     Raises:
@@ -276,10 +257,10 @@ def read(path: Path) -> Submission:
     except (ValueError, msgspec.DecodeError) as error:
         why = f"line {number}: {printable(str(error))}"
         raise FleetError(f"'{path}' is no result of `thermofleet leaderboard --submit`: {why}.") from error
-    return Submission(card=card, rows=tuple(rows))
+    return BoardResult(card=card, rows=tuple(rows))
 
 
-def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, about: str) -> list[Submission]:
+def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, about: str) -> list[BoardResult]:
     """A result for each policy and source of scores in the folder of a study; not yet checked.
 
     Shifts of other fleets, of other instances and with other seeds than the split's are left out.
@@ -300,7 +281,7 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
     splits = sorted({name.partition("/")[0] for name in card["instances"] if "/" in name} & set[str](JUDGED))
     if not splits:
         raise FleetError("The study has no instance of a split that policies are judged on; compare with --suite test.")
-    made: list[Submission] = []
+    made: list[BoardResult] = []
     for split in splits:
         seeds = {line.name: line.seed for line in manifest(split)}
         by_policy: dict[tuple[str, str], list[Row]] = {}
@@ -309,7 +290,7 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
                 by_policy.setdefault((row.key.policy, row.key.difficulty), []).append(row)
         for (policy, difficulty), own in sorted(by_policy.items()):
             header = {
-                "format": FORMAT, "policy": label(policy), "difficulty": difficulty, "split": split,
+                "format": 1, "policy": label(policy), "difficulty": difficulty, "split": split,
                 "scope": scope_of(policy), "trainings": 1 + max(row.key.training for row in own), "author": author,
                 "about": about, "manifest": manifest_hash(split), "code_hash": card["code_hash"],
                 "policy_hash": card["policies"][policy], "risk": card["risk"], "versions": card["versions"],
@@ -319,15 +300,13 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
             except msgspec.ValidationError as error:
                 raise FleetError(f"The result of '{policy}' cannot be written: {error}.") from error
             lines = tuple(result_line(row, card["instances"][row.key.instance]) for row in own)
-            made.append(Submission(card=head, rows=lines))
+            made.append(BoardResult(card=head, rows=lines))
     return made
 
 
 BASELINE = "wsept"
-"""Policy that differences refer to, with the scores of `SOURCE`; without it the last of the board."""
+"""Policy that differences refer to, with the predictions of `SOURCE`; without it the last of the board."""
 SOURCE = "oracle"
-HEADS = ("", "policy", "predictions", "scope", "mean score", "difference", "IQM", "short of 1", "better in", "to bound")
-MORE = ("faults", "failed", "by", "code")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -335,9 +314,9 @@ class Board:
     """The results on one split, the best first."""
 
     split: str
-    scores: Scores
+    scores: SuiteScores
     """By name of the submission."""
-    entries: Mapping[str, Submission]
+    entries: Mapping[str, BoardResult]
     instances: int
     """Of the split."""
 
@@ -346,12 +325,33 @@ class Board:
         """Names of the submissions, the best first."""
         return ranked(self.scores)
 
-    def best(self, scope: str) -> Submission | None:
-        """The best of a scope."""
-        return next((self.entries[name] for name in self.order if self.entries[name].card.scope == scope), None)
+    @property
+    def summary(self) -> str:
+        """The policy with the highest mean score of each scope, in a sentence."""
+        best: dict[str, str] = {}
+        for name in self.order:
+            card = self.entries[name].card
+            best.setdefault(card.scope, f"`{card.policy}` ({self.scores.policies[name].mean.text()})")
+        texts = [f"{scope} {best[scope]}" for scope in ("central", "arm") if scope in best]
+        return f"Highest mean score of scope {', of scope '.join(texts)}."
+
+    @property
+    def remark(self) -> str:
+        """What a reader must know of the results."""
+        scores, base = self.scores, self.entries[self.scores.baseline].card
+        remark = (
+            f"{scores.instances} of {self.instances} instances; differences to `{base.policy}` ({base.difficulty})."
+        )
+        if missing := self.instances - scores.instances - len(scores.flat):
+            remark += f" {missing} have no reference yet and are not scored."
+        if scores.flat:
+            remark += f" {scores.flat_remark}"
+        if len({each.card.code_hash for each in self.entries.values()}) > 1:
+            remark += " Results are of several versions of the code."
+        return remark
 
 
-def read_all(folder: Path, split: str) -> list[Submission]:
+def read_all(folder: Path, split: str) -> list[BoardResult]:
     """The checked results of a split in a folder, by the names of their files.
 
     Raises:
@@ -361,7 +361,7 @@ def read_all(folder: Path, split: str) -> list[Submission]:
         raise FleetError(
             f"'{folder}' is a folder of `thermofleet compare`; run `thermofleet leaderboard --submit` with it first."
         )
-    references, found = split_references(split), list[Submission]()
+    references, found = split_references(split), list[BoardResult]()
     for path in sorted(folder.glob("*.jsonl")):
         if (named := path.stem.partition("-")[0]) not in JUDGED:
             raise FleetError(
@@ -379,7 +379,7 @@ def read_all(folder: Path, split: str) -> list[Submission]:
 
 
 def board_of(
-    split: str, submissions: Sequence[Submission], references: Mapping[Shift, Reference] | None = None
+    split: str, submissions: Sequence[BoardResult], references: Mapping[Shift, ShiftReference] | None = None
 ) -> Board | None:
     """The board of a split; None without results or without references.
 
@@ -390,100 +390,10 @@ def board_of(
     values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
     if values is None:
         return None
-    base = next((name for name, each in entries.items() if _is_baseline(each)), None)
-    last = min(entries, key=lambda name: values.score[name].mean())
-    return Board(split=split, scores=scores_of(values, base or last), entries=entries, instances=len(manifest(split)))
-
-
-def _is_baseline(each: Submission) -> bool:
-    card = each.card
-    return (card.policy, card.difficulty, card.policy_hash) == (BASELINE, SOURCE, "")
-
-
-def board_text(board: Board | None, split: str) -> str:
-    """The board as Markdown: what is best of each scope, the table, and what must be known."""
-    if board is None:
-        return f"No results on the split {split}."
-    scores = board.scores
-    parts = [best_text(board)]
-    rows = [(str(place), *_cells(scores, name, board.entries[name])) for place, name in enumerate(board.order, start=1)]
-    parts.append(table((*HEADS, *MORE), rows))
-    return "\n\n".join([*parts, remark_text(board)])
-
-
-def best_text(board: Board) -> str:
-    """The policy with the highest mean score of each scope, in a sentence."""
-    best = [
-        f"{scope} `{each.card.policy}` ({board.scores.policies[each.name].mean.text()})"
-        for scope in ("central", "arm")
-        for each in [board.best(scope)]
-        if each
-    ]
-    return f"Highest mean score of scope {', of scope '.join(best)}."
-
-
-def remark_text(board: Board) -> str:
-    """What a reader must know of the results."""
-    scores = board.scores
-    base = board.entries[scores.baseline].card
-    missing = board.instances - scores.instances - len(scores.flat)
-    remark = f"{scores.instances} of {board.instances} instances; differences to `{base.policy}` ({base.difficulty})."
-    if missing:
-        remark += f" {missing} have no reference yet and are not scored."
-    if scores.flat:
-        remark += f" {scores.flat_remark}"
-    if len({each.card.code_hash for each in board.entries.values()}) > 1:
-        remark += " Results are of several versions of the code; `--verify` repeats some shifts of each with this one."
-    return remark
-
-
-def _cells(scores: Scores, name: str, entry: Submission) -> tuple[str, ...]:
-    mean, difference, stars, *rest = score_cells(scores, name)
-    card = entry.card
-    own = (
-        entry.title,
-        card.difficulty,
-        card.scope,
-        mean,
-        f"{difference} {stars}".strip().replace("*", "\\*"),
+    bases = (
+        name
+        for name, each in entries.items()
+        if (each.card.policy, each.card.difficulty, each.card.policy_hash) == (BASELINE, SOURCE, "")
     )
-    return (
-        *own,
-        *rest,
-        f"{entry.mean('faults'):.2f}",
-        str(entry.failures or ""),
-        card.author,
-        f"`{card.code_hash[:8]}`",
-    )
-
-
-CLOSE = 1e-6
-"""Relative difference of figures on other machines: libraries round differently."""
-
-
-def check_repeated(submission: Submission, count: int, progress: Progress = quiet) -> str:
-    """Run some shifts of a result again, always the same ones; returns what was done.
-
-    Raises:
-        FleetError: a figure came out otherwise.
-    """
-    card = submission.card
-    if card.policy_hash:
-        return f"{submission.name}: not repeated, as its policy is a file of its author."
-    rng = np.random.default_rng(np.random.SeedSequence([len(submission.rows), count]))
-    rows = [row for row in submission.rows if row.training == 0]
-    chosen = [rows[i] for i in sorted(rng.permutation(len(rows))[:count].tolist())]
-    cases = [Case(name=row.instance, scenario=instance(row.instance).scenario, seeds=(row.seed,)) for row in chosen]
-    study = Study(policies=[card.policy], cases=cases, difficulties=[card.difficulty], risk=card.risk)  # pyright: ignore[reportArgumentType]  # as it was written
-    for row, again in zip(chosen, run_study(study, workers=1, progress=progress), strict=True):
-        figures = None if again.outcome is None else list(asdict(again.outcome).values())
-        same = figures is not None and row.figures is not None
-        close = same and all(
-            isclose(a, b, rel_tol=CLOSE, abs_tol=CLOSE) for a, b in zip(figures or (), row.figures or (), strict=True)
-        )
-        if not close and (figures is not None or row.figures is not None):
-            raise FleetError(
-                f"The result '{submission.name}' does not repeat: {row.instance} has the figures {figures} with this "
-                f"code, not {row.figures}."
-            )
-    return f"{submission.name}: {len(chosen)} shifts repeated, with equal figures."
+    base = next(bases, min(entries, key=lambda name: values.score[name].mean()))
+    return Board(split=split, scores=scores_of(values, base), entries=entries, instances=len(manifest(split)))

@@ -9,7 +9,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from fleet.errors import FleetError
-from scenarios.processes import Result, Work
+from scenarios.processes import Result, WorkUnit
 
 START_S = 60.0
 """Time to wait for a CPU that another program uses."""
@@ -20,7 +20,7 @@ class _Runner:
     def ready(self) -> None:
         """Return when it runs."""
 
-    def run(self, work: Work[Any]) -> Any:
+    def run(self, work: WorkUnit[Any]) -> Any:
         return work()
 
 
@@ -60,7 +60,7 @@ class RayWorker:
         """What ends when the actor begins to run."""
         return self._actor.ready.remote()
 
-    def submit(self, work: Work[Result]) -> "Future[Result]":
+    def submit(self, work: WorkUnit[Result]) -> "Future[Result]":
         return self._actor.run.remote(work).future()
 
     def died(self, error: BaseException) -> bool:

@@ -2,6 +2,7 @@
 
 import re
 import time
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -19,7 +20,7 @@ from fleet.seeding import child
 from scenarios.evaluate.hindsight import (
     SIDE_BY_SIDE,
     Claim,
-    Replay,
+    ScheduleReplay,
     ShiftSimulator,
     Simulated,
     hindsight,
@@ -32,8 +33,7 @@ from scenarios.evaluate.study import suite_of
 from scenarios.evaluate.upper_bound import Relaxation, upper_bound
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import blaming, policy_at, policy_of
-from scenarios.prepare.fleet import Fleet, ShiftFactory
-from scenarios.prepare.known_cell import simulator_of_shift
+from scenarios.prepare.fleet import Fleet, ShiftFactory, simulator_of_shift
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.log import code_hash
@@ -41,6 +41,7 @@ from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import DECISION_LIMIT_S, RISK, Budget, DifficultyName
 from scenarios.spec.parse import scenario_hash
 from scenarios.suite.splits import Instance
+from scenarios.table import Table
 
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""
@@ -49,7 +50,7 @@ STARTS = tuple(name for name in RULES if name != "random")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reference:
+class ShiftReference:
     """What the reward of one instance is measured against."""
 
     instance: str
@@ -107,7 +108,7 @@ def reference(
     bound: bool = True,
     known: Sequence[Claim] = (),
     policies: Sequence[str] = STARTS,
-) -> Reference:
+) -> ShiftReference:
     """The reference of one instance of a prepared fleet.
 
     Args:
@@ -128,7 +129,7 @@ def reference(
     rule, best_rule = policies[best], float(starts.reward[best])
     bare = without_scores(world)
     if known:
-        starts = joined([starts, ShiftSimulator(bare, weights, 1).follow([Replay(known)])])
+        starts = joined([starts, ShiftSimulator(bare, weights, 1).follow([ScheduleReplay(known)])])
     drawn = [policy_of("random") for _ in range(RANDOM_SHIFTS)]
     for n, policy in enumerate(drawn):
         policy.reset(np.random.default_rng(child(np.random.SeedSequence([task.seed, 2]), n)))
@@ -138,7 +139,7 @@ def reference(
     bounded_s = time.process_time()
     upper = upper_bound(Relaxation(world, weights), nodes=budget.nodes) if bound else None
     ended_s, timed = time.process_time(), isfinite(budget.seconds)
-    return Reference(
+    return ShiftReference(
         instance=task.name,
         scenario_hash=scenario_hash(task.scenario),
         seed=task.seed,
@@ -161,11 +162,7 @@ def reference(
 
 
 def _followed(simulator: ShiftSimulator, name: str, task: Instance) -> Simulated:
-    """The shift of a task under a policy.
-
-    Raises:
-        PolicyFailed: the policy is one of one's own, and raised something, was too slow or returned no action.
-    """
+    """The shift of a task under a policy; a user-defined one that fails raises `PolicyFailed`."""
     limit = DecisionLimit(DECISION_LIMIT_S)
     with blaming(name, task.name), limit.watching():
         with limit.decision():
@@ -183,7 +180,7 @@ def references(
     workers: int = 1,
     policies: Sequence[str] = STARTS,
     progress: Progress = quiet,
-) -> list[Reference]:
+) -> list[ShiftReference]:
     """The references of instances, kept in a file of JSON lines; those in it are not computed again.
 
     A row counts if instance, content of the scenario, seed and source of scores are the same. With a larger budget the
@@ -200,7 +197,7 @@ def references(
     """
     rows, folder = Rows(path), cache or cache_folder()
     rows.check_writable()
-    keys = [key_of(task, difficulty) for task in tasks]
+    keys = [_key(task.name, scenario_hash(task.scenario), task.seed, difficulty) for task in tasks]
     known = {(each.instance, each.seed): each for each in _references_in(rows, keys)}
     left = [task for task in tasks if not _enough(known.get((task.name, task.seed)), budget)]
     first: dict[object, Instance] = {}
@@ -217,7 +214,7 @@ def references(
     progress("bounding", Count(done, max(1, len(tasks))))
     with worker_processes(max(1, min(workers, len(left)))) as pool:
         for new in pool(work):
-            assert isinstance(new, Reference)
+            assert isinstance(new, ShiftReference)
             rows.append(_key(new.instance, new.scenario_hash, new.seed, difficulty), asdict(new))
             done += 1
             progress("bounding", Count(done, len(tasks)))
@@ -226,10 +223,10 @@ def references(
 
 
 _fleets = Fleets()
+"""Of this process; instances of one cell share a fleet."""
 
 
 def _fleet_of(task: Instance, difficulty: DifficultyName, folder: Path, progress: Progress = quiet) -> Fleet:
-    """The prepared fleet of an instance; instances of one cell share it."""
     return _fleets.of(task.scenario, difficulty, RISK, folder, progress)
 
 
@@ -237,11 +234,10 @@ def _bounded(
     task: Instance,
     budget: Budget,
     difficulty: DifficultyName,
-    known: Reference | None,
+    known: ShiftReference | None,
     folder: Path,
     policies: Sequence[str],
-) -> Reference:
-    """The reference of a task, in whichever process this is."""
+) -> ShiftReference:
     fleet = _fleet_of(task, difficulty, folder)
     try:
         found = reference(
@@ -254,8 +250,7 @@ def _bounded(
         raise ScenarioError(f"{task.name}: {error}") from error
 
 
-def _enough(known: Reference | None, budget: Budget) -> bool:
-    """Whether a reference is of at least this budget."""
+def _enough(known: ShiftReference | None, budget: Budget) -> bool:
     if known is None or known.nodes < budget.nodes:
         return False
     if isfinite(budget.seconds):
@@ -264,20 +259,15 @@ def _enough(known: Reference | None, budget: Budget) -> bool:
 
 
 def _place(row: Row) -> list[object]:
-    """Sorts names of instances by their numbers."""
+    """Sort key: names of instances by their numbers."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", row["instance"])]
-
-
-def key_of(task: Instance, difficulty: str) -> str:
-    """What a row of a file of references is found by."""
-    return _key(task.name, scenario_hash(task.scenario), task.seed, difficulty)
 
 
 def _key(instance: str, scenario: str, seed: int, difficulty: str) -> str:
     return f"{instance} {scenario} {seed} {difficulty}"
 
 
-def load_references(path: Path, keys: Iterable[str] | None = None) -> list[Reference]:
+def load_references(path: Path, keys: Iterable[str] | None = None) -> list[ShiftReference]:
     """The references in a file: all, or those of some keys.
 
     Raises:
@@ -287,9 +277,9 @@ def load_references(path: Path, keys: Iterable[str] | None = None) -> list[Refer
     return _references_in(rows, rows.by_key if keys is None else keys)
 
 
-def _references_in(rows: Rows, keys: Iterable[str]) -> list[Reference]:
+def _references_in(rows: Rows, keys: Iterable[str]) -> list[ShiftReference]:
     with rows.readable():
-        return msgspec.convert(rows.some(keys), list[Reference])
+        return msgspec.convert(rows.some(keys), list[ShiftReference])
 
 
 def tasks_of(names: str, seeds: int, first_seed: int) -> list[Instance]:
@@ -300,42 +290,34 @@ def tasks_of(names: str, seeds: int, first_seed: int) -> list[Instance]:
             tasks.append(Instance(case.name, case.scenario, case.seeds[0]))
         else:
             tasks += [Instance(f"{case.name}/{seed}", case.scenario, seed) for seed in case.seeds]
-    for i, task in enumerate(tasks):
-        if task.name in {other.name for other in tasks[:i]}:
-            raise FleetError(f"The instance '{task.name}' is given twice.")
+    name, count = Counter(task.name for task in tasks).most_common(1)[0]
+    if count > 1:
+        raise FleetError(f"The instance '{name}' is given twice.")
     return tasks
 
 
 HEADS = ("instance", "random", "best start", "reward", "hindsight", "upper bound", "its score", "gap", "CPU s")
 
 
-def heads_of(references: Sequence[Reference]) -> tuple[str, ...]:
-    """Heads of the table of these references; that of times, the last one, only if times are known."""
-    return HEADS if any(each.seconds is not None for each in references) else HEADS[:-1]
-
-
-def cells(each: Reference) -> tuple[str, ...]:
-    """One line of the table."""
-    rewards = [f"{value:.1f}" for value in (each.best_rule, each.hindsight, each.upper)]
-    score = f"{each.normalised(each.best_rule):.3f}"
-    seconds = "" if each.seconds is None else f"{each.seconds:.0f}"
-    return each.instance, f"{each.random:.1f}", each.rule, *rewards, score, f"{each.gap:.3f}", seconds
-
-
-def reference_table(references: Sequence[Reference]) -> str:
-    """The table for a page, as Markdown: every instance, and the mean of each scenario."""
-    from scenarios.table import markdown_table as table
-
-    lines: list[tuple[str, ...]] = []
+def reference_table(references: Sequence[ShiftReference]) -> Table:
+    """Every instance, and the mean of each scenario with several; times only if they are known."""
+    rows: list[tuple[str, ...]] = []
     for scenario in dict.fromkeys(each.instance.rpartition("/")[0] for each in references):
         own = [each for each in references if each.instance.rpartition("/")[0] == scenario]
-        lines += [cells(each) for each in own]
-        figures = ("random", "best_rule", "hindsight", "upper")
-        random, *rewards = (f"**{sum(getattr(each, name) for each in own) / len(own):.1f}**" for name in figures)
-        score = sum(each.normalised(each.best_rule) for each in own) / len(own)
-        gap = sum(each.gap for each in own) / len(own)
-        times = [each.seconds for each in own if each.seconds is not None]
-        seconds = f"{sum(times) / len(times):.0f}" if times else ""
-        lines.append((f"**{scenario}**, mean", random, "", *rewards, f"**{score:.3f}**", f"**{gap:.3f}**", seconds))
-    heads = heads_of(references)
-    return table(heads, [line[: len(heads)] for line in lines])
+        rows += [_cells(each.instance, each.rule, [each]) for each in own]
+        if len(own) > 1:
+            rows.append(_cells(f"{scenario}, mean", "", own))
+    heads = HEADS if any(each.seconds is not None for each in references) else HEADS[:-1]
+    return Table(head=heads, rows=tuple(row[: len(heads)] for row in rows))
+
+
+def _cells(name: str, rule: str, references: Sequence[ShiftReference]) -> tuple[str, ...]:
+    """A row of means."""
+    random, *rewards = (
+        f"{np.mean([getattr(each, figure) for each in references]):.1f}"
+        for figure in ("random", "best_rule", "hindsight", "upper")
+    )
+    score = np.mean([each.normalised(each.best_rule) for each in references])
+    gap = np.mean([each.gap for each in references])
+    times = [each.seconds for each in references if each.seconds is not None]
+    return name, random, rule, *rewards, f"{score:.3f}", f"{gap:.3f}", f"{np.mean(times):.0f}" if times else ""

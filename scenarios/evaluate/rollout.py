@@ -18,13 +18,12 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.env.lookahead import CellSimulator
 from fleet.env.validation import actions_of
-from fleet.env.vector import BatchEnv, Library, Obs
+from fleet.env.vector import BatchEnv, Obs
 from fleet.observation import Observation
 from scenarios.evaluate.statistics import FigureKind
 from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.batch import library_of
-from scenarios.prepare.fleet import Fleet
-from scenarios.prepare.known_cell import as_known, simulator_of
+from scenarios.prepare.fleet import Fleet, as_known, simulator_of
 from scenarios.run.metrics import HeatUse, common_figures
 from scenarios.spec.jobs import weights_of
 from scenarios.spec.options import DECISION_LIMIT_S
@@ -85,21 +84,18 @@ class ShiftResult:
 
 
 def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel = PERFECT) -> list[Outcome]:
-    """The figures of a policy on each seed, independent of the other seeds. A decision takes at most
-    `DECISION_LIMIT_S`.
+    """The figures of a policy on each seed, independent of the other seeds.
 
     Raises:
-        PolicyFailed: the policy is one of one's own, and raised something, was too slow or returned no action.
+        PolicyFailed: a user-defined policy raised something, was slower than `DECISION_LIMIT_S`, or returned no action.
         Exception: whatever a built-in policy raises.
     """
-    results: list[Outcome] = []
-    for seed, played in zip(seeds, play(fleet, policy, seeds, channel, DECISION_LIMIT_S), strict=True):
-        if played.error is not None:
-            where = f"{fleet.scenario.name}/{seed}, at {played.time_s:g} s of the shift"
-            raise failure(policy, played.error, where) from played.error
-        assert played.outcome is not None
-        results.append(played.outcome)
-    return results
+    results = play(fleet, policy, seeds, channel, DECISION_LIMIT_S)
+    for seed, result in zip(seeds, results, strict=True):
+        if result.error is not None:
+            where = f"{fleet.scenario.name}/{seed}, at {result.time_s:g} s of the shift"
+            raise failure(policy, result.error, where) from result.error
+    return [result.outcome for result in results if result.outcome is not None]
 
 
 def play(
@@ -135,7 +131,6 @@ def play(
 
     @contextmanager
     def guarded(e: int) -> Iterator[None]:
-        """End the shift of an env whose policy fails."""
         try:
             with limit.decision():
                 yield
@@ -145,7 +140,6 @@ def play(
             results[e], running[e] = ShiftResult(None, 0, error, tick * dt_s), False
 
     def after_step(reward: Array, ended: Array) -> None:
-        """Keep the figures of the shifts that have ended."""
         nonlocal tick
         tick += 1
         heat.add(env.temp_c, dt_s)
@@ -237,9 +231,7 @@ def known_in(env: BatchEnv, e: int, obs: Obs) -> dict[str, Observation]:
     return env.layout.read_each(env.agents, obs["observation"][e], obs["action_mask"][e])
 
 
-@lru_cache(maxsize=1)
-def _library(fleet: Fleet) -> Library:
-    return library_of(fleet)
+_library = lru_cache(maxsize=1)(library_of)
 
 
 @lru_cache(maxsize=1)

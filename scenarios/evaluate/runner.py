@@ -19,7 +19,7 @@ from scenarios.evaluate import rollout
 from scenarios.evaluate.rollout import Outcome, ShiftResult, play
 from scenarios.evaluate.sources import Fleets, is_trained, plan_content
 from scenarios.evaluate.store import Store, opened
-from scenarios.evaluate.study import Row, Study, Unit, policy_hash
+from scenarios.evaluate.study import Row, RowKey, Study, Unit, policy_hash
 from scenarios.extras import require_extra
 from scenarios.policy_loader import error_text, is_built_in
 from scenarios.prepare.fleet import Fleet
@@ -63,13 +63,14 @@ class Settings:
 
 
 fleets = Fleets()
+"""Of this process."""
 
 
-def fleet_of(
-    unit: Unit, risk: RiskName, randomise: Randomisation | None, folder: Path, progress: Progress = quiet
-) -> Fleet:
-    """The prepared fleet of a unit."""
-    return fleets.of(unit.scenario, unit.difficulty, risk, folder, progress, training=unit.twins, randomise=randomise)
+def _fleet_of(unit: Unit, settings: Settings, progress: Progress = quiet) -> Fleet:
+    return fleets.of(
+        unit.scenario, unit.difficulty, settings.risk, settings.folder or cache_folder(), progress,
+        training=unit.twins, randomise=settings.randomise,
+    )  # fmt: skip
 
 
 def run_unit(unit: Unit, settings: Settings) -> list[Row]:
@@ -79,16 +80,14 @@ def run_unit(unit: Unit, settings: Settings) -> list[Row]:
         FleetError: the fleet cannot be prepared, or this machine has other code or another policy.
     """
     _check(unit.policy, settings)
-    fleet = fleet_of(unit, settings.risk, settings.randomise, settings.folder or cache_folder())
+    fleet = _fleet_of(unit, settings)
     with _one_thread(), _contained():  # one thread, so that sums have one order
         played = play(fleet, unit.played, unit.case.seeds, settings.channel, settings.decision_limit_s)
     _check(unit.policy, settings)  # its files may have been changed meanwhile
-    return [row_of(unit, i, each) for i, each in enumerate(played)]
+    return [_row_of(key, each) for key, each in zip(unit.keys, played, strict=True)]
 
 
-def row_of(unit: Unit, index: int, played: ShiftResult) -> Row:
-    """The row of the unit's i-th shift."""
-    key = unit.keys[index]
+def _row_of(key: RowKey, played: ShiftResult) -> Row:
     if played.outcome is not None:
         figures = {name: float(value) for name, value in asdict(played.outcome).items()}  # as a file gives them
         return Row(key, Outcome(**figures), played.illegal)
@@ -194,16 +193,16 @@ def run_study(
         FleetError: a fleet cannot be prepared, the folder holds something else, or the cluster cannot be reached.
         MissingExtra: a library is not installed.
     """
-    wanted = [key for unit in study.units(set()) for key in unit.keys]
+    wanted = [key for unit in study.units(()) for key in unit.keys]
     if out is not None:
         require_extra("report")
     with nullcontext(Store()) if out is None else opened(out, study.card) as store:
         # The largest first, so that processes end together; what shares plans follows.
-        units = sorted(study.units(set(store.rows)), key=lambda unit: (-unit.size, unit.cell))
-        folder = cache_dir or cache_folder()  # here: a worker may have started with another one
-        if ray is None or any(map(is_trained, study.sources)):  # other machines may have caches of their own
-            _warm(units, study, folder, progress)
-        settings = Settings.of(study, cache_dir if ray else folder)
+        units = sorted(study.units(store.rows), key=lambda unit: (-unit.size, unit.cell))
+        # The folder is stated here, because a worker may have started with another one; other machines have their own.
+        settings = Settings.of(study, cache_dir if ray else cache_dir or cache_folder())
+        if ray is None or any(map(is_trained, study.sources)):
+            _prepare_once(units, settings, progress)
         done = len(wanted) - sum(len(unit.case.seeds) for unit in units)
         for rows in _run(units, settings, workers, ray, tell):
             store.add(rows)
@@ -212,14 +211,14 @@ def run_study(
         return [store.rows[key] for key in wanted]
 
 
-def _warm(units: list[Unit], study: Study, folder: Path, progress: Progress) -> None:
+def _prepare_once(units: list[Unit], settings: Settings, progress: Progress) -> None:
     """Make the plans and twins that units share, so that no two processes make the same; all land in the cache."""
     seen: set[object] = set()
     for unit in units:
         cell = (plan_content(unit.scenario), unit.twins, unit.difficulty)
         if cell not in seen:
             seen.add(cell)
-            fleet_of(unit, study.risk, study.randomise, folder, progress)
+            _fleet_of(unit, settings, progress)
 
 
 def _run(

@@ -1,25 +1,14 @@
-"""Normalised scores of policies over instances: from rewards and references to means, differences and tables.
+"""Normalised scores of policies over instances: from rewards and references to means and differences."""
 
-Export of results in the format of raw data that marl-eval reads (Gorsane et al., NeurIPS 2022).
-
-A run is one fleet, training and seed of an instance. A policy without trainings repeats its runs for each training of
-the others, because marl-eval compares arrays of one shape.
-"""
-
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Any,  # rows of a result file, and JSON
-)
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fleet.errors import FleetError
 from scenarios.evaluate.statistics import Interval, aggregates, by_group, holm, improvement, interval, paired
 from scenarios.evaluate.study import Case, Row
 from scenarios.policy_loader import has_trainings
@@ -27,11 +16,9 @@ from scenarios.spec.parse import scenario_hash
 from scenarios.suite.splits import cell_name
 
 if TYPE_CHECKING:
-    from scenarios.evaluate.references import Reference
-
+    from scenarios.evaluate.references import ShiftReference
 
 Array = np.ndarray
-
 
 FEWEST = 2
 """Instances that intervals over instances need."""
@@ -109,14 +96,9 @@ class Score:
     bound_gap: Interval
     """Distance to the upper bound as a share of that from random to the bound, in the mean."""
 
-    @property
-    def stars(self) -> str:
-        """As `tables.LEGEND` says."""
-        return self.difference.stars(self.p_holm)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Scores:
+class SuiteScores:
     """Normalised scores of several policies."""
 
     baseline: str
@@ -149,7 +131,7 @@ class Scores:
         return remarks
 
 
-def scores_of(values: Normalised, baseline: str) -> Scores:
+def scores_of(values: Normalised, baseline: str) -> SuiteScores:
     """The figures of every policy; baseline is one of them.
 
     Raises:
@@ -162,7 +144,7 @@ def scores_of(values: Normalised, baseline: str) -> Scores:
     suite = aggregates(values.score, groups=groups)
     differences = [Interval(0.0, 0.0, 0.0) if name == baseline else values.difference(name, baseline) for name in names]
     adjusted = holm([each.p for each in differences]).tolist()
-    return Scores(
+    return SuiteScores(
         baseline=baseline,
         instances=len(values.instances),
         unit=values.unit,
@@ -189,7 +171,7 @@ def and_trainings(count: int) -> str:
     return f" × {count} trainings of a policy" if count > 1 else ""
 
 
-def ranked(scores: Scores) -> list[str]:
+def ranked(scores: SuiteScores) -> list[str]:
     """The policies, the best mean first."""
     return sorted(scores.policies, key=lambda name: -scores.policies[name].mean.mean)
 
@@ -197,13 +179,13 @@ def ranked(scores: Scores) -> list[str]:
 HEADS = ("policy", "mean", "difference", "", "IQM", "short of 1", "better in", "to bound")
 
 
-def score_cells(scores: Scores, name: str, digits: int = 2) -> tuple[str, ...]:
+def score_cells(scores: SuiteScores, name: str, digits: int = 2) -> tuple[str, ...]:
     """A row of `HEADS` but for the name."""
     each, base = scores.policies[name], name == scores.baseline
     return (
         each.mean.text(digits),
         "" if base else each.difference.text(digits),
-        "" if base else each.stars,
+        "" if base else each.difference.stars(each.p_holm),
         each.iqm.text(digits),
         each.optimality_gap.text(digits),
         "" if base else each.improvement.text(digits),
@@ -213,16 +195,14 @@ def score_cells(scores: Scores, name: str, digits: int = 2) -> tuple[str, ...]:
 
 Shift = tuple[str, int]
 """Instance and seed."""
-FOLDER = "suite/references"
-"""Of the references that come with the package, a file for each split."""
 
 
 def split_file(split: str) -> Path:
-    """File of the references of a split; there may be none."""
-    return Path(str(resources.files("scenarios").joinpath(FOLDER, f"{split}.jsonl")))
+    """File of the references of a split that come with the package; there may be none."""
+    return Path(str(resources.files("scenarios").joinpath("suite/references", f"{split}.jsonl")))
 
 
-def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shift, Reference]":
+def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shift, ShiftReference]":
     """The references of those shifts that have one.
 
     Args:
@@ -236,7 +216,7 @@ def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shif
     splits = dict.fromkeys(case.name.partition("/")[0] for case in cases if "/" in case.name)
     files = [file] if file else [path for path in map(split_file, splits) if path.is_file()]
     rows = {(each.instance, each.seed): each for path in files for each in load_references(path)}
-    found: dict[Shift, Reference] = {}
+    found: dict[Shift, ShiftReference] = {}
     for case in cases:
         content = scenario_hash(case.scenario)
         for seed in case.seeds:
@@ -247,7 +227,10 @@ def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shif
 
 
 def normalised(
-    by_policy: Mapping[str, Sequence[Row]], references: "Mapping[Shift, Reference]", *, failed_as_random: bool = False
+    by_policy: Mapping[str, Sequence[Row]],
+    references: "Mapping[Shift, ShiftReference]",
+    *,
+    failed_as_random: bool = False,
 ) -> Normalised | None:
     """The scores of policies on the shifts that have a reference; None if there are fewer than `FEWEST`.
 
@@ -288,75 +271,3 @@ def normalised(
         missing=len({(row.key.fleet, row.key.instance, row.key.seed) for row in first}) - len(scored),
         flat=tuple(references[shift].instance for shift in scored if shift not in set(spread)),
     )
-
-
-ENVIRONMENT = "thermofleet"
-"""Of instances whose name has no split before a slash."""
-Key = tuple[int, int, int]
-"""Fleet, training and seed."""
-Runs = dict[Key, dict[str, list[float]]]
-
-
-def to_marl_eval(rows: Iterable[Mapping[str, Any]], metrics: Sequence[str]) -> dict[str, Any]:
-    """Results as JSON: environment → task → algorithm → run → step → metrics.
-
-    The environment is the split of the instance (`test` of `test/0017`), the task the rest of its name, the algorithm
-    the policy, with `@DIFFICULTY` if there are several. There is one step, the evaluation, which `absolute_metrics`
-    repeats.
-
-    Args:
-        rows: With policy, instance, fleet, training, seed, difficulty and the metrics.
-        metrics: Names of figures.
-
-    Raises:
-        FleetError: a run that is missing or given twice, a figure that is not finite, or names that differ by case
-            only, which marl-eval ignores.
-    """
-    tasks: dict[tuple[str, str], dict[str, Runs]] = {}
-    rows = list(rows)
-    several = len({row["difficulty"] for row in rows}) > 1
-    for row in rows:
-        environment, _, task = str(row["instance"]).rpartition("/")
-        algorithm = str(row["policy"]).replace(",", ";") + (f"@{row['difficulty']}" if several else "")
-        runs = tasks.setdefault((environment or ENVIRONMENT, task), {}).setdefault(algorithm, {})
-        key = (int(row["fleet"]), int(row["training"]), int(row["seed"]))
-        figures = {name: [float(row[name])] for name in metrics}
-        bad = [name for name, (value,) in figures.items() if not math.isfinite(value)]
-        if key in runs or bad:
-            what = f"has no finite {bad[0]}" if bad else "is given twice"
-            raise FleetError(f"{_run_name(algorithm, str(row['instance']), key)} {what}.")
-        runs[key] = figures
-    algorithms = {name for each in tasks.values() for name in each}
-    for names in (algorithms, {"/".join(task) for task in tasks}):
-        if len({name.lower() for name in names}) < len(names):
-            raise FleetError(f"marl-eval ignores case, so names must differ by more (got {', '.join(sorted(names))}).")
-    result: dict[str, Any] = {}
-    for (environment, task), by_algorithm in tasks.items():
-        keys = sorted({key for runs in by_algorithm.values() for key in runs})
-        result.setdefault(environment, {})[task] = {
-            name: {
-                f"run_{n}": _steps(_figures(by_algorithm.get(name, {}), key, name, f"{environment}/{task}"))
-                for n, key in enumerate(keys, start=1)
-            }
-            for name in sorted(algorithms)
-        }
-    counts = {len(runs) for each in result.values() for task in each.values() for runs in task.values()}
-    if len(counts) > 1:
-        raise FleetError(f"marl-eval needs as many runs of every instance (got {', '.join(map(str, sorted(counts)))}).")
-    return result
-
-
-def _figures(runs: Runs, key: Key, algorithm: str, instance: str) -> dict[str, list[float]]:
-    trainings = {training for _, training, _ in runs}
-    own = (key[0], min(trainings), key[2]) if len(trainings) == 1 else key
-    if own not in runs:
-        raise FleetError(f"{_run_name(algorithm, instance, key)} is missing.")
-    return runs[own]
-
-
-def _steps(figures: dict[str, list[float]]) -> dict[str, Any]:
-    return {"step_1": {"step_count": 1, **figures}, "absolute_metrics": figures}
-
-
-def _run_name(algorithm: str, instance: str, key: Key) -> str:
-    return f"{algorithm} on {instance}, fleet {key[0]}, training {key[1]}, seed {key[2]}"

@@ -9,7 +9,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -29,7 +29,7 @@ from scenarios.spec.options import DifficultyName, RiskName
 from scenarios.spec.schema import Scenario
 
 if TYPE_CHECKING:  # need the extra `twin`
-    from twin.baselines import Evidence, LoadRegression, TorqueRms
+    from twin.baselines import Evidence, LoadRegression
     from twin.vae.twin import Twin
 
 Array = np.ndarray
@@ -185,14 +185,17 @@ def inverted(model: DifficultyModel) -> _Changed:
 class _Torque:
     """d_k from the RMS torque over that of the training motion; P from a regression on the mean squared torque."""
 
-    torque: "TorqueRms"
+    known_nm: Array
+    """RMS torque of the training motion, [joint]."""
     risk: DifficultyModel
     version: str = "torque"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
-        per_joint = difficulty_of_error(self.torque.scores([plan], [repetitions]).per_joint[0])
+        from twin.baselines import torque_ratio
+
+        per_joint = difficulty_of_error(torque_ratio(plan, repetitions, self.known_nm))
         score = self.risk.score(plan, repetitions)
-        weight = heat_weights(self.torque.nominal_nm**2)
+        weight = heat_weights(self.known_nm**2)
         return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk, weight=weight)
 
 
@@ -220,29 +223,19 @@ class _Constant:
         return Difficulty(np.full(JOINTS, 0.5), p_saturation=0.5)
 
 
-@dataclass(frozen=True)
-class Source:
-    """One source of predictions besides those of `PREPARED`."""
-
-    make: Callable[[PlannedFleet, int], Fleet]
-    """The fleet with its predictions, of a training, from 0."""
-    trained: bool = True
-    """Whether it depends on the training; else one training stands for all."""
-
-
 def _vae(
     planned: PlannedFleet, training: int, *, trained: bool = True, changes: Mapping[str, int] | None = None
 ) -> Fleet:
     return planned.scored(planned.learned(training, "excess", trained=trained, changes=changes))
 
 
-def _unweighted(planned: PlannedFleet, fleet: Fleet) -> Fleet:
-    return planned.scored([unweighted(arm.model) for arm in fleet.arms])
+def _changed(planned: PlannedFleet, fleet: Fleet, change: Callable[[DifficultyModel], _Changed]) -> Fleet:
+    return planned.scored([change(arm.model) for arm in fleet.arms])
 
 
 def _torque(planned: PlannedFleet) -> Fleet:
     from scenarios.prepare.twins import exploration_records, records, require_cool_plans
-    from twin.baselines import torque_over_known
+    from twin.baselines import known_torque
 
     scenario, twins = planned.scenario, planned.learned(0, "torque")
 
@@ -250,8 +243,8 @@ def _torque(planned: PlannedFleet) -> Fleet:
         cool = require_cool_plans(arm.all_plans, arm.hardware, scenario)
         return [*records(cool), *exploration_records(scenario, arm)]
 
-    rules = [torque_over_known(training_records(arm)) for arm in planned.arms]
-    return planned.scored([_Torque(rule, twin) for rule, twin in zip(rules, twins, strict=True)])
+    known_nm = [known_torque(training_records(arm)) for arm in planned.arms]
+    return planned.scored([_Torque(torque, twin) for torque, twin in zip(known_nm, twins, strict=True)])
 
 
 def _network(planned: PlannedFleet, risk: RiskName) -> Fleet:
@@ -271,31 +264,28 @@ def _random(planned: PlannedFleet, training: int) -> Fleet:
     return planned.scored([_Random(training_seed(planned.scenario, training))] * len(planned.arms))
 
 
-def _sized(**changes: int) -> Source:
-    """The VAE alone, with another configuration."""
-    return Source(lambda planned, training: _vae(planned, training, changes=changes))
-
-
-SOURCES: dict[str, Source] = {
+SOURCES: dict[str, Callable[[PlannedFleet, int], Fleet]] = {
     # d and P of the VAE alone; `twin` has P and peak of the identified thermal network besides.
-    "trained": Source(_vae),
-    "untrained": Source(lambda planned, training: _vae(planned, training, trained=False)),
-    "unweighted": Source(lambda planned, training: _unweighted(planned, _vae(planned, training))),
+    "trained": _vae,
+    "untrained": partial(_vae, trained=False),
+    "unweighted": lambda planned, training: _changed(planned, _vae(planned, training), unweighted),
     # RMS torque over that of the training motion.
-    "torque": Source(lambda planned, _: _unweighted(planned, _torque(planned)), trained=False),
-    "weighted-torque": Source(lambda planned, _: _torque(planned), trained=False),
+    "torque": lambda planned, _: _changed(planned, _torque(planned), unweighted),
+    "weighted-torque": lambda planned, _: _torque(planned),
     # Thermal networks alone: of a nominal arm, and as identified.
-    "rc-nominal": Source(lambda planned, _: _network(planned, "rc-nominal"), trained=False),
-    "rc": Source(lambda planned, _: _network(planned, "rc"), trained=False),
-    "random": Source(_random),
-    "inverted": Source(lambda planned, training: planned.scored([*map(inverted, planned.learned(training, "excess"))])),
-    "constant": Source(lambda planned, _: planned.scored([_Constant()] * len(planned.arms)), trained=False),
+    "rc-nominal": lambda planned, _: _network(planned, "rc-nominal"),
+    "rc": lambda planned, _: _network(planned, "rc"),
+    "random": _random,
+    "inverted": lambda planned, training: _changed(planned, _vae(planned, training), inverted),
+    "constant": lambda planned, _: planned.scored([_Constant()] * len(planned.arms)),
     # The VAE with other windows and sizes.
-    "trained-1s-16": _sized(window=12, hidden=16),
-    "trained-1s-32": _sized(window=12, hidden=32),
-    "trained-4s-32": _sized(window=50, hidden=32),
+    "trained-1s-16": partial(_vae, changes={"window": 12, "hidden": 16}),
+    "trained-1s-32": partial(_vae, changes={"window": 12, "hidden": 32}),
+    "trained-4s-32": partial(_vae, changes={"window": 50, "hidden": 32}),
 }
-"""Sources besides those of `PREPARED`, by name."""
+"""The fleet with the predictions of each source besides `PREPARED`, from its plans and the training, from 0."""
+UNTRAINED = ("torque", "weighted-torque", "rc-nominal", "rc", "constant")
+"""Sources that do not depend on the training: one stands for all."""
 ALL_SOURCES = (*PREPARED, *SOURCES)
 """Names, as `--difficulty` of `thermofleet compare` takes them."""
 
@@ -312,7 +302,7 @@ def check_source(name: str) -> None:
 
 def is_trained(source: str) -> bool:
     """Whether a source has several trainings."""
-    return source == "twin" if source in PREPARED else SOURCES[source].trained
+    return source == "twin" if source in PREPARED else source not in UNTRAINED
 
 
 def drawn(scenario: Scenario, fleet: int) -> Scenario:
@@ -404,5 +394,5 @@ class Fleets:
             last = self._planned
             if last is None or (last.scenario, last.folder) != (spec, folder):
                 self._planned = last = PlannedFleet(spec, folder, progress)
-            fleets.append(SOURCES[source].make(last, training))
+            fleets.append(SOURCES[source](last, training))
         return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))

@@ -1,33 +1,21 @@
-"""Intervals of means over fleets, trainings and seeds, and p-values that agree with them.
+"""Intervals of means, counts and shares, scores over a suite, and figures of policies beside a baseline.
 
-A seed draws the same jobs for every fleet, so values are correlated by fleet and by seed; trainings are within fleets.
-The variance of the mean is clustered both ways, V = V_fleet + V_seed − V_fleet×seed, and its degrees of freedom are the
-smaller number of clusters minus one (Cameron, Gelbach & Miller, Journal of Business & Economic Statistics 29, 2011).
-
-Student's t covers too rarely where values are skewed: .88 instead of .95 for ten lognormal values. So each bound is the
-outer one of Student's and of Hall's transformation, which removes the skewness of t (Journal of the Royal Statistical
-Society B 54, 1992). Both are in closed form: no resampling, and p-values as small as a table of many tests needs.
+**Means** over fleets, trainings and seeds. A seed draws the same jobs for every fleet, so values are correlated by
+fleet and by seed; trainings are within fleets. The variance of the mean is clustered both ways, V = V_fleet + V_seed −
+V_fleet×seed, with the smaller number of clusters minus one as degrees of freedom (Cameron, Gelbach & Miller, Journal of
+Business & Economic Statistics 29, 2011). Student's t covers too rarely where values are skewed: .88 instead of .95 for
+ten lognormal values. So each bound is the outer one of Student's and of Hall's transformation, which removes the
+skewness of t (Journal of the Royal Statistical Society B 54, 1992); both have a closed form.
 `benchmarks/statistics/interval_coverage.py` measures how often the intervals contain the mean.
 
-Intervals of counts and shares: exact, so that `0 faults in 10 shifts` is not `no faults`.
+**Counts and shares** have exact intervals, so that `0 faults in 10 shifts` is not `no faults`.
 
-Several tests at once.
-
-Scores over the instances of a suite: IQM, optimality gap, performance profile, probability of improvement.
-
-After Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021. Scores are
-[run, instance], normalised so that 1 is the best known; a run is a training that does all instances. Intervals are
-percentiles of bootstrap resamples of both, so they are about other trainings and other instances of the same generator;
-a single run is given, not a sample. If instances belong to groups, such as cells, then groups are drawn, and instances
-within each.
-
-Percentiles of few independent draws are too narrow, so these are farther out, as Student's t is (Hesterberg, What
-Teachers Should Know about the Bootstrap, The American Statistician 69, 2015, section 5.4).
-
-Resamples are weights, so every figure of every policy is a product of one matrix. The mean over instances needs none:
-`means.interval` of [run, 1, instance], or of `by_group`.
-
-Figures of several policies beside a baseline: means, paired differences, and Holm's correction over all of them.
+**Scores** over a suite [run, instance]: IQM, optimality gap, performance profile and probability of improvement
+(Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021), with 1 as the best
+known. Intervals are percentiles of bootstrap resamples of runs (trainings) and instances, or of groups of instances and
+instances within each; a single run is given, not a sample. Percentiles of few independent draws are too narrow, so
+these are farther out, as Student's t is (Hesterberg, The American Statistician 69, 2015, section 5.4). Resamples are
+weights, so every figure is a product of one matrix.
 """
 
 import math
@@ -89,7 +77,7 @@ class Interval:
         return f"{self.mean:{sign}z.{digits}f}{bounds}"
 
 
-class Bounds(NamedTuple):
+class MeanIntervals(NamedTuple):
     """Intervals of many means at once, each [...]."""
 
     mean: Array
@@ -138,7 +126,7 @@ def paired(values: ArrayLike, base: ArrayLike) -> Interval:
     return interval(x - y)
 
 
-def mean_bounds(values: Array, *, level: float = LEVEL) -> Bounds:
+def mean_bounds(values: Array, *, level: float = LEVEL) -> MeanIntervals:
     """The intervals of many means.
 
     Args:
@@ -164,7 +152,7 @@ def mean_bounds(values: Array, *, level: float = LEVEL) -> Bounds:
     least, most = np.minimum(ratio, np.maximum(hall, nearest)), np.maximum(ratio, np.minimum(hall, nearest))
     tails = student.cdf(most, max(clusters - 1, 1)), student.sf(least, max(clusters - 1, 1))
     p = np.minimum(1.0, 2 * np.minimum(*tails))
-    return Bounds(mean, mean - above * spread, mean - below * spread, p)
+    return MeanIntervals(mean, mean - above * spread, mean - below * spread, p)
 
 
 def draws(values: Array) -> int:
@@ -461,7 +449,7 @@ def _grouped(groups: tuple[int, ...]) -> Array:
 
 
 def _drawn(count: int, size: tuple[int, ...], stream: int) -> Array:
-    """How often each of some things is drawn, [*size, thing]."""
+    """How often each item is drawn, [*size, item]."""
     rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(stream,)))
     return rng.multinomial(count, np.full(count, 1 / count), size=size).astype(float)
 
@@ -514,9 +502,6 @@ class FigureKind(NamedTuple):
     """Of rare events; see `count_interval`."""
 
 
-ANY = FigureKind("", least=-math.inf)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Figure:
     """One figure of one policy, and its paired difference to that of the baseline."""
@@ -563,31 +548,29 @@ def figures_of(
     made = dict[tuple[str, str], tuple[Interval, Interval]]()
     for policy, figures in values.items():
         for name, x in figures.items():
-            kind = kinds.get(name, ANY)
+            kind = kinds.get(name, FigureKind("", least=-math.inf))
             own = count_interval(x) if kind.is_count else interval(x, least=kind.least, most=kind.most)
             to_base = (paired_counts if kind.is_count else paired)(x, values[baseline][name])
             made[policy, name] = own, Interval(0.0, 0.0, 0.0) if policy == baseline else to_base
     adjusted = dict(zip(made, holm([to_base.p for _, to_base in made.values()]).tolist(), strict=True))
-    return {
-        policy: {name: _figure(*made[policy, name], x, adjusted[policy, name]) for name, x in figures.items()}
-        for policy, figures in values.items()
-    }
 
+    def figure(policy: str, name: str) -> Figure:
+        (own, to_base), p_holm = made[policy, name], adjusted[policy, name]
+        return Figure(
+            mean=own.mean,
+            iqm=float(trim_mean(values[policy][name].ravel(), TRIM)),
+            low=own.low,
+            high=own.high,
+            note=own.note,
+            difference=to_base.mean,
+            difference_low=to_base.low,
+            difference_high=to_base.high,
+            difference_note=to_base.note,
+            p=to_base.p,
+            p_holm=p_holm if p_holm == p_holm else math.nan,  # one object, so that equal results compare equal
+        )
 
-def _figure(own: Interval, to_base: Interval, values: Array, p_holm: float) -> Figure:
-    return Figure(
-        mean=own.mean,
-        iqm=float(trim_mean(values.ravel(), 0.25)),
-        low=own.low,
-        high=own.high,
-        note=own.note,
-        difference=to_base.mean,
-        difference_low=to_base.low,
-        difference_high=to_base.high,
-        difference_note=to_base.note,
-        p=to_base.p,
-        p_holm=p_holm if p_holm == p_holm else math.nan,  # one object, so that equal results compare equal
-    )
+    return {policy: {name: figure(policy, name) for name in figures} for policy, figures in values.items()}
 
 
 def figure_rows(

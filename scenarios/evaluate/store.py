@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any  # Any: values of columns and cards
 from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.evaluate.rollout import FIGURES
-from scenarios.evaluate.study import CARD, Key, Row, columns, row_of
+from scenarios.evaluate.study import CARD, Row, RowKey, columns, row_of
 from scenarios.json_rows import Rows
 from scenarios.result_folder import disk_errors
 
@@ -27,7 +27,7 @@ RESULTS, UNFINISHED = "results.parquet", "rows.jsonl"
 COMMAND = "thermofleet compare --out"
 """That writes such a folder."""
 COLUMNS: dict[str, type] = {
-    **Key.__annotations__,
+    **RowKey.__annotations__,
     **dict.fromkeys(FIGURES, float),
     "illegal": int,
     "error": str,
@@ -40,7 +40,7 @@ NAMED = {"instances": "instance", "policies": "policy"}
 class Store:
     """Rows by key; `opened` gives one that also keeps them in a folder."""
 
-    def __init__(self, rows: Mapping[Key, Row] | None = None, file: Rows | None = None) -> None:
+    def __init__(self, rows: Mapping[RowKey, Row] | None = None, file: Rows | None = None) -> None:
         self.rows = dict(rows or {})
         self._file = file
 
@@ -154,7 +154,7 @@ def _schema() -> "pa.Schema":
     return pa.schema([(name, types[kind]) for name, kind in COLUMNS.items()])
 
 
-def _write_results(out: Path, rows: Mapping[Key, Row]) -> None:
+def _write_results(out: Path, rows: Mapping[RowKey, Row]) -> None:
     """One file of all rows, sorted by key, so that it does not depend on the order in which they came."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -164,7 +164,7 @@ def _write_results(out: Path, rows: Mapping[Key, Row]) -> None:
         pq.write_table(table, draft)
 
 
-def _read(out: Path, unfinished: Rows) -> dict[Key, Row]:
+def _read(out: Path, unfinished: Rows) -> dict[RowKey, Row]:
     """All rows of a folder: the finished ones, and those of its unfinished study."""
     import pyarrow as pa
     import pyarrow.parquet as pq

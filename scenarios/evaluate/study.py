@@ -2,10 +2,11 @@
 
 import hashlib
 import platform
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,7 +47,7 @@ def seeds_of_instance(seed: int, count: int) -> tuple[int, ...]:
     return (seed, *more)
 
 
-class Key(NamedTuple):
+class RowKey(NamedTuple):
     """Which shift a row is of."""
 
     policy: str
@@ -63,7 +64,7 @@ class Key(NamedTuple):
 class Row:
     """The result of one shift."""
 
-    key: Key
+    key: RowKey
     outcome: Outcome | None
     """None if the policy failed."""
     illegal: int = 0
@@ -93,10 +94,10 @@ class Unit:
     """Number of what its plans depend on (`scenarios.evaluate.sources.plan_content`); default: of each instance."""
 
     @property
-    def keys(self) -> list[Key]:
+    def keys(self) -> list[RowKey]:
         """The rows it gives."""
         of = (self.policy, self.case.name, self.fleet, self.training, self.difficulty)
-        return [Key(*of, seed) for seed in self.case.seeds]
+        return [RowKey(*of, seed) for seed in self.case.seeds]
 
     @property
     def scenario(self) -> Scenario:
@@ -129,19 +130,17 @@ class Study(StudySpec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for source in self.difficulties:
+            check_source(source)
         for what, given in (
             ("policy", self.policies),
+            ("policy", [f"{policy}@{source}" for policy, source in self.pairs]),
             ("instance", [case.name for case in self.cases]),
             ("difficulty", self.difficulties),
         ):
             for i, name in enumerate(given):
                 if name in given[:i]:
                     raise FleetError(f"The {what} '{name}' is given twice; names must be unique.")
-        for source in self.difficulties:
-            check_source(source)
-        if len(set(self.pairs)) < len(self.pairs):
-            policy, source = next(pair for i, pair in enumerate(self.pairs) if pair in self.pairs[:i])
-            raise FleetError(f"The policy '{policy}@{source}' is given twice; names must be unique.")
         randomise = randomisation_of(self.randomise)
         for case in self.cases:
             randomise.scenarios_of(case.scenario)  # before the first shift, as an error of a late one comes late
@@ -160,26 +159,24 @@ class Study(StudySpec):
             if (other := labels.setdefault(label(policy), policy)) != policy:
                 raise FleetError(f"'{other}' and '{policy}' are both called {label(policy)} in results: rename one.")
 
-    def units(self, done: set[Key]) -> Iterator[Unit]:
+    def units(self, done: Collection[RowKey]) -> Iterator[Unit]:
         """What is left to run, in the order of the instances."""
         together = TOGETHER if self.channel.perfect else 1
         cells: dict[object, int] = {}
         for case in self.cases:
             cell = cells.setdefault(plan_content(case.scenario), len(cells))
             for difficulty, policies in self._policies_with.items():
-                for fleet in range(self.fleets):
-                    most = max(self.trainings_of(policy, difficulty) for policy in policies)
-                    for training in range(most):
-                        for policy in policies:
-                            if training >= self.trainings_of(policy, difficulty):
-                                continue
-                            of = (policy, case.name, fleet, training, difficulty)
-                            left = [seed for seed in case.seeds if Key(*of, seed) not in done]
-                            for i in range(0, len(left), together):
-                                part = Case(name=case.name, scenario=case.scenario, seeds=tuple(left[i : i + together]))
-                                own = self.own_trainings[policy]
-                                member, twins = (training, 0) if len(own) > 1 else (0, training)
-                                yield Unit(policy, part, fleet, training, difficulty, own[member], twins, cell)
+                most = max(self.trainings_of(policy, difficulty) for policy in policies)
+                for fleet, training, policy in product(range(self.fleets), range(most), policies):
+                    if training >= self.trainings_of(policy, difficulty):
+                        continue
+                    key = (policy, case.name, fleet, training, difficulty)
+                    left = [seed for seed in case.seeds if RowKey(*key, seed) not in done]
+                    own = self.own_trainings[policy]
+                    member, twins = (training, 0) if len(own) > 1 else (0, training)
+                    for i in range(0, len(left), together):
+                        part = replace(case, seeds=tuple(left[i : i + together]))
+                        yield Unit(policy, part, fleet, training, difficulty, own[member], twins, cell)
 
     @cached_property
     def pairs(self) -> tuple[tuple[str, str], ...]:
@@ -243,7 +240,7 @@ class Study(StudySpec):
         """What makes two results comparable: hashes of code, scenarios and policies, versions, settings."""
         return {
             "code_hash": code_hash(),
-            "versions": {"python": platform.python_version()} | dict(_versions()),
+            "versions": {"python": platform.python_version()} | {name: _version(name) for name in _LIBRARIES},
             "risk": self.risk,
             "randomise": asdict(self.randomise or Randomisation()),
             "channel": self.channel.described(),
@@ -254,12 +251,11 @@ class Study(StudySpec):
         }
 
 
-def _versions() -> Iterator[tuple[str, str | None]]:
-    for name in _LIBRARIES:
-        try:
-            yield name, version(name)
-        except PackageNotFoundError:
-            yield name, None
+def _version(library: str) -> str | None:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return None
 
 
 def split_source(name: str) -> tuple[str, str | None]:
@@ -323,7 +319,9 @@ def row_of(found: Mapping[str, Any]) -> Row:
     """The row of its columns."""
     failed = found["error"] is not None
     outcome = None if failed else Outcome(**{figure: found[figure] for figure in FIGURES})
-    return Row(Key(*(found[name] for name in Key._fields)), outcome, found["illegal"], found["error"], found["trace"])
+    return Row(
+        RowKey(*(found[name] for name in RowKey._fields)), outcome, found["illegal"], found["error"], found["trace"]
+    )
 
 
 MOST_NAMES = 3
@@ -336,19 +334,17 @@ def cases_of(names: Sequence[str], seeds: int, first_seed: int = 0) -> list[Case
     Raises:
         FleetError: there is no such scenario, or two have one name.
     """
-    found: list[Case] = []
+    cases: list[Case] = []
     for name in names:
         if INSTANCE.fullmatch(name):
-            found.append(_case(instance(name), seeds))
+            cases.append(_case_of(instance(name), seeds))
         else:
-            scenario = load(name)
-            found.append(
-                Case(name=scenario.name, scenario=scenario, seeds=tuple(range(first_seed, first_seed + seeds)))
-            )
-    return found
+            scenario, own = load(name), tuple(range(first_seed, first_seed + seeds))
+            cases.append(Case(name=scenario.name, scenario=scenario, seeds=own))
+    return cases
 
 
-def _case(instance: Instance, seeds: int) -> Case:
+def _case_of(instance: Instance, seeds: int) -> Case:
     return Case(name=instance.name, scenario=instance.scenario, seeds=seeds_of_instance(instance.seed, seeds))
 
 
@@ -359,7 +355,7 @@ def suite_of(name: str, seeds: int, first_seed: int = 0) -> list[Case]:
         FleetError: there is no such split, instance or scenario.
     """
     if name in SPLITS:
-        return [_case(each, seeds) for each in split(name)]
+        return [_case_of(each, seeds) for each in split(name)]
     names = [each.strip() for each in name.split(",")]
     for each in names:
         if not (INSTANCE.fullmatch(each) or each in library() or each.endswith(".toml")):

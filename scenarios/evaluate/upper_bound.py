@@ -50,6 +50,7 @@ Upper bound of the reward of a shift.
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import networkx as nx
 import numpy as np
@@ -105,12 +106,24 @@ class Pieces:
         return len(self.arm)
 
 
+class Columns(NamedTuple):
+    """Numbers of the columns after the pieces."""
+
+    jobs: Array
+    """Whether each job is done, 0 or 1, int [job]."""
+    faults: Array
+    """Faults, int [arm]."""
+    lost: Array
+    """Seconds lost to faults, int [arm, period]."""
+    above: Array
+    """Seconds above the warning limit, int [arm, period]."""
+    count: int
+    """Of all columns."""
+
+
 @dataclass(frozen=True, eq=False)
 class Relaxation:
     """The relaxation of env 0 of a world.
-
-    Columns: the pieces, whether each job is done, the faults of each arm, then per arm and period the seconds lost to
-    faults and the seconds above the warning limit.
 
     Args:
         period_s: Length of a period, rounded to whole decision intervals.
@@ -230,40 +243,23 @@ class Relaxation:
         return found
 
     @cached_property
-    def _blocks(self) -> list[int]:
-        """Where jobs, faults, lost seconds, seconds above the warning limit begin, and the number of columns."""
-        arms, cells = len(self.world.arms), len(self.world.arms) * self.periods
-        return np.cumsum([len(self.pieces), self.jobs, arms, cells, cells]).tolist()
-
-    def job_columns(self) -> Array:
-        """Columns that say whether a job is done, 0 or 1, int [job]."""
-        return self._blocks[0] + np.arange(self.jobs)
-
-    def fault_columns(self) -> Array:
-        """Columns of the faults, int [arm]."""
-        return self._blocks[1] + np.arange(len(self.world.arms))
-
-    def lost_columns(self, arm: int) -> Array:
-        """Columns of the seconds that an arm loses to faults, int [period]."""
-        return self._blocks[2] + arm * self.periods + np.arange(self.periods)
-
-    def above_columns(self, arm: int) -> Array:
-        """Columns of the seconds of an arm above the warning limit, int [period]."""
-        return self._blocks[3] + arm * self.periods + np.arange(self.periods)
-
-    @property
-    def columns(self) -> int:
-        return self._blocks[4]
+    def columns(self) -> Columns:
+        """The columns after the pieces."""
+        arms = len(self.world.arms)
+        ends = np.cumsum([len(self.pieces), self.jobs, arms, arms * self.periods, arms * self.periods])
+        jobs, faults, lost, above = (np.arange(begin, end) for begin, end in pairwise(ends.tolist()))
+        shape = (arms, self.periods)
+        return Columns(jobs, faults, lost.reshape(shape), above.reshape(shape), count=int(ends[-1]))
 
     @cached_property
     def worth(self) -> Array:
         """Worth per unit of each column, [column]."""
-        worth, weights, arms = np.zeros(self.columns), self.weights, len(self.world.arms)
+        columns, weights = self.columns, self.weights
+        worth = np.zeros(columns.count)
         worth[: len(self.pieces)] = self.pieces.worth
-        worth[self.fault_columns()] = weights.faults
-        for arm in range(arms):
-            worth[self.lost_columns(arm)] = -weights.energy / 3600.0 * self.base_w[arm].sum()
-            worth[self.above_columns(arm)] = weights.above_warning / 60.0
+        worth[columns.faults] = weights.faults
+        worth[columns.lost] = -weights.energy / 3600.0 * self.base_w.sum(axis=1, keepdims=True)
+        worth[columns.above] = weights.above_warning / 60.0
         return worth
 
     @cached_property
@@ -317,13 +313,13 @@ class Relaxation:
     def rows(self) -> tuple[csr_array, Array]:
         """The rows A x <= b without heat budgets: A, sparse [row, column], and b, [row]."""
         pieces, count, arms = self.pieces, len(self.pieces), len(self.world.arms)
-        table = _Rows(self.columns)
+        table = _Rows(self.columns.count)
         room_s = np.diff(self.edges_s)
         room_s[-1] += self.tail_s
         for clique in self.cliques:
             inside = np.flatnonzero(np.isin(pieces.plan, list(clique)))
             involved = np.unique(pieces.arm[inside])
-            faults = self.fault_columns()[involved]
+            faults = self.columns.faults[involved]
             every = np.repeat(np.arange(self.periods), len(involved))
             table.add(
                 np.concatenate([pieces.period[inside], every]),
@@ -335,17 +331,17 @@ class Relaxation:
         for sign in (1.0, -1.0):  # the shares of a job add up to 1, or to 0
             table.add(
                 np.concatenate([pieces.job, jobs]),
-                np.concatenate([np.arange(count), self.job_columns()]),
+                np.concatenate([np.arange(count), self.columns.jobs]),
                 np.concatenate([np.full(count, sign), np.full(self.jobs, -sign)]),
                 np.zeros(self.jobs),
             )
         before = self.world.jobs.after[0, : self.jobs]
         waits = [(job, int(other)) for job in range(self.jobs) for other in before[job] if other >= 0]
         for job, other in waits:
-            table.add(np.zeros(2, int), self.job_columns()[[job, other]], np.array([1.0, -1.0]), np.zeros(1))
+            table.add(np.zeros(2, int), self.columns.jobs[[job, other]], np.array([1.0, -1.0]), np.zeros(1))
         for arm in range(arms):
-            lost = self.lost_columns(arm)
-            columns = np.append(lost, self.fault_columns()[arm])
+            lost = self.columns.lost[arm]
+            columns = np.append(lost, self.columns.faults[arm])
             values = np.append(np.ones(len(lost)), -self.world.horizon_s)
             table.add(np.zeros(len(columns), int), columns, values, np.zeros(1))
         return table.matrix()
@@ -437,12 +433,10 @@ class HeatBudget:
     def losses(self) -> tuple[csr_array, Array]:
         """Rows that limit the time that faults cost an arm."""
         relaxation, arms = self.relaxation, len(self.relaxation.world.arms)
-        columns = np.concatenate(
-            [[*relaxation.lost_columns(arm), relaxation.fault_columns()[arm]] for arm in range(arms)]
-        )
+        columns = np.column_stack([relaxation.columns.lost, relaxation.columns.faults]).ravel()
         values = np.tile(np.append(np.ones(relaxation.periods), -self.longest_loss_s), arms)
         row = np.repeat(np.arange(arms), relaxation.periods + 1)
-        return csr_array((values, (row, columns)), shape=(arms, relaxation.columns)), np.zeros(arms)
+        return csr_array((values, (row, columns)), shape=(arms, relaxation.columns.count)), np.zeros(arms)
 
     def violated(self, shares: Array) -> tuple[csr_array, Array]:
         """Budgets that a solution [column] violates most, as rows A x <= b: A, sparse [row, column], and b, [row]."""
@@ -453,17 +447,17 @@ class HeatBudget:
         _, integral = self._simulated(self._heat_of(shares)[:, period_of])
         found: list[tuple[Array, Array, float]] = []
         for arm in range(len(world.arms)):
-            above = shares[self.relaxation.above_columns(arm)]
+            above = shares[self.relaxation.columns.above[arm]]
             total = np.concatenate([np.zeros((1, JOINTS)), integral[arm, :, WINDING].cumsum(axis=0)])
             for length_s in WINDOWS_S:
                 for first, last, joint in self._worst(total, above, edges, length_s):
                     found.append(self._budget(arm, joint, first, last))
         if not found:
-            return csr_array((0, self.relaxation.columns)), np.zeros(0)
+            return csr_array((0, self.relaxation.columns.count)), np.zeros(0)
         lengths = [len(columns) for columns, _, _ in found]
         row = np.repeat(np.arange(len(found)), lengths)
         columns, values = (np.concatenate([each[i] for each in found]) for i in range(2))
-        matrix = csr_array((values, (row, columns)), shape=(len(found), self.relaxation.columns))
+        matrix = csr_array((values, (row, columns)), shape=(len(found), self.relaxation.columns.count))
         return matrix, np.array([bound for _, _, bound in found])
 
     def _heat_of(self, shares: Array) -> Array:
@@ -475,10 +469,8 @@ class HeatBudget:
         joules = (share[used] * pieces.cycles_s[used])[:, None] * self._surplus_w[used]
         np.add.at(heat_j, (pieces.arm[used], pieces.period[used]), joules)
         heat_w = heat_j / np.diff(relaxation.edges_s)[:, None] + relaxation.base_w[:, None]
-        for arm in range(len(heat_w)):
-            lost = shares[relaxation.lost_columns(arm)] / np.diff(relaxation.edges_s)
-            heat_w[arm] -= lost[:, None] * relaxation.base_w[arm]
-        return heat_w
+        lost = shares[relaxation.columns.lost] / np.diff(relaxation.edges_s)
+        return heat_w - lost[..., None] * relaxation.base_w[:, None]
 
     @cached_property
     def _surplus_w(self) -> Array:
@@ -521,7 +513,7 @@ class HeatBudget:
         ticks = np.round(edges_s[[first, last]] / world.dt_s).astype(int)
         base = float(self.base_c[1][arm, ticks[0] : ticks[1], joint].sum())
         bound = warning_c * float(edges_s[last] - edges_s[first]) - base
-        columns = np.concatenate([own, relaxation.lost_columns(arm), relaxation.above_columns(arm)[window]])
+        columns = np.concatenate([own, relaxation.columns.lost[arm], relaxation.columns.above[arm][window]])
         scale = float(edges_s[last] - edges_s[first])
         return columns, np.concatenate([effect, lost, above]) / scale, bound / scale
 
@@ -619,10 +611,10 @@ def _solve(relaxation: Relaxation, rows: csr_array, bounds: Array) -> tuple[floa
 
 def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array, nodes: int) -> float:
     """Bound with whole jobs; inf if branch and bound proved none, or if the program is too large."""
-    if relaxation.columns > MOST_COLUMNS:
+    if relaxation.columns.count > MOST_COLUMNS:
         return np.inf
-    whole = np.zeros(relaxation.columns)
-    whole[relaxation.job_columns()] = 1
+    whole = np.zeros(relaxation.columns.count)
+    whole[relaxation.columns.jobs] = 1
     result = milp(
         -relaxation.worth,
         constraints=LinearConstraint(rows, -np.inf, bounds),  # pyright: ignore[reportArgumentType]

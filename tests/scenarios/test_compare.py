@@ -31,7 +31,7 @@ from scenarios.evaluate.scores import Shift
 from scenarios.evaluate.sources import _Random, inverted
 from scenarios.evaluate.statistics import Figure
 from scenarios.evaluate.store import read_rows
-from scenarios.evaluate.study import Case, Key, Row, Study
+from scenarios.evaluate.study import Case, Row, RowKey, Study
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
 from scenarios.spec.load import load
@@ -50,6 +50,13 @@ def compared(scenario: Scenario, plans: Path, workers: int, **changes) -> Compar
     return compare(scenario, difficulty="blind", cache_dir=plans, workers=workers, **how)
 
 
+def printed(result: Comparison) -> str:
+    """The table of a comparison in 80 columns."""
+    page = io.StringIO()
+    Console(file=page, width=80).print(result.table)
+    return page.getvalue()
+
+
 @pytest.mark.parametrize("channel", [PERFECT, Channel(topology="line", delay_s=10.0)], ids=["perfect", "late"])
 def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, monkeypatch, channel):
     how = {"seeds": range(6), "channel": channel}
@@ -61,10 +68,9 @@ def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, mo
 
 
 def test_a_scenario_is_a_file_too_and_the_first_policy_the_default_baseline(small_toml, scenario, plans):
-    how = {"seeds": range(3), "difficulty": "blind", "cache_dir": plans, "workers": 1}
-    found = compare(small_toml, ["round_robin", "random"], **how)
-    assert found == compare(scenario, ["round_robin", "random"], baseline="round_robin", **how)
-    assert found.baseline == "round_robin"
+    policies = ["round_robin", "random"]
+    first = compare(small_toml, policies, seeds=range(3), difficulty="blind", cache_dir=plans, workers=1)
+    assert first == compared(scenario, plans, workers=1, policies=policies)
 
 
 def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
@@ -73,12 +79,6 @@ def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
     told: list[tuple[str, float]] = []
     compared(scenario, plans, workers=2, progress=lambda stage, share: told.append((stage, share)))
     assert [share for stage, share in told if stage == "comparing"] == [0.5, 1.0]
-
-
-def test_a_policy_differs_from_itself_by_nothing(scenario, plans):
-    result = compared(scenario, plans, workers=1)
-    for figure in result.figures["round_robin"].values():
-        assert (figure.difference, figure.difference_low, figure.difference_high) == (0.0, 0.0, 0.0)
 
 
 def test_figures_are_means_over_seeds_with_intervals_around_them(scenario, plans):
@@ -111,9 +111,7 @@ def test_a_comparison_that_makes_no_sense_is_told(scenario, plans, changes, sent
 
 def test_the_table_fits_eighty_columns_without_losing_a_word(scenario, plans):
     result = compared(scenario, plans, workers=1)
-    page = io.StringIO()
-    Console(file=page, width=80).print(result.table)
-    text = page.getvalue()
+    text = printed(result)
     assert "…  " not in text
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
     assert tuple(field.name for field in fields(Outcome)) == FIGURES
@@ -135,9 +133,7 @@ def shown(difference, low, high, p_holm):
                     p_holm=p_holm)  # fmt: skip
     figures = {"a": dict.fromkeys(FIGURES, same), "b": dict.fromkeys(FIGURES, other)}
     result = Comparison("s", (0, 1), "2 seeds", 2, "a", figures, {"a": "arm", "b": "arm"}, PERFECT.described(), "")
-    page = io.StringIO()
-    Console(file=page, width=80).print(result.table)
-    rows = [line.split() for line in page.getvalue().splitlines()]
+    rows = [line.split() for line in printed(result).splitlines()]
     return rows[rows.index(["faults"]) + 2]
 
 
@@ -160,9 +156,7 @@ def test_the_scope_of_every_policy_is_shown_and_which_read_no_messages(scenario,
     for channel, said in ((PERFECT, False), (late, True)):
         result = compared(scenario, plans, workers=1, seeds=range(2), channel=channel)
         assert result.scopes == {"random": "arm", "round_robin": "central"}
-        page = io.StringIO()
-        Console(file=page, width=80).print(result.table)
-        lines = [" ".join(line.split()) for line in page.getvalue().splitlines()]
+        lines = [" ".join(line.split()) for line in printed(result).splitlines()]
         assert {"random arm", "round_robin central"} <= set(lines)
         assert ("Central policies read no messages: round_robin." in lines) is said
 
@@ -188,6 +182,9 @@ class Known:
         self.instance = instance
 
 
+KNOWN_SHIFTS = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
+
+
 @pytest.fixture
 def study() -> Study:
     scenario = load("quickstart")
@@ -201,7 +198,7 @@ def rows_of(study: Study, error: str | None = None, failing: str = "random") -> 
     rows: list[Row] = []
     for policy in study.policies:
         for seed in study.cases[0].seeds:
-            key = Key(policy, study.cases[0].name, 0, 0, "blind", seed)
+            key = RowKey(policy, study.cases[0].name, 0, 0, "blind", seed)
             reward = REWARD.get(policy, 0.0) + 0.5 * rng.normal()
             failed = error is not None and policy == failing and seed == 5
             rows.append(Row(key, None, 0, error, "line 3") if failed else Row(key, replace(blank, reward=reward), 2))
@@ -219,9 +216,8 @@ def judged(study: Study, rows: list[Row], known: dict[Shift, Known]) -> Judged:
 
 
 def test_randomised_shifts_have_no_normalised_scores(study: Study):
-    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
     warmer = replace(study, randomise=Randomisation(ambient_k=(0.0, 5.0)))
-    plain, varied = (judged(each, rows_of(each), known) for each in (study, warmer))
+    plain, varied = (judged(each, rows_of(each), KNOWN_SHIFTS) for each in (study, warmer))
     assert plain.results[0].scores is not None
     assert varied.results[0].scores is None
     assert varied.values is None
@@ -230,9 +226,8 @@ def test_randomised_shifts_have_no_normalised_scores(study: Study):
 
 
 def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
-    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
     rows = rows_of(study, "Oops: <script>alert(1)</script>")
-    about = judged(study, rows, known)
+    about = judged(study, rows, KNOWN_SHIFTS)
     first, second, failed = verdict(about)
     mean = np.mean([row.outcome.reward for row in rows[6:12] if row.outcome]) / 20
     better = mean - np.mean([row.outcome.reward for row in rows[:6] if row.outcome]) / 20
@@ -255,8 +250,7 @@ def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
 
 
 def test_a_baseline_that_failed_has_no_differences(study: Study):
-    known = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
-    about = judged(study, rows_of(study, "Oops", failing="wspt"), known)
+    about = judged(study, rows_of(study, "Oops", failing="wspt"), KNOWN_SHIFTS)
     without, failed = verdict(about)
     assert without.endswith("no differences, as the baseline wspt failed.")
     assert failed.startswith("Failed: wspt;")
@@ -303,10 +297,8 @@ def test_charts_place_points_by_value():
 
 def test_a_comparison_is_one_table_in_every_form(study: Study):
     (result,) = judged(study, rows_of(study), {}).results
-    page = io.StringIO()
-    Console(file=page, width=120).print(result.table)
     figure = result.figures["wsept"]["reward"]
-    text, html, markdown, csv = page.getvalue(), result.table.html(), result.table.markdown(), result.table.csv()
+    text, html, markdown, csv = printed(result), result.table.html(), result.table.markdown(), result.table.csv()
     assert re.search(rf"^  wsept +{figure.mean:.1f} ", text, re.MULTILINE)
     assert f"<td>{figure.mean:.1f}</td>" in html
     assert f"| wsept | {figure.mean:.1f} |" in markdown
@@ -324,17 +316,11 @@ def test_the_command_line_has_what_is_no_default():
     ) -> None:
         told.append(options.command_line(ctx))
 
-    typer.main.get_command(app).main(
-        ["a", "my b", "--seeds", "5", "--more", "1", "--more", "2", "--fast"], "compare", standalone_mode=False
-    )
-    typer.main.get_command(app).main(["a", "--seeds", "3"], "compare", standalone_mode=False)
-    assert shlex.split(told[0]) == [
-        "thermofleet",
-        "compare",
-        "a",
-        "my b",
-        *["--seeds", "5", "--more", "1", "--more", "2", "--fast"],
-    ]
+    command = typer.main.get_command(app)
+    words = ["a", "my b", "--seeds", "5", "--more", "1", "--more", "2", "--fast"]
+    command.main(words, "compare", standalone_mode=False)
+    command.main(["a", "--seeds", "3"], "compare", standalone_mode=False)
+    assert shlex.split(told[0]) == ["thermofleet", "compare", *words]
     assert told[1] == "thermofleet compare a"
 
 

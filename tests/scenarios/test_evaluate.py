@@ -24,7 +24,7 @@ from fleet.seeding import shift_seeds
 from scenarios.evaluate.rollout import FIGURES, Outcome, outcomes
 from scenarios.evaluate.scores import normalised, references_of, scores_of
 from scenarios.evaluate.statistics import interval
-from scenarios.evaluate.study import Case, Key, Row
+from scenarios.evaluate.study import Case, Row, RowKey
 from scenarios.policy_loader import PolicyFailed, policy_of
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.prepare.oracle import Oracle, peaks
@@ -232,7 +232,7 @@ def rows_of(policy: str, rewards: dict[int, float | None], trainings: int = 1) -
     """A row for each shift and training; training k has k more reward, None is a failure."""
     blank = Outcome(**dict.fromkeys(FIGURES, 0.0))
     return [
-        Row(Key(policy, name, 0, k, "oracle", seed), replace(blank, reward=own + k) if own is not None else None)
+        Row(RowKey(policy, name, 0, k, "oracle", seed), replace(blank, reward=own + k) if own is not None else None)
         for (name, seed), own in zip(SHIFTS, rewards.values(), strict=True)
         for k in range(trainings)
     ]

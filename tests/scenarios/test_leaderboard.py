@@ -9,48 +9,38 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from docs.tables import board_text
 from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.evaluate import leaderboard
 from scenarios.evaluate.leaderboard import (
     MOST_BYTES,
+    BoardResult,
     Card,
     ResultLine,
-    Submission,
     board_of,
-    board_text,
     check,
-    check_repeated,
     read,
     read_all,
     write,
 )
-from scenarios.evaluate.references import Reference
+from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import FIGURES, Outcome
 from scenarios.evaluate.store import opened
 from scenarios.evaluate.study import Row, Study, suite_of
 from scenarios.policy_loader import policy_of, scope_of
 from scenarios.suite.splits import manifest
 
-REWARD = FIGURES.index("reward")
 BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0) | {"value": 50.0})
 
 
-def reference(line) -> Reference:
+def reference(line) -> ShiftReference:
     """Random has 10, hindsight 30, the bound is 40."""
-    more = {"difficulty": "oracle", "random_se": 0.0, "rule": "wspt", "best_rule": 20.0, "linear": 40.0, "claims": ()}
-    times = {
-        "evaluations": 1,
-        "nodes": 0,
-        "search_s": None,
-        "upper_s": None,
-        "seconds": None,
-        "code": "",
-        "seed": line.seed,
-    }
-    return Reference(
-        instance=line.name, scenario_hash=line.scenario, random=10.0, hindsight=30.0, upper=40.0, **more, **times
-    )  # pyright: ignore[reportArgumentType]  # of the dictionaries
+    return ShiftReference(
+        instance=line.name, scenario_hash=line.scenario, seed=line.seed, difficulty="oracle", random=10.0,
+        random_se=0.0, rule="wspt", best_rule=20.0, hindsight=30.0, upper=40.0, linear=40.0, evaluations=1, nodes=0,
+        search_s=None, upper_s=None, seconds=None, code="", claims=(),
+    )  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -102,19 +92,19 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     assert "of 200 instances; differences to `wsept` (oracle)." in capsys.readouterr().out
     assert run("leaderboard", "--submit", out, "--author", "Bob", "--out", sent) == 2
     assert "has a result of Ann" in capsys.readouterr().err
-    assert run("leaderboard", sent, "--markdown") == 0
-    text = capsys.readouterr().out
-    assert "Highest mean score of scope central `wsept` (0.75 [" in text or "of scope arm `wsept` (0.75 [" in text
+    text = board_text(sent, "test")
+    assert f"Highest mean score of scope {scope_of('wsept')} `wsept` (0.75 [" in text
     (first,) = re.findall(r"\| 1 \|.*", text)
     assert [cell.strip() for cell in first.split("|")][2:5] == ["`wsept`", "oracle", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text
+    assert board_text(sent, "sizes") == "No results on the split sizes."
     assert run("leaderboard", tmp_path / "absent") == 2
 
 
-def changed(index: int | None, **fields) -> Callable[[Submission], Submission]:
+def changed(index: int | None, **fields) -> Callable[[BoardResult], BoardResult]:
     """A change of the card, or of one row; figures are given by name."""
 
-    def change(given: Submission) -> Submission:
+    def change(given: BoardResult) -> BoardResult:
         if index is None:
             return msgspec.structs.replace(given, card=msgspec.structs.replace(given.card, **fields))
         rows, row = list(given.rows), given.rows[index]
@@ -129,7 +119,7 @@ def changed(index: int | None, **fields) -> Callable[[Submission], Submission]:
     return change
 
 
-def cut(first: int, last: int | None) -> Callable[[Submission], Submission]:
+def cut(first: int, last: int | None) -> Callable[[BoardResult], BoardResult]:
     return lambda given: msgspec.structs.replace(given, rows=given.rows[first:last])
 
 
@@ -164,7 +154,7 @@ FORGED = {
 
 
 @pytest.fixture(scope="module")
-def good(study: Study) -> Submission:
+def good(study: Study) -> BoardResult:
     scenarios = study.card["instances"]
     assert isinstance(scenarios, dict)
     versions: dict[str, str | None] = {name: "1" for name in leaderboard.NEEDED}
@@ -179,11 +169,11 @@ def good(study: Study) -> Submission:
                illegal=0)
         for case in study.cases
     ]  # fmt: skip
-    return Submission(card=card, rows=tuple(rows))
+    return BoardResult(card=card, rows=tuple(rows))
 
 
 @pytest.mark.parametrize(("change", "said"), FORGED.values(), ids=list(FORGED))
-def test_forged_and_incomplete_results_are_refused(good: Submission, known, change, said):
+def test_forged_and_incomplete_results_are_refused(good: BoardResult, known, change, said):
     if said is None:
         check(change(good), known)
         return
@@ -191,7 +181,7 @@ def test_forged_and_incomplete_results_are_refused(good: Submission, known, chan
         check(change(good), known)
 
 
-def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: Submission, tmp_path: Path):
+def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: BoardResult, tmp_path: Path):
     path = write(good, tmp_path)
     assert read(path) == good
     path.rename(tmp_path / "test-other-oracle.jsonl")
@@ -237,26 +227,6 @@ def test_studies_of_other_settings_are_refused(study: Study, tmp_path: Path):
     ):
         with pytest.raises(FleetError, match=said):
             leaderboard.submissions_of(card | change, [], "Ann", "")
-
-
-def test_a_repetition_finds_other_figures(good: Submission, monkeypatch: pytest.MonkeyPatch):
-    truth = list(good.rows[0].figures or ())
-
-    def ran(study, **_):
-        outcome = Outcome(**dict(zip(FIGURES, truth, strict=True)))
-        return [Row(key, outcome) for unit in study.units(set()) for key in unit.keys]
-
-    monkeypatch.setattr("scenarios.evaluate.leaderboard.run_study", ran)
-    of_code = changed(None, policy="wspt", policy_hash="")(good)
-    assert check_repeated(of_code, 3) == "test-wspt-oracle: 3 shifts repeated, with equal figures."
-    truth[REWARD] += 0.01
-    with pytest.raises(FleetError, match="does not repeat"):
-        check_repeated(of_code, 3)
-    assert "not repeated" in check_repeated(changed(None, policy_hash="b" * 16)(good), 3)
-
-
-def test_without_results_the_table_says_so():
-    assert board_text(board_of("test", []), "test") == "No results on the split test."
 
 
 def test_the_policy_of_the_page_can_be_loaded(tmp_path: Path):

@@ -16,7 +16,7 @@ from scenarios.evaluate import runner, sources
 from scenarios.evaluate.comparison import comparison_of, comparisons
 from scenarios.evaluate.rollout import FIGURES, outcomes
 from scenarios.evaluate.store import RESULTS, UNFINISHED, opened, read_rows
-from scenarios.evaluate.study import Case, Key, Row, Study, Unit, policy_hash, seeds_of_instance
+from scenarios.evaluate.study import Case, Row, RowKey, Study, Unit, policy_hash, seeds_of_instance
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.fleet import prepare
@@ -80,7 +80,7 @@ def test_rows_do_not_depend_on_processes_folders_and_blocks(scenario, plans, tmp
     study = study_of(scenario, seeds=5, fleets=2)
     alone = runner.run_study(study, cache_dir=plans, workers=1)
     assert [row.key for row in alone] == [
-        Key(policy, "heat", fleet, 0, "blind", seed)
+        RowKey(policy, "heat", fleet, 0, "blind", seed)
         for fleet in range(2)
         for policy in ("random", "round_robin")
         for seed in range(5)
@@ -323,7 +323,7 @@ def test_a_worker_stays_with_its_group_and_helps_others_at_the_end(scenario):
 
 
 def test_a_row_without_outcome_has_a_sentence():
-    row = Row(Key("p", "i", 0, 0, "blind", 1), None, error="It died.")
+    row = Row(RowKey("p", "i", 0, 0, "blind", 1), None, error="It died.")
     from scenarios.evaluate.study import columns, row_of
 
     assert row_of(columns(row)) == row
@@ -340,17 +340,13 @@ def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet,
     page = (out / "index.html").read_text(encoding="utf-8")
     assert f"thermofleet compare {small_toml} --policies round_robin,{bad}:Raises" in page
     assert "KeyError: &#39;nobody&#39; (at 30 s of the shift)" in page
-    told = thermofleet("compare", "--suite", small_toml, "--policies", "wspt,random", *how, "--fleets", "2", "--json",
-                       "--marl-eval")  # fmt: skip
+    told = thermofleet("compare", "--suite", small_toml, "--policies", "wspt,random", *how, "--fleets", "2", "--json")
     assert msgspec.json.decode(told.out)["scenario"] == str(small_toml)
     assert len(read_rows(out)) == 14
-    raw = msgspec.json.decode((out / "marl_eval.json").read_bytes())
-    assert len(raw["thermofleet"]["heat"]["wspt"]) == 4  # two fleets, two seeds
     for wrong, sentence in (
         ((), "Give either scenarios or --suite."),
         ((small_toml, "--suite", "test"), "Give either scenarios or --suite."),
         ((small_toml, "--workers", "2", "--ray", "auto"), "Give either --workers or --ray."),
-        ((small_toml, "--marl-eval"), "--marl-eval needs --out"),
         ((small_toml, "--references", "none.jsonl"), "There is no file of references 'none.jsonl'"),
         ((small_toml, "--difficulty", "blind,oracel"), "No difficulty 'oracel'; did you mean 'oracle'?"),
     ):

@@ -1,4 +1,4 @@
-"""Statistics against SciPy, rliable, arch, closed forms and simulated coverage."""
+"""Statistics against SciPy, arch, closed forms and simulated coverage."""
 
 import json
 from pathlib import Path
@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from benchmarks.statistics.interval_coverage import LAWS, SIZES, VERY_SKEWED, coverage, law_coverage, measure, shifts
-from fleet.errors import FleetError
-from scenarios.evaluate.scores import to_marl_eval
 from scenarios.evaluate.statistics import (
     EQUAL,
     FARTHEST,
@@ -120,23 +118,17 @@ def test_a_skewed_sample_reaches_as_far_as_hall_s_transformation() -> None:
     assert far.high - far.mean == pytest.approx(FARTHEST * (high - far.mean))
 
 
-def test_without_differences_between_fleets_the_interval_is_that_of_seeds() -> None:
-    values = np.tile(SYMMETRIC, (200, 2, 1))  # [fleet, training, seed]
-    found = interval(values)
-    assert (found.low, found.high) == pytest.approx(student(SYMMETRIC), rel=0.01)
-
-
-def test_without_differences_between_seeds_the_interval_is_that_of_fleets() -> None:
+def test_variances_are_clustered_by_fleet_and_by_seed() -> None:
+    """Without differences between fleets the interval is that of seeds, and the other way round; equal ones add."""
+    of_seeds = interval(np.tile(SYMMETRIC, (200, 2, 1)))  # [fleet, training, seed]
+    assert (of_seeds.low, of_seeds.high) == pytest.approx(student(SYMMETRIC), rel=0.01)
     fleets = np.array([1.0, 4.0, 7.0])
-    found = interval(np.tile(fleets[:, None, None], (1, 2, 500)))
-    assert (found.low, found.high) == pytest.approx(student(fleets), rel=0.01)
-
-
-def test_fleets_and_seeds_that_differ_as_much_add_their_variances() -> None:
+    of_fleets = interval(np.tile(fleets[:, None, None], (1, 2, 500)))
+    assert (of_fleets.low, of_fleets.high) == pytest.approx(student(fleets), rel=0.01)
     effect = np.linspace(-1.0, 1.0, 41)
-    found = interval(effect[:, None, None] + effect)
+    both = interval(effect[:, None, None] + effect)
     variance = 2 * effect.var(ddof=1) / 41
-    assert found.margin == pytest.approx(stats.t.ppf(0.975, 40) * np.sqrt(variance), rel=0.02)
+    assert both.margin == pytest.approx(stats.t.ppf(0.975, 40) * np.sqrt(variance), rel=0.02)
 
 
 def test_trainings_are_the_sample_within_a_single_fleet_unless_they_change_nothing() -> None:
@@ -244,6 +236,9 @@ def test_coverage_of_every_law_and_size():
     assert min(measured["sizes"]["10 × 1 × 10"]) >= 0.94
 
 
+KINDS = {"faults": FigureKind("faults", is_count=True)}
+
+
 @pytest.fixture
 def paired_values() -> dict[str, dict[str, np.ndarray]]:
     """Ten seeds: `better` clearly, `luck` at p = .02 by itself, `same` by a constant."""
@@ -255,7 +250,7 @@ def paired_values() -> dict[str, dict[str, np.ndarray]]:
 
 
 def test_differences_are_paired_and_corrected_over_the_table(paired_values):
-    found = figures_of(paired_values, "base", {"faults": FigureKind("faults", is_count=True)})
+    found = figures_of(paired_values, "base", KINDS)
     better, luck = found["better"]["value"], found["luck"]["value"]
     expected = paired(paired_values["better"]["value"], paired_values["base"]["value"])
     assert (better.difference, better.difference_low) == (expected.mean, expected.low)
@@ -269,16 +264,12 @@ def test_differences_are_paired_and_corrected_over_the_table(paired_values):
     assert luck.p < 0.05 < luck.p_holm
 
 
-def test_a_policy_differs_from_itself_by_nothing_and_two_without_faults_by_a_bound(paired_values):
-    found = figures_of(paired_values, "base", {"faults": FigureKind("faults", is_count=True)})
+def test_a_baseline_differs_by_nothing_and_cells_without_variation_say_so(paired_values):
+    found = figures_of(paired_values, "base", KINDS)
     base, other = found["base"]["faults"], found["better"]["faults"]
     assert (base.difference_low, base.difference_high) == (0.0, 0.0)
     assert (other.low, other.high) == (0.0, pytest.approx(0.369, abs=0.001))
     assert (other.difference_low, other.difference_high) == (-other.high, other.high)
-
-
-def test_cells_without_variation_say_so(paired_values):
-    found = figures_of(paired_values, "base", {"faults": FigureKind("faults", is_count=True)})
     shown = figure_rows({policy: each["value"] for policy, each in found.items()}, "base", str)
     rows = {name: cells for name, *cells in shown}
     assert rows["same"][-3:] == ["+2.0", EQUAL, ""]
@@ -302,27 +293,6 @@ def scores() -> tuple[np.ndarray, np.ndarray]:
     return own, base
 
 
-def test_figures_are_those_of_rliable(scores):
-    library = pytest.importorskip("rliable.library", reason="rliable is in the extra `dev`")
-    from rliable import metrics
-
-    own, base = scores
-    names = {"iqm": metrics.aggregate_iqm, "optimality_gap": metrics.aggregate_optimality_gap}
-    np.random.seed(0)  # noqa: NPY002 # rliable draws from the global state
-    points, _ = library.get_interval_estimates(
-        {"own": own}, lambda x: np.array([figure(x) for figure in names.values()]), reps=2
-    )
-    found = aggregates({"own": own})["own"]
-    for i, name in enumerate(names):
-        assert getattr(found, name).mean == pytest.approx(points["own"][i])
-    shares, _ = library.create_performance_profile({"own": own}, THRESHOLDS, reps=2)
-    np.testing.assert_allclose(profile(own, THRESHOLDS).share, shares["own"])
-    points, _ = library.get_interval_estimates(
-        {"pair": [own, base]}, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]), reps=2
-    )
-    assert improvement(own, base).mean == pytest.approx(points["pair"][0])
-
-
 def test_resamples_are_those_of_arch(scores):
     """Of a single run, which is given: percentiles as far out as Student's t is, of resampled instances."""
     bootstrap = pytest.importorskip("arch.bootstrap", reason="arch is in the extra `dev`")
@@ -342,6 +312,7 @@ def test_figures_are_those_of_scipy_and_by_hand(scores):
     by_instance = [stats.mannwhitneyu(x, y).statistic / 80 for x, y in zip(own.T, base.T, strict=True)]
     assert improvement(own, base).mean == pytest.approx(np.mean(by_instance))
     assert improvement(own, own).mean == 0.5
+    np.testing.assert_allclose(profile(own, THRESHOLDS).share, [(own > at).mean() for at in THRESHOLDS])
 
 
 def test_more_is_drawn_the_wider_the_interval(scores):
@@ -388,58 +359,3 @@ def test_a_certain_order_has_the_bound_of_a_share():
     ends = profile(own, [0.0, 1.0])
     assert (ends.low[0], ends.high[0]) == pytest.approx((found.low, 1.0))
     assert (ends.low[1], ends.high[1]) == pytest.approx((0.0, 1 - found.low))
-
-
-def rows() -> list[dict[str, object]]:
-    """A rule without trainings and a policy with two, on two instances of a split, with two fleets."""
-    result = []
-    for policy, trainings in (("wspt", 1), ("Learned, large", 2)):
-        for n in range(2):
-            for fleet in range(2):
-                for training in range(trainings):
-                    value = 10.0 * n + fleet + 0.1 * training
-                    key = {"policy": policy, "instance": f"test/{n:04}", "fleet": fleet, "training": training}
-                    result.append({**key, "seed": n, "difficulty": "twin", "reward": value, "faults": 0})
-    return result
-
-
-def test_the_export_has_the_documented_structure():
-    """https://github.com/instadeepai/marl-eval#data-structure-for-raw-experiment-data."""
-    made = json.loads(json.dumps(to_marl_eval(rows(), ["reward", "faults"])))
-    assert list(made) == ["test"]
-    assert list(made["test"]) == ["0000", "0001"]
-    for task in made["test"].values():
-        assert sorted(task) == ["Learned; large", "wspt"]
-        for runs in task.values():
-            assert list(runs) == ["run_1", "run_2", "run_3", "run_4"]
-            for steps in runs.values():
-                assert steps["step_1"] == {"step_count": 1, **steps["absolute_metrics"]}
-    rewards = {name: [run["absolute_metrics"]["reward"] for run in runs.values()] for name, runs in task.items()}
-    assert rewards == {"wspt": [[10.0], [10.0], [11.0], [11.0]], "Learned; large": [[10.0], [10.1], [11.0], [11.1]]}
-
-
-def test_marl_eval_reads_the_export():
-    """Its release pins pandas 1.4.4, which Python 3.11 has not; `pip install --no-deps id-marl-eval colorama` does."""
-    processing = pytest.importorskip("marl_eval.utils.data_processing_utils")
-    from marl_eval.utils.diagnose_data_errors import DiagnoseData
-
-    made = to_marl_eval(rows(), ["reward", "faults"])
-    checks = DiagnoseData(made).check_data()["test"]
-    assert all(checks.values()), checks
-    processed = processing.data_process_pipeline(made, ["reward"])
-    matrices, _ = processing.create_matrices_for_rliable(processed, "test", ["reward"])
-    normalised = matrices["mean_norm_reward"]["learned; large"]  # [run, instance], from 0 to 1 in each instance
-    np.testing.assert_allclose(normalised, [[0, 0], [1 / 11, 1 / 11], [10 / 11, 10 / 11], [1, 1]], atol=1e-4)
-
-
-def test_an_export_that_marl_eval_cannot_read_is_refused():
-    complete = rows()
-    for damaged, sentence in (
-        (complete[:3] + complete[4:], "wspt on test/0001, fleet 1, training 0, seed 1 is missing"),
-        ([*complete, complete[0]], "wspt on test/0000, fleet 0, training 0, seed 0 is given twice"),
-        ([*complete[1:], {**complete[0], "reward": np.nan}], "has no finite reward"),
-        ([*complete, {**complete[0], "policy": "WSPT"}], "names must differ by more"),
-        ([row for row in complete if row["instance"] == "test/0000" or row["fleet"] == 0], "as many runs"),
-    ):
-        with pytest.raises(FleetError, match=sentence):
-            to_marl_eval(damaged, ["reward", "faults"])
