@@ -31,8 +31,7 @@ from fleet.env.lookahead import Lookahead
 from fleet.observation import Layout, Observation
 from scenarios.evaluate.hindsight import ShiftSimulator
 from scenarios.policy_loader import policy_at, scope_of
-from scenarios.prepare.fleet import ShiftFactory, prepare
-from scenarios.prepare.known_cell import simulator_of_shift
+from scenarios.prepare.fleet import ShiftFactory, prepare, simulator_of_shift
 from scenarios.spec.jobs import weights_of
 from scenarios.suite.splits import instance
 

@@ -30,7 +30,6 @@ from torch import Tensor
 from benchmarks.harness import in_turns, options, seconds
 from fleet.motion import RATE_HZ
 from twin.vae.config import TwinConfig
-from twin.vae.inference import reconstruct
 from twin.vae.model import LstmVae, build, weights_of
 from twin.vae.onnx import export_onnx
 from twin.vae.train import Run, train
@@ -146,7 +145,7 @@ def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
 
     calls: dict[str, Callable[[], object]] = {
         "features": lambda: twin.window_features(z),
-        "ours": lambda: reconstruct(twin.networks, z),
+        "ours": lambda: twin.networks.reconstruct(z),
         "plain": plain,
         "floor": floor(config, windows, 1, len(twin.nets)),
     }

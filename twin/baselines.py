@@ -1,4 +1,4 @@
-"""Simpler methods beside which a twin is judged.
+"""Simpler methods with which a twin is compared.
 
 A network that learned nothing; RMS torque relative to a nominal torque, the usual rule for sizing a motor; and
 P(saturation) by a logistic regression on the load of the joints, fitted on the arm's past jobs.
@@ -15,12 +15,14 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fleet.difficulty import KNOWN, Forecast
-from fleet.motion import CHANNELS, Plan
+from fleet.motion import Plan
 from twin.thermal.thermal_twin import LEAST_JOBS, NotEnoughExperience
 from twin.vae.config import TwinConfig
 from twin.vae.json_file import check_version, read_card, write_card
-from twin.vae.measures import Features
+from twin.vae.measures import TAU, Features
 from twin.vae.window import STD_FLOOR, check_jobs
+
+Array = np.ndarray
 
 
 def untrained_config(config: TwinConfig) -> TwinConfig:
@@ -28,64 +30,30 @@ def untrained_config(config: TwinConfig) -> TwinConfig:
     return replace(config, epochs=1, learning_rate=1e-12, restarts=1, allow_collapse=True)
 
 
-Array = np.ndarray
-
-TAU = CHANNELS.index("tau")
-
-
-@dataclass(frozen=True, eq=False)
-class Scores:
-    """Scores of some jobs, larger for harder ones, in the scorer's own unit."""
-
-    per_joint: Array
-    """[job, joint]."""
-    total: Array
-    """[job]."""
+def known_torque(records: Sequence[Array]) -> Array:
+    """RMS torque of training motion [time, 3, joint], N·m, [joint]; needs no motor data."""
+    if not records:
+        raise ValueError("The torque of the training motion needs at least one record (got none).")
+    squares = np.concatenate([np.square(record[:, TAU], dtype=float) for record in records])
+    # A joint without load in training has no torque to divide by.
+    return np.maximum(np.sqrt(squares.mean(axis=0)), STD_FLOOR[TAU])
 
 
-@dataclass(frozen=True, eq=False)
-class TorqueRms:
-    """RMS torque over the job's time divided by a nominal torque; the total is the worst joint."""
+def torque_ratio(plan: Plan, repetitions: int, nominal_nm: Array) -> Array:
+    """RMS torque over the time of the repeated plan divided by a nominal torque > 0, [joint].
 
-    name: str
-    nominal_nm: Array
-    """[joint]."""
-
-    def __post_init__(self) -> None:
-        if self.nominal_nm.ndim != 1 or not np.all(self.nominal_nm > 0):
-            raise ValueError(f"TorqueRms.nominal_nm must be one torque > 0 per joint (got {self.nominal_nm}).")
-
-    def scores(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Scores:
-        """Score of each job, a repeated plan.
-
-        Raises:
-            ValueError: no jobs, repetitions < 1, or a plan without motion, not finite or of other joints.
-        """
-        check_jobs(plans, repetitions)
-        rms = np.stack([_rms_torque(plan, times) for plan, times in zip(plans, repetitions, strict=True)])
-        if rms.shape[1] != len(self.nominal_nm):
-            raise ValueError(f"'{self.name}' has torques of {len(self.nominal_nm)} joints, a plan has {rms.shape[1]}.")
-        per_joint = rms / self.nominal_nm
-        return Scores(per_joint, per_joint.max(axis=1))
-
-
-def _rms_torque(plan: Plan, repetitions: int) -> Array:
-    """N·m, [joint]."""
+    Raises:
+        ValueError: repetitions < 1, or a plan without motion or of other joints.
+    """
+    check_jobs([plan], [repetitions])
     squares = [
         share * np.square(phase.profile[:, TAU], dtype=float).mean(axis=0)
         for phase, share in zip(plan.phases, plan.weights(repetitions), strict=True)
         if len(phase.profile)
     ]
-    return np.sqrt(np.sum(squares, axis=0))
-
-
-def torque_over_known(records: Sequence[Array]) -> TorqueRms:
-    """RMS torque over that of the training motion [time, 3, joint]; needs no motor data."""
-    if not records:
-        raise ValueError("The torque of the training motion needs at least one record (got none).")
-    squares = np.concatenate([np.square(record[:, TAU], dtype=float) for record in records])
-    # A joint without load in training has no torque to divide by.
-    return TorqueRms("RMS torque / known", np.maximum(np.sqrt(squares.mean(axis=0)), STD_FLOOR[TAU]))
+    if len(squares[0]) != len(nominal_nm):
+        raise ValueError(f"The nominal torque has {len(nominal_nm)} joints, the plan {len(squares[0])}.")
+    return np.sqrt(np.sum(squares, axis=0)) / nominal_nm
 
 
 Evidence = Literal["excess", "torque"]
@@ -233,7 +201,7 @@ def logistic(z: Array, passed: Array, strength: float, start: Array | None = Non
     return solution[:-1], float(solution[-1])
 
 
-class _Card(msgspec.Struct, forbid_unknown_fields=True):
+class RegressionCard(msgspec.Struct, forbid_unknown_fields=True):
     """The content of `saturation.json`."""
 
     format: int
@@ -243,7 +211,7 @@ class _Card(msgspec.Struct, forbid_unknown_fields=True):
 
 def save_regression(model: LoadRegression, folder: Path) -> None:
     """Write the model atomically into a folder, made if need be."""
-    write_card(_Card(FORMAT, model.version, model), folder / FILE)
+    write_card(RegressionCard(FORMAT, model.version, model), folder / FILE)
 
 
 def load_regression(folder: Path) -> LoadRegression:
@@ -252,6 +220,6 @@ def load_regression(folder: Path) -> LoadRegression:
     Raises:
         CheckpointError: the file is missing or damaged, of another format, or not what was saved.
     """
-    card = read_card(folder / FILE, _Card, format_=FORMAT, what="saturation model")
+    card = read_card(folder / FILE, RegressionCard, format_=FORMAT, what="saturation model")
     check_version(folder / FILE, card.version, card.model.version)
     return card.model

@@ -29,7 +29,7 @@ from fleet.seeding import child
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
 from scenarios.prepare.arms import ArmHardware
-from scenarios.prepare.identify import own_logs
+from scenarios.prepare.calibrate import own_logs
 from scenarios.prepare.twins import cold_peaks, records
 from scenarios.table import Table
 from twin.thermal.identify import HeatModel, identify

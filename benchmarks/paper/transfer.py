@@ -49,7 +49,7 @@ from fleet.robot import Mount, Robot
 from fleet.seeding import child
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
-from scenarios.prepare.identify import own_logs
+from scenarios.prepare.calibrate import own_logs
 from scenarios.prepare.twins import records
 from scenarios.table import Table
 from twin.logs.recording import Recording, cool_stretches, stretches

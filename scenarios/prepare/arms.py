@@ -4,12 +4,14 @@ True temperatures serve simulated past jobs and the model `oracle`, which measur
 of the simulator, which arms and policies must not use.
 """
 
+import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from fleet.arm.plan_cache import CachedPlanner, LoadedPlans, rest_torque
@@ -18,14 +20,7 @@ from fleet.difficulty import Blind
 from fleet.engine.world import Arm, warm_start
 from fleet.errors import InfeasibleJob
 from fleet.heat.motor import Motors, gen3_motors, thermal_data
-from fleet.heat.thermal import (
-    WINDING,
-    ThermalModel,
-    ThermalSpread,
-    gen3_network,
-    spread_motors,
-    thermal_model,
-)
+from fleet.heat.thermal import WINDING, ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.job import Work
 from fleet.motion import Plan
 from fleet.robot import JOINTS, Robot
@@ -43,10 +38,11 @@ class ArmHardware(NamedTuple):
     motors: Motors
     thermal: ThermalModel
 
-    def content(self) -> bytes:
-        """Every parameter of motors and thermal model, for cache keys."""
+    def key(self, parts: Sequence[object], *data: bytes) -> str:
+        """Cache key of a model of this arm, which also depends on other values, as JSON, and data."""
         values = (*vars(self.motors).values(), *vars(self.thermal).values())
-        return b"".join(np.asarray(value, dtype=float).tobytes() for value in values)
+        content = b"".join(np.asarray(value, dtype=float).tobytes() for value in values)
+        return hashlib.sha256(msgspec.json.encode(parts) + content + b"".join(data)).hexdigest()[:32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +50,7 @@ class PlannedArm:
     """An arm of a scenario with its plans."""
 
     index: int
-    """Place in the scenario's list of arms; random draws for the arm depend on it."""
+    """Index in the scenario; random numbers for the arm depend on it."""
     hardware: ArmHardware
     plans: Mapping[Work, tuple[Plan, ...]]
     infeasible: tuple[InfeasibleJob, ...] = ()
@@ -84,8 +80,8 @@ def air_offsets(scenario: Scenario) -> np.ndarray:
     """Ambient temperature at each arm minus that of the cell, K, [arm]: given by the scenario, plus a random part."""
     sd = scenario.spread.scale * thermal_data()["spread"]["ambient_k"]
     rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, len(scenario.arms), 1]))
-    drawn = sd * rng.standard_normal(len(scenario.arms))
-    return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
+    random_k = sd * rng.standard_normal(len(scenario.arms))
+    return random_k + np.array([arm.ambient_offset_k for arm in scenario.arms])
 
 
 class CellPlanner:
@@ -136,7 +132,7 @@ def homes_in_fixtures(scenario: Scenario) -> list[str]:
 def plan_arms(
     scenario: Scenario, indices: Sequence[int], works: Sequence[Work], folder: Path, progress: Progress
 ) -> list[PlannedArm]:
-    """The arms at these places of the scenario, each with its plans for the works (cached in `folder`)."""
+    """The arms with these indices in the scenario, each with its plans for the works (cached in `folder`)."""
     planned, loaded = [], LoadedPlans()
     for done, index in enumerate(indices):
         hardware = hardware_of(scenario, index)
@@ -202,7 +198,7 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
 def _outside_limits_at_home(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
     """A sentence for each arm that begins too cold, or that never settles at home though the shift begins settled."""
     cell_c, offsets_k = float(scenario.ambient.at(np.zeros(1))[0]), air_offsets(scenario)
-    lower_c, found = scenario.limits.lower_c, []
+    lower_c, problems = scenario.limits.lower_c, list[str]()
     for arm in arms:
         ambient_c = coldest_c = cell_c + float(offsets_k[arm.index])
         if scenario.start == "idle_warm":
@@ -214,12 +210,12 @@ def _outside_limits_at_home(scenario: Scenario, arms: Sequence[PlannedArm], fold
             except ValueError as error:
                 reason = str(error).rstrip(".")
                 advice = 'give it more cooling or cooler air, or begin with start = "cold"'
-                found.append(f"arms[{arm.index}]: {reason}; {advice}")
+                problems.append(f"arms[{arm.index}]: {reason}; {advice}")
         if coldest_c < lower_c:
             advice = "give it warmer air" + (', or begin with start = "idle_warm"' if scenario.start == "cold" else "")
             name = scenario.arms[arm.index].name
-            found.append(
+            problems.append(
                 f"arms[{arm.index}]: a motor of '{name}' begins at {coldest_c:.1f} °C, below limits.lower_c "
                 f"({lower_c:g} °C); {advice}"
             )
-    return found
+    return problems

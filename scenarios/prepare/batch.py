@@ -1,9 +1,9 @@
-"""Scenarios for the batched environment: fleets planned and scored once, shifts drawn as arrays."""
+"""Scenarios for the batched environment: fleets planned and scored once, shifts sampled as arrays."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +21,6 @@ from scenarios.spec.jobs import JobSampler, weights_of, works_of
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, DifficultyName, RiskName
 from scenarios.spec.schema import Scenario
-
-if TYPE_CHECKING:
-    pass
-
 
 _SINGLE = frozenset({"plant", "bus", "channel", "render_mode", "mask_in"})
 """Options of `make_env` that a batch does not have."""
@@ -96,7 +92,7 @@ def _kinds(scenario: Scenario) -> list[Job]:
 
 
 class _ShiftSampler:
-    """Draws the shift of a seed as arrays: the shift that `ShiftFactory` makes of it."""
+    """Samples the shift of a seed as arrays: the shift that `ShiftFactory` makes of it."""
 
     def __init__(self, fleet: Fleet) -> None:
         scenario, self._fleet = fleet.scenario, fleet
@@ -107,13 +103,13 @@ class _ShiftSampler:
         self._due_s = np.array([stream.due_s for stream in scenario.jobs], dtype=float)
 
     def __call__(self, seed: np.random.SeedSequence) -> Shift:
-        varied = self._fleet.variation(seed)
+        conditions = self._fleet.conditions(seed)
         jobs_seed, sensor_seed = shift_seeds(seed)
-        sampler, jobs = self._jobs, self._jobs.sample(jobs_seed, varied.arrivals)
+        sampler, jobs = self._jobs, self._jobs.sample(jobs_seed, conditions.arrivals)
         stream = jobs.stream
         return Shift(
-            fleet=varied.fleet,
-            ambient_offset_k=varied.ambient_k,
+            fleet=conditions.fleet,
+            ambient_offset_k=conditions.ambient_k,
             kind=self._first_kind[stream] + jobs.payload * sampler.choices[stream, 1] + jobs.extra,
             release_s=jobs.release_s,
             due_s=jobs.release_s + self._due_s[stream],

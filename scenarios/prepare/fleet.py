@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from agents.policy import PlanningPolicy, Policy
 from fleet.arm.plan_cache import rest_torque
 from fleet.arm.space import SpaceTable, space_table
 from fleet.bus.exchange.channel import PERFECT, Channel
@@ -16,7 +17,9 @@ from fleet.bus.exchange.memory import Exchange
 from fleet.difficulty import Blind
 from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.state import World
+from fleet.engine.tables import Tables, tables_of
 from fleet.engine.world import Arm, build_world, warm_start
+from fleet.env.lookahead import CellSimulator
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError
 from fleet.files import cache_folder
 from fleet.jit import cache_of_this_code
@@ -27,7 +30,7 @@ from fleet.seeding import shift_seeds
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms, problems_of
-from scenarios.prepare.randomisation import Randomisation, Variation, randomisation_of
+from scenarios.prepare.randomisation import Randomisation, ShiftConditions, randomisation_of
 from scenarios.progress import Count, Progress, check_progress, quiet
 from scenarios.spec.jobs import JobSampler, all_works, rehearsal_works, weights_of
 from scenarios.spec.load import scenario_with
@@ -62,9 +65,9 @@ class Fleet:
         """The fleet and its variants."""
         return (self, *self.variants)
 
-    def variation(self, seed: np.random.SeedSequence) -> Variation:
-        """What was drawn for the shift of a seed; its fleet is a place in `all`."""
-        return self.randomise.drawn(seed, len(self.all))
+    def conditions(self, seed: np.random.SeedSequence) -> ShiftConditions:
+        """The conditions of the shift of a seed; its fleet is an index of `all`."""
+        return self.randomise.sample(seed, len(self.all))
 
 
 def prepare(
@@ -161,7 +164,7 @@ def _arms(
     training: int = 0,
     like: Fleet | None = None,
 ) -> tuple[list[Arm], Sequence[PlannedArm]]:
-    """The arms at these places of the scenario, with their difficulty models and as they were planned.
+    """The arms with these indices in the scenario, with their difficulty models, and as they were planned.
 
     Args:
         every_work: Raise if none of the arms can do some work.
@@ -247,7 +250,7 @@ def world_of(fleet: Fleet, jobs: Sequence[Job], warmer_k: float = 0.0) -> tuple[
     """The world of a shift with these jobs, and the plan of each row of its plan table.
 
     Args:
-        warmer_k: Added to every temperature of the cell, at the start and of the air.
+        warmer_k: Added to every temperature of the cell, at the start and ambient.
     """
     scenario = fleet.scenario
     times = (np.arange(scenario.ticks) + 0.5) * scenario.decision_interval_s
@@ -283,7 +286,7 @@ class ShiftFactory:
         """Draw the jobs and build the world; the same seed gives the same episode."""
         from fleet.engine.shift import Episode
 
-        chosen, warmer_k, rate = self.fleet.variation(seed)
+        chosen, warmer_k, rate = self.fleet.conditions(seed)
         fleet = self.fleet.all[chosen]
         scenario, arms = fleet.scenario, fleet.arms
         jobs_seed, sensor_seed = shift_seeds(seed)
@@ -298,6 +301,37 @@ class ShiftFactory:
             plant = ProfilePlant(plans, np.stack([robot.home_q() for robot in robots]), rest_tau)
         twins = tuple(arm.model.version for arm in arms)
         return Episode(world=world, plant=plant, twins=twins, sensors=sensor_seed)
+
+
+def as_known(fleet: Fleet) -> Fleet:
+    """The fleet with the thermal networks and motors that its arms know, and without scores."""
+    variants = tuple(as_known(each) for each in fleet.variants)
+    arms = tuple(
+        replace(arm, thermal=arm.beliefs[0], motors=arm.beliefs[1], model=Blind(), known=arm.beliefs)
+        for arm in fleet.arms
+    )
+    return replace(fleet, arms=arms, variants=variants)
+
+
+def simulator_of(fleet: Fleet, tables: Tables) -> CellSimulator:
+    """The simulator of a cell for policies that plan.
+
+    Args:
+        tables: Of `as_known(fleet)`.
+    """
+    return CellSimulator(tables, len(fleet.arms), fleet.scenario.slots, weights_of(fleet.scenario))
+
+
+def simulator_of_shift(fleet: Fleet, seed: int) -> CellSimulator:
+    """The simulator of a cell for the shift of one seed, in which every job is a kind of its own."""
+    world = ShiftFactory(as_known(fleet))(np.random.SeedSequence(seed)).world
+    return simulator_of(fleet, tables_of(world)[0])
+
+
+def let_plan(policy: Policy, fleet: Fleet, env: "AllocationEnv", seed: int) -> None:
+    """Give a policy that plans a simulator of the shift that an env has just begun, of a prepared fleet and a seed."""
+    if isinstance(policy, PlanningPolicy):
+        policy.plan_in(env.lookahead(simulator_of_shift(fleet, seed)))
 
 
 def open_exchange(

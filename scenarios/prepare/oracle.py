@@ -7,11 +7,7 @@ import numpy as np
 
 from fleet.difficulty import Difficulty, difficulty_of_error
 from fleet.heat.motor import Motors
-from fleet.heat.thermal import (
-    WINDING,
-    ThermalModel,
-    simulate_temperatures,
-)
+from fleet.heat.thermal import WINDING, ThermalModel, simulate_temperatures
 from fleet.motion import Plan, drives
 from twin.thermal.thermal_twin import LinearHeat, peak_forecast
 

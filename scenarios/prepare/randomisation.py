@@ -19,7 +19,7 @@ MOST_ARRIVALS = 100.0
 
 @dataclass(frozen=True, kw_only=True)
 class Randomisation:
-    """Ranges from which each shift is drawn."""
+    """Ranges from which each shift is sampled."""
 
     ambient_k: tuple[float, float] = (0.0, 0.0)
     """Added to the ambient temperature of the cell, K."""
@@ -85,13 +85,13 @@ class Randomisation:
                     raise ScenarioError(f"{each.name}: a variant must keep the {what} of its scenario.")
         return all_of_them
 
-    def drawn(self, seed: np.random.SeedSequence, fleets: int) -> "Variation":
-        """The variation of the shift of a seed, among a number of fleets."""
+    def sample(self, seed: np.random.SeedSequence, fleets: int) -> "ShiftConditions":
+        """The conditions of the shift of a seed, among a number of fleets."""
         if fleets == 1 and not self:
-            return Variation(0, 0.0, 1.0)
+            return ShiftConditions(0, 0.0, 1.0)
         rng = np.random.default_rng(child(seed, 2))
         warmer_k, rate = rng.uniform(*self.ambient_k), rng.uniform(*self.arrivals)
-        return Variation(int(rng.integers(fleets)), float(warmer_k), float(rate))
+        return ShiftConditions(int(rng.integers(fleets)), float(warmer_k), float(rate))
 
     def _check_ambient(self, scenario: Scenario) -> None:
         for warmer_k in self.ambient_k:
@@ -114,8 +114,8 @@ def randomisation_of(given: object) -> Randomisation:
     return given or Randomisation()
 
 
-class Variation(NamedTuple):
-    """What was drawn for one shift."""
+class ShiftConditions(NamedTuple):
+    """What is sampled for one shift besides its jobs."""
 
     fleet: int
     """0: the scenario's own; others: the variants."""

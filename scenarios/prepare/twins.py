@@ -1,14 +1,14 @@
 """Twins of the arms of a scenario, or of logs of a real arm: trained on motion that stays cool, cached, and saved.
 
-Planned motion is cool if it can repeat over a whole horizon from a cold start, judged by the true motors: a heavy job
+Planned motion is cool if it can repeat over a whole horizon from a cold start, by the true motors: a heavy job
 begins cool, too. Training data hold the arm's own cool motion and random light motions of other kinds. Without the
 latter, every new motion would score as difficult.
 """
 
-import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 from urllib.parse import quote
 
-import msgspec
 import numpy as np
 from joblib import cpu_count, delayed
 
@@ -33,10 +32,9 @@ from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario, TwinSpec
-from twin.logs.recording import NothingCool, Recording, cool_stretches
+from twin.logs.recording import NothingCool, Recording, Stretch, cool_stretches
 from twin.vae.config import TwinConfig, training_key
 from twin.vae.measures import Features
-from twin.vae.train import train
 from twin.vae.twin import CARD as TWIN_CARD
 from twin.vae.twin import Twin, load, net_names, save
 from twin.verdict import log_features
@@ -57,9 +55,8 @@ def cold_peaks(
     plans: Sequence[Plan], motors: Motors, thermal: ThermalModel, *, ambient_c: float, horizon_s: float
 ) -> Array:
     """Hottest winding temperatures when each plan's cycle repeats over the horizon from ambient, °C, [plan, joint]."""
-    cold_c = np.full(NODES, ambient_c)
-    horizons = [horizon_s] * len(plans)
-    return peaks(plans, horizons, motors=motors, thermal=thermal, start_c=cold_c, ambient_c=ambient_c)
+    cold_c, lasts_s = np.full(NODES, ambient_c), [horizon_s] * len(plans)
+    return peaks(plans, lasts_s, motors=motors, thermal=thermal, start_c=cold_c, ambient_c=ambient_c)
 
 
 def cool_plans(plans: Sequence[Plan], hardware: ArmHardware, spec: TwinSpec) -> tuple[Plan, ...]:
@@ -106,22 +103,21 @@ class CachedModel(Generic[Model]):
 def load_or_make(models: Sequence[CachedModel[Model]], stage: str, progress: Progress = quiet) -> list[Model]:
     """Every model: from its folder if it is there and intact, else made now, several at a time."""
     loaded = [_load_intact(model) for model in models]
-    missing = [i for i, model in enumerate(loaded) if model is None]
-    progress(stage, Count(len(models) - len(missing), len(models)))
+    missing = [model for model, ready in zip(models, loaded, strict=True) if ready is None]
 
     def report(made: float) -> None:
         progress(stage, Count(len(models) - len(missing) + made, len(models)))
 
+    report(0)
     reasons: list[str | None] = []
     if len(missing) == 1:  # in this process, which can report progress within one model
-        reasons = [models[missing[0]].make(models[missing[0]].folder, report)]
+        reasons = [missing[0].make(missing[0].folder, report)]
         report(1)
     elif missing:
         with worker_processes(min(len(missing), cpu_count())) as pool:
-            tasks = (delayed(models[i].make)(models[i].folder, _ignore) for i in missing)
-            for made, reason in enumerate(pool(tasks), start=1):
+            for reason in pool(delayed(model.make)(model.folder, _ignore) for model in missing):
                 reasons.append(reason)
-                report(made)
+                report(len(reasons))
     for reason in filter(None, reasons):
         log.warning("%s", reason)
     return [model.load(model.folder) if ready is None else ready for model, ready in zip(models, loaded, strict=True)]
@@ -138,7 +134,7 @@ def _load_intact(model: CachedModel[Model]) -> Model | None:
 
 
 def _ignore(_fraction: float) -> None:
-    pass
+    """Progress of a worker process, which nobody reads."""
 
 
 REHEARSAL_VERSION = 4
@@ -150,8 +146,6 @@ FEWEST_HELD_OUT = 8
 """With fewer held-out motions of a kind a twin stays uncalibrated."""
 MOST_DRAWS = 12
 """Most draws of work per held-out job: little work of an arm in a hot place stays cool."""
-
-
 TRAINING_STEP = 1000
 """Between the seeds of two trainings; the first one is the scenario's own."""
 
@@ -187,15 +181,20 @@ def train_twins(
 
 
 def _model(scenario: Scenario, arm: PlannedArm, folder: Path, config: TwinConfig, seed: int) -> CachedModel[Twin]:
-    own = require_cool_plans(arm.all_plans, arm.hardware, scenario)
+    """The twin of an arm; its key is that of its own motion, and of everything that determines its exploration."""
+    own, spec = require_cool_plans(arm.all_plans, arm.hardware, scenario), scenario.twin
     training_seed = arm_seed(seed, arm.index)
 
     def make(home: Path, report: Callable[[float], None]) -> None:
         save(train_twin(own, config, training_seed, scenario=scenario, arm=arm, progress=report), home)
 
     key = training_key(records(own), config, training_seed)
-    exploration_seed = scenario.spread.seed if seed != scenario.spread.seed else None
-    return CachedModel(folder / "twins" / _key(key, scenario.twin, arm.hardware, exploration_seed), load, make)
+    if spec.exploration:
+        parts = [key, REHEARSAL_VERSION, RANDOM_MOTIONS_VERSION, asdict(spec), asdict(arm.hardware.robot)]
+        if seed != scenario.spread.seed:
+            parts.append(scenario.spread.seed)
+        key = arm.hardware.key(parts)
+    return CachedModel(folder / "twins" / key, load, make)
 
 
 def train_twin(
@@ -215,9 +214,9 @@ def train_twin(
         own: The arm's cool plans.
         progress: Called with the fraction of the training that is done.
     """
-    trained_on = [*records(own), *exploration_records(scenario, arm)]
     from twin.vae.train import train
 
+    trained_on = [*records(own), *exploration_records(scenario, arm)]
     twin = train(trained_on, config, seed, arm=arm.hardware.robot.name, progress=progress)
     kinds = [[(plan, 1) for plan in plans] for plans in held_out(scenario, arm)]
     return twin.with_calibration(*kinds) if min(map(len, kinds)) >= FEWEST_HELD_OUT else twin
@@ -229,7 +228,7 @@ def held_out(scenario: Scenario, arm: PlannedArm, *key: int) -> tuple[tuple[Plan
     Args:
         key: Other spawn keys give other draws.
     """
-    work = np.random.default_rng(_draw_seed(scenario, arm, HELD_OUT_WORK, *key))
+    work = np.random.default_rng(arm_seed(scenario.spread.seed, arm.index, HELD_OUT_WORK, *key))
     robot, wanted = arm.hardware.robot, scenario.twin.exploration
     jobs = list[Plan]()
     for _ in range(MOST_DRAWS):
@@ -244,42 +243,27 @@ def exploration_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
 
 
 def _cool_exploration(scenario: Scenario, arm: PlannedArm, *draw: int) -> tuple[Plan, ...]:
-    rng = np.random.default_rng(_draw_seed(scenario, arm, *draw))
+    rng = np.random.default_rng(arm_seed(scenario.spread.seed, arm.index, *draw))
     light = light_jobs(arm.hardware.robot, scenario.twin.exploration, rng)
     return cool_plans(light, arm.hardware, scenario.twin)
 
 
-def _draw_seed(scenario: Scenario, arm: PlannedArm, *draw: int) -> np.random.SeedSequence:
-    return np.random.SeedSequence([scenario.spread.seed, arm.index], spawn_key=draw)
-
-
-def arm_seed(seed: int, index: int) -> np.random.SeedSequence:
-    """The seed of an arm's training, by its place in the scenario, whichever other arms are trained."""
-    return np.random.SeedSequence([seed, index])
-
-
-def _key(own: str, spec: TwinSpec, hardware: ArmHardware, exploration_seed: int | None = None) -> str:
-    """Cache key of a twin: the key of its own motion, and everything that determines its exploration.
+def arm_seed(seed: int, index: int, *draw: int) -> np.random.SeedSequence:
+    """The seed of an arm's training, or of another draw, by its index in the scenario, whichever other arms there are.
 
     Args:
-        exploration_seed: Seed of the exploration if it is not the one in the key of the own motion.
+        draw: Spawn key.
     """
-    if not spec.exploration:
-        return own
-    parts = [own, REHEARSAL_VERSION, RANDOM_MOTIONS_VERSION, asdict(spec), asdict(hardware.robot)]
-    digest = hashlib.sha256(msgspec.json.encode(parts if exploration_seed is None else [*parts, exploration_seed]))
-    digest.update(hardware.content())
-    return digest.hexdigest()[: len(own)]
+    return np.random.SeedSequence([seed, index], spawn_key=draw)
 
 
 def train_or_load(
     records: list[Array], config: TwinConfig, seed: np.random.SeedSequence, *, arm: str, folder: Path
 ) -> Twin:
     """The twin of these records: from the folder while its inputs are unchanged, else trained and kept there."""
+    from twin.vae.train import train
 
     def make(home: Path, _report: Callable[[float], None]) -> None:
-        from twin.vae.train import train
-
         save(train(records, config, seed, arm=arm), home)
 
     home = folder / "twins" / training_key(records, config, seed)
@@ -315,8 +299,6 @@ LOG_INPUT = {"rate_hz": 2.0, "window": 50, "hidden": 32}
 """Twins of logs: at the common rate of Gen3 loggers a second has two samples only, so windows last 25 s."""
 LOADED = (0, 1, 2, 3)
 """The large motors, index 0..6, which determine whether a log is cool: idle wrists are above 40 °C."""
-
-
 HOLD_OUT = 0.3
 """Share of the cool recordings that calibrate the twin of a log and are not trained on."""
 FEWEST_RECORDINGS = 4
@@ -334,7 +316,7 @@ def train_log(
 ) -> Twin:
     """The twin of the arm of some recordings, trained on the parts after which no large motor got warm.
 
-    Some of the recordings that are cool from start to end are held out, drawn by the seed, and calibrate the twin.
+    Some of the recordings that are cool from start to end are held out, sampled by the seed, and calibrate the twin.
 
     Args:
         hold_out: Share of the cool recordings that are held out.
@@ -350,48 +332,47 @@ def train_log(
     names = arms_of(recordings)
     if len(names) > 1:
         raise FleetError(f"The log holds several arms ({', '.join(names)}); train on the log of one arm.")
+    from twin.vae.train import train
+
     config = replace(config, record_hz=config.rate_hz)
-    entropy = np.random.SeedSequence([seed, 0])
-    held_out = _held_out(recordings, config, hold_out, np.random.default_rng(entropy.spawn(1)[0]), cool_c)
+    held_out = _held_out(recordings, config, hold_out, np.random.default_rng(arm_seed(seed, 0, 0)), cool_c)
     reserved = {recording.name for recording in held_out}
     own = [recording for recording in recordings if recording.name not in reserved]
-    least_s = config.window / config.rate_hz
-    cool = cool_stretches(own, config.rate_hz, cool_c=cool_c, joints=LOADED, least_s=least_s)
     progress("learning the log", 0.0)
     twin = train(
-        [stretch.profile for stretch in cool],
+        [stretch.profile for stretch in _cool_stretches(own, config, cool_c)],
         config,
-        np.random.SeedSequence([seed, 0]),
+        arm_seed(seed, 0),
         arm=names[0],
         progress=lambda share: progress("learning the log", share),
     )
     if not held_out:
         return twin
-    features = [log_features(twin, recording) for recording in held_out]
-    return twin.calibrated_on(Features(np.stack([each.packed for each in features])), np.zeros(len(features), int))
+    reference = np.stack([log_features(twin, recording).packed for recording in held_out])
+    return twin.calibrated_on(Features(reference), np.zeros(len(reference), int))
+
+
+def _cool_stretches(recordings: Sequence[Recording], config: TwinConfig, cool_c: float) -> list[Stretch]:
+    """Stretches of a window or more after which no large motor gets warm; raises as `cool_stretches`."""
+    least_s = config.window / config.rate_hz
+    return cool_stretches(recordings, config.rate_hz, cool_c=cool_c, joints=LOADED, least_s=least_s)
 
 
 def _held_out(
     recordings: Sequence[Recording], config: TwinConfig, share: float, rng: np.random.Generator, cool_c: float
 ) -> list[Recording]:
     """Recordings that are cool from start to end and last a window, to be held out; none if too few are."""
-    cool = [r for r in recordings if _is_cool(r, config, cool_c)]
+    cool = list[Recording]()
+    for recording in recordings:
+        assert recording.temp_c is not None
+        if len(recording.time_s) and recording.temp_c[:, list(LOADED)].max() < cool_c:
+            with suppress(NothingCool):
+                _cool_stretches([recording], config, cool_c)
+                cool.append(recording)
     count = round(share * len(cool))
     if count < FEWEST_RECORDINGS:
         return []
     return [cool[i] for i in np.sort(rng.permutation(len(cool))[:count])]
-
-
-def _is_cool(recording: Recording, config: TwinConfig, cool_c: float) -> bool:
-    assert recording.temp_c is not None
-    if not len(recording.time_s) or recording.temp_c[:, list(LOADED)].max() >= cool_c:
-        return False
-    try:
-        least_s = config.window / config.rate_hz
-        cool_stretches([recording], config.rate_hz, cool_c=cool_c, joints=LOADED, least_s=least_s)
-    except NothingCool:
-        return False
-    return True
 
 
 def arms_of(recordings: Sequence[Recording]) -> list[str]:

@@ -17,8 +17,7 @@ from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
 from scenarios.policy_loader import OnBus, blaming, policy_at
-from scenarios.prepare.fleet import Fleet, env_of, prepare
-from scenarios.prepare.known_cell import let_plan
+from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.result_folder import new_folder
 from scenarios.run.log import RUN, RunLog, card_of, provenance

@@ -11,7 +11,7 @@ from benchmarks.paper.subjects import Study, make_study
 from fleet.errors import FleetError
 from fleet.heat.thermal import WINDING
 from fleet.robot import JOINTS
-from scenarios.prepare.identify import AIR_SD_K, own_logs
+from scenarios.prepare.calibrate import AIR_SD_K, own_logs
 from twin.logs.recording import Recording, heat_logs
 from twin.thermal.identify import HeatModel, Noise, ParameterVector, Problem, identify, nominal_heat_model
 from twin.thermal.thermal_twin import RcTwin

@@ -16,12 +16,11 @@ from agents.registry import make_policy
 from fleet.arm.random_motions import random_jobs
 from fleet.bus.router import Router
 from fleet.heat.motor import gen3_motors
-from fleet.heat.thermal import NODES, ThermalSpread, gen3_network, spread_motors, thermal_model
+from fleet.heat.thermal import ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.robot import Robot
 from scenarios.cli.main import main
 from scenarios.motion.generate import bare_arm
-from scenarios.prepare.oracle import peaks
-from scenarios.prepare.twins import records
+from scenarios.prepare.twins import cold_peaks, records
 from scenarios.terminal import progress_bar
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
@@ -72,8 +71,8 @@ speeds = [1.0]
 """
 
 
-class Said(NamedTuple):
-    """What one call of the command line said."""
+class CommandResult(NamedTuple):
+    """Exit code and output of one call of the command line."""
 
     code: int
     out: str
@@ -82,16 +81,14 @@ class Said(NamedTuple):
 
 @pytest.fixture(scope="session")
 def subject() -> SimpleNamespace:
-    """An arm with heat of its own, light jobs that it knows to stay cool, and a small twin trained on them."""
+    """An arm with its own deviation from a Gen3, light jobs that stay cool, and a small twin trained on them."""
     draw = np.random.default_rng(np.random.SeedSequence(8))
     robot, spread = Robot(name="arm", tool_kg=0.9), ThermalSpread.gen3(0.5)
     motors = spread_motors(gen3_motors(), spread, draw)
     thermal = thermal_model(gen3_network(spread=spread, rng=draw))
-    drawn = random_jobs(robot, 40, draw, payload_kg=(0.0, 1.5))
-    half_hours = [1800.0] * len(drawn)
-    cold_c = np.full(NODES, 23.0)
-    peak_c = peaks(drawn, half_hours, motors=motors, thermal=thermal, start_c=cold_c, ambient_c=23.0).max(axis=1)
-    jobs = tuple(job for job, highest in zip(drawn, peak_c, strict=True) if highest < 40.0)
+    sampled = random_jobs(robot, 40, draw, payload_kg=(0.0, 1.5))
+    peak_c = cold_peaks(sampled, motors, thermal, ambient_c=23.0, horizon_s=1800.0).max(axis=1)
+    jobs = tuple(job for job, highest in zip(sampled, peak_c, strict=True) if highest < 40.0)
     config = TwinConfig(hidden=16, max_windows=384, epochs=40, batch=64, restarts=1)
     twin = train(records(jobs), config, np.random.SeedSequence(3), arm=robot.name)
     return SimpleNamespace(arm=bare_arm(robot, motors, thermal), jobs=jobs, twin=twin)
@@ -115,24 +112,24 @@ def endpoint() -> Iterator[str]:
 @pytest.fixture
 def thermofleet(
     plans: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., Said]:
+) -> Callable[..., CommandResult]:
     """The command line: `thermofleet("run", path, "--seed", 3)`."""
     monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
     # A stage that is slow on a slow machine prints a line of progress; what a command prints shall not depend on that.
     monkeypatch.setitem(progress_bar.__wrapped__.__kwdefaults__, "after_s", 1e6)  # type: ignore[attr-defined]
 
-    def call(*args: object) -> Said:
+    def call(*args: object) -> CommandResult:
         with pytest.raises(SystemExit) as left:
             main([str(arg) for arg in args])
-        said = capsys.readouterr()
+        output = capsys.readouterr()
         assert isinstance(left.value.code, int)
-        return Said(left.value.code, said.out, said.err)
+        return CommandResult(left.value.code, output.out, output.err)
 
     return call
 
 
 class PressingCtrlC:
-    """Round robin, until somebody presses Ctrl-C at a certain step."""
+    """Round robin that sends SIGINT to its own process at a certain step."""
 
     def __init__(self, step: int, times: int) -> None:
         self._policy, self._left, self._times = make_policy("round_robin"), step, times
@@ -150,7 +147,7 @@ class PressingCtrlC:
 
 @pytest.fixture
 def press_ctrl_c() -> Callable[..., AbstractContextManager[object]]:
-    """A function that has the shifts within a block interrupted at their fourth step."""
+    """A function that interrupts the shifts within a block at their fourth step."""
 
     def press(times: int = 1) -> AbstractContextManager[object]:
         return patch("scenarios.policy_loader.policy_of", lambda *name: PressingCtrlC(step=4, times=times))

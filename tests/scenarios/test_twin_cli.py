@@ -1,4 +1,4 @@
-"""`thermofleet twin`, called as a person calls it: trained on a scenario and on a log, scored, told what is wrong."""
+"""`thermofleet twin` from the command line: training on a scenario and on a log, scores, and errors."""
 
 import csv
 import io
@@ -10,26 +10,20 @@ import pytest
 
 from scenarios.cli.main import main
 from scenarios.show.twin_report import Size
+from tests.logs import RATE_HZ, logged
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU
 from twin.vae.twin import load
 
 TINY = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "--allow-collapse")
-LOG_HZ = 2.0
 
 
 def log_csv(seconds: float, *, celsius: float, load: float = 1.0, seed: int = 0, warms_k: float = 0.0) -> str:
-    """A plain log: seven joints swinging at 2 Hz, joint 2 at one temperature or warming, all others cool."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(0.0, seconds, 1 / LOG_HZ)
-    omega = rng.uniform(0.1, 0.6, 7)
-    q = 0.5 * np.sin(np.outer(time_s, omega) + rng.uniform(0, 6, 7))
-    qd = 0.5 * omega * np.cos(np.outer(time_s, omega))
-    tau = load * 10 * np.cos(q) + rng.normal(0, 0.2, q.shape)
-    temp_c = np.full(q.shape, 30.0)
-    temp_c[:, 1] = celsius + warms_k * (1 - np.exp(-time_s / 300))
+    """`tests.logs.logged` as a plain log; joint 2 may warm."""
+    log = logged("log", load=load, celsius=celsius, seed=seed, seconds=seconds)
+    log.temp_c[:, 1] += warms_k * (1 - np.exp(-log.time_s / 300))
     head = ["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau", "temp_c") for j in range(1, 8))]
-    rows = np.hstack([time_s[:, None], q, qd, tau, temp_c])
+    rows = np.hstack([log.time_s[:, None], log.q, log.qd, log.tau, log.temp_c])
     return "\n".join([",".join(head), *(",".join(f"{v:.6f}" for v in row) for row in rows)]) + "\n"
 
 
@@ -56,7 +50,7 @@ def trained(logs, tmp_path_factory):
 
 @pytest.fixture
 def twins(trained, tmp_path):
-    """A copy of one's own."""
+    """A copy that a test may change."""
     return shutil.copytree(trained, tmp_path / "twins")
 
 
@@ -68,7 +62,7 @@ def test_a_log_becomes_a_twin_that_finds_threefold_torque_harder(thermofleet, tw
         said = thermofleet("twin", "score", twins, "--log", logs / name, "--format", "csv")
         assert said.code == 0
         rows = list(csv.DictReader(io.StringIO(said.out)))
-        assert len(rows) == int((400 if "cool" in name else 100) * LOG_HZ) // 50
+        assert len(rows) == int((400 if "cool" in name else 100) * RATE_HZ) // 50
         assert {row["twin"] for row in rows} == {card["twins"][0]["version"]}
         assert {row["data"] for row in rows} == {card["twins"][0]["data_hash"]}
         mean_d[name] = np.mean([float(row["d_2"]) for row in rows])
@@ -92,7 +86,7 @@ def test_ctrl_c_while_learning_a_log_promises_nothing(thermofleet, logs, tmp_pat
     def interrupted(*_args, **_more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenarios.prepare.twins.train", interrupted)
+    monkeypatch.setattr("twin.vae.train.train", interrupted)
     said = thermofleet("twin", "train", "--log", logs / "cool", *TINY, "--out", tmp_path / "twins")
     assert said.code == 130
     assert said.err.splitlines()[-1] == "Interrupted while learning the log: nothing was written."

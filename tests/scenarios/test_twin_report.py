@@ -13,7 +13,7 @@ from fleet.errors import FleetError
 from fleet.motion import RATE_HZ
 from fleet.robot import Robot
 from scenarios.prepare.arms import hardware_of
-from scenarios.prepare.identify import own_logs
+from scenarios.prepare.calibrate import own_logs
 from scenarios.show import twin_report as report
 from scenarios.spec.load import load
 from scenarios.table import Table

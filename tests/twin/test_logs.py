@@ -204,7 +204,8 @@ def test_as_many_samples_stay_as_can(times):
 def test_a_file_that_is_no_log_says_why(tmp_path: Path, content: bytes, line: int | None, match: str):
     path = tmp_path / "bad.csv"
     path.write_bytes(content)
-    refused(path, match, line)
+    where = f"{path}, line {line}: " if line else f"{path}: "
+    assert str(refused(path, match, line)).startswith(where)
 
 
 def test_strange_columns_are_left_out_on_demand(tmp_path: Path):
@@ -248,23 +249,20 @@ def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
     path.write_bytes(b"PAR1 and no more")
     refused(path, "is not a complete parquet file", None)
     columns = {"time_s": [0.0, 1.0, 2.0], **{name: [0.5] * 3 for name in PLAIN[1:]}}
-    pq.write_table(pa.table(columns), path)
-    refused(path, "lacks the column arm", None)
-    pq.write_table(pa.table({"arm": ["a"] * 3, **columns, "q_3": ["x"] * 3}), path)
-    refused(path, "column q_3 holds string, not numbers", None)
-    pq.write_table(pa.table({"arm": ["a"] * 3, **{k: v for k, v in columns.items() if k != "q_3"}}), path)
-    refused(path, "lacks the column q_3", None)
-    pq.write_table(pa.table({"arm": ["a"] * 3, **columns, "tau_2": [0.0, None, 0.0]}), path)
-    refused(path, "tau_2 is missing or not a finite number", 2)
+    good = {"arm": ["a"] * 3, **columns}
+    for table, words, line in (
+        (columns, "lacks the column arm", None),
+        (good | {"q_3": ["x"] * 3}, "column q_3 holds string, not numbers", None),
+        ({name: values for name, values in good.items() if name != "q_3"}, "lacks the column q_3", None),
+        ({name: values for name, values in good.items() if name != "time_s"}, "lacks the column time_s", None),
+        ({"arm": ["a"]}, "lacks the column time_s", None),
+        (good | {"arm": ["a", None, "a"]}, "names no arm", 2),
+        ({"arm": pa.array([], pa.string()), "time_s": pa.array([], pa.float64())}, "holds no rows", None),
+        (good | {"tau_2": [0.0, None, 0.0]}, "tau_2 is missing or not a finite number", 2),
+    ):
+        pq.write_table(pa.table(table), path)
+        refused(path, words, line)
     assert read(path, damaged="skip")[0].time_s.tolist() == [0.0, 2.0]
-    pq.write_table(pa.table({"arm": ["a"], **{k: v[:1] for k, v in columns.items() if k != "time_s"}}), path)
-    refused(path, "lacks the column time_s", None)
-    pq.write_table(pa.table({"arm": ["a"]}), path)
-    refused(path, "lacks the column time_s", None)
-    pq.write_table(pa.table({"arm": ["a", None, "a"], **columns}), path)
-    refused(path, "names no arm", 2)
-    pq.write_table(pa.table({"arm": pa.array([], pa.string()), "time_s": pa.array([], pa.float64())}), path)
-    refused(path, "holds no rows", None)
     with pytest.raises(ValueError, match="one of refuse, skip"):
         read(path, damaged="ignore")  # pyright: ignore[reportArgumentType]
     with pytest.raises(LogError, match="cannot be read: No such file"):

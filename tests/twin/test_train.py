@@ -92,23 +92,19 @@ def test_a_limited_joint_is_not_moved_by_turns():
 
 def test_z_scores_have_mean_zero_and_deviation_one_go_back_to_si_and_floor_a_still_joint(records):
     cool = windows_of(records, TwinConfig())
-    z = Scaler.fit(cool).to_z(cool)
+    scaler = Scaler.fit(cool)
+    z = scaler.to_z(cool)
     np.testing.assert_allclose(z.mean(axis=(0, 1)), 0, atol=1e-4)
     np.testing.assert_allclose(z.std(axis=(0, 1)), 1, atol=1e-3)
-    cool = windows_of(records, TwinConfig())
-    scaler = Scaler.fit(cool)
+    np.testing.assert_allclose(scaler.to_si(z), cool, atol=1e-5)
     heavy = cool.copy()
     heavy[..., 2] *= 3
     assert scaler.to_z(heavy)[..., 2].std() > 2.5
-    cool = windows_of(records, TwinConfig())
     cool[:, :, 4] = 1.0
     scaler = Scaler.fit(cool)
     np.testing.assert_array_equal(scaler.std[4], STD_FLOOR)
     np.testing.assert_array_equal(scaler.still, np.arange(7) == 4)
     assert np.all(np.isfinite(scaler.to_z(cool)))
-    cool = windows_of(records[:3], TwinConfig())
-    scaler = Scaler.fit(cool)
-    np.testing.assert_allclose(scaler.to_si(scaler.to_z(cool)), cool, atol=1e-5)
 
 
 def test_records_that_cannot_teach_are_refused(rng, motion, tiny):
@@ -197,12 +193,6 @@ def test_an_autoencoder_is_certain_whatever_the_noise():
     assert torch.equal(logvar.exp(), torch.zeros_like(mu))
 
 
-@pytest.mark.parametrize(("scope", "networks", "channels"), [("joint", 7, 3), ("arm", 1, 21)])
-def test_a_scope_says_how_many_networks_read_how_much(scope, networks, channels):
-    config = TwinConfig(scope=scope)
-    assert (config.networks(7), config.channels(7)) == (networks, channels)
-
-
 DRAW = torch.Generator().manual_seed(0)
 
 
@@ -211,14 +201,6 @@ def test_kl_is_that_of_torch_distributions():
     posterior = Independent(Normal(mu, (0.5 * logvar).exp()), 1)
     prior = Independent(Normal(torch.zeros(5, 3), torch.ones(5, 3)), 1)
     torch.testing.assert_close(kl(mu, logvar), kl_divergence(posterior, prior))
-
-
-def test_kl_is_the_mean_log_ratio_over_samples():
-    mu, logvar = torch.tensor([[0.7, -1.2]]), torch.tensor([[-1.0, 0.5]])
-    q = Normal(mu, (0.5 * logvar).exp())
-    z = mu + (0.5 * logvar).exp() * torch.randn(200_000, 2, generator=DRAW)
-    ratio = (q.log_prob(z) - Normal(0.0, 1.0).log_prob(z)).sum(1)
-    np.testing.assert_allclose(kl(mu, logvar).item(), ratio.mean(), rtol=0.02)
 
 
 def test_beta_weighs_the_kl_and_that_of_the_prior_is_zero():
@@ -246,16 +228,6 @@ def tiny() -> TwinConfig:
     return TwinConfig(hidden=8, max_windows=64, epochs=3, batch=32, restarts=2, trial=0.4, allow_collapse=True)
 
 
-def test_the_objective_rises_on_the_same_windows():
-    draw = torch.Generator().manual_seed(0)
-    time, phase = torch.arange(50) / 12.5, 6.28 * torch.rand(1, 1, 32, generator=draw)
-    x = 2 * torch.sin(time[:, None, None] + phase + torch.tensor([0.0, 1.57, 0.5])[:, None])
-    config = TwinConfig(hidden=16, learning_rate=2e-2, epochs=120, batch=32)
-    run = Run([x], torch.zeros(1, 3), config, [0])
-    run.train(config.epochs)
-    assert run.elbo_by_epoch[-1] > 0.6 * run.elbo_by_epoch[0]
-
-
 def test_the_twin_knows_its_training_better_than_their_mean(twin):
     for fit in twin.fits:
         assert fit.mean_squared_error < 0.75
@@ -265,6 +237,7 @@ def test_the_twin_knows_its_training_better_than_their_mean(twin):
 
 def test_a_seed_gives_the_same_weights_and_leaves_global_states_alone(records, tiny):
     first = train(records, tiny, SEED, arm="a")
+    assert first.data_hash == hash_records(records)
     again = train(records, tiny, SEED, arm="a")
     other = train(records, tiny, np.random.SeedSequence(12), arm="a")
     assert first.version == again.version != other.version
@@ -294,14 +267,6 @@ def test_the_restart_that_is_ahead_after_the_trial_is_trained_to_the_end(records
     alone = train(records[:8], replace(config, restarts=1), SEED, arm="a").fits
     for joint, fit in enumerate(twin.fits):
         assert (fit.elbo_by_epoch == pytest.approx(alone[joint].elbo_by_epoch, rel=1e-6)) == (fit.restart == 0)
-
-
-def test_a_whole_trial_keeps_the_best_of_full_trainings(records, tiny):
-    config = replace(tiny, trial=1.0)
-    both = train(records[:8], config, SEED, arm="a")
-    first = train(records[:8], replace(config, restarts=1), SEED, arm="a")
-    assert all(b.elbo >= f.elbo for b, f in zip(both.fits, first.fits, strict=True))
-    assert any(b.elbo > f.elbo for b, f in zip(both.fits, first.fits, strict=True))
 
 
 def test_more_windows_than_wanted_are_drawn_without_bias(records, tiny):
@@ -358,12 +323,6 @@ def test_the_key_changes_with_data_configuration_and_seed(records, tiny):
         training_key(records, tiny, np.random.SeedSequence(11, spawn_key=(1,))),
     ]
     assert len({key, *others}) == 6
-
-
-def test_the_data_is_named_by_its_content_unless_told(records, tiny):
-    one = replace(tiny, epochs=1, restarts=1)
-    assert train(records[:2], one, SEED, arm="a").data_hash == hash_records(records[:2])
-    assert train(records[:2], one, SEED, arm="a", data_hash="lot 7").data_hash == "lot 7"
 
 
 def test_one_network_can_know_the_whole_arm(records, small):

@@ -38,7 +38,7 @@ class Damage:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class LogTable:
     """The numbers of one arm's log as written."""
 
     names: tuple[str, ...]
@@ -103,23 +103,6 @@ def _longest_increasing(values: Array) -> Array:
     return keep[::-1]
 
 
-def out_of_range(values: Array, where: Array, bounds: tuple[float, float], reason: str) -> list[Damage]:
-    """Rows with a reading outside the bounds.
-
-    Args:
-        values: [row, joint].
-        where: Line of each row, [row].
-        reason: Template with {value} and {joint}, counted from 1.
-    """
-    outside = (values < bounds[0]) | (values > bounds[1])
-    rows = np.flatnonzero(outside.any(axis=1))
-    joints = outside[rows].argmax(axis=1)
-    return [
-        Damage(int(where[row]), reason.format(value=values[row, joint], joint=joint + 1))
-        for row, joint in zip(rows, joints, strict=True)
-    ]
-
-
 def damage_summary(damage: Sequence[Damage]) -> tuple[str, ...]:
     """One sentence per run of lines with the same reason, `line 40: …` or `lines 40 to 52: …`."""
     ordered = sorted(damage, key=lambda d: d.line)
@@ -141,7 +124,7 @@ def _kind(reason: str) -> str:
 _GZIP = b"\x1f\x8b"
 
 
-def read_csv(path: Path) -> Table:
+def read_csv(path: Path) -> LogTable:
     """The numbers of all good lines after the header; blank lines are ignored.
 
     Raises:
@@ -175,7 +158,7 @@ def read_csv(path: Path) -> Table:
         except ValueError as error:
             damage.append(Damage(line, str(error)))
     values = np.array(rows, dtype=float).reshape(-1, len(names))
-    return Table(names, values, np.array(where, dtype=int), tuple(damage), (broken,) if broken else ())
+    return LogTable(names, values, np.array(where, dtype=int), tuple(damage), (broken,) if broken else ())
 
 
 def _decompress(data: bytes) -> tuple[bytes, str | None]:
@@ -305,14 +288,13 @@ def check_columns(layout: Format, names: Sequence[str]) -> tuple[list[str], list
     return groups, [name for name in names if name not in wanted]
 
 
-def channels(layout: Format, groups: Sequence[str], table: Table) -> dict[str, Array]:
+def channels(layout: Format, groups: Sequence[str], table: LogTable) -> dict[str, Array]:
     """The groups of a table in SI with our signs, each [row, joint]; a Gen3's angles within half a turn of zero."""
     readings: dict[str, Array] = {}
     for channel, group, factor in zip(READINGS, layout.groups, layout.factors, strict=True):
         if group in groups:
-            readings[channel] = (
-                table.values[:, [table.names.index(column) for column in layout.columns(group)]] * factor
-            )
+            columns = [table.names.index(column) for column in layout.columns(group)]
+            readings[channel] = table.values[:, columns] * factor
     if layout.turns:
         readings["q"] = (readings["q"] + np.pi) % (2 * np.pi) - np.pi
     return readings
@@ -326,14 +308,19 @@ def implausible_readings(layout: Format, readings: dict[str, Array], where: Arra
         where: Line of each row, [row].
     """
     damage: list[Damage] = []
+
+    def check_range(values: Array, low: float, high: float, reason: str) -> None:
+        outside = (values < low) | (values > high)
+        for row in np.flatnonzero(outside.any(axis=1)):
+            joint = int(outside[row].argmax())
+            damage.append(Damage(int(where[row]), f"joint {joint + 1} at {values[row, joint]:.5g} is {reason}"))
+
     if not layout.turns:
         # Beyond half a turn a joint with end stops has passed them.
         q = np.where(np.isin(np.arange(JOINTS), CONTINUOUS), 0.0, readings["q"])
-        reason = "joint {joint} at {value:.5g} is beyond its stops; q is in rad"
-        damage += out_of_range(q, where, (-np.pi, np.pi), reason)
+        check_range(q, -np.pi, np.pi, "beyond its stops; q is in rad")
     if "temp_c" in readings:
-        reason = "joint {joint} at {value:.5g} is not a motor temperature in °C"
-        damage += out_of_range(readings["temp_c"], where, TEMP_RANGE_C, reason)
+        check_range(readings["temp_c"], *TEMP_RANGE_C, "not a motor temperature in °C")
     return damage
 
 
@@ -341,7 +328,7 @@ ARM, MODE = "arm", "mode"
 """Text columns: the arm's name and its mode."""
 
 
-def read_arms(path: Path) -> dict[str, Table]:
+def read_arms(path: Path) -> dict[str, LogTable]:
     """The readings of every arm, in the order of their first rows; the line of a row is its number in the file.
 
     Raises:
@@ -361,15 +348,13 @@ def read_arms(path: Path) -> dict[str, Table]:
     arms = np.array(table[ARM].cast(pa.string()).to_pylist(), dtype=object)
     if None in arms:
         raise LogError(str(path), arms.tolist().index(None) + 1, "names no arm.")
-    finite = np.isfinite(values)
+    finite, tables = np.isfinite(values), dict[str, LogTable]()
     good = finite.all(axis=1)
-
-    def of_arm(arm: str) -> Table:
+    for arm in dict.fromkeys(arms.tolist()):
         rows, bad = np.flatnonzero((arms == arm) & good), np.flatnonzero((arms == arm) & ~good)
         damage = [Damage(int(i) + 1, f"{names[finite[i].argmin()]} is missing or not a finite number") for i in bad]
-        return Table(names, values[rows], rows + 1, tuple(damage))
-
-    return {arm: of_arm(arm) for arm in dict.fromkeys(arms.tolist())}
+        tables[arm] = LogTable(names, values[rows], rows + 1, tuple(damage))
+    return tables
 
 
 def _parquet_numbers(path: Path, name: str, column: pa.ChunkedArray) -> Array:
@@ -445,7 +430,7 @@ def _name(path: Path) -> str:
     return next((path.name[: -len(s)] for s in SUFFIXES if path.name.lower().endswith(s)), path.name)
 
 
-def _recording(path: Path, name: str, table: Table, damaged: Damaged) -> Recording:
+def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Recording:
     """A recording from the good rows of a table."""
     is_csv = path.suffix != ".parquet"
     try:

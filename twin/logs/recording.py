@@ -78,8 +78,8 @@ class Recording:
 
     def part(self, rows: slice | Array) -> "Recording":
         """The recording of some of its samples, by slice, mask or indices."""
-        own = {channel: getattr(self, channel) for channel in READINGS}
-        kept = {channel: None if values is None else values[rows] for channel, values in own.items()}
+        readings = {channel: getattr(self, channel) for channel in READINGS}
+        kept = {channel: None if values is None else values[rows] for channel, values in readings.items()}
         return replace(self, time_s=self.time_s[rows], **kept)
 
 
@@ -89,10 +89,15 @@ def interval_speed(recording: Recording) -> Array:
     The larger of measured speed, which slow sampling may miss, and change of position, which misses moves there and
     back. Angles may wrap.
     """
-    moved = np.diff(recording.q, axis=0)
-    moved = np.abs((moved + np.pi) % (2 * np.pi) - np.pi)
-    read = (np.abs(recording.qd[1:]) + np.abs(recording.qd[:-1])) / 2.0
-    return np.maximum(read, moved / np.diff(recording.time_s)[:, None])
+    measured, by_position = _speeds(recording)
+    return np.maximum(measured, np.abs(by_position))
+
+
+def _speeds(recording: Recording) -> tuple[Array, Array]:
+    """Mean of the measured speeds, >= 0, and signed change of position over each interval, rad/s, [time − 1, joint]."""
+    moved = (np.diff(recording.q, axis=0) + np.pi) % (2 * np.pi) - np.pi
+    measured = (np.abs(recording.qd[1:]) + np.abs(recording.qd[:-1])) / 2.0
+    return measured, moved / np.diff(recording.time_s)[:, None]
 
 
 def interval_current_sq(recording: Recording) -> Array:
@@ -147,16 +152,15 @@ def stretches(recording: Recording, rate_hz: float, *, gap_s: float = GAP_S) -> 
             "all of it; give a larger gap_s."
         )
     pieces = np.split(np.arange(len(recording.time_s)), np.flatnonzero(steps > gap_s) + 1)
-    resampled = [_stretch(recording.part(piece), rate_hz) for piece in pieces if len(piece) > 1]
-    return [stretch for stretch in resampled if len(stretch.time_s)]
-
-
-def _stretch(recording: Recording, rate_hz: float) -> Stretch:
-    channels = [unwrap(recording.q, recording.qd, recording.time_s), recording.qd, recording.tau]
-    if recording.temp_c is not None:
-        channels.append(recording.temp_c)
-    time_s, values = at_rate(recording.time_s, np.stack(channels, axis=1), rate_hz)
-    return Stretch(recording.name, time_s, values[:, :3], None if recording.temp_c is None else values[:, 3])
+    resampled = list[Stretch]()
+    for part in (recording.part(piece) for piece in pieces if len(piece) > 1):
+        channels = [unwrap(part.q, part.qd, part.time_s), part.qd, part.tau]
+        if part.temp_c is not None:
+            channels.append(part.temp_c)
+        time_s, values = at_rate(part.time_s, np.stack(channels, axis=1), rate_hz)
+        if len(time_s):
+            resampled.append(Stretch(part.name, time_s, values[:, :3], None if part.temp_c is None else values[:, 3]))
+    return resampled
 
 
 def unwrap(q: Array, qd: Array, time_s: Array) -> Array:
@@ -216,16 +220,23 @@ def cool_stretches(
     unknown = [j for j in joints if not 0 <= j < recordings[0].joints]
     if unknown or not joints:
         raise ValueError(f"joints must be some of 0 … {recordings[0].joints - 1} (got {tuple(joints)}).")
-    cool_parts, whole = list[Stretch](), True
+    cool_parts, whole, coolest = list[Stretch](), True, np.full(recordings[0].joints, np.inf)
     for recording in recordings:
         if recording.temp_c is None:
             raise ValueError(f"Recording '{recording.name}' has no motor temperatures, so its cool parts are unknown.")
         hot = np.flatnonzero((recording.temp_c[:, list(joints)] >= cool_c).any(axis=1))
         begin = int(hot[-1]) + 1 if len(hot) else 0
         whole &= begin == 0
+        coolest = np.minimum(coolest, recording.temp_c.min(axis=0, initial=np.inf))
         cool_parts += stretches(recording.part(slice(begin, None)), rate_hz)
     if not cool_parts:
-        raise NothingCool(_no_cool_moment(recordings, cool_c, joints))
+        always = ", ".join(f"{j + 1} ({coolest[j]:.1f} °C)" for j in joints if coolest[j] >= cool_c)
+        raise NothingCool(
+            f"At no moment of {len(recordings)} recording(s) do the motors {', '.join(str(j + 1) for j in joints)} "
+            f"stay below {cool_c:g} °C for the rest of its recording."
+            + (f" Always above: {always}, the coolest sample." if always else "")
+            + " Raise the limit (--cool), or record light work."
+        )
     long = [s for s in cool_parts if len(s.time_s) >= least_s * rate_hz]
     if not long:
         longest_s = max(len(s.time_s) for s in cool_parts) / rate_hz
@@ -235,17 +246,6 @@ def cool_stretches(
             "s. Record for longer, or choose a smaller window (--window)."
         )
     return long
-
-
-def _no_cool_moment(recordings: Sequence[Recording], cool_c: float, joints: Sequence[int]) -> str:
-    coolest = np.min([r.temp_c.min(axis=0) for r in recordings if r.temp_c is not None and len(r.time_s)], axis=0)
-    always = [f"{j + 1} ({coolest[j]:.1f} °C)" for j in joints if coolest[j] >= cool_c]
-    return (
-        f"At no moment of {len(recordings)} recording(s) do the motors {', '.join(str(j + 1) for j in joints)} stay "
-        f"below {cool_c:g} °C for the rest of its recording."
-        + (f" Always above: {', '.join(always)}, the coolest sample." if always else "")
-        + " Raise the limit (--cool), or record light work."
-    )
 
 
 CurrentSource = Literal["current", "torque"]
@@ -367,22 +367,15 @@ def _current_terms(recording: Recording, motors: Motors, source: CurrentSource) 
         return np.concatenate([measured[..., None], np.zeros((*measured.shape, 5))], axis=-1)
     # The law is affine in the friction coefficients: i = i_0 + c·i_c + b·i_b.
     none, coulomb, viscous = (_with_friction(motors, *friction) for friction in ((0, 0), (1, 0), (0, 1)))
+    measured, by_position = _speeds(recording)
     ends = []
     for end in (slice(None, -1), slice(1, None)):
-        tau, qd = recording.tau[end], _signed_speed(recording, recording.qd[end])
+        tau, qd = recording.tau[end], np.where(np.abs(by_position) > measured, by_position, recording.qd[end])
         still = np.zeros_like(tau)
         i_0 = reference_current(tau, qd, none)
         i_c, i_b = reference_current(still, qd, coulomb), reference_current(still, qd, viscous)
         ends.append(np.stack([i_0**2, 2 * i_0 * i_c, 2 * i_0 * i_b, i_c**2, 2 * i_c * i_b, i_b**2], axis=-1))
     return (ends[0] + ends[1]) / 2.0
-
-
-def _signed_speed(recording: Recording, qd: Array) -> Array:
-    """Speed at one end of each interval, rad/s, or that of the positions where the samples missed a move."""
-    moved = (np.diff(recording.q, axis=0) + np.pi) % (2 * np.pi) - np.pi
-    by_position = moved / np.diff(recording.time_s)[:, None]
-    read = (np.abs(recording.qd[1:]) + np.abs(recording.qd[:-1])) / 2.0
-    return np.where(np.abs(by_position) > read, by_position, qd)
 
 
 def _friction_terms(recording: Recording, motors: Motors) -> Array:

@@ -1,7 +1,6 @@
 """An identified arm in one file, `rc.json`: readable numbers with their intervals and their origin."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -15,14 +14,14 @@ from fleet.heat.thermal import thermal_model
 from fleet.robot import JOINTS
 from twin.logs.recording import CurrentSource
 from twin.thermal.identify import HeatModel, Identified, Parameter
-from twin.thermal.thermal_twin import PeakCurve, RcTwin
+from twin.thermal.thermal_twin import PeakCurve
 from twin.vae.json_file import check_version, read_card, write_card
 
 FORMAT = 2
 CARD, CURVE = "rc.json", "saturation_curve.json"
 
 
-class _Card(msgspec.Struct, forbid_unknown_fields=True):
+class NetworkCard(msgspec.Struct, forbid_unknown_fields=True):
     """The content of `rc.json`."""
 
     format: int
@@ -39,22 +38,22 @@ class _Card(msgspec.Struct, forbid_unknown_fields=True):
     motors: dict[str, float | list[float]]
     capacity_j_per_k: dict[str, float]
     conductance_w_per_k: list[tuple[str, str, float]]
-    saturation: PeakCurve | None = None
+    saturation: None = None
+    """Kept because stored files name it; P(saturation) is in `saturation_curve.json`."""
 
 
 _SHARED = ("arm", "data_hash", "ambient_c", "ambient_sd_k", "source", "seconds", "parameters", "rms_k", "memory_s")
 
 
-def save(identified: Identified, folder: Path, *, saturation: PeakCurve | None = None) -> None:
-    """Write an identified arm, with its P(saturation) if given, atomically into a folder, made if need be."""
+def save(identified: Identified, folder: Path) -> None:
+    """Write an identified arm atomically into a folder, made if need be."""
     network = identified.heat_model.network
-    card = _Card(
+    card = NetworkCard(
         format=FORMAT,
         version=identified.version,
         motors={name: np.asarray(value).tolist() for name, value in vars(identified.heat_model.motors).items()},
         capacity_j_per_k={name: node["capacity_j_per_k"] for name, node in network.nodes.items() if node},
         conductance_w_per_k=list(network.edges(data="conductance_w_per_k")),
-        saturation=saturation,
         **{name: getattr(identified, name) for name in _SHARED},
     )
     write_card(card, folder / CARD)
@@ -67,34 +66,8 @@ def load(folder: Path) -> Identified:
         CheckpointError: the file is missing, damaged, of another format or for another number of joints, or its
             numbers are not those that were saved.
     """
-    return _load(folder / CARD)[0]
-
-
-def load_twin(folder: Path) -> RcTwin:
-    """The physical twin of what `save` wrote, with P(saturation) if it was saved; raises as `load`."""
-    identified, curve = _load(folder / CARD)
-    return replace(RcTwin.of(identified), curve=curve)
-
-
-def save_curve(curve: PeakCurve, folder: Path) -> None:
-    """Write the curve of a thermal twin atomically into a folder, made if need be."""
-    write_card(_CurveCard(FORMAT, curve), folder / CURVE)
-
-
-def load_curve(folder: Path) -> PeakCurve:
-    """The curve that `save_curve` wrote; raises as `load`."""
-    return read_card(folder / CURVE, _CurveCard, format_=FORMAT, what="curve of P(saturation)").curve
-
-
-class _CurveCard(msgspec.Struct, forbid_unknown_fields=True):
-    """The content of `saturation_curve.json`."""
-
-    format: int
-    curve: PeakCurve
-
-
-def _load(path: Path) -> tuple[Identified, PeakCurve | None]:
-    card = read_card(path, _Card, format_=FORMAT, what="identified arm")
+    path = folder / CARD
+    card = read_card(path, NetworkCard, format_=FORMAT, what="identified arm")
     widths = {name: len(value) for name, value in card.motors.items() if isinstance(value, list)}
     if wrong := {name: width for name, width in widths.items() if width != JOINTS}:
         raise CheckpointError(f"{path}: motors must have {JOINTS} joints (got {wrong}).")
@@ -112,4 +85,21 @@ def _load(path: Path) -> tuple[Identified, PeakCurve | None]:
     shared = {name: getattr(card, name) for name in _SHARED}
     identified = Identified(heat_model=HeatModel(motors, graph), **shared)
     check_version(path, card.version, identified.version)
-    return identified, card.saturation
+    return identified
+
+
+class CurveCard(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of `saturation_curve.json`."""
+
+    format: int
+    curve: PeakCurve
+
+
+def save_curve(curve: PeakCurve, folder: Path) -> None:
+    """Write the curve of a thermal twin atomically into a folder, made if need be."""
+    write_card(CurveCard(FORMAT, curve), folder / CURVE)
+
+
+def load_curve(folder: Path) -> PeakCurve:
+    """The curve that `save_curve` wrote; raises as `load`."""
+    return read_card(folder / CURVE, CurveCard, format_=FORMAT, what="curve of P(saturation)").curve

@@ -10,6 +10,7 @@ parameters (variable projection: Golub & Pereyra 1973; Jacobian in Kaufman's for
 """
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -94,11 +95,12 @@ class HeatModel:
 
     def with_values(self, values: Mapping[str, Array]) -> "HeatModel":
         """The same arm with some parameters of `PRIOR_SD` replaced, each [joint] or [1] as `value` gives them."""
-        graph = self.network.copy()
-        own = {}
+        graph, of_motors = self.network.copy(), dict[str, Array]()
+        for *_, data in (*graph.nodes(data=True), *graph.edges(data=True)):
+            data.update({name: float(value) for name, value in data.items()})  # as JSON
         for name, value in values.items():
             if hasattr(self.motors, name):
-                own[name] = np.array(value)
+                of_motors[name] = np.array(value)
             elif name in _CAPACITIES:
                 for j in range(JOINTS):
                     graph.nodes[_CAPACITIES[name](j)]["capacity_j_per_k"] = float(value[j])
@@ -108,7 +110,7 @@ class HeatModel:
             else:
                 for edge in _NEIGHBOURS:
                     graph.edges[edge]["conductance_w_per_k"] = float(value[0])
-        return HeatModel(replace(self.motors, **own), graph)
+        return HeatModel(replace(self.motors, **of_motors), graph)
 
     def thermal(self) -> ThermalModel:
         """The network as matrices."""
@@ -119,7 +121,6 @@ class ParameterVector:
     """Free parameters of one arm as a vector of logarithms, with their Gaussian prior around a nominal arm."""
 
     def __init__(self, nominal: HeatModel, free: Sequence[str] = tuple(PRIOR_SD)) -> None:
-        """Raise ValueError for a name that is not in `PRIOR_SD` or given twice, and for a nominal value of zero."""
         if not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
             raise ValueError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {tuple(free)}).")
         self.nominal = nominal
@@ -128,9 +129,10 @@ class ParameterVector:
         centre = [nominal.value(name) for name in free]
         if none := [name for name, values in zip(free, centre, strict=True) if not np.all(values > 0)]:
             raise ValueError(f"Free parameters must have nominal values > 0 (got 0 for {', '.join(none)}).")
+        of_joint = {name: np.repeat(sd, (LARGE, JOINTS - LARGE)) for name, sd in PRIOR_SD.items()}
         self.mean = np.log(np.concatenate(centre))
         """Prior mean of the logarithms, [parameter]."""
-        self.sd = np.concatenate([_sd(name, len(values)) for name, values in zip(free, centre, strict=True)])
+        self.sd = np.concatenate([of_joint[name][: len(values)] for name, values in zip(free, centre, strict=True)])
         """Prior standard deviation of the logarithms, [parameter]."""
         self.names = tuple(
             (name, joint if len(values) > 1 else None)
@@ -162,57 +164,29 @@ class ParameterVector:
 
         The same matrices as by `heat_model`, without a graph for each: the Laplacian is linear in the conductances.
         """
-        values = self.values(x)
+        values, joints = self.values(x), range(JOINTS)
         between = np.broadcast_to(values["neighbour_w_per_k"], (*x.shape[:-1], JOINTS - 1))
         to_air = 1.0 / values["housing_ambient_k_per_w"]
         conductance = np.concatenate([1.0 / values["winding_housing_k_per_w"], to_air, between], axis=-1)
         laplacian = np.einsum("...e,en,em->...nm", conductance, _INCIDENCE, _INCIDENCE)
         capacity = np.concatenate([values["winding_j_per_k"], values["housing_j_per_k"]], axis=-1)
-        direct = np.array([self._direct(j) for j in range(JOINTS)])
-        laplacian[..., range(JOINTS), range(JOINTS)] += direct
+        # From windings to ambient, 0 unless the arm is immersed: no parameter changes it.
+        edges = self.nominal.network.adj["ambient"]
+        direct = np.array([edges.get(winding(j), {"conductance_w_per_k": 0.0})["conductance_w_per_k"] for j in joints])
+        laplacian[..., joints, joints] += direct
         to_ambient = np.concatenate([np.broadcast_to(direct, to_air.shape), to_air], axis=-1)
         return modal_model(capacity, laplacian, to_ambient)
-
-    def _direct(self, joint: int) -> float:
-        """Conductance from a winding to ambient, which no parameter changes; 0 unless the arm is immersed."""
-        edge = (winding(joint), "ambient")
-        network = self.nominal.network
-        return float(network.edges[edge]["conductance_w_per_k"]) if network.has_edge(*edge) else 0.0
 
 
 _ROWS = np.eye(NODES)
 _INCIDENCE = np.concatenate([_ROWS[WINDING] - _ROWS[HOUSING], _ROWS[HOUSING], np.diff(_ROWS[HOUSING], axis=0)])
 """Ends of the edges winding–housing, housing–ambient and housing–housing, ±1, [edge, node]; ambient is no node."""
-
-
-def _sd(name: str, width: int) -> Array:
-    large, small = PRIOR_SD[name]
-    return np.array([large] * LARGE + [small] * (JOINTS - LARGE))[:width]
-
-
 HOUSING_SD_K = 10.0
 """Prior standard deviation of a housing from its winding at the start of a log."""
 FITTED = 6
 """Usual number of parameters per joint."""
 _NUDGE = 1e-4
 """Change of a logarithm in central differences; their error is of order 1e-8."""
-
-
-def heat(log: HeatLog, values: Mapping[str, Array], motors: Motors, winding_c: Array, housing_c: Array) -> Array:
-    """Heat per node over each step, W, [set, step, node].
-
-    Args:
-        values: Parameters by name, [set, joint].
-        winding_c: For the resistance, [step, joint].
-        housing_c: For the magnets, where the current comes from torque, [step, joint].
-    """
-    coulomb, viscous = values["coulomb_nm"], values["viscous_nms_per_rad"]
-    current_sq = log.current_sq(coulomb, viscous)
-    if log.source == "torque":
-        current_sq = current_sq / magnet_factor(housing_c, motors) ** 2
-    per_ohm = copper_loss(current_sq, winding_c, motors) / motors.copper_w_per_a2
-    winding_w = values["copper_w_per_a2"][:, None] * per_ohm
-    return node_heat(winding_w, values["idle_w"][:, None] + log.friction_w(coulomb, viscous))
 
 
 def linear_temperatures(dt_s: Array, model: ThermalModel, heat_w: Array, ambient_c: float, start_c: Array) -> Array:
@@ -237,13 +211,6 @@ def linear_temperatures(dt_s: Array, model: ThermalModel, heat_w: Array, ambient
     return np.moveaxis(z, 0, 1) @ np.swapaxes(left, -1, -2)
 
 
-def start_sensitivity(elapsed_s: Array, model: ThermalModel) -> Array:
-    """Derivative of each winding by each initial temperature of one network [1, ...], [time, joint, node]."""
-    left, right = (part[0] for part in _modal(model))
-    decay = np.exp(-np.outer(elapsed_s, model.rates[0]))
-    return (left[WINDING] * decay[:, None]) @ right.T
-
-
 def _modal(model: ThermalModel) -> tuple[Array, Array]:
     """Temperatures = left · modes and modes = rightᵀ · temperatures, each [..., node, mode]."""
     root = np.sqrt(model.capacity)[..., None]
@@ -252,7 +219,7 @@ def _modal(model: ThermalModel) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Residuals of a fit: their size and autocorrelation."""
+    """Size and autocorrelation of the residuals of a fit."""
 
     sd_k: Array
     """[joint]."""
@@ -346,8 +313,15 @@ class Problem:
         return [temp[:, WINDING] - log.temp_c for temp, log in zip(temps, self.logs, strict=True)]
 
     def _temperatures(self, i: int, model: ThermalModel, values: Mapping[str, Array], start: Array) -> Array:
-        log = self.logs[i]
-        heat_w = heat(log, values, self.vector.nominal.motors, self.winding_c[i], self.housing_c[i])
+        """Node temperatures of log i for sets of parameters, °C, [set, step + 1, node]."""
+        log, motors = self.logs[i], self.vector.nominal.motors
+        coulomb, viscous = values["coulomb_nm"], values["viscous_nms_per_rad"]
+        current_sq = log.current_sq(coulomb, viscous)
+        if log.source == "torque":
+            current_sq = current_sq / magnet_factor(self.housing_c[i], motors) ** 2
+        per_ohm = copper_loss(current_sq, self.winding_c[i], motors) / motors.copper_w_per_a2
+        winding_w = values["copper_w_per_a2"][:, None] * per_ohm
+        heat_w = node_heat(winding_w, values["idle_w"][:, None] + log.friction_w(coulomb, viscous))
         ambient_c = self.ambient_c + start[NODES:].sum()
         return linear_temperatures(log.dt_s, model, heat_w, ambient_c, start[:NODES])
 
@@ -357,7 +331,9 @@ class Problem:
 
     def _unknowns_in(self, i: int, model: ThermalModel, values: Mapping[str, Array]) -> _Unknowns:
         log = self.logs[i]
-        effect = start_sensitivity(log.time_s - log.time_s[0], model)
+        left, right = (part[0] for part in _modal(model))
+        decay = np.exp(-np.outer(log.time_s - log.time_s[0], model.rates[0]))
+        effect = (left[WINDING] * decay[:, None]) @ right.T  # of each start on each winding, [time, joint, node]
         if self.ambient_sd_k > 0:
             no_heat = np.zeros((1, len(log.dt_s), NODES))
             warmer = linear_temperatures(log.dt_s, model, no_heat, 1.0, np.zeros(NODES))[0, :, WINDING]
@@ -450,7 +426,7 @@ class Identified:
 
 
 def nominal_heat_model(cooling: Cooling = "still_air") -> HeatModel:
-    """A Gen3 by the project's defaults."""
+    """A Gen3 with the default parameters."""
     return HeatModel(gen3_motors(), gen3_network(cooling=cooling))
 
 
@@ -497,11 +473,11 @@ def identify(
     logs = [log for r in recordings for log in heat_logs(r, nominal.motors, source, step_s=step_s)]
     _check_logs(logs, nominal)
     vector = ParameterVector(nominal, free)
-    problem, x, jacobian = _fit(logs, ambient_c, sd_k, vector)
+    problem, x = _fit(logs, ambient_c, sd_k, vector)
     return Identified(
         arm=arm,
         heat_model=vector.heat_model(x),
-        parameters=_parameters(vector, x, jacobian),
+        parameters=_parameters(problem, x),
         ambient_c=ambient_c,
         ambient_sd_k=sd_k,
         source=source,
@@ -512,10 +488,8 @@ def identify(
     )
 
 
-def _fit(
-    logs: Sequence[HeatLog], ambient_c: float, sd_k: float, vector: ParameterVector
-) -> tuple[Problem, Array, Array]:
-    """The problem with the noise of its own residuals, its solution, and the Jacobian there."""
+def _fit(logs: Sequence[HeatLog], ambient_c: float, sd_k: float, vector: ParameterVector) -> tuple[Problem, Array]:
+    """The problem with the noise of its own residuals, and its solution."""
     steps = max(_FIRST_MEMORY_S / _step(logs), 1.0)
     problem = Problem(logs, ambient_c, sd_k, vector, Noise(np.full(JOINTS, _FIRST_SD_K), np.full(JOINTS, steps)))
     x = _solve(problem, vector.mean)
@@ -524,7 +498,7 @@ def _fit(
         problem = Problem(logs, ambient_c, sd_k, vector, noise)
         problem.housing_c = [(temp[1:, HOUSING] + temp[:-1, HOUSING]) / 2.0 for temp in temp_c]
         x = _solve(problem, x)
-    return problem, x, problem.jacobian(x)
+    return problem, x
 
 
 def _solve(problem: Problem, x: Array) -> Array:
@@ -537,7 +511,8 @@ def _step(logs: Sequence[HeatLog]) -> float:
     return float(np.median(np.concatenate([log.dt_s for log in logs])))
 
 
-def _parameters(vector: ParameterVector, x: Array, jacobian: Array) -> tuple[Parameter, ...]:
+def _parameters(problem: Problem, x: Array) -> tuple[Parameter, ...]:
+    vector, jacobian = problem.vector, problem.jacobian(x)
     sd = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     value, low, high = (np.exp(x + shift * sd) for shift in (0.0, -_SIGMA_95, _SIGMA_95))
     prior = np.exp(vector.mean)
@@ -570,8 +545,7 @@ def _hash(recordings: Sequence[Recording]) -> str:
 def _check_recordings(recordings: Sequence[Recording]) -> None:
     if not recordings:
         raise IdentificationError("Identification needs at least one recording (got none).")
-    names = [r.name for r in recordings]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    if twice := sorted(name for name, count in Counter(r.name for r in recordings).items() if count > 1):
         raise IdentificationError(f"Names of recordings must differ; given more than once: {', '.join(twice)}.")
     for recording in recordings:
         if recording.joints != JOINTS:
@@ -599,9 +573,9 @@ def _check_logs(logs: Sequence[HeatLog], nominal: HeatModel) -> None:
             "at least. Record the arm while it works after a rest, or hold a load outstretched for some minutes."
         )
     motors = nominal.motors
-    squares = [log.current_sq(motors.coulomb_nm, motors.viscous_nms_per_rad).max() for log in logs]
-    if np.sqrt(max(squares)) < LEAST_CURRENT_A:
+    most_a = np.sqrt(max(log.current_sq(motors.coulomb_nm, motors.viscous_nms_per_rad).max() for log in logs))
+    if most_a < LEAST_CURRENT_A:
         raise IdentificationError(
-            f"No motor carries more than {np.sqrt(max(squares)):.2f} A, so copper loss is unknown. Record the "
+            f"No motor carries more than {most_a:.2f} A, so copper loss is unknown. Record the "
             "powered arm while it moves, or holds a posture against gravity."
         )

@@ -36,7 +36,7 @@ AROUND_C = 50.0, 42.0
 ROUNDING_K = 0.5
 """Error of a peak that is accepted for fewer pieces."""
 _STARTS = 512
-"""Number of realistic starts by which pieces that never decide are found."""
+"""Number of realistic starts by which pieces that are never the maximum are dropped."""
 _LEVELS = np.array([0.003, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.997])
 """Probabilities at the knots of a curve."""
 BAND_K = 12.0
@@ -201,7 +201,7 @@ class RcTwin:
 
     @classmethod
     def nominal(cls, arm: str = "arm", *, ambient_c: float = AMBIENT_C, cooling: Cooling = "still_air") -> "RcTwin":
-        """A Gen3 by the project's defaults."""
+        """A Gen3 with the default parameters."""
         return cls(arm=arm, heat_model=nominal_heat_model(cooling), ambient_c=ambient_c, base="rc-nominal")
 
     @classmethod
@@ -212,7 +212,7 @@ class RcTwin:
 
     @property
     def version(self) -> str:
-        """Names parameters, ambient temperature and limit, and the curve if there is one."""
+        """Parameters, ambient temperature, limit, and the curve if there is one, as a name."""
         return f"{self.base}-{self.ambient_c:g}-{self.warning_c:g}" + (f"-{self.curve.name}" if self.curve else "")
 
     @property
@@ -233,8 +233,7 @@ class RcTwin:
     def likely_start(self, temp_c: Array) -> Array:
         """Node temperatures for measured motor temperatures, °C, [..., joint] to [..., node].
 
-        Housings have no sensor and are taken as warm as their windings: true after some minutes of rest, cautious right
-        after work.
+        Housings have no sensor and count as warm as their windings: true after minutes of rest, cautious after work.
         """
         return np.concatenate([temp_c, temp_c], axis=-1)
 
@@ -257,8 +256,13 @@ class RcTwin:
         Args:
             start_c: [node], or [plan, node]; `likely_start` makes it from measured temperatures.
         """
-        load, duration_s = self._mean_drive(plans, repetitions)
-        return self.simulate(load, duration_s, start_c)[..., WINDING].max(axis=0)
+        self._check(plans, repetitions)
+        square, friction = np.zeros((2, len(plans), JOINTS))
+        for i, (plan, times) in enumerate(zip(plans, repetitions, strict=True)):
+            share, phases = plan.weights(times), drives([phase.profile for phase in plan.phases], self.motors)
+            square[i], friction[i] = share @ phases.current_sq, share @ phases.friction_w
+        duration_s = [plan.duration_s(times) for plan, times in zip(plans, repetitions, strict=True)]
+        return self.simulate(Drive(square, friction), np.array(duration_s), start_c)[..., WINDING].max(axis=0)
 
     def simulate(self, load: Drive, duration_s: Array, start_c: Array) -> Array:
         """Node temperatures under constant drives [job, joint], °C, [step + 1, job, node].
@@ -292,12 +296,11 @@ class RcTwin:
         times, temps, now_s = [np.zeros(1)], [temp[None]], 0.0
         for phase, count in zip(plan.phases, (1, repetitions, 1), strict=True):
             lasts_s = phase.duration_s * count
-            if lasts_s == 0:
-                continue
-            part = self.simulate(drives([phase.profile], self.motors), np.array([lasts_s]), temps[-1][-1])[:, 0]
-            times.append(now_s + lasts_s * np.arange(1, len(part)) / (len(part) - 1))
-            temps.append(part[1:])
-            now_s += lasts_s
+            if lasts_s > 0:
+                part = self.simulate(drives([phase.profile], self.motors), np.array([lasts_s]), temps[-1][-1])[:, 0]
+                times.append(now_s + lasts_s * np.arange(1, len(part)) / (len(part) - 1))
+                temps.append(part[1:])
+                now_s += lasts_s
         return np.concatenate(times), np.concatenate(temps)[:, WINDING]
 
     def peak(self, plan: Plan, repetitions: int) -> Forecast:
@@ -308,11 +311,6 @@ class RcTwin:
             self._heat[plan] = LinearHeat.of(load, self.motors, self.thermal)
         lasts_s = plan.duration_s(repetitions) * plan.weights(repetitions)
         return peak_forecast(self._heat[plan], lasts_s, self.curve and np.array(self.curve.knots))
-
-    def peaks_from(self, plans: Sequence[Plan], repetitions: Iterable[int], known_c: Array) -> Array:
-        """Hottest motor during each job, °C, [plan], by `peak` from known temperatures [plan, KNOWN]."""
-        jobs = zip(plans, repetitions, known_c, strict=True)
-        return np.array([float(self.peak(plan, int(times)).value(known)) for plan, times, known in jobs])
 
     def with_past_jobs(
         self, plans: Sequence[Plan], repetitions: Iterable[int], *, known_c: Array, peak_c: Array
@@ -326,18 +324,9 @@ class RcTwin:
         Raises:
             NotEnoughExperience: too few jobs.
         """
-        predicted_c = self.peaks_from(plans, repetitions, known_c)
-        return replace(self, curve=fit_curve(predicted_c, peak_c, self.warning_c))
-
-    def _mean_drive(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> tuple[Drive, Array]:
-        """Mean drive of each job over its whole time, [job, joint], and its duration, s, [job]."""
-        self._check(plans, repetitions)
-        square, friction = np.zeros((2, len(plans), JOINTS))
-        for i, (plan, times) in enumerate(zip(plans, repetitions, strict=True)):
-            share, phases = plan.weights(times), drives([phase.profile for phase in plan.phases], self.motors)
-            square[i], friction[i] = share @ phases.current_sq, share @ phases.friction_w
-        duration_s = [plan.duration_s(times) for plan, times in zip(plans, repetitions, strict=True)]
-        return Drive(square, friction), np.array(duration_s, dtype=float)
+        jobs = zip(plans, repetitions, known_c, strict=True)
+        predicted_c = [float(self.peak(plan, int(times)).value(known)) for plan, times, known in jobs]
+        return replace(self, curve=fit_curve(np.array(predicted_c), peak_c, self.warning_c))
 
     def _check(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> None:
         check_jobs(plans, repetitions, least=0)

@@ -19,21 +19,12 @@ Array = np.ndarray
 
 _MOST = np.float32(7.9053111)
 """Beyond it, tanh rounds to one in the rational approximation."""
-_A = tuple(
-    map(
-        np.float32,
-        (
-            4.89352455891786e-03,
-            6.37261928875436e-04,
-            1.48572235717979e-05,
-            5.12229709037114e-08,
-            -8.60467152213735e-11,
-            2.00018790482477e-13,
-            -2.76076847742355e-16,
-        ),
-    )
+_ABOVE = (
+    *(4.89352455891786e-03, 6.37261928875436e-04, 1.48572235717979e-05, 5.12229709037114e-08),
+    *(-8.60467152213735e-11, 2.00018790482477e-13, -2.76076847742355e-16),
 )
-_B = tuple(map(np.float32, (4.89352518554385e-03, 2.26843463243900e-03, 1.18534705686654e-04, 1.19825839466702e-06)))
+_BELOW = (4.89352518554385e-03, 2.26843463243900e-03, 1.18534705686654e-04, 1.19825839466702e-06)
+_A, _B = (tuple(map(np.float32, each)) for each in (_ABOVE, _BELOW))
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
 
 
@@ -142,12 +133,12 @@ _CHUNK = 128
 def shapes(config: TwinConfig, channels: int) -> dict[str, tuple[int, ...]]:
     """Shapes of the parameters of one network."""
     hidden, latent = config.hidden, config.latent
-    found: dict[str, tuple[int, ...]] = {}
+    sizes: dict[str, tuple[int, ...]] = {}
     for lstm, size in (("encoder", channels), ("decoder", hidden)):
         for layer in range(config.layers):
-            found[f"{lstm}.weight_ih_l{layer}"] = 4 * hidden, hidden if layer else size
-            found[f"{lstm}.weight_hh_l{layer}"] = 4 * hidden, hidden
-            found[f"{lstm}.bias_ih_l{layer}"] = found[f"{lstm}.bias_hh_l{layer}"] = (4 * hidden,)
+            sizes[f"{lstm}.weight_ih_l{layer}"] = 4 * hidden, hidden if layer else size
+            sizes[f"{lstm}.weight_hh_l{layer}"] = 4 * hidden, hidden
+            sizes[f"{lstm}.bias_ih_l{layer}"] = sizes[f"{lstm}.bias_hh_l{layer}"] = (4 * hidden,)
     linear = {
         "summary": (hidden, hidden),
         "mu": (latent, hidden),
@@ -157,8 +148,8 @@ def shapes(config: TwinConfig, channels: int) -> dict[str, tuple[int, ...]]:
     if config.kind == "vae":
         linear["logvar"] = latent, hidden
     for name, (rows, columns) in linear.items():
-        found[f"{name}.weight"], found[f"{name}.bias"] = (rows, columns), (rows,)
-    return found
+        sizes[f"{name}.weight"], sizes[f"{name}.bias"] = (rows, columns), (rows,)
+    return sizes
 
 
 class Networks:
@@ -175,8 +166,26 @@ class Networks:
         self.summary, self.mu, self.expand, self.out = map(self._linear, ("summary", "mu", "expand", "out"))
         self.logvar = self._linear("logvar") if "logvar.weight" in nets[0] else None
 
-    def encode(self, z: Array) -> tuple[Array, Array]:
+    def posterior(self, z: Array) -> tuple[Array, Array]:
         """Posterior mean and standard deviation, [batch, net, latent], of windows [batch, time, joint, channel]."""
+        mu, sigma = _in_chunks(self._encode, z)
+        return mu, sigma
+
+    def decode(self, latent: Array, steps: int) -> Array:
+        """Windows decoded from latents [batch, net, latent], float32 [batch, time, joint, channel]."""
+        return _in_chunks(lambda part: (self._decode(part, steps),), np.asarray(latent, dtype=np.float32))[0]
+
+    def reconstruct(self, z: Array) -> tuple[Array, Array]:
+        """Windows [batch, time, joint, channel] decoded from their posterior means, float32, and these means."""
+
+        def both(part: Array) -> tuple[Array, Array]:
+            mu = self._encode(part)[0]
+            return self._decode(mu, z.shape[1]), mu
+
+        z_hat, mu = _in_chunks(both, z)
+        return z_hat, mu
+
+    def _encode(self, z: Array) -> tuple[Array, Array]:
         parts = z.reshape(*z.shape[:2], self.count, -1).transpose(1, 2, 3, 0)  # [time, net, channel, batch]
         summary = np.tanh(_affine(self._unroll(self.encoder, parts, z.shape[1])[-1], self.summary))
         mu = _affine(summary, self.mu)
@@ -186,8 +195,7 @@ class Networks:
             sigma = np.exp(0.5 * np.clip(_affine(summary, self.logvar), *LOGVAR_RANGE))
         return mu.transpose(2, 0, 1), sigma.transpose(2, 0, 1)
 
-    def decode(self, latent: Array, steps: int) -> Array:
-        """Windows decoded from latents [batch, net, latent], [batch, time, joint, channel]."""
+    def _decode(self, latent: Array, steps: int) -> Array:
         first = np.tanh(_affine(latent.transpose(1, 2, 0), self.expand))
         z = _affine(self._unroll(self.decoder, first, steps), self.out)  # [time, net, channel, batch]
         return z.transpose(3, 0, 1, 2).reshape(z.shape[3], steps, -1, len(CHANNELS))
@@ -240,31 +248,6 @@ class Networks:
 
 def _affine(x: Array, linear: Linear) -> Array:
     return np.matmul(linear[0], x) + linear[1]
-
-
-def posterior(networks: Networks, z: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation of the latent of windows [batch, time, joint, channel], [batch, net, latent]."""
-    mu, sigma = _in_chunks(networks.encode, z)
-    return mu, sigma
-
-
-def decode(networks: Networks, latent: Array, steps: int) -> Array:
-    """Windows decoded from latents [batch, net, latent], float32 [batch, time, joint, channel]."""
-    return _in_chunks(lambda part: (networks.decode(part, steps),), np.asarray(latent, dtype=np.float32))[0]
-
-
-def reconstruct(networks: Networks, z: Array) -> tuple[Array, Array]:
-    """Windows [batch, time, joint, channel] decoded from the means of their posteriors, float32, and these means.
-
-    The means are [batch, net, latent].
-    """
-
-    def both(part: Array) -> tuple[Array, Array]:
-        mu = networks.encode(part)[0]
-        return networks.decode(mu, z.shape[1]), mu
-
-    z_hat, mu = _in_chunks(both, z)
-    return z_hat, mu
 
 
 def _in_chunks(function: Callable[[Array], tuple[Array, ...]], values: Array) -> list[Array]:

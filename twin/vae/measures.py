@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 
 from fleet.difficulty import difficulty_of_error
-from fleet.errors import nearest
 from fleet.motion import CHANNELS
 
 Array = np.ndarray
@@ -208,12 +207,7 @@ class Calibration:
         Args:
             weight: w_k of the joints, [joint].
             reading: One of `READINGS`.
-
-        Raises:
-            ValueError: another reading.
         """
-        if reading not in READINGS:
-            raise ValueError(f"No reading '{reading}'{nearest(reading, READINGS)}")
         reference, scores = (READINGS[reading](each, self) @ weight for each in (self.reference, features))
         return largest_p_value(reference, self.group, scores - TIE * np.abs(scores))
 
@@ -273,24 +267,19 @@ class Measures:
 
     def of_job(self, i: int) -> "Measures":
         """The measures of one of many jobs."""
-        if self.difficulty.ndim < 2:
-            raise ValueError("These are the measures of one job.")
         per_job = {name: v[i] for name, v in vars(self).items() if isinstance(v, np.ndarray) and name != "weight"}
         return replace(self, **per_job)
 
     def why(self, most: int = 2) -> str:
-        """The largest causes as text, `joint 2: more load (61 %), joint 4: a new place (20 %)`."""
-        if self.shares.ndim != 2:
-            raise ValueError("Ask for the reasons of one job: measures.of_job(i).why().")
+        """The largest causes of one job as text, `joint 2: more load (61 %), joint 4: a new place (20 %)`."""
         order = np.argsort(-self.shares, axis=None, kind="stable")[:most]
         places = [divmod(int(flat), len(CHANNELS)) for flat in order if self.shares.flat[flat] > 0]
         causes = [f"joint {j + 1}: {self._cause(j, c)} ({100 * self.shares[j, c]:.0f} %)" for j, c in places]
         return ", ".join(causes) or "nothing beyond the usual"
 
     def _cause(self, joint: int, channel: int) -> str:
-        if channel == TAU:
-            return "more load" if self.heavier[joint] else "another load"
-        return ("a new place", "a new speed")[channel]
+        torque = "more load" if self.heavier[joint] else "another load"
+        return ("a new place", "a new speed", torque)[channel]
 
 
 def measures_of(features: Features, calibration: Calibration | None, *, weight: Array, version: str) -> Measures:

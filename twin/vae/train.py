@@ -34,19 +34,12 @@ from twin.vae.twin import Fit, Twin, net_names
 from twin.vae.window import Scaler, draw_windows, windows_of
 
 
-@dataclass(eq=False)
 class _Memory:
     """Arrays of one layer that the gradient needs, kept from step to step."""
 
-    steps: int
-    nets: int
-    inputs: int
-    hidden: int
-    batch: int
-
-    def __post_init__(self) -> None:
-        steps, nets, hidden, batch = self.steps, self.nets, self.hidden, self.batch
-        self.states = torch.zeros(steps + 1, nets, self.inputs + hidden, batch)
+    def __init__(self, steps: int, nets: int, inputs: int, hidden: int, batch: int) -> None:
+        self.steps, self.nets, self.inputs, self.batch = steps, nets, inputs, batch
+        self.states = torch.zeros(steps + 1, nets, inputs + hidden, batch)
         """Inputs of a step and hidden states before it: what the weights multiply."""
         self.cells = torch.zeros(steps + 1, nets, hidden, batch)
         self.gates = torch.empty(steps, nets, 4 * hidden, batch)
@@ -165,7 +158,7 @@ class SideBySide:
 
     def _lstm(self, name: str, x: Tensor, steps: int, *, last: bool = False) -> Tensor:
         """Hidden states of the highest layer; x is [time, net, size, batch], or [net, size, batch] at every step."""
-        hidden, layers = self.config.hidden, self.config.layers
+        layers = self.config.layers
         for layer in range(layers):
             of_input, recurrent, bias, bias_hh = (
                 self.weights[f"{name}.{kind}_l{layer}"] for kind in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
@@ -176,16 +169,13 @@ class SideBySide:
                 driven, weight = driven + torch.bmm(of_input, x), recurrent
             else:
                 weight = torch.cat([of_input, recurrent], dim=2)
-            memory = self._memory_of(name, layer, steps, len(bias), 0 if constant else x.shape[2], hidden, x.shape[-1])
-            x = _Lstm.apply(None if constant else x, driven, weight, memory, last and layer == layers - 1)
+            key = name, layer, x.shape[-1]
+            if key not in self._memory:
+                sizes = len(bias), 0 if constant else x.shape[2], self.config.hidden, x.shape[-1]
+                self._memory[key] = _Memory(steps, *sizes)
+            last_layer = layer == layers - 1
+            x = _Lstm.apply(None if constant else x, driven, weight, self._memory[key], last and last_layer)
         return x
-
-    def _memory_of(self, name: str, layer: int, steps: int, *sizes: int) -> _Memory:
-        nets, inputs, hidden, batch = sizes
-        key = name, layer, batch
-        if key not in self._memory:
-            self._memory[key] = _Memory(steps, nets, inputs, hidden, batch)
-        return self._memory[key]
 
 
 class Run:
@@ -339,7 +329,6 @@ def train(
     seed: np.random.SeedSequence,
     *,
     arm: str,
-    data_hash: str | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Twin:
     """A twin trained on motion of an arm that stayed cool for the whole horizon.
@@ -349,7 +338,6 @@ def train(
     Args:
         records: Profiles [time, 3, joint] at `config.record_hz`. The phases of a plan, given one by one, are cut and
             padded as they will be when scored.
-        data_hash: Name of the data in the checkpoint; by default the hash of the records.
         progress: Called with the share done, 0 to 1, after every epoch.
 
     Raises:
@@ -376,8 +364,8 @@ def train(
     still = [bool(part.all()) for part in np.split(scaler.still, len(names))]
     checked = [_checked(*each, arm, config) for each in zip(names, results, still, strict=True)]
     fits, nets = zip(*checked, strict=True)
-    data = hash_records(records) if data_hash is None else data_hash
-    return Twin(config, scaler, list(nets), arm=arm, data_hash=data, seed=seed_text(seed), fits=fits)
+    about = {"arm": arm, "data_hash": hash_records(records), "seed": seed_text(seed)}
+    return Twin(config, scaler, list(nets), fits=fits, **about)
 
 
 def _checked(

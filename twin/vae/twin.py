@@ -19,9 +19,8 @@ from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.motion import CHANNELS, Plan
 from fleet.robot import JOINTS
-from twin.vae import inference
 from twin.vae.config import TwinConfig
-from twin.vae.inference import shapes
+from twin.vae.inference import Networks, Weights, shapes
 from twin.vae.json_file import check_version, read_card, write_card
 from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, latent_moments, measures_of, moments
 from twin.vae.window import PHASES, PlanCache, Scaler, check_jobs, cut_phases
@@ -60,7 +59,7 @@ class Twin:
 
     config: TwinConfig
     scaler: Scaler
-    nets: Sequence[inference.Weights]
+    nets: Sequence[Weights]
     """Weights of the networks, one per joint or one for the arm."""
     _: KW_ONLY
     arm: str
@@ -81,8 +80,8 @@ class Twin:
                 f"A twin of scope '{self.config.scope}' for {self.joints} joints needs {wanted} network(s) and fits "
                 f"(got {len(self.nets)} and {len(self.fits)})."
             )
-        if self.calibration is not None and self.calibration.reference.packed.shape[1] != self.joints:
-            joints = self.calibration.reference.packed.shape[1]
+        joints = self.joints if self.calibration is None else self.calibration.reference.packed.shape[1]
+        if joints != self.joints:
             raise ValueError(f"The calibration is for {joints} joints, the twin has {self.joints}.")
 
     def __getstate__(self) -> dict[str, object]:
@@ -99,9 +98,9 @@ class Twin:
         return heat_weights(self.scaler.mean[:, TAU] ** 2 + self.scaler.std[:, TAU] ** 2)
 
     @cached_property
-    def networks(self) -> inference.Networks:
+    def networks(self) -> Networks:
         """The networks as one."""
-        return inference.Networks(self.nets)
+        return Networks(self.nets)
 
     @property
     def version(self) -> str:
@@ -194,18 +193,18 @@ class Twin:
 
     def posterior(self, windows: Array) -> tuple[Array, Array]:
         """Mean and standard deviation of the latent of windows in SI units, each [batch, net, latent]."""
-        return inference.posterior(self.networks, self._to_z(windows))
+        return self.networks.posterior(self._to_z(windows))
 
     def decode(self, latent: Array) -> Array:
         """Decoded latents [batch, net, latent], SI units, [batch, time, joint, channel]."""
         wanted = (len(self.nets), self.config.latent)
         if latent.ndim != 3 or latent.shape[1:] != wanted:
             raise ValueError(f"Latents must be [batch, {wanted[0]}, {wanted[1]}] (got {latent.shape}).")
-        return self.scaler.to_si(inference.decode(self.networks, latent, self.config.window))
+        return self.scaler.to_si(self.networks.decode(latent, self.config.window))
 
     def reconstruct(self, windows: Array) -> Array:
         """Reconstructed windows, SI units, [batch, time, joint, channel]; angles near the training data."""
-        return self.scaler.to_si(inference.reconstruct(self.networks, self._to_z(windows))[0])
+        return self.scaler.to_si(self.networks.reconstruct(self._to_z(windows))[0])
 
     def _to_z(self, windows: Array) -> Array:
         wanted = (self.config.window, self.joints, len(CHANNELS))
@@ -231,7 +230,7 @@ class Twin:
 
     def _window_features(self, z: Array, weights: Array) -> Array:
         """Packed features of windows in z-scores, summed over time with weights [batch, time], [batch, joint, part]."""
-        z_hat, mu = inference.reconstruct(self.networks, z)
+        z_hat, mu = self.networks.reconstruct(z)
         std = self.scaler.std[:, TAU]
         offset = (self.scaler.mean[:, TAU] / std).astype(np.float32)
         size, size_hat = np.abs(z[..., TAU] + offset), np.abs(z_hat[..., TAU] + offset)
@@ -263,7 +262,7 @@ REFERENCE, GROUP = "calibration.reference", "calibration.group"
 without a calibration."""
 
 
-class _Card(msgspec.Struct, forbid_unknown_fields=True):
+class TwinCard(msgspec.Struct, forbid_unknown_fields=True):
     """The content of `twin.json`; the names are those of `Twin` and `Scaler`."""
 
     format: int
@@ -295,7 +294,7 @@ def save(twin: Twin, folder: Path) -> None:
     shared = {name: getattr(twin, name) for name in _SHARED}
     scaler = {name: values.tolist() for name, values in vars(twin.scaler).items()}
     calibrated = twin.calibration is not None
-    write_card(_Card(format=FORMAT, version=twin.version, calibrated=calibrated, **shared, **scaler), folder / CARD)
+    write_card(TwinCard(format=FORMAT, version=twin.version, calibrated=calibrated, **shared, **scaler), folder / CARD)
 
 
 def load(folder: Path, *, joints: int = JOINTS) -> Twin:
@@ -305,7 +304,7 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
         CheckpointError: a file is missing or damaged, of another format, for another number of joints, lacks
             tensors, or is not what was saved.
     """
-    card = read_card(folder / CARD, _Card, format_=FORMAT, what="twin")
+    card = read_card(folder / CARD, TwinCard, format_=FORMAT, what="twin")
     if len(card.turn_q) != joints:
         raise CheckpointError(f"{folder / CARD}: the twin has {len(card.turn_q)} joints, the arm has {joints}.")
     scaler = Scaler(*(np.array(getattr(card, field.name)) for field in fields(Scaler)))

@@ -92,10 +92,11 @@ def windows_of(records: Sequence[Array], config: TwinConfig) -> Array:
     Raises:
         ValueError: no record, a record of another shape, or one that is not finite.
     """
-    checked = [check_profile(record, f"Record {i}") for i, record in enumerate(records)]
+    for i, record in enumerate(records):
+        check_profile(record, f"Record {i}")
     parts = [
         cut(resample(record, config.record_hz, config.rate_hz), config.window, config.stride)
-        for record in checked
+        for record in records
         if len(record)
     ]
     if not parts:
@@ -112,14 +113,13 @@ def draw_windows(windows: Array, most: int, seed: np.random.SeedSequence) -> Arr
     return windows[np.sort(np.random.default_rng(seed).choice(len(windows), most, replace=False))]
 
 
-def check_profile(profile: Array, name: str) -> Array:
-    """The profile itself if it is finite and [time, 3, joint]; `name` is its name in the error."""
+def check_profile(profile: Array, name: str) -> None:
+    """Raise ValueError unless the profile, of this name in the error, is finite and [time, 3, joint]."""
     if profile.ndim != 3 or profile.shape[1] != len(CHANNELS):
         raise ValueError(f"{name} must be [time, 3, joint] (got shape {profile.shape}).")
     if not np.isfinite(profile).all():
         time, channel, joint = np.argwhere(~np.isfinite(profile))[0]
         raise ValueError(f"{name} is not finite: {CHANNELS[channel]} of joint {joint + 1} at sample {time}.")
-    return profile
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,18 +155,15 @@ def cut_phases(plans: Sequence[Plan], config: TwinConfig) -> JobWindows:
     parts, weights, owners = [], [], []
     for plan in plans:
         for name, phase in zip(PHASES, plan.phases, strict=True):
-            profile = check_profile(_one_window(phase.profile, config), f"{name.capitalize()} of arm '{plan.arm}'")
+            profile = phase.profile
+            if len(distinct(profile)) < len(profile):  # all windows of a standstill are equal: one is enough
+                profile = profile[: int(np.ceil(config.window * RATE_HZ / config.rate_hz))]
+            check_profile(profile, f"{name.capitalize()} of arm '{plan.arm}'")
             samples = resample(profile, RATE_HZ, config.rate_hz)
             parts.append(cut(samples, config.window, config.score_stride))
             weights.append(cover(len(samples), config.window, config.score_stride))
             owners.append(np.full(len(parts[-1]), len(owners)))
     return JobWindows(np.concatenate(parts), np.concatenate(weights), np.concatenate(owners), len(owners))
-
-
-def _one_window(profile: Array, config: TwinConfig) -> Array:
-    """The samples of one window of a standstill that is stored once: all its windows are equal."""
-    count = int(np.ceil(config.window * RATE_HZ / config.rate_hz))
-    return profile[:count] if len(distinct(profile)) < len(profile) else profile
 
 
 def cut_jobs(plans: Sequence[Plan], repetitions: Sequence[int], config: TwinConfig) -> JobWindows:
@@ -183,11 +180,8 @@ def cut_jobs(plans: Sequence[Plan], repetitions: Sequence[int], config: TwinConf
 
 
 def check_jobs(plans: Sequence[Plan], repetitions: Sequence[int], *, least: int = 1) -> None:
-    """Refuse jobs that have no time mean.
-
-    Raises:
-        ValueError: fewer than `least` jobs, unequal numbers of plans and repetitions, repetitions < 1, or a plan
-            without motion.
+    """Raise ValueError for fewer than `least` jobs, unequal numbers of plans and repetitions, repetitions < 1, or a
+    plan without motion.
     """
     if len(plans) < least:
         raise ValueError("There is no job to score.")
