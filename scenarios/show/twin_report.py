@@ -421,12 +421,10 @@ def epoch_study(
         and of each test window the sum over the channels, [seed, epochs, window, joint].
 
     Raises:
-        ValueError: too few jobs, or no epochs or seeds.
+        ValueError: too few jobs.
     """
     if records < 1 or len(jobs) < 2 * records:
         raise ValueError(f"The epoch table needs {2 * max(records, 1)} cool jobs or more (got {len(jobs)}).")
-    if not epochs or not seeds or min(epochs) < 0:
-        raise ValueError(f"The epoch table needs seeds, and epochs >= 0 (got {seeds!r}, {epochs!r}).")
     base = replace(config, restarts=1, allow_collapse=True)
     # Longest first, so that no core ends with a long training alone.
     tasks = sorted(product(range(len(seeds)), range(len(epochs))), key=lambda task: -epochs[task[1]])
@@ -601,7 +599,7 @@ def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Section:
 def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     """Reconstruction error against epochs, and how well the error then tells hot from cool."""
     s = subjects[0]
-    upto = slice(s.joint + 1)  # Further joints would only take time: each has a network of its own.
+    upto = slice(s.joint + 1)  # Each joint has its own network: further ones would only take time.
     jobs = [[phase[:, :, upto] for phase in job] for job in s.cool_jobs]
     few = _few(s.window_hot, size.windows // 4)
     windows, hot, seeds = s.windows[few], s.window_hot[few], tuple(range(size.epoch_seeds))
@@ -724,34 +722,32 @@ def _charts(
         shared: Give the panels of a row the same y axis.
         height: Pixels; by default by the number of rows.
     """
+    from plotly.subplots import make_subplots
+
     rows, columns = (1 + max(place[axis] for place in cells) for axis in (0, 1))
-    layout: dict[str, Any] = LAYOUT | {
-        "grid": {"rows": rows, "columns": columns, "pattern": "independent", "xgap": 0.12, "ygap": 0.16},
-        "height": height or 150 + 170 * rows,
-        "margin": {"l": 60, "r": 20, "t": 80, "b": 50},
-        "boxmode": "group",
-        "legend": {"orientation": "h", "x": 0, "y": 1, "yref": "container", "yanchor": "top"},
-        "annotations": [],
-    }
-    data, named = list[dict[str, Any]](), set[str]()
+    sharing = {"shared_yaxes": shared, "horizontal_spacing": 0.06, "vertical_spacing": 0.3 / (rows + 1)}
+    figure = make_subplots(rows, columns, subplot_titles=heads, **sharing)
+    named = set[str]()
     for (row, column), traces in sorted(cells.items()):
-        n = row * columns + column + 1
-        number = "" if n == 1 else str(n)
-        layout[f"xaxis{number}"] = AXIS | {"title": {"text": x if row == rows - 1 else ""}}
-        if any(isinstance(value, str) for trace in traces for value in trace["x"][:1]):
-            layout[f"xaxis{number}"]["type"] = "category"
-        layout[f"yaxis{number}"] = AXIS | {"title": {"text": "" if column else y[row]}}
-        if shared and column:
-            layout[f"yaxis{number}"]["matches"] = f"y{n - column}" if n - column > 1 else "y"
-        if row == 0:
-            place = {"xref": f"x{number} domain", "yref": f"y{number} domain", "x": 0, "y": 1.02, "yanchor": "bottom"}
-            layout["annotations"].append({"text": heads[column], "showarrow": False, "xanchor": "left", **place})
         for trace in traces:
-            axes = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
-            data.append(trace | axes | {"showlegend": trace["name"] not in named})
+            own = {"legendgroup": trace["name"], "showlegend": trace["name"] not in named}
+            figure.add_trace(trace | own, row + 1, column + 1)
             named.add(trace["name"])
+    figure.update_layout(
+        LAYOUT,
+        height=height or 150 + 170 * rows,
+        margin={"l": 60, "r": 20, "t": 80, "b": 50},
+        boxmode="group",
+        legend={"orientation": "h", "x": 0, "y": 1, "yref": "container", "yanchor": "top"},
+    )
+    figure.update_annotations(font_size=12)
+    figure.update_xaxes(AXIS, type="category" if x == "epochs" else "-")
+    figure.update_yaxes(AXIS)
+    figure.update_xaxes(title_text=x, row=rows)
+    for row, title in enumerate(y):
+        figure.update_yaxes(title_text=title, row=row + 1, col=1)
     alt = f"{', '.join(y)} by {x or 'joint'}: {', '.join(filter(None, heads)) or 'cool and hot'}"
-    return (Chart(key=f"chart_{key}", figure={"data": data, "layout": layout}, alt=alt),)
+    return (Chart(key=f"chart_{key}", figure=figure.to_plotly_json(), alt=alt),)
 
 
 # The report.

@@ -1,8 +1,9 @@
 """The page of a twin report: its numbers on small inputs, what it says of missing data, and the documented commands."""
 
 import json
+import re
 from dataclasses import replace
-from html.parser import HTMLParser
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -57,21 +58,9 @@ def chapters(subject):
     return {each.key: each for each in report.chapters_of([subject], SMALL)}
 
 
-class Page(HTMLParser):
-    """Sections, addresses and text of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.sections, self.outside, self.words = list[str](), list[str](), ""
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        if tag == "section":
-            self.sections.append(str(dict(attrs)["id"]))
-        self.outside += [v for k, v in attrs if k in ("src", "href") and not str(v).startswith(("data:", "#"))]
-
-    def handle_data(self, data):
-        self.words += data
+def words_of(page: str) -> str:
+    """The text of a page, without its tags."""
+    return unescape(re.sub(r"<[^>]*>", "", page))
 
 
 def test_an_example_is_usual_in_every_channel():
@@ -174,12 +163,11 @@ def test_the_page_holds_every_chapter_in_the_order_of_the_paper(chapters, subjec
     origin = report.origin_of([subject]) | {"command": "thermofleet twin report <x>"}
     card = report.write(list(chapters.values()), origin, tmp_path, "The twin & more")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    page = Page(text)
     order = ["data", "latent", "reconstruction", "difficulty", "epochs", "generation"]
-    assert page.sections == list(chapters) == order
-    assert page.outside == []
+    assert re.findall(r'<section id="(\w+)"', text) == list(chapters) == order
+    assert not re.search(r'(?:src|href)="(?!data:|#)', text)
     for words in ("The twin & more", "twin report <x>", subject.twin.version, "untrained", "RMS torque"):
-        assert words in page.words
+        assert words in words_of(text)
     assert text == report.report_page("The twin & more", list(chapters.values()), origin)
     stored = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert stored["failed"] == card["failed"] == {}
@@ -194,9 +182,9 @@ def test_a_chapter_that_fails_leaves_its_reason_and_the_others(subject):
     failed = {each.key: each.failed for each in chapters if each.failed}
     assert set(failed) == {"data", "reconstruction", "difficulty"}
     assert "0 of 6 recordings or jobs get hot" in str(failed["data"])
-    page = Page(report.report_page("Title", chapters, {}))
-    assert "3 of 6 sections could not be computed: Training data" in page.words
-    assert page.words.count("Not computed: ") == 3
+    words = words_of(report.report_page("Title", chapters, {}))
+    assert "3 of 6 sections could not be computed: Training data" in words
+    assert words.count("Not computed: ") == 3
 
 
 def test_logs_that_cannot_be_studied_say_why(tmp_path):
@@ -258,11 +246,9 @@ def test_workers_do_not_change_the_error_by_epochs(waves):
         np.testing.assert_array_equal(a, b)
 
 
-def test_too_few_jobs_or_no_epochs_are_refused(waves):
+def test_too_few_jobs_are_refused(waves):
     with pytest.raises(ValueError, match="needs 10 cool jobs or more"):
         report.epoch_study(waves, np.zeros((5, 12, 2, 3)), **SHORT | {"records": 5})
-    with pytest.raises(ValueError, match="needs seeds, and epochs"):
-        report.epoch_study(waves, np.zeros((5, 12, 2, 3)), **SHORT | {"epochs": ()})
 
 
 @pytest.mark.slow
