@@ -1,20 +1,18 @@
-"""The auction algorithm: arms bid for jobs by price; the total is within a bound of the best assignment.
+"""Auctions of jobs: by price with a central auctioneer, and by consensus of the arms without one.
 
-In a round every arm without a job bids for the job with the largest profit, benefit less price. It raises the price by
-its profit over that of its second choice, plus ε, so that the job still is within ε of its best choice. An arm without
-a profit leaves. At the end every arm is within ε of its best choice and no job without an arm has a price, therefore
-the total benefit of n arms is within n · ε of the optimum.
+In a round of the auction algorithm every arm without a job bids for the job with the largest profit, benefit less
+price. It raises the price by its profit over that of its second choice, plus ε, so that the job still is within ε of
+its best choice. An arm without a profit leaves. At the end every arm is within ε of its best choice and no job without
+an arm has a price, therefore the total benefit of n arms is within n · ε of the optimum.
 
 Source: Bertsekas, The Auction Algorithm: A Distributed Relaxation Method for the Assignment Problem, Annals of
 Operations Research 14, 1988; all arms without a job bid at once (Jacobi version).
 
-The consensus-based auction algorithm for one job per arm: arms bid, and forward the best bids they received.
-
-In a round every arm without a job bids for its cheapest job among those where it beats the best bid it knows. Then it
-adopts, for every job, the best bid of its own and its neighbours' beliefs, and loses its job if that bid is another
-arm's. After at most (diameter × the smaller number of arms and jobs) rounds all connected arms agree, and no job has
-two winners. The outcome is that of the greedy choice of the cheapest pair by a central auctioneer. Each component of a
-disconnected graph agrees separately.
+In a round of the consensus-based auction algorithm for one job per arm every arm without a job bids for its cheapest
+job among those where it beats the best bid it knows. Then it adopts, for every job, the best bid of its own and its
+neighbours' beliefs, and loses its job if that bid is another arm's. After at most (diameter × the smaller number of
+arms and jobs) rounds all connected arms agree, and no job has two winners. The outcome is that of the greedy choice of
+the cheapest pair by a central auctioneer. Each component of a disconnected graph agrees separately.
 
 Source: Choi, Brunet & How (2009), Consensus-Based Decentralized Auctions for Robust Task Allocation, IEEE T-RO 25(4),
 algorithms 1 and 2 and theorem 1; here a bid is a cost, and the lower one wins.

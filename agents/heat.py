@@ -1,13 +1,12 @@
-"""Reactive thermal control as a wrapper of any policy: a torque limiter, a thermal switch and a fuzzy speed control.
+"""Guards that wrap any policy, and rules that weigh value per time against heat.
 
-Both react to measured temperatures, and need neither a twin nor a thermal model. On a real arm they act on torque and
-speed within a motion. An allocation policy has no such command, so they act by what the environment allows: they close
-claims, leave only the cooler of the two plans of a job, and give the current job back after its cycle. The wrapped
-policy chooses among the claims that are left.
+Guards (a torque limiter, a thermal switch, a fuzzy speed control) react to measured temperatures, and need neither a
+twin nor a thermal model. On a real arm they act on torque and speed within a motion. An allocation policy has no such
+command, so they act by what the environment allows: they close claims, leave only the cooler of the two plans of a job,
+and give the current job back after its cycle. The wrapped policy chooses among the claims that are left.
 
-Rules that consider heat and value: one by measured temperatures, the others by predicted peak temperatures.
-
-All take the jobs with the most value per time. Warning and error limit follow from the observed headrooms.
+The rule `thermometer` reads measured temperatures, the `wsept` rules read predicted peak temperatures. Warning and
+error limit follow from the observed headrooms.
 """
 
 from collections.abc import Callable, Mapping, Sequence

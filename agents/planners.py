@@ -1,22 +1,22 @@
-"""Model predictive control: search repeatedly for the best schedule of the open jobs, in a simulator of the cell.
+"""Policies that plan ahead: model predictive control in a simulator of the cell, and a rolling horizon.
 
-When an arm may claim a job, and a job is new in the slots or the last search is `every_s` old, the policy searches for
-a schedule of all jobs in the slots: which arm does which job, by which plan, when. The worth of a schedule is its
-simulated reward until the end of the shift; what comes a time t later counts exp(−t / `tau_s`), because jobs that
-arrive later will need the arms too. The search begins at the last schedule and tries each new job at the beginning, in
-the middle and at the end of the order, by every plan; then it tries random changes (large neighbourhood search). In
-between the arms follow the schedule.
+Model predictive control (`Mpc`) searches repeatedly for the best schedule of the open jobs. When an arm may claim a
+job, and a job is new in the slots or the last search is `every_s` old, the policy searches for a schedule of all jobs
+in the slots: which arm does which job, by which plan, when. The worth of a schedule is its simulated reward until the
+end of the shift; what comes a time t later counts exp(−t / `tau_s`), because jobs that arrive later will need the arms
+too. The search begins at the last schedule and tries each new job at the beginning, in the middle and at the end of the
+order, by every plan; then it tries random changes (large neighbourhood search). In between the arms follow the
+schedule.
 
 The simulator knows what a dispatcher of the cell knows, see `fleet.env.lookahead`: no job that has no slot yet, no
 true temperature, no thermal network but that which the arms know.
 
 Sources: Mayne et al., Automatica 36, 2000 (model predictive control); Shaw, CP 1998 (large neighbourhood search).
 
-Rolling horizon: the best sequences of jobs for all arms within the next hour, planned anew at every decision.
-
-Each arm, also a busy one from the moment it is home, gets a sequence of at most two plans for open jobs, each job in at
-most one sequence. The program chooses among the enumerated sequences (set packing, a mixed-integer program, solved by
-HiGHS within a time limit). A sequence earns, for each of its jobs,
+The rolling horizon (`RollingHorizon`) plans the next hour anew at every decision. Each arm, also a busy one from the
+moment it is home, gets a sequence of at most two plans for open jobs, each job in at most one sequence. The program
+chooses among the enumerated sequences (set packing, a mixed-integer program, solved by HiGHS within a time limit). A
+sequence earns, for each of its jobs,
 
 - the expected worth of `wsept`, discounted until the finish by exp(−time / 30 min): jobs that arrive later need the
   arm too, so time has a price, without which plans wait for ever cooler arms, and

@@ -46,7 +46,7 @@ class Option:
 
     @property
     def limits(self) -> str:
-        """The bounds in words."""
+        """The bounds as text."""
         if self.above:
             return f"> {self.low:.10g} and at most {self.high:.10g}"
         return f"{self.low:.10g} to {self.high:.10g}"

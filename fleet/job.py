@@ -43,7 +43,7 @@ def reason_to_give_up(arms: Iterable[str]) -> str:
     return f"Given up, because arms faulted in it: {by}."
 
 
-class Bounds(NamedTuple):
+class NumberRange(NamedTuple):
     """Smallest and largest allowed value of a number."""
 
     low: float
@@ -54,16 +54,16 @@ class Bounds(NamedTuple):
         return f"between {self.low:.15g} and {self.high:.15g} {self.unit}".rstrip()
 
 
-BOUNDS: Mapping[str, Bounds] = {
-    "payload_kg": Bounds(0.0, 10.0, "kg"),
-    "force_n": Bounds(0.0, 200.0, "N"),
-    "dwell_s": Bounds(0.02, 3600.0, "s"),  # from one sample of a plan; see also `check_dwell`
-    "repetitions": Bounds(1, 100_000),
-    "release_s": Bounds(0.0, 1e9, "s"),
-    "due_s": Bounds(0.0, 1e9, "s"),
-    "value": Bounds(0.0, 1e6),
-    "retreat_m": Bounds(0.0, 1.0, "m"),
-    "tool_deg": Bounds(-360.0, 360.0, "deg"),
+BOUNDS: Mapping[str, NumberRange] = {
+    "payload_kg": NumberRange(0.0, 10.0, "kg"),
+    "force_n": NumberRange(0.0, 200.0, "N"),
+    "dwell_s": NumberRange(0.02, 3600.0, "s"),  # from one sample of a plan; see also `check_dwell`
+    "repetitions": NumberRange(1, 100_000),
+    "release_s": NumberRange(0.0, 1e9, "s"),
+    "due_s": NumberRange(0.0, 1e9, "s"),
+    "value": NumberRange(0.0, 1e6),
+    "retreat_m": NumberRange(0.0, 1.0, "m"),
+    "tool_deg": NumberRange(-360.0, 360.0, "deg"),
 }
 """Bounds of every number of a job and a place, in scenarios, on the bus and in Python."""
 

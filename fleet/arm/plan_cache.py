@@ -50,7 +50,7 @@ LoadedPlans = dict[Path, tuple[Plan, ...] | InfeasibleJob]
 class CachedPlanner:
     """A `fleet.arm.planner.Planner` with the same arguments that computes each set of plans once.
 
-    Like arms have the same plans (`fleet.arm.kinematics`).
+    Like arms have the same plans (`fleet.arm.own_frame`).
     """
 
     def __init__(

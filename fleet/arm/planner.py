@@ -9,7 +9,7 @@ import numpy as np
 from fleet.arm.gen3 import ELBOW_ANGLES_DEG
 from fleet.arm.kinematics import InverseKinematics, Pose, Unreachable
 from fleet.arm.model import ArmModel
-from fleet.arm.task_phases import Segment, Stop, TaskPhases, task_phases
+from fleet.arm.task_phases import Segment, TaskPhases, TaskStop, task_phases
 from fleet.arm.time_limit import check_time
 from fleet.arm.trajectory import CollisionChecker, LoadedMotion, build_phase, move, rest
 from fleet.errors import InfeasibleJob
@@ -64,13 +64,13 @@ class Planner:
                 the variant that came furthest.
         """
         phases = task_phases(work)
-        variants: list[tuple[dict[Stop, Array], list[Plan]]] = []
+        variants: list[tuple[dict[TaskStop, Array], list[Plan]]] = []
         failures: list[tuple[int, InfeasibleJob]] = []
         for elbow_deg in ELBOW_ANGLES_DEG:
             if len(variants) == self.elbows:
                 break
             check_time()
-            postures: dict[Stop, Array] = {}
+            postures: dict[TaskStop, Array] = {}
             try:
                 self._solve(phases, elbow_deg, postures)
             except InfeasibleJob as failure:
@@ -99,7 +99,7 @@ class Planner:
         by_duration = sorted((plans for _, plans in variants), key=lambda plans: plans[0].duration_s(1))
         return tuple(replace(plan, elbow=elbow) for elbow, plans in enumerate(by_duration) for plan in plans)
 
-    def _solve(self, phases: TaskPhases, elbow_deg: float, postures: dict[Stop, Array]) -> None:
+    def _solve(self, phases: TaskPhases, elbow_deg: float, postures: dict[TaskStop, Array]) -> None:
         """Put the joint positions of each stop, with this elbow angle, into `postures`."""
         for stop, previous in phases.previous_stops().items():
             check_time()
@@ -109,13 +109,13 @@ class Planner:
             except Unreachable as error:
                 raise InfeasibleJob(self.robot.name, stop.place.name, str(error)) from error
 
-    def _same_elbow(self, postures: dict[Stop, Array], other: dict[Stop, Array]) -> bool:
+    def _same_elbow(self, postures: dict[TaskStop, Array], other: dict[TaskStop, Array]) -> bool:
         return all(
             np.linalg.norm(self._arm.elbow_position(q) - self._arm.elbow_position(other[stop])) < SAME_ELBOW_M
             for stop, q in postures.items()
         )
 
-    def _check_collisions(self, phases: TaskPhases, postures: dict[Stop, Array], payload_kg: float) -> None:
+    def _check_collisions(self, phases: TaskPhases, postures: dict[TaskStop, Array], payload_kg: float) -> None:
         for ends, carries in phases.paths().items():
             check_time()
             start, end = (self.robot.home_q() if stop is None else postures[stop] for stop in ends)
@@ -124,7 +124,7 @@ class Planner:
                 assert stop is not None, "no path leads from home to home"
                 raise InfeasibleJob(self.robot.name, stop.place.name, collision)
 
-    def _plan(self, work: Work, phases: TaskPhases, postures: dict[Stop, Array], speed: float) -> Plan:
+    def _plan(self, work: Work, phases: TaskPhases, postures: dict[TaskStop, Array], speed: float) -> Plan:
         here, built = self.robot.home_q(), []
         for segments in phases:
             check_time()
@@ -162,6 +162,6 @@ def _loaded_motion(work: Work, segment: Segment, start: Array, end: Array, speed
     )
 
 
-def _pose(stop: Stop) -> Pose:
+def _pose(stop: TaskStop) -> Pose:
     pose = Pose(np.array(stop.place.position_m), rotation(stop.place.tool_deg))
     return pose.retracted(stop.place.retreat_m) if stop.retracted else pose

@@ -28,7 +28,7 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ArmReference:
     """Planned motion of one arm over samples of 1/RATE_HZ, and the load at its hand from each sample on."""
 
     motion: Array
@@ -39,13 +39,13 @@ class Reference:
     """Force on the tool point, world frame, [sample + 1, 3]."""
 
 
-def still(q: Array, tau: Array, samples: int) -> Reference:
+def still(q: Array, tau: Array, samples: int) -> ArmReference:
     """Standstill at `q` rad, held by `tau` N·m, both [joint], with an empty hand."""
     motion = np.broadcast_to(np.stack([q, np.zeros(JOINTS), tau]), (samples + 1, 3, JOINTS))
-    return Reference(motion, np.zeros(samples + 1), np.zeros((samples + 1, 3)))
+    return ArmReference(motion, np.zeros(samples + 1), np.zeros((samples + 1, 3)))
 
 
-def reference(plan: Plan, repetitions: int, progress_s: float, samples: int, home: Reference) -> Reference:
+def reference(plan: Plan, repetitions: int, progress_s: float, samples: int, home: ArmReference) -> ArmReference:
     """Part of a job with `repetitions` cycles that starts `progress_s` after leaving home, then standstill at home.
 
     Args:
@@ -64,10 +64,10 @@ def reference(plan: Plan, repetitions: int, progress_s: float, samples: int, hom
     motion[:moving] = np.concatenate([phase.profile for phase in plan.phases])[rows]
     payload_kg[:moving] = np.concatenate([phase.payload_kg for phase in plan.phases])[rows]
     force_n[:moving] = np.where(presses[:, None], back_n, 0.0)
-    return Reference(motion, payload_kg, force_n)
+    return ArmReference(motion, payload_kg, force_n)
 
 
-def control(references: list[Reference], steps: int, kp: Array, kv: Array) -> Array:
+def control(references: list[ArmReference], steps: int, kp: Array, kv: Array) -> Array:
     """Control signal of position servos for computed-torque control, [sample · steps, arm · joint].
 
     A servo exerts kp (ctrl − q) − kv qd. With ctrl = q_ref + (kv qd_ref + tau_ref)/kp this is
@@ -101,7 +101,7 @@ def control(references: list[Reference], steps: int, kp: Array, kv: Array) -> Ar
     return out.reshape(-1, out.shape[-1])
 
 
-def _same_load(r: Reference) -> Array:
+def _same_load(r: ArmReference) -> Array:
     """Whether the load is the same at each sample and the next, bool [sample]."""
     return (np.diff(r.payload_kg) == 0) & (np.diff(r.force_n, axis=0) == 0).all(axis=1)
 
@@ -175,7 +175,7 @@ class MujocoPlant:
         self._tick = -1
         self._at = np.concatenate([[0.0], self._home_q.ravel(), np.zeros(arms * JOINTS)])
         """Time, then joint positions, then speeds: MuJoCo's physics state."""
-        self._held: dict[int, Reference] = {}
+        self._held: dict[int, ArmReference] = {}
         """References of the braked arms."""
         self._faults = np.zeros(arms, dtype=int)
         self._lost_s = np.zeros(arms)
@@ -268,7 +268,7 @@ class MujocoPlant:
         self._tick = tick
         self._faults, self._lost_s = state.faults[0].copy(), state.lost_s[0].copy()
 
-    def _reference(self, world: World, state: State, a: int, samples: int) -> Reference:
+    def _reference(self, world: World, state: State, a: int, samples: int) -> ArmReference:
         if a in self._held:
             return self._held[a]
         home = still(self._home_q[a], self._home_tau[a], samples)
@@ -277,7 +277,7 @@ class MujocoPlant:
         plan = self._plans[state.plan[0, a]]
         return reference(plan, int(state.todo[0, a]), float(state.progress_s[0, a]), samples, home)
 
-    def _simulate(self, references: list[Reference]) -> None:
+    def _simulate(self, references: list[ArmReference]) -> None:
         ctrl = control(references, self._steps, self._kp, self._kv)
         payload_kg = np.stack([r.payload_kg for r in references], axis=1)[:-1]  # [sample, arm]
         force_n = np.stack([r.force_n for r in references], axis=1)[:-1]

@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.arm.model import ArmModel
 from fleet.arm.task_phases import GRASP_S
-from fleet.arm.trajectory import CollisionChecker, LoadedMotion, Motion, build_phase, move, rest
+from fleet.arm.trajectory import CollisionChecker, JointMotion, LoadedMotion, build_phase, move, rest
 from fleet.errors import FleetError, InfeasibleJob
 from fleet.job import LONGEST_GRASP_S, Place, Work
 from fleet.motion import Plan
@@ -80,7 +80,7 @@ def plan_motion(
     )
     home, first = arm.robot.home_q(), stops[0]
 
-    def part(motion: Motion, to: int = 0, kg: float = 0.0) -> LoadedMotion:
+    def part(motion: JointMotion, to: int = 0, kg: float = 0.0) -> LoadedMotion:
         return LoadedMotion(motion, places[to].name, kg)
 
     approach, retreat = [part(move(home, first, speed))], [part(move(first, home, speed))]

@@ -10,7 +10,7 @@ GRASP_S = 0.5
 
 
 @dataclass(frozen=True)
-class Stop:
+class TaskStop:
     """A posture in which the arm stops: at a place, or retracted from it."""
 
     place: Place
@@ -21,7 +21,7 @@ class Stop:
 class Segment:
     """A move to a stop (None is home), or a pause there."""
 
-    to: Stop | None
+    to: TaskStop | None
     pause_s: float = 0.0
     """0 for a move."""
     carries: bool = False
@@ -40,24 +40,24 @@ class TaskPhases:
         """Approach, cycle, retreat."""
         return iter((self.approach, self.cycle, self.retreat))
 
-    def previous_stops(self) -> dict[Stop, Stop | None]:
+    def previous_stops(self) -> dict[TaskStop, TaskStop | None]:
         """For every stop, in the order of the first visit: the stop from which it is first reached (None is home).
 
         The arm only ever moves along these edges, in both directions, so that no joint winds up from cycle to cycle.
         """
-        previous: dict[Stop, Stop | None] = {}
-        here: Stop | None = None
+        previous: dict[TaskStop, TaskStop | None] = {}
+        here: TaskStop | None = None
         for segment in (*self.approach, *self.cycle, *self.retreat):
             if segment.to is not None:
                 previous.setdefault(segment.to, here)
             here = segment.to
         return previous
 
-    def paths(self) -> dict[tuple[Stop | None, Stop | None], bool]:
+    def paths(self) -> dict[tuple[TaskStop | None, TaskStop | None], bool]:
         """Stops (None is home) between which the arm moves, in the order of the first time, and whether it ever
         carries between them; a stop with itself where the arm carries in a pause."""
-        paths: dict[tuple[Stop | None, Stop | None], bool] = {}
-        here: Stop | None = None
+        paths: dict[tuple[TaskStop | None, TaskStop | None], bool] = {}
+        here: TaskStop | None = None
         for segment in (*self.approach, *self.cycle, *self.retreat):
             path = (segment.to, here) if (segment.to, here) in paths else (here, segment.to)
             if segment.carries or segment.to != here:
@@ -72,8 +72,8 @@ def task_phases(work: Work) -> TaskPhases:
     A sort moves straight from place to place. A hold grasps in the approach and releases in the retreat. A press has
     its payload, if any, for as long as it presses.
     """
-    first, above = (Stop(work.places[0], retracted) for retracted in (False, True))
-    second, above_second = (Stop(work.places[-1], retracted) for retracted in (False, True))
+    first, above = (TaskStop(work.places[0], retracted) for retracted in (False, True))
+    second, above_second = (TaskStop(work.places[-1], retracted) for retracted in (False, True))
     match work.kind:
         case "pick_place":
             return TaskPhases(

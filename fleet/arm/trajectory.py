@@ -1,4 +1,4 @@
-"""Jerk-limited motion from rest to rest with its torque, and checks of it: limits, collisions, and time to plan."""
+"""Jerk-limited motion from rest to rest with its torque, and checks of its limits and collisions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -45,7 +45,7 @@ def limit_violation(q: Array, qd: Array, qdd: Array, tau: Array, position_range:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class JointMotion:
     """Sampled joint motion; the next motion begins one sample after the last row."""
 
     q: Array
@@ -63,7 +63,7 @@ class Motion:
 class LoadedMotion:
     """A motion with a constant load at the hand."""
 
-    motion: Motion
+    motion: JointMotion
     place: str
     """Name of the place that errors report."""
     payload_kg: float = 0.0
@@ -72,7 +72,7 @@ class LoadedMotion:
     """Unit vector of the pressing force in the world frame, [3]."""
 
 
-def move(start: Array, end: Array, speed: float) -> Motion:
+def move(start: Array, end: Array, speed: float) -> JointMotion:
     """Motion from rest at `start` to rest at `end` on a straight line in joint space.
 
     Velocity, acceleration and jerk stay below `speed` times those of `GEN3`. The fastest motion is stretched to the
@@ -92,14 +92,14 @@ def move(start: Array, end: Array, speed: float) -> Motion:
     samples = max(1, int(np.ceil(trajectory.duration * RATE_HZ - 1e-9)))
     shrink = trajectory.duration * RATE_HZ / samples
     q, qd, qdd = np.array([trajectory.at_time(i / RATE_HZ * shrink) for i in range(samples)]).transpose(1, 0, 2)
-    return Motion(q, qd * shrink, qdd * shrink**2)
+    return JointMotion(q, qd * shrink, qdd * shrink**2)
 
 
-def rest(q: Array, seconds: float) -> Motion:
+def rest(q: Array, seconds: float) -> JointMotion:
     """Standstill at `q` for the nearest whole number of samples."""
     shape = (round(seconds * RATE_HZ), JOINTS)  # stored once, however long
     still = np.broadcast_to(0.0, shape)
-    return Motion(np.broadcast_to(q, shape), still, still)
+    return JointMotion(np.broadcast_to(q, shape), still, still)
 
 
 def straight_line(start: Array, end: Array, step_rad: float) -> Array:
@@ -115,7 +115,7 @@ def build_phase(arm: ArmModel, parts: Sequence[LoadedMotion]) -> Phase:
         InfeasibleJob: a limit of the arm is exceeded; names the place and the load.
     """
     if len(parts) == 1 and len(parts[0].motion) > 1 and not parts[0].motion.qd.any():
-        first = Motion(*(array[:1] for array in vars(parts[0].motion).values()))
+        first = JointMotion(*(array[:1] for array in vars(parts[0].motion).values()))
         one = build_phase(arm, [replace(parts[0], motion=first)])
         count = len(parts[0].motion)
         return Phase(
@@ -141,7 +141,7 @@ def _torque(arm: ArmModel, part: LoadedMotion) -> Array:
     force_n = -part.pressing_n * np.asarray(part.direction)  # of the environment on the tool
     if len(motion) and not motion.qd.any():
         # A standstill needs one torque, and is often most of the samples.
-        motion = Motion(motion.q[:1], motion.qd[:1], motion.qdd[:1])
+        motion = JointMotion(motion.q[:1], motion.qd[:1], motion.qdd[:1])
     tau = arm.inverse_dynamics(motion.q, motion.qd, motion.qdd, part.payload_kg, force_n)
     return np.broadcast_to(tau, (len(part.motion), JOINTS)) if len(motion) == 1 else tau
 

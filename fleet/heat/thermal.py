@@ -4,12 +4,10 @@ C_w Tw' = P_w − (Tw − Th)/R_wh;  C_h Th' = (Tw − Th)/R_wh − (Th − Ta)/
 Lumped capacitance with two nodes per joint (Kawaharazuka et al., arXiv 2407.08055); parameters in
 `fleet/data/gen3_thermal.json`. Order of nodes: windings of joints 1..7, then housings of joints 1..7.
 
-Estimate the housing temperatures, which have no sensor, from the measured motor temperatures.
-
-The inputs of the housings' part of the thermal network are the measured windings, the ambient temperature, and idle and
-friction heat: C_h Th' = −L_hh Th + G_wh Tw + g Ta + P_h, stepped exactly for constant inputs. It is a reduced-order
-observer (Luenberger, IEEE Trans. Automatic Control 16, 1971) without correction: an initial error decays with the
-housings' time constants.
+Housings have no sensor; `HousingObserver` estimates them from the measured motor temperatures. The inputs of their part
+of the thermal network are the measured windings, the ambient temperature, and idle and friction heat: C_h Th' = −L_hh
+Th + G_wh Tw + g Ta + P_h, stepped exactly for constant inputs. It is a reduced-order observer (Luenberger, IEEE Trans.
+Automatic Control 16, 1971) without correction: an initial error decays with the housings' time constants.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -411,15 +409,8 @@ def housing_observer(thermal: ThermalModel, motors: Motors, dt_s: Array | float)
     Args:
         dt_s: Length of the step; [...] for one observer per element.
     """
-    dt = np.asarray(dt_s, dtype=float)[..., None, None]
-    inner = thermal.laplacian[HOUSING, HOUSING]
-    root = np.sqrt(thermal.capacity[HOUSING])
-    rates, modes = np.linalg.eigh(inner / np.outer(root, root))
-    left, right = modes / root[:, None], modes.T
-    keep = (left * np.exp(-rates * dt)) @ (right * root)
-    gain = (left * (-np.expm1(-rates * dt) / rates)) @ (right / root)
+    to_ambient = thermal.to_ambient[HOUSING]
+    housings = modal_model(thermal.capacity[HOUSING], thermal.laplacian[HOUSING, HOUSING], to_ambient)
+    keep, gain = housings.step_matrices(dt_s)
     from_winding = -np.diagonal(thermal.laplacian[WINDING, HOUSING])
-    return HousingObserver(keep, gain, from_winding.copy(), thermal.to_ambient[HOUSING], motors.idle_w)
-
-
-assert NODES == 2 * JOINTS, "each joint has a winding and a housing"
+    return HousingObserver(keep, gain, from_winding.copy(), to_ambient, motors.idle_w)

@@ -1,8 +1,6 @@
-"""The jobs of a shift, drawn from a scenario's streams for one seed.
+"""The jobs of a shift, sampled from a scenario's streams for one seed, and the default price of a fault.
 
-The price of a fault in a scenario: the default cost of a fault in the reward.
-
-The two factors of `fleet.engine.batch.FaultPrice` follow from the scenario alone.
+The two factors of the price, `fleet.engine.batch.FaultPrice`, follow from the scenario alone.
 
 - Value rate: expected value of arriving jobs per second, over all streams.
 - Downtime: time in which all motors of a nominal arm cool below `limits.restart_c`, plus `limits.clear_s`. The arm
@@ -70,7 +68,7 @@ class SampledJobs:
 def sample_jobs(
     table: ArrivalTable, key: Array, choices: Array, after_streams: Array, release_s: Array, job: Array, after: Array
 ) -> int:
-    """Draw the jobs of one shift; return their number, or −1 if the output arrays are too short.
+    """Sample the jobs of one shift; return their number, or −1 if the output arrays are too short.
 
     A value depends on the key, its stream and its number only, so streams are independent.
 
@@ -116,7 +114,7 @@ def sample_jobs(
 
 
 class JobSampler:
-    """Draws the jobs of a scenario's shifts."""
+    """Samples the jobs of a scenario's shifts."""
 
     def __init__(self, scenario: Scenario) -> None:
         streams = scenario.jobs

@@ -61,7 +61,7 @@ class ArmSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class JobStream:
-    """A kind of job that arrives repeatedly; payload and repetitions are drawn for each job."""
+    """A kind of job that arrives repeatedly; payload and repetitions are sampled for each job."""
 
     name: str
     kind: Kind
@@ -164,12 +164,10 @@ class Planning:
     """Shares of the arm's speed limits."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.elbows <= 12:
-            raise ValueError(f"Planning.elbows must be between 1 and 12 (got {self.elbows})")
-        if not self.speeds or not all(0.05 <= speed <= 1 for speed in self.speeds):
-            raise ValueError(
-                f"Planning.speeds must be a non-empty list of shares between 0.05 and 1 (got {list(self.speeds)})"
-            )
+        check_between(self, 1, 12, "elbows")
+        if not self.speeds:
+            raise ValueError("Planning.speeds must have at least one share of the speed limits (got [])")
+        check_between(self, 0.05, 1.0, "speeds")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,8 +196,7 @@ class TwinSpec:
             raise ValueError(f"TwinSpec.payload_kg must be masses >= 0 (got {list(self.payload_kg)})")
         if self.air_c is not None and not -40 <= self.air_c[0] <= self.air_c[1] <= 60:
             raise ValueError(f"TwinSpec.air_c must be [lowest, highest] between -40 and 60 °C (got {list(self.air_c)})")
-        if not 0 <= self.exploration <= MOST_EXPLORATION:
-            raise ValueError(f"TwinSpec.exploration must be between 0 and {MOST_EXPLORATION} (got {self.exploration})")
+        check_between(self, 0, MOST_EXPLORATION, "exploration")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,12 +269,8 @@ class Scenario:
                 "Scenario.telemetry_interval_s must not exceed decision_interval_s "
                 f"(got {self.telemetry_interval_s}, {self.decision_interval_s})"
             )
-        if not 0 <= self.clearance_m <= MOST_CLEARANCE_M:
-            raise ValueError(
-                f"Scenario.clearance_m must be between 0 and {MOST_CLEARANCE_M} m (got {self.clearance_m})"
-            )
-        if not 1 <= self.slots <= MOST_SLOTS:
-            raise ValueError(f"Scenario.slots must be between 1 and {MOST_SLOTS} (got {self.slots})")
+        check_between(self, 0.0, MOST_CLEARANCE_M, "clearance_m")
+        check_between(self, 1, MOST_SLOTS, "slots")
         if len(self.fixtures) > MOST_FIXTURES:
             raise ValueError(f"Scenario.fixtures must be at most {MOST_FIXTURES} (got {len(self.fixtures)})")
         if self.horizon_s / self.telemetry_interval_s > MOST_SAMPLES:

@@ -160,7 +160,7 @@ WRONG = [
     (put("ambient", "points", [[0]]), "ambient.points[0]: expected 2 values, got 1."),
     (put("ambient", "points", [[0, 400]]), "ambient.points must be between -40 and 60 °C (got [400.0])."),
     (put("reward", "faullts", 1), "reward: unknown key 'faullts'; did you mean 'faults'?"),
-    (put("planning", "speeds", []), "planning.speeds must be a non-empty list of shares between 0.05 and 1 (got [])."),
+    (put("planning", "speeds", []), "planning.speeds must have at least one share of the speed limits (got [])."),
     (put("twin", "size", "ful"), "twin.size: 'ful' is not allowed; did you mean 'full'? Allowed: full, quick."),
     (
         put("fixtures", [{"name": "oven", "position_m": [0, 0, 0], "size_m": [1, 0, 1]}]),
@@ -369,9 +369,6 @@ def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
     assert report.problems == ()
     assert len(report.at_once) >= 3
     assert report.excluded_share < 0.3
-    for place in load(name).places:
-        here = [entry for entry in report.reach if entry.place == place.name]
-        assert sum(entry.payload_kg is not None or "this arm's limit" in entry.reason for entry in here) >= 2
 
 
 @pytest.mark.parametrize("name", sorted({*library()} - {"scale_64"}))
@@ -426,7 +423,7 @@ def test_clearance_changes_the_space(cache):
     assert shares == sorted(shares)
     assert shares[0] < shares[-1]
     for wrong in (-0.01, 0.21, float("nan")):
-        with pytest.raises(ValueError, match=r"clearance_m must be between 0 and 0\.2 m"):
+        with pytest.raises(ValueError, match=r"clearance_m must be between 0 and 0\.2 \("):
             replace(scenario, clearance_m=wrong)
 
 
@@ -468,12 +465,6 @@ def test_the_command_shows_the_cell_and_fails_if_there_are_problems(cache, tmp_p
     code, _, err = call(file)
     assert code == 2
     assert "Error: near.toml: arms: at home 'arm_0' (" in err
-
-
-def test_every_work_of_the_library_has_a_volume(cache):
-    scenario = load("heat_wave")
-    fleet = prepare(scenario, difficulty="blind", cache=cache)
-    assert {work for _, work, _, _ in fleet.space.volume} == set(all_works(scenario))
 
 
 def test_stations_side_by_side_are_for_one_arm_at_a_time(cache):
@@ -522,18 +513,15 @@ def test_the_same_seed_draws_the_same_jobs_and_another_seed_others(small_scenari
     assert drawn(small_scenario, 3) != drawn(small_scenario, 4)
 
 
-def test_jobs_come_in_order_of_release_and_inside_the_shift(small_scenario):
-    jobs = drawn(small_scenario, 0)
-    times = [job.release_s for job in jobs]
-    assert times == sorted(times)
-    assert 0 <= times[0] <= times[-1] < small_scenario.horizon_s
-    assert len({job.name for job in jobs}) == len(jobs)
-
-
-def test_every_job_is_one_its_stream_asks_for(small_scenario):
+def test_jobs_come_in_order_of_release_and_every_one_is_one_its_stream_asks_for(small_scenario):
     streams = {stream.name: stream for stream in small_scenario.jobs}
     for seed in range(20):
-        for job in drawn(small_scenario, seed):
+        jobs = drawn(small_scenario, seed)
+        times = [job.release_s for job in jobs]
+        assert times == sorted(times)
+        assert 0 <= times[0] <= times[-1] < small_scenario.horizon_s
+        assert len({job.name for job in jobs}) == len(jobs)
+        for job in jobs:
             stream = streams[job.name.rsplit("-", 1)[0]]
             low, high = stream.repetitions
             assert low <= job.repetitions <= high
@@ -551,13 +539,6 @@ def test_payloads_and_repetitions_are_drawn_evenly(small_scenario):
     for repetitions in (1, 2, 3):
         count = sum(job.repetitions == repetitions for job in jobs)
         assert abs(count - 1000) < 4 * np.sqrt(3000 * (1 / 3) * (2 / 3))
-
-
-def test_a_poisson_stream_brings_horizon_over_gap_jobs_on_average(small_scenario):
-    """Mean and variance of a Poisson variable are both 180 s / 30 s = 6."""
-    counts = np.array([sum(j.name.startswith("sort") for j in drawn(small_scenario, seed)) for seed in range(500)])
-    assert counts.mean() == pytest.approx(6.0, abs=4 * np.sqrt(6 / 500))
-    assert counts.var() == pytest.approx(6.0, rel=4 * np.sqrt(2 / 500) + 0.05)
 
 
 def test_a_further_stream_disturbs_none_of_the_others(small_scenario):
