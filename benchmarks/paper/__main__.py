@@ -11,20 +11,16 @@ MODULES = {
     "sides": "readings:SIDES",
     "sweep": "sweep:SWEEP",
     "parsimony": "sweep:PARSIMONY",
-    "quality": "quality:QUALITY",
-    "saturation": "saturation:SATURATION",
-    "reliability": "saturation:RELIABILITY",
+    "reliability": "reliability:RELIABILITY",
     "questions": "real_logs:QUESTIONS_OF_LOGS",
-    "forecast": "real_logs:FORECAST",
     "identification": "real_logs:IDENTIFICATION",
     "transfer": "transfer:TRANSFER",
-    "transfer-logs": "transfer:LOGS",
     "features": "features:FEATURES",
     "augmentation": "features:AUGMENTATION",
     "drift": "drift:DRIFT",
     "cooling": "cooling:COOLING_STUDY",
 }
-"""Module and attribute of each study; a module is imported when its study is asked for."""
+"""Module and attribute of each study; a module is imported when its study runs."""
 
 
 def study(name: str) -> harness.Experiment:

@@ -30,7 +30,7 @@ from benchmarks.paper.harness import (
 from benchmarks.result_tables import difference
 from fleet.heat.motor import thermal_data
 from fleet.heat.thermal import ThermalModel, gen3_network, housing, in_series, modal_model, winding
-from fleet.robot import COOLING, JOINTS, Cooling, ThermalLimits
+from fleet.robot import COOLING, Cooling
 from scenarios.evaluate.comparison import figures_of_shifts
 from scenarios.evaluate.rollout import Outcome, outcomes
 from scenarios.json_rows import Row
@@ -57,18 +57,15 @@ LONGEST_S = 1e5
 """Time after which a motor below its limit counts as never reaching it."""
 
 
-class Published(NamedTuple):
-    """What is published of the motor."""
-
-    limit_s: dict[Arrangement, float]
-    """Time from 26 °C to 125 °C."""
-    immersed_c: float
-    """Temperature at which the immersed winding settles."""
-    immersed_ratio: float
-    """Conductance from winding to water of immersion relative to forced water."""
-
-
-ZHU = Published({"no_interface": 3.6, "forced_air": 10.69, "forced_water": 11.59}, 85.0, 3.7)
+PUBLISHED = {
+    "no_interface_s": 3.6,
+    "forced_air_s": 10.69,
+    "forced_water_s": 11.59,
+    "immersed_c": 85.0,
+    "immersed_ratio": 3.7,
+}
+"""Times from 26 °C to 125 °C, the temperature at which the immersed winding settles, and the conductance from winding
+to water of immersion relative to forced water."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,16 +133,10 @@ class CooledMotor:
         return float(brentq(excess, 0.0, late_s))  # pyright: ignore[reportArgumentType]
 
     def figures(self) -> dict[str, float]:
-        """The published figures as this motor has them, see `published`."""
+        """The figures of this motor by the names of `PUBLISHED`."""
         ratio = self.conductance_per_s("immersion") / self.conductance_per_s("forced_water")
-        times = {f"{each}_s": self.limit_s(each) for each in ZHU.limit_s}
+        times = {f"{each}_s": self.limit_s(each) for each in ARRANGEMENTS if each != "immersion"}
         return {**times, "immersed_c": self.steady_c("immersion"), "immersed_ratio": ratio}
-
-
-def published() -> dict[str, float]:
-    """The published figures by the names of `CooledMotor.figures`."""
-    times = {f"{each}_s": value for each, value in ZHU.limit_s.items()}
-    return {**times, "immersed_c": ZHU.immersed_c, "immersed_ratio": ZHU.immersed_ratio}
 
 
 ZHU_MOTOR = CooledMotor(
@@ -168,8 +159,8 @@ class Fit(NamedTuple):
 
     motor: CooledMotor
     relative_sd: dict[str, float]
-    """Standard deviation of each parameter's logarithm, by name; about that of its prior where the figures say
-    nothing."""
+    """Standard deviation of each parameter's logarithm, by name; about that of its prior where the figures do
+    not determine it."""
 
 
 def fit_motor() -> Fit:
@@ -177,8 +168,8 @@ def fit_motor() -> Fit:
 
     def residuals(x: Array) -> Array:
         motor = _motor(x)
-        got, wanted = motor.figures(), published()
-        figures = [np.log(min(got[name], LONGEST_S) / wanted[name]) / _FIGURE_SD for name in wanted]
+        got = motor.figures()
+        figures = [np.log(min(got[name], LONGEST_S) / wanted) / _FIGURE_SD for name, wanted in PUBLISHED.items()]
         (core, core_sd), (bare, bare_sd) = CAPACITY_PRIOR, BARE_PRIOR
         gap = np.log(motor.bare_per_s / motor.interface_per_s / bare) / bare_sd
         return np.array([*figures, np.log(motor.housing_capacity / core) / core_sd, gap])
@@ -210,10 +201,10 @@ MOTOR_FIGURES = {
     "immersed_c": "immersed: never; settles at, °C",
     "immersed_ratio": "conductance of immersion / forced water",
 }
-"""What the rows of the motor are: time from 26 to 125 °C, unless said otherwise."""
+"""What the rows of the motor are: time from 26 to 125 °C, unless stated otherwise."""
 CHANGES = {
     "still_air": "–",
-    "heat_sink": "fins: 1.8 × conductance to air, 1.35 × capacity of the housing",
+    "heat_sink": "fins: 1.8 × conductance to ambient, 1.35 × capacity of the housing",
     "heat_spreader": "copper strip: 0.2 W/K more to the next housings, 1.1 × capacity",
     "forced_air": "2.5 × conductance from housing to air",
     "liquid": "6 ×",
@@ -222,36 +213,10 @@ CHANGES = {
 """What each way of cooling changes in the network."""
 
 
-CORE_WARNING_C = 80.0
-"""Of the microcontroller of an actuator, Kinova Gen3 user guide, actuator safety items; its error limit is 90 °C."""
-HOTTEST_AIR_C = 36.0
-
-
-def core_allowance_k_per_w(joint: int, ambient_c: float, limits: ThermalLimits | None = None) -> float:
-    """Least thermal resistance from core to housing with which the core warns before the motor reaches its error limit.
-
-    The worst case for the core: a joint without neighbours whose motor settles exactly at the error limit, so that its
-    housing is as warm as it can be, and a core that makes all of the idle heat.
-
-    Args:
-        joint: 0..6.
-        limits: Default: those of a Gen3.
-
-    Returns:
-        K/W; a smaller resistance lets the motor stop the arm first.
-    """
-    data, limits = thermal_data(), limits or ThermalLimits()
-    outer, inner = data["housing_ambient_k_per_w"][joint], data["winding_housing_k_per_w"][joint]
-    idle_w = data["idle_w"][joint]
-    copper_w = max(0.0, (limits.error_c - ambient_c - outer * idle_w) / (outer + inner))
-    housing_c = ambient_c + outer * (copper_w + idle_w)
-    return (CORE_WARNING_C - housing_c) / idle_w
-
-
 def motor_rows() -> list[Row]:
     """The published figures beside those of the fitted motor."""
     modelled = ZHU_MOTOR.figures()
-    return [{"figure": name, "published": value, "modelled": modelled[name]} for name, value in published().items()]
+    return [{"figure": name, "published": value, "modelled": modelled[name]} for name, value in PUBLISHED.items()]
 
 
 def joint_row(cooling: Cooling) -> Row:
@@ -283,9 +248,8 @@ def joint_row(cooling: Cooling) -> Row:
 
 
 def law_row() -> Row:
-    """Motor, joint and core: what follows from the laws alone."""
-    core = [core_allowance_k_per_w(joint, HOTTEST_AIR_C) for joint in range(JOINTS)]
-    return {"motor": motor_rows(), "joint": [joint_row(each) for each in STRATEGIES], "core_k_per_w": core}
+    """Motor and joint, which follow from the laws alone."""
+    return {"motor": motor_rows(), "joint": [joint_row(each) for each in STRATEGIES]}
 
 
 def fleet_rows(
@@ -338,10 +302,6 @@ def cooling_tables(rows: Sequence[Row]) -> dict[str, Table]:
             motor = [(MOTOR_FIGURES[e["figure"]], f"{e['published']:g}", f"{e['modelled']:.2f}") for e in row["motor"]]
             tables["cooling_motor"] = table_of(("time to 125 °C, or temperature", "published", "here"), motor)
             tables["cooling_joint"] = joint_table(row["joint"])
-            core = [(f"joint {joint}", f"{value:.1f}") for joint, value in enumerate(row["core_k_per_w"], start=1)]
-            tables["cooling_core"] = table_of(
-                (f"core warns first at {HOTTEST_AIR_C:g} °C from", "K/W to housing"), core
-            )
         if "fit" in row:
             parameters = [(name, f"{value:.4g}", f"{sd:.2f}") for name, (value, sd) in row["fit"].items()]
             tables["cooling_fit"] = table_of(("parameter, per J/K of the winding", "value", "relative sd"), parameters)
@@ -364,7 +324,7 @@ def joint_table(rows: Sequence[Row]) -> Table:
         for row in rows
     ]
     hold_heads = ("3 kg held outstretched: 60 °C after", "75 °C after", "settles at")
-    return table_of(("`cooling`", "what changes", "winding to air, W/K", *hold_heads), lines)
+    return table_of(("`cooling`", "what changes", "winding to ambient, W/K", *hold_heads), lines)
 
 
 def fleet_table(row: Row) -> Table:

@@ -1,4 +1,4 @@
-"""An arm that wears or cools less from week to week: when its twins notice, when they are retrained, what it costs.
+"""Detection of wear and weaker cooling by an arm's twins, and cost of retraining: `drift`.
 
 Every day the arm does cool work and work of the natural mix. Its learned twin scores the cool jobs, its thermal network
 predicts the peak temperature of all jobs. Upward CUSUMs watch the daily means. An alarm retrains the twin that it
@@ -20,7 +20,7 @@ from benchmarks.paper.harness import (
     seeded,
     table_of,
 )
-from benchmarks.paper.subjects import SHORT, Study, sensed, usual_study, with_steps
+from benchmarks.paper.subjects import SHORT, Study, make_study, sensed, with_steps
 from benchmarks.paper.transfer import continue_training
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import ThermalModel, thermal_model
@@ -73,29 +73,24 @@ class DriftSize:
     """Share by which friction has grown then."""
     cooling: float = 0.6
     """Factor of the conductance to ambient then."""
-    jobs: int = 6
+    jobs: int = 4
     """Per day, of cool work, and as many of the natural mix."""
     window: int = 14
     """Days whose cool jobs retrain a twin."""
-    period: int = 14
+    period: int = 28
     """Days between retrainings under `ALWAYS`."""
     least: int = 12
     """Fewest cool jobs for a retraining."""
-    train: int = 60
-    pool: int = 60
+    train: int = 40
+    pool: int = 40
     """Other cool jobs, for calibration, and as many for the daily work; the natural mix has three times as many."""
-    steps: int = 300
-    further_steps: int = 75
+    steps: int = 200
+    further_steps: int = 50
     slack: float = 0.5
     """Of a CUSUM, in standard deviations of a day."""
     threshold: float = 5.0
     """Of a CUSUM, in standard deviations of a day."""
     config: TwinConfig = SHORT
-
-    @classmethod
-    def quick(cls) -> "DriftSize":
-        """Fewer jobs, training steps and planned retrainings."""
-        return cls(jobs=4, period=28, train=40, pool=40, steps=200, further_steps=50)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +300,7 @@ def drift_rows(seed: int, size: DriftSize, wanted: Collection[str]) -> Iterator[
         FleetError: nearly no motion of the arm stays cool.
     """
     root = np.random.SeedSequence(seed)
-    study = usual_study(child(root, 0), train=size.train, reference=2 * size.pool, test=3 * size.pool, novel=size.pool)
+    study = make_study(child(root, 0), train=size.train, reference=2 * size.pool, test=3 * size.pool, novel=size.pool)
     known = sensed(study.train.plans, study.motors)
     parts = records(known)
     twin = train(parts, with_steps(size.config, parts, size.steps), child(root, 1), arm=study.robot.name)
@@ -372,8 +367,7 @@ def _false_alarms(row: Row, name: str) -> int:
 
 
 DRIFT = seeded(
-    "When a twin notices wear or weaker cooling, and what retraining costs.\n\n"
-    "With --quick a seed takes a minute of one core, without it many times as long.",
+    "Detection of wear and weaker cooling by a twin, and cost of retraining.\n\nA seed takes a minute of one core.",
     DriftSize,
     3,
     drift_rows,

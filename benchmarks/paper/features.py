@@ -1,4 +1,4 @@
-"""What else a twin is good for: its latent as `features`, its motion as further training data (`augmentation`).
+"""Other uses of a twin: its latent as `features`, its motion as further training data (`augmentation`).
 
 `features`: latent means as input of a ridge regression of temperature rise, payload and friction, cross-validated by
 job, compared with the means of an untrained encoder of the same twin and with plain features of the same windows. Every
@@ -7,7 +7,8 @@ friction.
 
 `augmentation`: an arm has a few cool jobs with measured peak temperatures. Its twin, trained on these jobs alone,
 generates motion near them. The arm labels that motion with the peaks that a nominal thermal network predicts, or
-performs it. Controls add as many noisy copies of its jobs, random light motions with predicted peaks, or measured jobs.
+performs it. Controls add the same number of noisy copies of its jobs, random light motions with predicted peaks, or
+measured jobs.
 """
 
 import warnings
@@ -30,7 +31,7 @@ from benchmarks.paper.harness import (
     seeded,
     table_of,
 )
-from benchmarks.paper.subjects import SHORT, USUAL, Jobs, Sample, Study, jobs_of, sensed, usual_study, with_steps
+from benchmarks.paper.subjects import SHORT, Sample, Study, make_study, sensed, with_steps
 from fleet.arm.model import ArmModel
 from fleet.arm.random_motions import light_jobs
 from fleet.errors import FleetError
@@ -67,7 +68,7 @@ INPUTS = ("latent", "untrained", "raw", "latent and raw")
 TARGETS = ("temperature rise, K", "payload, kg", "friction, share of wear")
 
 
-def job_inputs(twin: Twin, jobs: Jobs) -> dict[str, Array]:
+def job_inputs(twin: Twin, jobs: Sample) -> dict[str, Array]:
     """Inputs of a regressor for each job, [job, feature], by the names of `INPUTS`.
 
     For each window the posterior means (latent), or mean, standard deviation and RMS of each channel in SI units
@@ -112,28 +113,23 @@ def fit(regressor: str, x: Array, y: Array, seed: int) -> TransformedTargetRegre
 class FeatureSize:
     """Numbers of jobs and training steps."""
 
-    labels: tuple[int, ...] = (50, 400)
+    labels: tuple[int, ...] = (50, 200)
     """Jobs of a cross-validation, ascending."""
-    train: int = 120
+    train: int = 80
     """Cool jobs that train the twin."""
-    steps: int = 600
-    config: TwinConfig = USUAL
-
-    @classmethod
-    def quick(cls) -> "FeatureSize":
-        """Smaller networks and half the jobs."""
-        return cls(labels=(50, 200), train=80, steps=400, config=SHORT)
+    steps: int = 400
+    config: TwinConfig = SHORT
 
 
-def worn_jobs(study: Study, rng: np.random.Generator) -> tuple[Jobs, dict[str, Array]]:
+def worn_jobs(study: Study, rng: np.random.Generator) -> tuple[Sample, dict[str, Array]]:
     """The study's test jobs as recorded by the arm in random states of wear, and their targets [job] by name."""
-    jobs = jobs_of(study.test, study.horizon_s)
+    jobs = study.test
     wear = rng.uniform(*WEAR, len(jobs.plans))
     worn = [with_wear(study.motors, share) for share in wear]
     plans = tuple(sensed([plan], motors)[0] for plan, motors in zip(jobs.plans, worn, strict=True))
     peak_c = np.array([_peak(plan, motors, study) for plan, motors in zip(jobs.plans, worn, strict=True)])
     payload_kg = np.array([plan.work.payload_kg for plan in jobs.plans])
-    return Jobs(plans, jobs.repetitions, peak_c), {
+    return Sample(plans, peak_c, study.horizon_s), {
         TARGETS[0]: peak_c.max(axis=1) - study.ambient_c,
         TARGETS[1]: payload_kg,
         TARGETS[2]: wear,
@@ -192,7 +188,7 @@ def feature_rows(seed: int, size: FeatureSize, _wanted: Collection[str]) -> Iter
     if min(size.labels) < 2 * FOLDS:
         raise FleetError(f"--labels must be {2 * FOLDS} or more for a cross-validation (got {min(size.labels)}).")
     root = np.random.SeedSequence(seed)
-    study = usual_study(child(root, 0), train=size.train, reference=0, test=max(size.labels), novel=0)
+    study = make_study(child(root, 0), train=size.train, reference=0, test=max(size.labels), novel=0)
     parts = records(sensed(study.train.plans, study.motors))
     config = with_steps(size.config, parts, size.steps)
     twin = train(parts, config, child(root, 1), arm="arm")
@@ -219,8 +215,7 @@ def feature_tables(rows: Sequence[Row]) -> dict[str, Table]:
 
 
 FEATURES = seeded(
-    "The latent as input of regressions of temperature, payload and friction.\n\n"
-    "With --quick a seed takes 10 s of one core, without it many times as long.",
+    "The latent as input of regressions of temperature, payload and friction.\n\nA seed takes 10 s of one core.",
     FeatureSize,
     3,
     feature_rows,
@@ -243,20 +238,15 @@ JITTER = 0.1
 class AugmentationSize:
     """Numbers of jobs and training steps."""
 
-    measured: tuple[int, ...] = (10, 20, 40)
+    measured: tuple[int, ...] = (10, 30)
     """Cool jobs with measured peaks."""
-    added: int = 80
-    held_out: int = 100
-    test: int = 300
+    added: int = 60
+    held_out: int = 60
+    test: int = 150
     s: float = 1.0
     """Perturbation of generated motion, posterior standard deviations."""
-    steps: int = 300
-    config: TwinConfig = USUAL
-
-    @classmethod
-    def quick(cls) -> "AugmentationSize":
-        """Smaller networks and fewer jobs."""
-        return cls(measured=(10, 30), added=60, held_out=60, test=150, steps=200, config=SHORT)
+    steps: int = 200
+    config: TwinConfig = SHORT
 
 
 def _fits(study: Study, seed: int, count: int, size: AugmentationSize, random: np.random.SeedSequence) -> Iterator[Row]:
@@ -271,7 +261,7 @@ def _fits(study: Study, seed: int, count: int, size: AugmentationSize, random: n
         ).max(axis=1)
 
     def features(plans: Sequence[Plan]) -> Array:
-        return job_inputs(twin, jobs_of(Sample(tuple(plans), np.zeros((len(plans), 7))), study.horizon_s))["raw"]
+        return job_inputs(twin, Sample(tuple(plans), np.zeros((len(plans), 7)), study.horizon_s))["raw"]
 
     synthetic = tuple(islice(synthetic_motion(twin, study, own, nominal, size.s, rng), size.added))
     light = light_jobs(study.robot, size.added, rng)
@@ -315,7 +305,7 @@ def synthetic_motion(
     Clearance and closed-loop tracking are not checked here, unlike in `scenarios.motion.generate.generate`.
 
     Raises:
-        GenerationError: `MOST_DRAWS` times as many draws as sources in a row gave no such motion.
+        GenerationError: `MOST_DRAWS` samples per source in a row gave no such motion.
     """
     model, barren = ArmModel(study.robot), 0
     while barren < MOST_DRAWS * len(sources):
@@ -335,7 +325,7 @@ def synthetic_motion(
 def augmentation_rows(seed: int, size: AugmentationSize, _wanted: Collection[str]) -> Iterator[tuple[str, Row]]:
     """Every kind of training data with every regressor, by number of measured jobs."""
     root, most = np.random.SeedSequence(seed), max(size.measured) + size.added
-    study = usual_study(child(root, 0), train=most, reference=size.held_out, test=size.test, novel=0)
+    study = make_study(child(root, 0), train=most, reference=size.held_out, test=size.test, novel=0)
     fits = [fit for count in size.measured for fit in _fits(study, seed, count, size, child(root, 1, count))]
     yield "", {"seed": seed, "fits": fits}
 
@@ -368,7 +358,7 @@ def augmentation_tables(rows: Sequence[Row]) -> dict[str, Table]:
 
 AUGMENTATION = seeded(
     "Synthetic cool motion of a twin as training data of a temperature regressor.\n\n"
-    "With --quick a seed takes half a minute of one core, without it many times as long.",
+    "A seed takes half a minute of one core.",
     AugmentationSize,
     5,
     augmentation_rows,

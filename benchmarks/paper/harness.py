@@ -1,7 +1,7 @@
-"""What every study of the paper shares: one resumable store, one table, one command line.
+"""The harness of the studies: one resumable store, one table, one command line.
 
-A study is a list of units of work, each with the keys of the rows that it computes, and a function from rows to tables.
-Rows are JSON lines: each is appended when it is known, so the same command continues after an interruption. Equal keys
+A study is a list of units, each with the keys of the rows that it computes, and a function from rows to tables. Rows
+are JSON lines: each is appended when it is complete, so the same command continues after an interruption. Equal keys
 mean equal results: a key ends with a hash of everything that a result depends on.
 """
 
@@ -9,7 +9,7 @@ import hashlib
 import sys
 from argparse import ArgumentParser, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from time import monotonic
@@ -35,11 +35,11 @@ KeyedRows = Iterable[tuple[str, Mapping[str, Any]]]
 
 
 class Unit(NamedTuple):
-    """Work whose rows share something, such as the jobs of an arm."""
+    """Rows that are computed together, because they share for example the jobs of an arm."""
 
     keys: tuple[str, ...]
     compute: Callable[[Collection[str]], KeyedRows]
-    """Rows of some of the keys, each with its key, as they become known; it must be picklable."""
+    """Rows of some of the keys, each with its key, one by one; it must be picklable."""
 
 
 def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> Table:
@@ -48,7 +48,7 @@ def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str = 
 
 
 def mean_by_group(values: Iterable[tuple[str, float]]) -> Interval:
-    """The interval of the mean over groups that each have some values, such as arms under seeds of their own.
+    """The interval of the mean over groups that each have some values, such as an arm under several seeds.
 
     The groups are the sample; of a single group, its values are.
 
@@ -63,7 +63,7 @@ def mean_by_group(values: Iterable[tuple[str, float]]) -> Interval:
 
 
 def no_options(parser: ArgumentParser) -> None:
-    """Options of a study that has none of its own."""
+    """Options of a study without options."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,7 @@ def compute(units: Sequence[Unit], rows: Rows, *, workers: int = 1) -> None:
         workers: Processes; 1 computes in this one. The rows do not depend on it, except their CPU times.
 
     Raises:
-        FleetError: the file cannot be written, or as the study says.
+        FleetError: the file cannot be written, or an error of the study.
     """
     rows.check_writable()
     missing = [(unit, [key for key in unit.keys if key not in rows]) for unit in units]
@@ -238,31 +238,26 @@ def scenarios_of(given: Sequence[str]) -> list[Scenario]:
 
 
 def size_options(parser: ArgumentParser, size: type[Any]) -> None:
-    """Add --quick if the size has a quick one, and an option for each of its whole numbers, such as --test.
-
-    Tests use tiny ones: results are then of no use.
+    """Add an option for each whole number of a size, such as --test.
 
     Args:
         size: A dataclass (Any: of any study); its other fields have no options.
     """
-    quick, group = hasattr(size, "quick"), parser.add_argument_group("numbers of jobs, training steps and the like")
-    if quick:
-        parser.add_argument("--quick", action="store_true", help="smaller networks and fewer jobs")
+    group = parser.add_argument_group("numbers of jobs, training steps and the like")
     for each in fields(size):
         default = each.default
         some = "+" if isinstance(default, tuple) else None
         if some or (isinstance(default, int) and not isinstance(default, bool)):
             text = " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
-            help_ = f"[{text}{', fewer with --quick' * quick}]"
-            group.add_argument(f"--{each.name.replace('_', '-')}", type=whole(0), nargs=some, metavar="N", help=help_)
+            flag = f"--{each.name.replace('_', '-')}"
+            group.add_argument(flag, type=whole(0), nargs=some, metavar="N", help=f"[{text}]")
 
 
 def size_given(given: Namespace, size: type[Any]) -> Any:
     """The size of the options that `size_options` added."""
-    base = size.quick() if getattr(given, "quick", False) else size()
     own = {each.name: getattr(given, each.name, None) for each in fields(size)}
     own = {name: tuple(value) if isinstance(value, list) else value for name, value in own.items() if value is not None}
-    return replace(base, **own)
+    return size(**own)
 
 
 def seeded(

@@ -1,12 +1,12 @@
-"""What a twin's errors and its latent space tell of jobs: `readings` and `sides`.
+"""Overheating and a twin's errors (`readings`), and the hot side of its latent space (`sides`).
 
 A reading makes one score of a job from the errors of its joints and channels, without labels. The paper's is the sum of
 d_k. Each is judged on jobs of an arm with its true mount: does it rank jobs by whether any joint overheats, and how
 often does a verdict with it call a cool job anomalous?
 
 `sides` samples motion from the hot and from the cool side of the latent space and heats the simulated arm with it. The
-side of a job is told by its latents alone: a linear discriminant of their means over the job, fitted on one half of the
-test jobs. New motion is decoded from perturbed latents of the other half, its torque comes from MuJoCo's inverse
+side of a job follows from its latents alone: a linear discriminant of their means over the job, fitted on one half of
+the test jobs. New motion is decoded from perturbed latents of the other half, its torque comes from MuJoCo's inverse
 dynamics. With one payload for all, the sides differ by motion only.
 """
 
@@ -36,15 +36,16 @@ from benchmarks.paper.harness import (
     table_of,
     whole,
 )
-from benchmarks.paper.saturation import wilson
-from benchmarks.paper.subjects import ALARM_RATE, SCENARIOS, Sample, Study, arm_of, cached_twin, jobs_of, make_study
+from benchmarks.paper.reliability import wilson
+from benchmarks.paper.subjects import ALARM_RATE, SCENARIOS, Sample, Study, arm_of, make_study
 from fleet.arm.model import ArmModel
 from fleet.errors import FleetError
+from fleet.files import cache_folder
 from fleet.motion import Plan
 from scenarios.evaluate.statistics import Interval
 from scenarios.json_rows import Row
 from scenarios.motion.generate import Rejected, planned
-from scenarios.prepare.twins import cold_peaks
+from scenarios.prepare.twins import cold_peaks, train_or_load
 from scenarios.spec.schema import Scenario
 from scenarios.table import Table
 from twin.vae.config import TwinConfig
@@ -136,14 +137,14 @@ def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
         `any`: [reading][measure], `carrier`: the joint of the largest w_k, counted from one, `joint`:
         [reading][measure] for it, and shares of jobs that overheat. A measure without jobs of both kinds is None.
     """
-    parts = {name: _features(twin, study, getattr(study, name)) for name in ("train", "reference", "test", "novel")}
+    parts = {name: _features(twin, getattr(study, name)) for name in ("train", "reference", "test", "novel")}
     work, light = parts["reference"], parts["novel"]
     split = [_rows(light, slice(LIGHT)), _rows(work, slice(WORK))]
     count = CALIBRATION_BEFORE
     before = [_rows(light, slice(count)), _rows(parts["train"], slice(count))]
     peak_c = study.test.peak_c
     cool = peak_c.max(axis=1) < study.cool_c
-    asked = {
+    judged_on = {
         "test": parts["test"],
         "work": _stack([_rows(work, slice(WORK, None)), _rows(parts["test"], cool)]),
         "light": _rows(light, slice(LIGHT, None)),
@@ -163,18 +164,18 @@ def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
             return largest_p_value(known, 0 * group if pooled else group, scores(features, kinds))
 
         peak = peak_c.max(axis=1) if joint is None else peak_c[:, joint]
-        hot, score = peak >= study.warning_c, scores(asked["test"], split)
+        hot, score = peak >= study.warning_c, scores(judged_on["test"], split)
         both = hot.any() and not hot.all()
         return {
             "auroc": float(roc_auc_score(hot, score)) if both else None,
             "auprc": float(average_precision_score(hot, score)) if both else None,
             "spearman": float(np.asarray(spearmanr(score, peak))[0]),
-            "hits": float((p(asked["test"], split)[hot] <= ALARM_RATE).mean()) if both else None,
+            "hits": float((p(judged_on["test"], split)[hot] <= ALARM_RATE).mean()) if both else None,
             **{
-                f"false_{kind}": float((p(asked[kind], split) <= ALARM_RATE).mean())
+                f"false_{kind}": float((p(judged_on[kind], split) <= ALARM_RATE).mean())
                 for kind in ("work", "light", "known")
             },
-            "false_before": float((p(asked["work"], before, pooled=True) <= ALARM_RATE).mean()),
+            "false_before": float((p(judged_on["work"], before, pooled=True) <= ALARM_RATE).mean()),
         }
 
     return {
@@ -187,9 +188,8 @@ def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
     }
 
 
-def _features(twin: Twin, study: Study, sample: Sample) -> Features:
-    jobs = jobs_of(sample, study.horizon_s)
-    return twin.features(jobs.plans, jobs.repetitions)
+def _features(twin: Twin, sample: Sample) -> Features:
+    return twin.features(sample.plans, sample.repetitions)
 
 
 def _rows(features: Features, rows: slice | Array) -> Features:
@@ -240,7 +240,7 @@ def studied(
 ) -> tuple[Study, Twin]:
     """Jobs of an arm of a scenario, and the twin of its cool ones."""
     study = make_study(draw, robot=scenario.arms[index].robot(), **asdict(size))  # pyright: ignore[reportArgumentType]
-    return study, cached_twin(study.train.records(), config, draw)
+    return study, train_or_load(study.train.records(), config, draw, arm="arm", folder=cache_folder())
 
 
 def arm_row(
@@ -285,40 +285,17 @@ MOST_DRAWS = 5
 """Most attempts per requested motion."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Share:
-    """How many of the motions of one side get hot, with 95 % intervals (Wilson)."""
-
-    motions: int
-    rejected: int
-    """Beyond joint or torque limits."""
-    warm: tuple[float, float, float]
-    """Share in which a motor passes the cool limit when the motion repeats over the horizon."""
-    critical: tuple[float, float, float]
-    """Share in which one reaches the warning limit."""
-    peak_c: float
-    """Median temperature of the hottest motor."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sides:
-    """Both sides of the latent space."""
-
-    sources: dict[str, int]
-    """Test jobs on each side."""
-    source_critical: dict[str, float]
-    """Share of them that are critical."""
-    own: dict[str, Share]
-    """With the payload of the source, by side."""
-    common: dict[str, Share]
-    """With `COMMON_KG` for all, by side."""
-
-
-def sides(study: Study, twin: Twin, *, count: int = 40, s: float = 1.0, seed: int = 0) -> Sides:
+def sides(study: Study, twin: Twin, *, count: int = 40, s: float = 1.0, seed: int = 0) -> Row:
     """Generate `count` motions from each side of the latent space and heat the arm with them.
 
     Args:
         s: Perturbation in posterior standard deviations.
+
+    Returns:
+        `sources`: test jobs on each side, `source_critical`: share of them that are critical. `own` and `common`, with
+        the payload of the source and with `COMMON_KG` for all: for each side the numbers of `motions` and of those
+        `rejected` beyond joint or torque limits, the shares that get `warm` (above the cool limit) and `critical` when
+        the motion repeats over the horizon, with 95 % intervals, and the median `peak_c` of the hottest motor.
 
     Raises:
         FleetError: a side has no jobs, or none of its motions is possible.
@@ -328,11 +305,16 @@ def sides(study: Study, twin: Twin, *, count: int = 40, s: float = 1.0, seed: in
     if not all(map(len, chosen.values())):
         raise FleetError("All test jobs lie on one side of the latent space; take another arm or more test jobs.")
     model = ArmModel(study.robot)
-    result: dict[str, dict[str, Share]] = {"own": {}, "common": {}}
+    result: Row = {
+        "sources": {side: len(index) for side, index in chosen.items()},
+        "source_critical": {side: float(critical[index].mean()) for side, index in chosen.items()},
+        "own": {},
+        "common": {},
+    }
     for number, (side, index) in enumerate(chosen.items()):
         rng = np.random.default_rng([seed, number])
-        motions: dict[str, list[Plan]] = {name: [] for name in result}
-        rejected = dict.fromkeys(result, 0)
+        motions: dict[str, list[Plan]] = {"own": [], "common": []}
+        rejected = dict.fromkeys(motions, 0)
         for _ in range(MOST_DRAWS * count):
             if len(motions["own"]) == count:
                 break
@@ -345,13 +327,17 @@ def sides(study: Study, twin: Twin, *, count: int = 40, s: float = 1.0, seed: in
                     rejected[name] += 1
         if not all(motions.values()):
             raise FleetError(f"No motion from the {side} side stays within the arm's limits; take a smaller --s.")
+        law = {"ambient_c": study.ambient_c, "horizon_s": study.horizon_s}
         for name, plans in motions.items():
-            result[name][side] = _share(study, plans, rejected[name])
-    return Sides(
-        sources={side: len(index) for side, index in chosen.items()},
-        source_critical={side: float(critical[index].mean()) for side, index in chosen.items()},
-        **result,
-    )
+            peak_c = cold_peaks(plans, study.motors, study.thermal, **law).max(axis=1)
+            result[name][side] = {
+                "motions": len(plans),
+                "rejected": rejected[name],
+                "warm": share_of(peak_c > study.cool_c),
+                "critical": share_of(peak_c >= study.warning_c),
+                "peak_c": float(np.median(peak_c)),
+            }
+    return result
 
 
 def hot_side(study: Study, twin: Twin) -> tuple[Array, Array, Array]:
@@ -361,8 +347,7 @@ def hot_side(study: Study, twin: Twin) -> tuple[Array, Array, Array]:
         Discriminant of each test job, positive on the hot side, whether it is critical, each [job], and the indices of
         the jobs that it was not fitted on.
     """
-    jobs = jobs_of(study.test, study.horizon_s)
-    latent = twin.features(jobs.plans, jobs.repetitions).latent_moments[0].reshape(len(jobs.plans), -1)
+    latent = _features(twin, study.test).latent_moments[0].reshape(len(study.test), -1)
     critical = study.critical
     fitted, rest = np.arange(0, len(latent), 2), np.arange(1, len(latent), 2)
     kinds = [latent[fitted][critical[fitted] == kind] for kind in (False, True)]
@@ -381,23 +366,9 @@ def _realised(model: ArmModel, made: Variation, source: Plan, payload_kg: float 
     return planned(made, source, model)
 
 
-def _share(study: Study, plans: Sequence[Plan], rejected: int) -> Share:
-    peak_c = cold_peaks(plans, study.motors, study.thermal, ambient_c=study.ambient_c, horizon_s=study.horizon_s).max(
-        axis=1
-    )
-    return Share(
-        motions=len(plans),
-        rejected=rejected,
-        warm=share_of(peak_c > study.cool_c),
-        critical=share_of(peak_c >= study.warning_c),
-        peak_c=float(np.median(peak_c)),
-    )
-
-
 def share_of(event: Array) -> tuple[float, float, float]:
     """Share of true values with its 95 % Wilson interval."""
-    low, high = wilson(event.mean(keepdims=True), np.array([len(event)]))
-    return float(event.mean()), float(low[0]), float(high[0])
+    return float(event.mean()), *wilson(event)
 
 
 PAYLOADS = {"own": "as the source", "common": "2 kg for all"}
@@ -440,7 +411,7 @@ def side_row(given: Namespace) -> Row:
     draw = np.random.SeedSequence([given.seed, index + 1])
     study, twin = studied(scenario, index, draw, TwinConfig.quick(), size_given(given, ArmSize))
     found = sides(study, twin, count=given.count, s=given.s, seed=given.seed)
-    return {"scenario": scenario.name, "arm": scenario.arms[index].name, "seed": given.seed, **asdict(found)}
+    return {"scenario": scenario.name, "arm": scenario.arms[index].name, "seed": given.seed, **found}
 
 
 def side_units(given: Namespace) -> list[Unit]:

@@ -18,18 +18,16 @@ from sklearn.metrics import average_precision_score, roc_auc_score
 from benchmarks.paper.harness import scenarios_of
 from fleet.arm.random_motions import light_jobs, random_jobs
 from fleet.errors import FleetError
-from fleet.files import cache_folder
 from fleet.heat.motor import Motors, friction_torque, gen3_motors
 from fleet.heat.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.motion import CHANNELS, Phase, Plan, distinct
 from fleet.robot import JOINTS, Robot, ThermalLimits
 from fleet.seeding import child
 from scenarios.prepare.arms import ArmHardware
-from scenarios.prepare.twins import cold_peaks, records, train_or_load
+from scenarios.prepare.twins import cold_peaks, records
 from scenarios.spec.schema import Scenario
 from twin.vae.config import TwinConfig
-from twin.vae.measures import fewest
-from twin.vae.twin import Twin
+from twin.vae.measures import fewest, p_value
 from twin.vae.window import windows_of
 
 Array = np.ndarray
@@ -42,13 +40,12 @@ RANKING = ("auroc", "auprc", "spearman")
 """Measures that need no threshold."""
 LABELS = {"auroc": "AUROC", "auprc": "AUPRC", "spearman": "Spearman"}
 ALARM_RATE = 0.05
-"""Share of cool jobs that may raise an alarm."""
+"""Rate of false alarms on cool jobs."""
 SHORT = TwinConfig(
     hidden=16, rate_hz=6.25, window=25, stride=5, score_stride=25, batch=32, restarts=1, max_windows=100_000,
     allow_collapse=True,
 )  # fmt: skip
 """Half the hidden units and half the sample rate of a usual twin: an eighth of its time."""
-USUAL = TwinConfig(batch=32, max_windows=100_000, allow_collapse=True)
 EVERYTHING_C = 1e6
 """A limit that no motor reaches: any motion is cool."""
 QD, TAU = CHANNELS.index("qd"), CHANNELS.index("tau")
@@ -69,6 +66,12 @@ class Sample:
     plans: tuple[Plan, ...]
     peak_c: Array
     """Hottest winding temperature when the cycle repeats over the horizon from a cold start, °C, [plan, joint]."""
+    horizon_s: float
+
+    @property
+    def repetitions(self) -> tuple[int, ...]:
+        """Repetitions of each plan that fill the horizon."""
+        return tuple(max(1, int(np.ceil(self.horizon_s / plan.cycle.duration_s))) for plan in self.plans)
 
     def __len__(self) -> int:
         return len(self.plans)
@@ -138,7 +141,7 @@ def make_study(
 
     Args:
         train: Training jobs, exploration included.
-        exploration: Light motions among the training jobs, drawn as those of `novel`, but independently.
+        exploration: Light motions among the training jobs, sampled like those of `novel`, but independently.
         spread: Deviation of the arm from the nominal one, `ThermalSpread.gen3()` by default.
 
     Raises:
@@ -182,13 +185,13 @@ class _Simulator:
     def sample(self, plans: Sequence[Plan]) -> Sample:
         """The plans with their peak temperatures."""
         peak_c = cold_peaks(plans, self.motors, self.thermal, ambient_c=self.ambient_c, horizon_s=self.horizon_s)
-        return Sample(tuple(plans), peak_c)
+        return Sample(tuple(plans), peak_c, self.horizon_s)
 
     def cool_jobs(self, *parts: tuple[Callable[..., Sequence[Plan]], np.random.Generator, int]) -> Sample:
         """Jobs that stay cool over the whole horizon: for each part how to draw them, and their number."""
         jobs = [job for draw, rng, wanted in parts for job in islice(self._cool_jobs(draw, rng), wanted)]
         peak_c = np.array([peak for _, peak in jobs]).reshape(len(jobs), JOINTS)
-        return Sample(tuple(plan for plan, _ in jobs), peak_c)
+        return Sample(tuple(plan for plan, _ in jobs), peak_c, self.horizon_s)
 
     def _cool_jobs(self, draw: Callable[..., Sequence[Plan]], rng: np.random.Generator) -> Iterator[tuple[Plan, Array]]:
         """Cool jobs with their peaks, one by one without end.
@@ -199,96 +202,28 @@ class _Simulator:
         kind = "light" if draw is light_jobs else "job"
         barren = 0
         for batch in count():
-            drawn = self.sample(draw(self.robot, _BATCH, rng, name=f"{kind}_{batch}"))
-            cool = ~(drawn.peak_c.max(axis=1) > self.cool_c)
+            sample = self.sample(draw(self.robot, _BATCH, rng, name=f"{kind}_{batch}"))
+            cool = ~(sample.peak_c.max(axis=1) > self.cool_c)
             barren = 0 if cool.any() else barren + 1
             if barren == _MOST_BATCHES:
                 raise FleetError(
                     f"Of {barren * _BATCH} jobs of arm '{self.robot.name}' none stays below {self.cool_c:g} °C for "
                     f"{self.horizon_s:g} s from {self.ambient_c:g} °C; raise cool_c."
                 )
-            yield from ((drawn.plans[i], drawn.peak_c[i]) for i in np.flatnonzero(cool))
+            yield from ((sample.plans[i], sample.peak_c[i]) for i in np.flatnonzero(cool))
 
 
-@dataclass(frozen=True, eq=False)
-class Jobs:
-    """Jobs with their true outcome."""
-
-    plans: tuple[Plan, ...]
-    repetitions: tuple[int, ...]
-    """[job]."""
-    peak_c: Array
-    """True peak of each joint's winding, °C, [job, joint]."""
-
-    def __post_init__(self) -> None:
-        if not len(self.plans) == len(self.repetitions) == len(self.peak_c):
-            raise ValueError(
-                f"Jobs need a repetition and a peak per plan (got {len(self.plans)} plans, "
-                f"{len(self.repetitions)} repetitions, {len(self.peak_c)} peaks)."
-            )
-
-
-def jobs_of(sample: Sample, horizon_s: float) -> Jobs:
-    """The jobs of a sample, each repeated to fill the horizon."""
-    times = [max(1, int(np.ceil(horizon_s / plan.cycle.duration_s))) for plan in sample.plans]
-    return Jobs(sample.plans, tuple(times), sample.peak_c)
-
-
-class TooFewJobs(FleetError):
-    """Too few jobs for the false-alarm rate."""
-
-
-def allowed(count: int, alpha: float) -> int:
-    """floor(α (n + 1)): a new score is an alarm if fewer than so many of the n reference scores reach it."""
-    return int(np.floor(alpha * (count + 1) + 1e-9))
-
-
-def alarm_threshold(scores: Sequence[float] | Array, alpha: float = ALARM_RATE) -> float:
-    """The score above which an alarm is raised: at most the share `alpha` of jobs without the event, on average.
-
-    The bound is one over calibrations, for jobs exchangeable with those of the scores, not for motion of another kind.
-    Source: Vovk, Gammerman & Shafer, Algorithmic Learning in a Random World, 2005, ch. 4; Laxhammar & Falkman 2010.
-
-    Args:
-        scores: Of jobs without the event that the score was not fitted on, [job].
-
-    Raises:
-        TooFewJobs: fewer than 1/alpha − 1.
-        ValueError: alpha outside (0, 1), or scores that are not finite.
-    """
-    if not 0 < alpha < 1:
-        raise ValueError(f"The rate of false alarms must be between 0 and 1 (got {alpha}).")
-    ordered = np.sort(np.asarray(scores, dtype=float))
-    if not np.isfinite(ordered).all():
-        raise ValueError("Scores of jobs without the event must be finite.")
-    count = allowed(len(ordered), alpha)
-    if count < 1:
-        raise TooFewJobs(
-            f"A false-alarm rate of {alpha:g} needs {fewest(alpha)} or more jobs without the event "
-            f"(got {len(ordered)}). Collect more jobs, or choose a larger alpha."
-        )
-    return float(ordered[-count])
-
-
-def raised(score: Array, threshold: float) -> float:
-    """Share of scores that raise an alarm; NaN does, and without scores it is NaN."""
-    return float((~(np.asarray(score, dtype=float) <= threshold)).mean()) if len(score) else float("nan")
-
-
-def detection(
-    score: Array, peak_c: Array, *, reference: Array, limit_c: float, novel: Array | None = None
-) -> dict[str, float]:
+def detection(score: Array, peak_c: Array, *, reference: Array, limit_c: float) -> dict[str, float]:
     """Quality of scores [job] of held-out jobs with true peaks [job], °C.
 
     Args:
-        reference: Scores of other held-out cool jobs, [job]; the threshold comes from these alone.
+        reference: Scores of other held-out cool jobs, [job], which set the alarm.
         limit_c: A job is critical if its peak reaches this.
-        novel: Scores of light new motions, [job].
 
     Returns:
         `auroc`: probability that a critical job scores above another one. `auprc`: average precision; by chance, the
-        share of critical jobs. `spearman`: rank correlation with the true peak. `caught`: share of critical jobs that
-        raise an alarm. `false_novel`: share of light new motions that do so although they stay cool.
+        share of critical jobs. `spearman`: rank correlation with the true peak. `caught`: share of critical jobs with a
+        conformal p-value of at most `ALARM_RATE` (Laxhammar & Falkman 2010).
 
     Raises:
         ValueError: scores that are not finite, or not one per peak.
@@ -296,8 +231,7 @@ def detection(
     """
     if score.shape != peak_c.shape or score.ndim != 1:
         raise ValueError(f"Scores and peaks must be [job] alike (got {score.shape} and {peak_c.shape}).")
-    novel = np.zeros(0) if novel is None else novel
-    if not all(np.isfinite(values).all() for values in (score, peak_c, reference, novel)):
+    if not all(np.isfinite(values).all() for values in (score, peak_c, reference)):
         raise ValueError("Scores and peaks must be finite.")
     critical = peak_c >= limit_c
     if critical.all() or not critical.any():
@@ -305,13 +239,17 @@ def detection(
             f"{critical.sum()} of {len(critical)} test jobs reach {limit_c:g} °C: without some of both kinds no "
             "quality can be measured. Change the payloads, the ambient temperature or the limit."
         )
-    threshold = alarm_threshold(reference)
+    if len(reference) < fewest(ALARM_RATE):
+        raise FleetError(
+            f"A false-alarm rate of {ALARM_RATE:g} needs {fewest(ALARM_RATE)} or more cool reference jobs (got "
+            f"{len(reference)}). Increase their number."
+        )
+    rate = ALARM_RATE + 1e-9 / (len(reference) + 1)
     return {
         "auroc": float(roc_auc_score(critical, score)),
         "auprc": float(average_precision_score(critical, score)),
         "spearman": float(np.asarray(spearmanr(score, peak_c))[0]),
-        "caught": raised(score[critical], threshold),
-        "false_novel": raised(novel, threshold),
+        "caught": float((p_value(np.sort(reference), score[critical]) <= rate).mean()),
     }
 
 
@@ -385,7 +323,7 @@ def subjects_of(
     """The arms with these indices of every scenario, under every seed.
 
     Raises:
-        FleetError: a scenario is unknown, or none has so many arms.
+        FleetError: a scenario is unknown, or an arm index is too large.
     """
     chosen = scenarios_of(list(scenarios))
     last = max(len(scenario.arms) for scenario in chosen) - 1
@@ -400,18 +338,8 @@ def subjects_of(
     ]
 
 
-def usual_study(seed: int | np.random.SeedSequence, **sizes: int) -> Study:
-    """`make_study` of the usual arm with sizes by name."""
-    return make_study(np.random.SeedSequence(seed) if isinstance(seed, int) else seed, **sizes)  # pyright: ignore[reportArgumentType]
-
-
-def cached_twin(records: Sequence[Array], config: TwinConfig, seed: np.random.SeedSequence, arm: str = "arm") -> Twin:
-    """A twin of these records from the cache of all twins, or trained and stored there."""
-    return train_or_load(list(records), config, seed, arm=arm, folder=cache_folder())
-
-
 def with_steps(config: TwinConfig, parts: Sequence[Array], steps: int) -> TwinConfig:
-    """The configuration with as many epochs on these records as come closest to a number of steps."""
+    """The configuration with the number of epochs on these records that is closest to a number of steps."""
     batches = -(-len(windows_of(parts, config)) // config.batch)
     return replace(config, epochs=max(1, round(steps / batches)))
 

@@ -1,4 +1,4 @@
-"""What the choices of a twin and the amount of its data change, on several arms: `sweep` and `parsimony`.
+"""Effect of the hyperparameters of a twin (`sweep`) and of the amount of its data (`parsimony`), on several arms.
 
 `sweep` changes one choice of the twin at a time, and takes the paper's own choices. `parsimony` trains on more and more
 jobs, beside an LSTM regressor of temperature. The twin sees cool jobs without labels. The regressor needs the
@@ -36,14 +36,13 @@ from benchmarks.paper.subjects import (
     RANKING,
     SCENARIOS,
     TAU,
-    Jobs,
+    Sample,
     Sizes,
     Study,
     Subject,
     arm_of,
     carrier_of,
     detection,
-    jobs_of,
     subjects_of,
 )  # fmt: skip
 from fleet.errors import FleetError, nearest
@@ -165,7 +164,7 @@ def sweep_rows(
 def measures(twin: Twin, subject: Subject, study: Study) -> Row:
     """How the twin's scores rank the test jobs: [label][score][measure]; and how the training went, carrier first."""
     carrier = carrier_of(study)
-    test, reference = jobs_of(study.test, study.horizon_s), jobs_of(study.reference, study.horizon_s)
+    test, reference = study.test, study.reference
     of_test, of_reference = (_scores(twin, subject, jobs, carrier) for jobs in (test, reference))
     own, hottest = test.peak_c[:, carrier], test.peak_c.max(axis=1)
     row: Row = {"carrier": carrier + 1}
@@ -184,7 +183,7 @@ def measures(twin: Twin, subject: Subject, study: Study) -> Row:
     return row
 
 
-def _scores(twin: Twin, subject: Subject, jobs: Jobs, carrier: int) -> dict[str, Array]:
+def _scores(twin: Twin, subject: Subject, jobs: Sample, carrier: int) -> dict[str, Array]:
     """By the names of `SCORES`."""
     features = twin.features(subject.seen(jobs.plans, carrier), jobs.repetitions)
     if subject.carrier_only:
@@ -351,7 +350,7 @@ def parsimony_measures(model: str, jobs: int, subject: Subject, study: Study, ho
     carrier = carrier_of(study)
     sample = (hot if model == LSTM_ANY else study).train
     plans, known = sample.plans[:jobs], records(sample.plans[:jobs])
-    test, reference = jobs_of(study.test, study.horizon_s), jobs_of(study.reference, study.horizon_s)
+    test, reference = study.test, study.reference
     if model == TWIN:
         windows = min(BASE.max_windows, len(windows_of(known, BASE)))
         config = replace(BASE, epochs=max(1, round(STEPS / -(-windows // BASE.batch))))
@@ -361,7 +360,7 @@ def parsimony_measures(model: str, jobs: int, subject: Subject, study: Study, ho
             for each in (test, reference)
         ]
     else:
-        times = jobs_of(sample, study.horizon_s).repetitions[:jobs]
+        times = sample.repetitions[:jobs]
         seed = int(subject.entropy.generate_state(1)[0])
         rise_k = sample.peak_c[:jobs] - study.ambient_c
         regressor = train_regressor(plans, times, rise_k, BASE, seed, steps=STEPS)
@@ -480,7 +479,7 @@ def train_regressor(
     Args:
         rise_k: Rise of every motor at the end of each job, K, [job, joint].
         config: How windows are cut.
-        steps: Steps of Adam, each with 128 windows drawn at random.
+        steps: Steps of Adam, each with 128 random windows.
 
     Raises:
         ValueError: not one row of rises for each job.

@@ -1,15 +1,13 @@
-"""One arm's twin as the start for another arm, the data and training that this saves: `transfer`, `transfer-logs`.
+"""Data and training that one arm's twin saves when a twin of another arm starts from it: `transfer`.
 
-The second arm has another mount, tool or wear, or is the real one of some logs. Its twin is trained from nothing on n
-of its jobs, or starts from the twin of the first arm: with its networks unchanged and only new z-scores, or with a
-short further training. All are judged on other cool jobs of the second arm. Torque is computed from the motor current,
-so wear is visible.
+The second arm has another mount, tool or wear. Its twin is trained from nothing on n of its jobs, or starts from the
+twin of the first arm: with its networks unchanged and only new z-scores, or with a short further training. All are
+judged on other cool jobs of the second arm. Torque is computed from the motor current, so wear is visible.
 """
 
 import time
-from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -17,42 +15,27 @@ import torch
 from sklearn.metrics import roc_auc_score
 
 from benchmarks.paper.harness import (
-    Experiment,
-    Unit,
-    content_key,
     matching,
     number,
-    one_row,
-    seed_options,
     seeded,
-    seeds_of,
-    size_given,
-    size_options,
     table_of,
 )
-from benchmarks.paper.real_logs import CONFIG, HOT_C, log_options, recordings_given
 from benchmarks.paper.subjects import (
     CARRIER,
     GRIPPER_KG,
     SHORT,
     SUBJECT,
-    USUAL,
     Study,
-    jobs_of,
     make_study,
     sensed,
-    usual_study,
     with_steps,
 )
-from fleet.errors import FleetError
 from fleet.robot import Mount, Robot
 from fleet.seeding import child
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Row
-from scenarios.prepare.calibrate import own_logs
 from scenarios.prepare.twins import records
 from scenarios.table import Table
-from twin.logs.recording import Recording, cool_stretches, stretches
 from twin.vae.config import TwinConfig, hash_records, seed_text
 from twin.vae.model import one_thread
 from twin.vae.train import Run, train
@@ -79,34 +62,20 @@ SHAPE = ("scope", "kind", "latent", "hidden", "layers", "window", "rate_hz")
 class TransferSize:
     """Numbers of jobs and training steps."""
 
-    jobs: tuple[int, ...] = (5, 10, 20, 40)
+    jobs: tuple[int, ...] = (5, 10, 40)
     """Jobs of the second arm, ascending; the last one is the reference."""
-    source_jobs: int = 160
+    source_jobs: int = 120
     """Cool jobs of the first arm."""
-    source_steps: int = 1500
-    held_out: int = 60
-    test: int = 200
+    source_steps: int = 1000
+    held_out: int = 30
+    test: int = 40
     """Jobs of the natural mix, for AUROC."""
-    steps: int = 600
+    steps: int = 300
     """Of a training from nothing; the better of two starts counts there and for the first arm."""
-    further_steps: int = 100
+    further_steps: int = 75
     further_rate: float = 1e-3
     """Peak learning rate of the further training."""
-    config: TwinConfig = USUAL
-
-    @classmethod
-    def quick(cls) -> "TransferSize":
-        """Smaller networks and fewer jobs, about a tenth of the time."""
-        return cls(
-            jobs=(5, 10, 40),
-            source_jobs=120,
-            source_steps=1000,
-            held_out=30,
-            test=40,
-            steps=300,
-            further_steps=75,
-            config=BETTER,
-        )
+    config: TwinConfig = BETTER
 
 
 def continue_training(
@@ -214,7 +183,7 @@ def compare_starts(
 
 
 def error_of(twin: Twin, windows: Array, common: Scaler) -> float:
-    """Mean |x − x̂| of windows in the z-scores of `common`, whatever those of the twin."""
+    """Mean |x − x̂| of windows in the z-scores of `common`."""
     return float(np.abs(common.to_z(windows) - common.to_z(twin.reconstruct(windows))).mean())
 
 
@@ -243,7 +212,7 @@ def arm_rows(seed: int, size: TransferSize, wanted: Collection[str]) -> Iterator
 
 def auroc_of(study: Study, twin: Twin) -> float:
     """AUROC of d of joint 2 for test jobs that overheat joint 2; NaN if all do or none does."""
-    test = jobs_of(study.test, study.horizon_s)
+    test = study.test
     critical = test.peak_c[:, CARRIER] >= study.warning_c
     if critical.all() or not critical.any():
         return float("nan")
@@ -294,76 +263,10 @@ def data_ratio(row: Row, start: str) -> float:
 
 TRANSFER = seeded(
     "One arm's twin as the start for an arm with another tool, wear or mount: the data that this saves.\n\n"
-    "With --quick a seed takes a minute of one core, without it many times as long.",
+    "A seed takes a minute of one core.",
     TransferSize,
     3,
     arm_rows,
     transfer_tables,
     parts=tuple(TARGETS),
-)
-
-FILES = (1, 2, 4, 8, 16)
-LEAST_HELD_OUT = 8
-"""Fewest cool files to judge on."""
-WORK_S, REST_S = 150.0, 30.0
-"""Simulated log of each job of the first arm."""
-
-
-def cool_files(recordings: Sequence[Recording], config: TwinConfig) -> list[list[Array]]:
-    """Records of joint 2's cool motion in each file that never reaches `HOT_C`.
-
-    Raises:
-        FleetError: too few files are cool.
-    """
-    cool = [r for r in recordings if r.temp_c is not None and r.temp_c[:, CARRIER].max(initial=-np.inf) < HOT_C]
-    parts = [
-        [part.profile for part in cool_stretches([r], config.rate_hz, cool_c=HOT_C, joints=(CARRIER,))] for r in cool
-    ]
-    parts = [some for some in parts if any(len(profile) >= config.window for profile in some)]
-    least = FILES[-1] + LEAST_HELD_OUT
-    if len(parts) < least:
-        raise FleetError(
-            f"{len(parts)} of {len(recordings)} logs stay below {HOT_C:g} °C on joint {CARRIER + 1} and last "
-            f"{config.window / config.rate_hz:g} s: the study needs {least}; add logs of light work."
-        )
-    return parts
-
-
-def log_row(recordings: Sequence[Recording], seed: int, size: TransferSize) -> Row:
-    """As `arm_rows` with a real second arm: `jobs` counts files, and AUROC is unknown."""
-    parts, root = cool_files(recordings, size.config), np.random.SeedSequence(seed)
-    first = usual_study(child(root, 0), train=size.source_jobs, reference=0, test=0, novel=0)
-    rng = np.random.default_rng(child(root, 1))
-    logs = own_logs(first.hardware, first.train.plans, rng, ambient_c=first.ambient_c, work_s=WORK_S, rest_s=REST_S)
-    own = [part.profile for log in logs for part in stretches(log, size.config.rate_hz)]
-    source = train(own, with_steps(size.config, own, size.source_steps), child(root, 2), arm="simulated")
-    order = np.random.default_rng(child(root, 3)).permutation(len(parts))
-    chosen = {n: [record for i in order[:n] for record in parts[i]] for n in FILES}
-    held_out = windows_of([record for i in order[FILES[-1] :] for record in parts[i]], size.config)
-    found = compare_starts(source, chosen, held_out, size, child(root, 4), lambda _: float("nan"))
-    return {"target": "real arm", "seed": seed, **found}
-
-
-def transfer_log_options(parser: ArgumentParser) -> None:
-    """Options of `transfer-logs`."""
-    log_options(parser, seeds=0)
-    seed_options(parser, 1)
-    size_options(parser, TransferSize)
-
-
-def transfer_log_units(given: Namespace) -> list[Unit]:
-    """A unit for each seed."""
-    (recordings, logs), size = recordings_given(given), size_given(given, TransferSize)
-    windows = {name: getattr(CONFIG, name) for name in ("rate_hz", "record_hz", "window", "stride")}
-    size = replace(size, config=size.config.changed(**windows))
-    basis = content_key(logs, asdict(size))
-    return [one_row(f"{seed}/{basis}", partial(log_row, recordings, seed, size)) for seed in seeds_of(given)]
-
-
-LOGS = Experiment(
-    help="The twin of a simulated arm as the start for the real arm of some logs.\n\n"
-    "With --quick a seed takes a minute of one core.",
-    options=transfer_log_options,
-    units=transfer_log_units,
-    tables=lambda rows: {name: table for name, table in transfer_tables(rows).items() if name == "transfer_errors"},
 )

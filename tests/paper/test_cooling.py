@@ -1,4 +1,4 @@
-"""Cooling: the motor of Zhu et al. by integration and closed forms, the core, one joint, and a fleet."""
+"""Cooling: the motor of Zhu et al. by integration and closed forms, one joint, and a fleet."""
 
 import math
 from dataclasses import astuple, replace
@@ -10,22 +10,16 @@ from scipy.integrate import solve_ivp
 from benchmarks.paper.cooling import (
     ARRANGEMENTS,
     COOLANT_C,
-    CORE_WARNING_C,
     LIMIT_C,
+    PUBLISHED,
     STRATEGIES,
-    ZHU,
     ZHU_MOTOR,
     Arrangement,
-    core_allowance_k_per_w,
     fit_motor,
     fleet_rows,
     joint_row,
     motor_rows,
-    published,
 )
-from fleet.heat.motor import thermal_data
-from fleet.heat.thermal import HOUSING, WINDING, gen3_network, housing, node_heat, thermal_model
-from fleet.robot import JOINTS, ThermalLimits
 from scenarios.evaluate.rollout import outcomes
 from scenarios.prepare.fleet import prepare
 from scenarios.spec.load import load, override
@@ -60,10 +54,10 @@ def test_each_way_of_cooling_is_within_ten_percent_of_the_published_figure(arran
     assert ZHU_MOTOR.limit_s(arrangement) == pytest.approx(moment_s, rel=1e-6)
     if arrangement == "immersion":
         assert moment_s == math.inf
-        assert last_c == pytest.approx(ZHU.immersed_c, rel=0.1)
+        assert last_c == pytest.approx(PUBLISHED["immersed_c"], rel=0.1)
         assert ZHU_MOTOR.steady_c(arrangement) == pytest.approx(last_c, abs=1e-3)
     else:
-        assert moment_s == pytest.approx(ZHU.limit_s[arrangement], rel=0.1)
+        assert moment_s == pytest.approx(PUBLISHED[f"{arrangement}_s"], rel=0.1)
 
 
 def test_immersion_conducts_3_7_times_what_forced_water_does():
@@ -72,7 +66,7 @@ def test_immersion_conducts_3_7_times_what_forced_water_does():
     immersed = ZHU_MOTOR.heating_k_per_s * (1 + ALPHA * rise) / rise
     water = 1 / (1 / ZHU_MOTOR.interface_per_s + 1 / ZHU_MOTOR.water_per_s)
     assert immersed / water == pytest.approx(3.7, rel=0.1)
-    assert ZHU_MOTOR.figures() == pytest.approx(published(), rel=0.1)
+    assert ZHU_MOTOR.figures() == pytest.approx(PUBLISHED, rel=0.1)
 
 
 def test_without_any_conduction_the_winding_warms_exponentially():
@@ -95,25 +89,6 @@ def test_the_fit_gives_the_stored_motor_and_says_what_the_figures_leave_open():
     np.testing.assert_allclose(astuple(fit.motor), astuple(ZHU_MOTOR), rtol=1e-3)
     assert max(fit.relative_sd, key=lambda name: fit.relative_sd[name]) == "bare_per_s"
     assert fit.relative_sd["bare_per_s"] > 1.0 > 0.3 > fit.relative_sd["water_per_s"]
-
-
-@pytest.mark.parametrize("joint", range(JOINTS))
-def test_a_core_of_the_allowed_resistance_warns_just_as_its_motor_reaches_the_error_limit(joint):
-    network = gen3_network()
-    for j in range(1, JOINTS):
-        network.edges[housing(j - 1), housing(j)]["conductance_w_per_k"] = 0.0
-    model, idle_w = thermal_model(network), np.array(thermal_data()["idle_w"])
-    per_watt = model.steady(node_heat(np.ones(JOINTS), np.zeros(JOINTS)), 0.0)[WINDING][joint]
-    idle_c = model.steady(node_heat(np.zeros(JOINTS), idle_w), 36.0)[WINDING][joint]
-    copper_w = np.full(JOINTS, (ThermalLimits.error_c - idle_c) / per_watt)
-    settled_c = model.steady(node_heat(copper_w, idle_w), 36.0)
-    assert settled_c[WINDING][joint] == pytest.approx(ThermalLimits.error_c)
-    core_c = settled_c[HOUSING][joint] + core_allowance_k_per_w(joint, 36.0) * idle_w[joint]
-    assert core_c == pytest.approx(CORE_WARNING_C)
-
-
-def test_cooler_air_allows_more():
-    assert core_allowance_k_per_w(1, 20.0) > core_allowance_k_per_w(1, 36.0)
 
 
 def test_every_published_figure_is_met_within_ten_percent():

@@ -35,7 +35,7 @@ from benchmarks.paper.features import (
     with_wear,
     worn_jobs,
 )
-from benchmarks.paper.subjects import SHORT, jobs_of, make_study, sensed, with_steps
+from benchmarks.paper.subjects import SHORT, make_study, sensed, with_steps
 from benchmarks.paper.transfer import (
     FURTHER,
     NOTHING,
@@ -269,12 +269,11 @@ def test_moments_by_hand():
 
 
 def test_inputs_follow_their_jobs(study, twin):
-    jobs = jobs_of(study.test, study.horizon_s)
+    jobs = study.test
     order = np.random.default_rng(0).permutation(len(jobs.plans))
     moved = replace(
         jobs,
         plans=tuple(jobs.plans[i] for i in order),
-        repetitions=tuple(jobs.repetitions[i] for i in order),
         peak_c=jobs.peak_c[order],
     )
     first, again = job_inputs(twin, jobs), job_inputs(twin, moved)

@@ -1,53 +1,11 @@
-"""Readings of a twin's errors, the sides of its latent space, and questions on logs: by hand and by made-up windows."""
-
-from dataclasses import replace
+"""Readings of a twin's errors and the sides of its latent space, by hand and by synthetic features."""
 
 import numpy as np
 import pytest
 
 from benchmarks.paper.readings import JOINTS, MEASURES, TOTALS, Errors, reading_cells, share_of
-from benchmarks.paper.real_logs import QUESTIONS, Windows, answers, judged_windows
-from fleet.errors import FleetError
 from scenarios.evaluate.statistics import interval
-from tests.logs import COOL, TINY, WARM
 from twin.vae.measures import PARTS, Calibration, Features, moments
-
-
-def windows_of(file: list[str], d: list[float], rms: list[float], temp_c: list[float]) -> Windows:
-    scores = {"d": np.array(d), "load": np.array(d), "latent": np.array(d), "rms_torque": np.array(rms)}
-    temps = np.array(temp_c)
-    return Windows(
-        file=np.array(file), fold=np.zeros(len(file), int), scores=scores, temp_c=temps, end_c=temps, peak_next_c=temps
-    )
-
-
-def test_a_lead_over_rms_torque_has_an_interval_over_files() -> None:
-    """d ranks every window rightly, RMS torque is constant: AUROC 1 and ½, whichever files are drawn."""
-    file = [name for name in "abcdef" for _ in range(4)]
-    temp_c = [45.0 if name in "abc" else 30.0 for name in file]
-    found = answers(windows_of(file, temp_c, [1.0] * len(file), temp_c))
-    assert list(found) == list(QUESTIONS)[:1]  # nothing passes 40 °C from below, nothing gains 1 K
-    (answer,) = found.values()
-    assert [answer[each] for each in ("windows", "events", "files", "files_with")] == [24, 12, 6, 3]
-    auroc, lead = answer["auroc"], answer["lead"]
-    means = auroc["d"].mean, auroc["rms_torque"].mean, lead["d"].mean
-    assert means == (1.0, 0.5, 0.5)
-    assert lead["d"].note.startswith("no variation in ")
-    # One file with the event: no interval over files.
-    alone = [45.0 if name == "a" else 30.0 for name in file]
-    assert answers(windows_of(file, alone, alone, alone)) == {}
-
-
-def test_every_file_is_judged_once_by_a_twin_that_does_not_know_it(tmp_path) -> None:
-    recordings = [*COOL, WARM, replace(WARM, name="warm_2")]
-    windows = judged_windows(recordings, 0, config=replace(TINY, epochs=1), folder=tmp_path)
-    assert set(windows.file) == {r.name for r in recordings}
-    for name in np.unique(windows.file):
-        assert len(np.unique(windows.fold[windows.file == name])) == 1
-    assert len(np.unique(windows.fold)) == 5
-    assert all(np.isfinite(score).all() for score in windows.scores.values())
-    with pytest.raises(FleetError, match="needs 10 logs that stay below 40 °C on joint 2"):
-        judged_windows(COOL[:9], 0, config=TINY, folder=tmp_path)
 
 
 def test_readings_rank_more_error_higher_and_tell_jobs_apart() -> None:

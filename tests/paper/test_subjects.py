@@ -6,16 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.stats import binom
 
-from benchmarks.paper.subjects import Study, make_study
+from benchmarks.paper.subjects import ALARM_RATE, CARRIER, Study, detection, make_study
 from fleet.arm.model import ArmModel
 from fleet.difficulty import SETTLING_S
 from fleet.errors import FleetError
 from fleet.heat.thermal import HOUSING, NODES, WINDING, ThermalSpread, drive_heat
 from fleet.motion import drive
 from fleet.robot import JOINTS, ThermalLimits
-from scenarios.prepare.calibrate import past_jobs
-from twin.thermal.identify import HeatModel
+from scenarios.prepare.calibrate import AIR_SD_K, own_logs, past_jobs
+from twin.thermal.identify import HeatModel, identify
+from twin.thermal.thermal_twin import RcTwin
 
 SEED = np.random.SeedSequence(11)
 SIZES: dict[str, Any] = {"train": 12, "reference": 10, "test": 60, "novel": 12}
@@ -197,3 +199,67 @@ def test_past_jobs_repeat_and_none_are_none(study, past):
     assert len(nothing) == 0
     assert nothing.passed.shape == (0,)
     assert nothing.start_c.shape == (0, NODES)
+
+
+REFERENCE = np.arange(19.0)
+
+
+def test_measures_by_hand():
+    peak_c = np.array([30.0, 40.0, 50.0, 60.0, 70.0])
+    score = np.array([2.0, 1.0, 19.0, 18.0, 20.0])
+    found = detection(score, peak_c, limit_c=60.0, reference=REFERENCE)
+    assert found["auroc"] == pytest.approx(5 / 6)  # of six pairs critical-other only (18, 19) is the wrong way round
+    assert found["auprc"] == pytest.approx(0.5 * 1 + 0.5 * 2 / 3)  # precision 1 at the first, 2/3 at the second
+    # ranks 2 1 4 3 5 against 1 2 3 4 5: 1 − 6·(1 + 1 + 1 + 1)/(5·24)
+    assert found["spearman"] == pytest.approx(0.8)
+    assert found["caught"] == 0.5  # 18 ties with a reference, 20 is beyond all
+
+
+@pytest.mark.parametrize(
+    ("score", "peak_c", "reference", "says"),
+    [
+        (np.arange(4.0), np.full(4, 80.0), REFERENCE, "some of both kinds"),
+        (np.arange(4.0), np.full(4, 20.0), REFERENCE, "some of both kinds"),
+        (np.arange(2.0), np.array([30.0, 70.0]), np.arange(18.0), r"needs 19 or more cool reference jobs \(got 18\)"),
+        (np.array([0.0, np.nan]), np.array([30.0, 70.0]), REFERENCE, "finite"),
+        (np.arange(3.0), np.array([30.0, 70.0]), REFERENCE, "alike"),
+    ],
+)
+def test_invalid_scores_are_refused(score, peak_c, reference, says):
+    with pytest.raises((FleetError, ValueError), match=says):
+        detection(score, peak_c, limit_c=60.0, reference=reference)
+
+
+@pytest.mark.parametrize("draw", ["normal", "exponential", "coarse"])
+@pytest.mark.parametrize("n", [19, 150])
+def test_false_alarms_have_the_stated_rate_for_any_distribution(draw, n):
+    """Exactly floor(alpha (n + 1))/(n + 1) without ties, and less with them."""
+    rng, trials = np.random.default_rng(n), 600
+    exact = np.floor(ALARM_RATE * (n + 1) + 1e-9) / (n + 1)
+    scores = rng.integers(0, 9, (trials, n + 1)) if draw == "coarse" else getattr(rng, draw)(size=(trials, n + 1))
+    # The new cool job stands for the critical one, whose alarms are counted.
+    false = sum(
+        detection(row[-1] - np.arange(2.0), np.array([70.0, 0.0]), limit_c=60.0, reference=row[:-1])["caught"]
+        for row in scores.astype(float)
+    )
+    assert false <= binom.ppf(0.9999, trials, exact)
+    if draw != "coarse":
+        assert false >= binom.ppf(0.0001, trials, exact)
+
+
+def test_jobs_fill_the_horizon(study):
+    for plan, times in zip(study.test.plans, study.test.repetitions, strict=True):
+        assert times * plan.cycle.duration_s >= study.horizon_s
+        assert (times - 1) * plan.cycle.duration_s < study.horizon_s
+
+
+def test_logs_of_cool_jobs_identify_the_arm(study):
+    """Nearer to the truth than a nominal arm, for jobs that overheat too, none of which was logged."""
+    jobs, start_c = study.test, np.full(NODES, study.ambient_c)
+    logs = own_logs(study.hardware, study.train.plans[:2], np.random.default_rng(1), ambient_c=study.ambient_c)
+    own = identify(logs, ambient_c=study.ambient_c, ambient_sd_k=AIR_SD_K)
+    wrong_k = [
+        rc.peaks(jobs.plans, jobs.repetitions, start_c=start_c)[:, CARRIER] - jobs.peak_c[:, CARRIER]
+        for rc in (RcTwin.nominal(ambient_c=study.ambient_c), RcTwin.of(own))
+    ]
+    assert np.abs(wrong_k[1]).mean() < 0.5 * np.abs(wrong_k[0]).mean()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sklearn.metrics import brier_score_loss, roc_auc_score
 
 from fleet.difficulty import KNOWN
 from fleet.errors import CheckpointError
@@ -100,6 +101,14 @@ def test_many_jobs_teach_the_true_law() -> None:
     assert model.of_log_duration == pytest.approx(1.2, abs=0.12)
     new, p = world(5_000, 2)
     assert np.abs(p_of(model, new) - p).mean() < 0.01
+
+
+def test_two_hundred_jobs_tell_more_than_their_share() -> None:
+    new, _ = world(3_000, 4)
+    p, passed = p_of(fitted(world(200, 3)[0]), new), new["passed"]
+    assert ((p >= 0) & (p <= 1)).all()
+    assert roc_auc_score(passed, p) > 0.75
+    assert brier_score_loss(passed, p) < 0.9 * passed.mean() * (1 - passed.mean())
 
 
 @settings(max_examples=5)

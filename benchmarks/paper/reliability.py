@@ -1,9 +1,4 @@
-"""Quality of P(saturation): on past jobs of one arm (`saturation`), and at the awards of shifts (`reliability`).
-
-`saturation` fits the learned twin and thermal networks on labelled past jobs of one studied arm and judges them, and
-their alarms, on others. `reliability` compares P and predicted peaks at each award of simulated shifts with the outcome
-of the plan.
-"""
+"""P(saturation) and predicted peaks at the awards of simulated shifts, compared with the outcomes: `reliability`."""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -11,8 +6,8 @@ from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
-from scipy.stats import norm
-from sklearn.metrics import roc_auc_score
+from scipy.stats import binomtest
+from sklearn.metrics import brier_score_loss, roc_auc_score
 
 from agents.policy import WAIT
 from benchmarks.paper.harness import (
@@ -23,33 +18,22 @@ from benchmarks.paper.harness import (
     number,
     scenarios_of,
     seed_options,
-    seeded,
     seeds_of,
     table_of,
     whole,
 )
-from benchmarks.paper.quality import QualitySize, spread
-from benchmarks.paper.subjects import Study, alarm_threshold, cached_twin, raised, usual_study
 from fleet.difficulty import SETTLING_S
 from fleet.engine.shift import StepRecord
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
-from fleet.robot import ThermalLimits
 from scenarios.evaluate.sources import drawn
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
-from scenarios.prepare.calibrate import PastJobs, past_jobs
-from scenarios.prepare.fleet import Fleet, env_of, prepare
-from scenarios.prepare.identify import SIMULATED_LOGS, identify_from_work
-from scenarios.prepare.known_cell import let_plan
+from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.parse import choose
 from scenarios.spec.schema import Scenario
 from scenarios.table import Table
-from twin.baselines import EVIDENCE, fit_regression
-from twin.thermal.thermal_twin import RcTwin
-from twin.vae.measures import Features
-from twin.vae.twin import Twin
 
 Array = np.ndarray
 
@@ -79,185 +63,33 @@ class Reliability:
         return float(np.average(np.abs(self.share - self.mean_p), weights=self.count))
 
 
-def reliability(p: Array, event: Array, *, bins: int = BINS, confidence: float = 0.95) -> Reliability:
+def reliability(p: Array, event: Array, *, bins: int = BINS) -> Reliability:
     """The reliability table of stated probabilities [job] against outcomes, bool [job].
 
     Raises:
         ValueError: no jobs, unequal lengths, or probabilities outside [0, 1].
     """
-    p, event = _checked(p, event)
-    if bins < 1:
-        raise ValueError(f"A reliability table needs at least one bin (got {bins}).")
-    edges = np.percentile(p, np.linspace(0.0, 1.0, bins + 1) * 100)  # rounds as scikit-learn does
-    of_job = np.searchsorted(edges[1:-1], p)
-    count = np.bincount(of_job, minlength=bins)
-    filled = count > 0
-    some = np.maximum(count, 1)
-    share = np.bincount(of_job, weights=event, minlength=bins) / some
-    mean_p = np.bincount(of_job, weights=p, minlength=bins) / some
-    low, high = wilson(share[filled], count[filled], confidence)
-    return Reliability(mean_p[filled], share[filled], count[filled], low, high)
-
-
-def wilson(share: Array, count: Array, confidence: float = 0.95) -> tuple[Array, Array]:
-    """Confidence interval of a probability from the share of `count` draws (Wilson, JASA 22, 1927), both ends."""
-    z = float(norm.ppf(0.5 + 0.5 * confidence))
-    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
-    half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
-    return np.clip(middle - half, 0.0, 1.0), np.clip(middle + half, 0.0, 1.0)
-
-
-def brier(p: Array, event: Array) -> float:
-    """Mean squared distance of stated probabilities [job] from outcomes, bool [job]; 0 is perfect."""
-    p, event = _checked(p, event)
-    return float(np.mean(np.square(p - event)))
-
-
-def _checked(p: Array, event: Array) -> tuple[Array, Array]:
     p, event = np.asarray(p, dtype=float), np.asarray(event)
     if p.ndim != 1 or p.shape != event.shape or len(p) == 0:
         raise ValueError(f"Probabilities and events must be [job], at least one (got {p.shape}, {event.shape}).")
     if not ((p >= 0) & (p <= 1)).all():
         raise ValueError("Probabilities must lie in [0, 1].")
-    return p, event.astype(bool).astype(float)
-
-
-MEASURES = {"auroc": "AUROC", "brier": "Brier", "ece": "ECE", "peak_error_k": "error of the peak, K"}
-ALARMS = {"false_alarms": "false alarms", "false_novel": "alarms on light new motion", "caught": "jobs found"}
-
-
-@dataclass(frozen=True)
-class SaturationSize(QualitySize):
-    """Numbers of jobs; `test` follows from those of past jobs."""
-
-    novel: int = 200
-    exploration: int = 0
-    """Light motions among the training jobs."""
-    labelled: int = 200
-    """Past jobs that a model is fitted on; as many more set the alarm."""
-    held_out: int = 800
-    """Past jobs that no model is fitted on."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PastWork:
-    """Past jobs of a studied arm; the natural mix is split into jobs to fit on, to set alarms, and to judge on."""
-
-    study: Study
-    seed: int
-    jobs: PastJobs
-    fit: Array
-    """Indices of jobs, int [job], as are the following."""
-    watched: Array
-    held_out: Array
-    novel: Array
-
-
-def past_work(study: Study, *, seed: int, labelled: int, watched: int) -> PastWork:
-    """Past jobs made of the study's test jobs and novel motions.
-
-    Raises:
-        ValueError: too few test jobs.
-    """
-    natural = len(study.test)
-    if natural <= labelled + watched:
-        raise ValueError(f"Past work needs more than {labelled} + {watched} test jobs (got {natural}).")
-    # In one call, so that novel motions too begin as warm as natural work before them leaves the arm.
-    plans = (*study.test.plans, *study.novel.plans)
-    jobs = past_jobs(study.hardware, plans, np.random.default_rng([seed, 7]), limits=ThermalLimits())
-    order = np.random.default_rng([seed, 8]).permutation(natural)
-    fit, setting, rest = np.split(order, (labelled, labelled + watched))
-    novel = np.arange(natural, len(jobs))
-    return PastWork(study=study, seed=seed, jobs=jobs, fit=fit, watched=setting, held_out=rest, novel=novel)
-
-
-def judged(p: Array, passed: Array, peak_error_k: float = np.nan) -> Row:
-    """Quality of P of jobs, [job]; `peak_error_k` is unknown where no peak is predicted."""
-    quality = {"auroc": float(roc_auc_score(passed, p)), "brier": brier(p, passed)}
-    return quality | {"ece": reliability(p, passed).error, "peak_error_k": peak_error_k}
-
-
-def judge_twin(work: PastWork, twin: Twin) -> tuple[dict[str, Row], dict[str, Row]]:
-    """Every prediction of saturation by a regression on the features of a learned twin, and the alarm on its score."""
-    jobs, (fit, rest) = work.jobs, (work.fit, work.held_out)
-    packed = twin.features(jobs.plans, jobs.repetitions.tolist()).packed
-    calm = [work.watched, work.held_out, work.novel]
-    setting, calm_rest, calm_novel = (rows[~jobs.passed[rows]] for rows in calm)
-    groups_of_alarms = (calm_rest, calm_novel, rest[jobs.passed[rest]])
-    predictions, alarms = dict[str, Row](), dict[str, Row]()
-    for evidence in EVIDENCE:
-        past = (Features(packed[fit]), jobs.duration_s[fit], jobs.known_c[fit], jobs.passed[fit])
-        risk = fit_regression(*past, evidence=evidence).risk(Features(packed), jobs.duration_s)
-        predictions[evidence] = judged(risk.at(jobs.known_c)[rest], jobs.passed[rest])
-        score = risk.value(jobs.known_c)  # ranks jobs also where P rounds to 0 or 1
-        threshold = alarm_threshold(score[setting])
-        shares = (raised(score[rows], threshold) for rows in groups_of_alarms)
-        alarms[evidence] = dict(zip(ALARMS, shares, strict=True))
-    return predictions, alarms
-
-
-def judge_networks(work: PastWork) -> dict[str, Row]:
-    """Prediction of the nominal thermal network, and of one identified from logs of some of the labelled jobs."""
-    study, rng = work.study, np.random.default_rng([work.seed, 9])
-    logged = [work.jobs.plans[i] for i in work.fit[:SIMULATED_LOGS]]
-    arm = identify_from_work(study.hardware, logged, rng, ambient_c=study.ambient_c)
-    nominal = RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c)
-    return {"rc nominal": judge_network(nominal, work), "rc identified": judge_network(RcTwin.of(arm), work)}
-
-
-def judge_network(twin: RcTwin, work: PastWork) -> Row:
-    """Prediction of a thermal network whose P is fitted to the errors of its peaks."""
-    jobs, fit, rest = work.jobs, work.fit, work.held_out
-    plans, times = [jobs.plans[i] for i in fit], jobs.repetitions[fit].tolist()
-    fitted = twin.with_past_jobs(plans, times, known_c=jobs.known_c[fit], peak_c=jobs.hottest_c[fit])
-    forecasts = [fitted.peak(jobs.plans[i], int(jobs.repetitions[i])) for i in rest]
-    p, peak_c = (
-        np.array([float(getattr(each, of)(known)) for each, known in zip(forecasts, jobs.known_c[rest], strict=True)])
-        for of in ("at", "value")
+    edges = np.percentile(p, np.linspace(0.0, 1.0, bins + 1) * 100)  # rounds as scikit-learn does
+    of_job = np.searchsorted(edges[1:-1], p)
+    groups = [of_job == each for each in np.unique(of_job)]
+    mean_p, share, count = (
+        np.array([of(group) for group in groups])
+        for of in (lambda group: p[group].mean(), lambda group: event[group].mean(), np.count_nonzero)
     )
-    return judged(p, jobs.passed[rest], float(np.sqrt(np.mean((peak_c - jobs.hottest_c[rest]) ** 2))))
+    low, high = np.transpose([wilson(event[group]) for group in groups])
+    return Reliability(mean_p, share, count, low, high)
 
 
-def saturation_rows(seed: int, size: SaturationSize, _wanted: Collection[str]) -> Iterator[tuple[str, Row]]:
-    """Every prediction and alarm."""
-    draw = np.random.SeedSequence(seed)
-    study = usual_study(
-        draw,
-        train=size.train,
-        exploration=size.exploration,
-        reference=size.reference,
-        test=2 * size.labelled + size.held_out,
-        novel=size.novel,
-    )
-    work = past_work(study, seed=seed, labelled=size.labelled, watched=size.labelled)
-    predictions, alarms = judge_twin(work, cached_twin(study.train.records(), size.config, draw))
-    yield "", {"seed": seed, "predictions": predictions | judge_networks(work), "alarms": alarms}
+def wilson(event: Array) -> tuple[float, float]:
+    """95 % interval of the probability of an event, bool [draw] (Wilson, JASA 22, 1927), both ends."""
+    ends = binomtest(int(event.sum()), len(event)).proportion_ci(method="wilson")
+    return float(ends.low), float(ends.high)
 
-
-def saturation_tables(rows: Sequence[Row]) -> dict[str, Table]:
-    """Quality of every prediction and of every alarm, over the seeds."""
-
-    def table(kind: str, measures: Mapping[str, str], caption: str) -> Table:
-        lines = [
-            (name, *(spread([number(row[kind][name][measure]) for row in rows]) for measure in measures))
-            for name in rows[0][kind]
-        ]
-        return table_of(("", *measures.values()), lines, f"{caption}; mean ± standard deviation over {len(rows)} seeds")
-
-    return {
-        "saturation": table("predictions", MEASURES, "P(saturation) of held-out past jobs"),
-        "saturation_alarms": table("alarms", ALARMS, "Alarm at 5 % on P(saturation), by evidence"),
-    }
-
-
-SATURATION = seeded(
-    "P(saturation) and its alarm, for the learned twin and for thermal networks, on past jobs of one arm.\n\n"
-    "Minutes for each seed.",
-    SaturationSize,
-    3,
-    saturation_rows,
-    saturation_tables,
-)
 
 POLICIES = "wspt,wspt_cool,least_difficulty"
 FIRST_SEED = 10_000
@@ -317,7 +149,7 @@ def verdict(awards: Awards) -> Row | None:
         "awards": len(awards),
         "passed": int(awards.passed.sum()),
         "ece": table.error,
-        "brier": brier(awards.p, awards.passed),
+        "brier": float(brier_score_loss(awards.passed, awards.p, pos_label=True)),
         "auroc": float(roc_auc_score(awards.passed, awards.p)) if both else np.nan,
         "peak_rms_k": float(np.sqrt(np.mean(error_k**2))) if peaks else np.nan,
         "peak_bias_k": float(error_k.mean()) if peaks else np.nan,

@@ -1,0 +1,124 @@
+"""Reliability tables and intervals equal those of scikit-learn and of textbooks."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.calibration import calibration_curve
+
+from benchmarks.paper.reliability import _plans, _true_peak, reliability, reliability_rows, wilson
+from fleet.events import Event
+from scenarios.prepare import twins
+from scenarios.spec.load import load
+from twin.vae.measures import PARTS, Features
+
+jobs = st.builds(
+    lambda seed, n, steps: (
+        np.round(np.random.default_rng(seed).random(n) * steps) / steps,
+        np.random.default_rng(seed + 1).random(n) < 0.4,
+    ),
+    st.integers(0, 9999),
+    st.integers(1, 200),
+    st.sampled_from([4, 50, 10**6]),
+)
+
+
+@given(jobs=jobs, bins=st.integers(1, 12))
+def test_the_table_is_scikit_learn_s(jobs, bins) -> None:
+    p, event = jobs
+    table = reliability(p, event, bins=bins)
+    share, mean_p = calibration_curve(event, p, n_bins=bins, strategy="quantile", pos_label=True)
+    np.testing.assert_allclose(table.share, share)
+    np.testing.assert_allclose(table.mean_p, mean_p)
+    assert table.count.sum() == len(p)
+    assert (table.low <= table.share + 1e-12).all()
+    assert (table.share <= table.high + 1e-12).all()
+
+
+def test_the_error_of_two_bins_by_hand() -> None:
+    p = np.array([0.1, 0.2, 0.3, 0.9, 0.9, 1.0])
+    event = np.array([0, 0, 1, 1, 1, 0], bool)
+    # Means 0.2 and 2.8/3, shares 1/3 and 2/3, three jobs each.
+    assert reliability(p, event, bins=2).error == pytest.approx(0.5 * (1 / 3 - 0.2) + 0.5 * (2.8 / 3 - 2 / 3))
+
+
+def test_a_true_probability_has_little_error_and_a_boast_has_much() -> None:
+    rng = np.random.default_rng(0)
+    p = rng.random(20_000)
+    event = rng.random(20_000) < p
+    assert reliability(p, event).error < 0.01
+    # A forecast pushed to the ends errs by the mean distance between stated and known probability.
+    share = np.square(p) / (np.square(p) + np.square(1 - p))
+    grid = np.linspace(0, 1, 100_001)
+    expected = np.mean(np.abs(np.square(grid) / (np.square(grid) + np.square(1 - grid)) - grid))
+    assert reliability(share, event).error == pytest.approx(expected, abs=0.012)
+
+
+def test_the_interval_is_wilson_s() -> None:
+    # Newcombe, Statistics in Medicine 17 (1998), table I, method 3: 81/263, 15/148, 0/20, 1/29.
+    samples = (np.arange(n) < k for k, n in ((81, 263), (15, 148), (0, 20), (1, 29)))
+    low, high = np.transpose([wilson(each) for each in samples])
+    assert low == pytest.approx([0.2553, 0.0624, 0.0, 0.0061], abs=5e-5)
+    assert high == pytest.approx([0.3662, 0.1605, 0.1611, 0.1718], abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("p", "event", "says"),
+    [
+        (np.zeros(0), np.zeros(0, bool), "at least one"),
+        (np.zeros(3), np.zeros(2, bool), "must be"),
+        (np.array([1.2]), np.array([True]), r"\[0, 1\]"),
+        (np.array([np.nan]), np.array([True]), r"\[0, 1\]"),
+    ],
+)
+def test_invalid_probabilities_are_refused(p, event, says) -> None:
+    with pytest.raises(ValueError, match=says):
+        reliability(p, event)
+
+
+class Plain:
+    """Replaces the learned twin, which P by `rc` does not need: every plan is equally difficult."""
+
+    version = "plain"
+    joint_weight = None
+
+    def features(self, plans, repetitions) -> Features:
+        return Features(np.full((len(plans), 7, PARTS), 0.1))
+
+
+def test_p_and_peaks_agree_with_the_outcomes_of_a_shift(monkeypatch) -> None:
+    monkeypatch.setattr(
+        twins, "train_twins", lambda scenario, planned, folder, progress, seed: [Plain()] * len(planned)
+    )
+    ((key, row),) = reliability_rows(load("heat_wave"), (10_000, 10_001), 1, "rc", {"key": "wspt"}, ["key"])
+    assert (key, row["policy"]) == ("key", "wspt")
+    every = row["groups"]["all"]
+    assert every["awards"] > 100
+    assert 20 < every["passed"] < every["awards"] - 20
+    assert every["ece"] <= 0.05
+    assert every["brier"] <= 0.05
+    assert every["auroc"] >= 0.95
+    assert every["peak_rms_k"] < 2.0
+    assert row["groups"]["warm"]["brier"] <= 0.05
+    assert row["groups"]["warm"]["awards"] + row["groups"]["cool"]["awards"] == every["awards"]
+
+
+def test_a_plan_ends_at_home_or_by_a_fault_and_else_its_outcome_is_unknown() -> None:
+    times = {
+        "a": [("award", 0), ("home", 50), ("award", 60), ("fault", 90), ("recover", 200), ("award", 210)],
+        "b": [("award", 10), ("give_back", 40), ("home", 60)],
+    }
+    events = [Event(time_s=t, kind=kind, arm=arm) for arm, log in times.items() for kind, t in log]  # pyright: ignore
+    assert list(_plans(events)) == [
+        ("a", 0, 50, False),
+        ("a", 60, 90, True),
+        ("a", 210, None, False),
+        ("b", 10, None, False),
+    ]
+
+
+def test_the_first_two_minutes_do_not_count_but_in_short_plans() -> None:
+    ends_c = 80.0 - np.arange(60.0)[:, None]  # cooling by 1 K in each step of 10 s
+    assert _true_peak(ends_c, 10.0, 0.0, 400.0) == 80.0 - 11  # at 120 s
+    assert _true_peak(ends_c, 10.0, 100.0, 150.0) == 80.0 - 14  # at its end
+    assert _true_peak(-ends_c, 10.0, 100.0, 400.0) == 39.0 - 80.0
