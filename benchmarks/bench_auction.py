@@ -3,7 +3,7 @@
     python -m benchmarks.bench_auction [--arms 8] [--jobs 50] [--batches 100] [--policy matching]
 
 Router, auctioneer and every arm are separate processes on loopback. Ours: JSON messages validated at both ends, costs,
-matching, and a journal that is on disk before an award is sent. The arms quote constants and accept every award. Bare
+matching, and awards that are durable before they are sent. The arms quote constants and accept every award. Bare
 Zenoh: in the same processes, a query to all arms and one to each, with payloads of the same sizes, half of it before
 and half after ours. Then the journal alone.
 """
@@ -43,32 +43,32 @@ STATE_S = 0.1
 JOINTS = 7
 
 
-def offer(word: JobSpec, number: int) -> JobEstimate:
-    """Offer with numbers of typical length, different for every arm."""
+def estimate(job: JobSpec, number: int) -> JobEstimate:
+    """Estimate with numbers of typical length, different for every arm."""
     d = tuple(0.123456789 * (1 + joint + number) for joint in range(JOINTS))
     heat = (51.23456789, 9.123456789, 0.0123456789 * number, d, sum(d))
-    return JobEstimate(word.name, tuple(PlanQuote(plan, *heat, 123.456789, 234.56789) for plan in range(2)))
+    return JobEstimate(job.name, tuple(PlanQuote(plan, *heat, 123.456789, 234.56789) for plan in range(2)))
 
 
 def arm(pipe: Connection, endpoint: str, number: int, quote_size: int) -> None:
     """An arm's process: quotes, accepts awards, publishes its state ten times per second and answers bare queries."""
-    name, numbers, said_s = f"arm_{number}", count(), 0.0
+    name, numbers, published_s = f"arm_{number}", count(), 0.0
     with BusClient(endpoint, FLEET, timeout_s=PATIENCE_S) as link, open_client(endpoint, timeout_s=PATIENCE_S) as bare:
 
         def quote(request: QuoteRequest) -> Quote:
-            offers = tuple(offer(word, number) for word in request.jobs)
+            offers = tuple(estimate(job, number) for job in request.jobs)
             return Quote(name, request.auction, f"{name}-{next(numbers)}", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
 
         link.reply_to(keys.of_arm(FLEET, name, "quote"), QuoteRequest, quote)
-        link.reply_to(keys.of_arm(FLEET, name, "award"), Award, lambda word: Ack(name, word.award, True))
+        link.reply_to(keys.of_arm(FLEET, name, "award"), Award, lambda award: Ack(name, award.award, True))
         link.declare_token(keys.of_arm(FLEET, name, "alive"))
         sizes = {"quote": quote_size, "award": len(encode(Ack(name, "x" * 32, True)))}
         queryables = [constant(bare, f"bare/{number}/{topic}", b"x" * size) for topic, size in sizes.items()]
         pipe.send("ready")
         while not pipe.poll():
             link.serve(time.monotonic() + STATE_S / 2)
-            if time.monotonic() >= said_s + STATE_S:
-                said_s = time.monotonic()
+            if time.monotonic() >= published_s + STATE_S:
+                published_s = time.monotonic()
                 link.publish(
                     keys.of_arm(FLEET, name, "state"), State(name, next(numbers), 0.0, "idle", (30.0,) * JOINTS, 30.0)
                 )
@@ -93,14 +93,14 @@ class Stopwatch:
         self.batches_s: list[tuple[int, float]] = []
         """Number of awards and duration of each batch."""
         self._asked_s, self._open, self._sent = 0.0, 0, 0
-        ask, acknowledged = link.query, node.auctioneer.apply_ack
+        query, acknowledged = link.query, node.auctioneer.apply_ack
 
-        def asked(key: str, word: Any, *rest: Any, **more: Any) -> None:
-            if isinstance(word, QuoteRequest):
+        def timed_query(key: str, message: Any, *rest: Any, **more: Any) -> None:
+            if isinstance(message, QuoteRequest):
                 self._asked_s, self._open, self._sent = time.perf_counter(), 0, 0
-            elif isinstance(word, Award):
+            elif isinstance(message, Award):
                 self._open, self._sent = self._open + 1, self._sent + 1
-            ask(key, word, *rest, **more)
+            query(key, message, *rest, **more)
 
         def answered(*acknowledgement: Any) -> None:
             acknowledged(*acknowledgement)
@@ -108,10 +108,10 @@ class Stopwatch:
             if not self._open:
                 self.batches_s.append((self._sent, time.perf_counter() - self._asked_s))
 
-        vars(link)["query"], vars(node.auctioneer)["apply_ack"] = asked, answered
+        vars(link)["query"], vars(node.auctioneer)["apply_ack"] = timed_query, answered
 
 
-def words(jobs: int) -> list[JobSpec]:
+def job_specs(jobs: int) -> list[JobSpec]:
     """Jobs at separate stations, so that every batch is full."""
     return [
         JobSpec(
@@ -126,7 +126,7 @@ def ours(endpoint: str, folder: Path, given: Namespace) -> tuple[list[tuple[int,
 
     timing = Timing(lease_s=120.0, max_jobs=given.jobs)
     # Enough jobs to keep the number of offers constant until the last batch.
-    work = words(given.arms * given.batches + given.jobs)
+    work = job_specs(given.arms * given.batches + given.jobs)
     allocate = CentralAllocation(policy_at(given.policy, 0), LiveFleet(arms=()))
     with BusClient(endpoint, FLEET) as link, Journal[AuctionRecord](folder / "bench.journal", AuctionRecord) as book:
         node = AuctionNode(link, "auctioneer", book, allocate=allocate, speed=1.0, timing=timing)
@@ -153,9 +153,9 @@ def bare_batch(session: zenoh.Session, arms: int, request: bytes, award: bytes) 
     return seconds(both, time.perf_counter)
 
 
-def gather(session: zenoh.Session, asked: list[str], payload: bytes, answers: int) -> None:
+def gather(session: zenoh.Session, requested: list[str], payload: bytes, answers: int) -> None:
     """Query each key, wait for the end of all, and check the number of replies."""
-    left, came, done = count(len(asked) - 1, -1), count(1), Event()
+    left, came, done = count(len(requested) - 1, -1), count(1), Event()
     last = [0]
 
     def reply(one: zenoh.Reply) -> None:
@@ -166,7 +166,7 @@ def gather(session: zenoh.Session, asked: list[str], payload: bytes, answers: in
         if next(left) == 0:
             done.set()
 
-    for key in asked:
+    for key in requested:
         handler: Any = zenoh.handlers.Callback(reply, drop=over, indirect=False)
         session.get(
             key,
@@ -205,10 +205,10 @@ def row(what: str, times_s: list[float]) -> str:
 def main() -> None:
     """Print the table and whether the targets are met."""
     given = options(__doc__, arms=8, jobs=(50, "on offer at a time"), batches=100, policy="matching")
-    sample = words(given.jobs)
+    sample = job_specs(given.jobs)
     request = encode(QuoteRequest("auctioneer-0a1b2c3d-1", tuple(sample)))
     quote = encode(
-        Quote("arm_0", "a" * 22, "q" * 12, 5.0, "t", 0.0, "idle", 20.0, 1, tuple(offer(w, 1) for w in sample))
+        Quote("arm_0", "a" * 22, "q" * 12, 5.0, "t", 0.0, "idle", 20.0, 1, tuple(estimate(job, 1) for job in sample))
     )
     award = encode(Award("a" * 36, "a" * 24, "auctioneer", "q" * 16, sample[0]))
     with ExitStack() as stack:

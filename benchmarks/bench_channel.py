@@ -3,8 +3,8 @@
     python -m benchmarks.bench_channel [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
         [--out docs/results/channels/SCENARIO.json]
 
-Writes the figures of every shift, and prints them as the table of docs/exchange.md that `docs/tables.py` makes of
-the file. `heard`: share of messages delivered, over all pairs of arms. `lost`: claims for a job or station that another
+Writes the figures of every shift, and prints them as the table of docs/exchange.md that `docs/tables.py` makes of the
+file. `received`: share of messages delivered, over all pairs of arms. `lost`: claims for a job or station that another
 arm won. Policies that use no peer messages (round_robin) are equal on every channel. In memory, with the profile plant
 and the arms' twins, on all cores. The defaults are 130 shifts: some eight minutes of CPU time, half of that on two idle
 cores, and a few minutes more if the twins are not cached. `heat_wave` takes three times as long.
@@ -32,7 +32,7 @@ from scenarios.spec.load import load
 from scenarios.spec.options import RunSpec
 from scenarios.spec.schema import Scenario
 
-FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "heard")
+FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "received")
 
 
 def channels(scenario: Scenario) -> dict[str, Channel]:
@@ -65,9 +65,9 @@ def shifts(scenario: Scenario, cache: Path, policy: str, channel: Channel, seeds
     for seed in seeds:
         result = run(fleet, RunSpec(policy=policy, seed=seed, bus="memory", channel=channel), record=False)
         m = result.metrics
-        words = arms * (arms - 1) * (round(result.time_s / scenario.decision_interval_s) + 1)
+        messages = arms * (arms - 1) * (round(result.time_s / scenario.decision_interval_s) + 1)
         lost = sum(event.kind == "lost" for event in result.events)
-        rows.append([m.value, m.on_time, m.faults, m.above_warning_min, lost, m.messages / words])
+        rows.append([m.value, m.on_time, m.faults, m.above_warning_min, lost, m.messages / messages])
     return np.array(rows)
 
 

@@ -3,9 +3,9 @@
     python -m benchmarks.bench_dashboard [--arms 16] [--rate 10] [--seconds 20] [--pages 1] [--chromium PROGRAM]
 
 A process publishes states of arms with all their quantities, --rate a second each (live arms: 10), and scores of 16
-jobs with every tenth, on a router of its own. `thermofleet bus gateway --page` serves the page. Readers take its
-stream as the page does; with --chromium the page itself is opened too, drawn without a graphics card, and its processes
-are measured apart. Linux only.
+jobs with every tenth, on a separate router. `thermofleet bus gateway --page` serves the page. Readers take its
+stream as the page does; with --chromium the page is opened too, rendered without a graphics card, and its processes are
+measured separately. Linux only.
 """
 
 import json
@@ -151,7 +151,7 @@ def measure(address: str, server: int, given: Namespace) -> dict[str, float]:
             after = page.evaluate(read)
             span_s = after["at"] - before["at"]
             found["states of each arm in the page, 1/s"] = (after["states"] - before["states"]) / span_s / given.arms
-            found["pictures drawn by the page, 1/s"] = (after["updates"] - before["updates"]) / span_s
+            found["frames rendered by the page, 1/s"] = (after["updates"] - before["updates"]) / span_s
             found["browser, cores"] = (sum(map(cpu_s, mine)) - core) / span_s
             browser.close()
         return found

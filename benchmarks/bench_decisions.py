@@ -2,9 +2,9 @@
 
     python -m benchmarks.bench_decisions [--arms 16] [--jobs 50] [--decisions 30] [--policies a,b] [--wall] [--out FILE]
 
-Prints Markdown for docs/policies.md and writes JSON to FILE. The observations are drawn: jobs of 2 to 30 min, values of
-1 to 4 and predicted peaks of 35 to 75 °C. Each arm can do 60 % of them, and half of the arms are free. The time is CPU
-time, which other programs on the machine hardly change; with --wall real time, for a policy `bus:NAME`. That of a
+Prints Markdown for docs/policies.md and writes JSON to FILE. The observations are sampled: jobs of 2 to 30 min, values
+of 1 to 4 and predicted peaks of 35 to 75 °C. Each arm can do 60 % of them, and half of the arms are free. The time is
+CPU time, which other programs on the machine hardly change; with --wall real time, for a policy `bus:NAME`. That of a
 policy of scope `arm` is for one free arm; that of `mpc` for the decisions with a search in a shift of 16 arms and 48
 slots. For `rolling_horizon` the largest gap that the solver left is added. Exits with an error if a median exceeds its
 limit.

@@ -94,10 +94,10 @@ class Dealer:
         """Arms whose last state is `working`."""
         self.refused: list[str] = []
         self._link, self._speed, self._began_s = link, speed, time.monotonic()
-        link.subscribe(keys.of_every_arm(FLEET, "state"), State, self._heard, history=history)
+        link.subscribe(keys.of_every_arm(FLEET, "state"), State, self._receive, history=history)
         link.reply_to(keys.asked_by_every_arm(FLEET, DEALER, "lease"), LeaseRequest, self._lease)
         link.reply_to(
-            keys.asked_by_every_arm(FLEET, DEALER, "report"), Report, lambda word: Receipt(DEALER, word.award)
+            keys.asked_by_every_arm(FLEET, DEALER, "report"), Report, lambda report: Receipt(DEALER, report.award)
         )
         link.reply_to(keys.of_clock(FLEET), ClockRequest, lambda _: Clock(self._now_s(), speed))
 
@@ -123,12 +123,12 @@ class Dealer:
         while time.monotonic() < end_s and not until():
             self._link.serve(min(end_s, time.monotonic() + 0.2))
 
-    def _heard(self, arm: str, word: State) -> None:
-        self.ticks[arm].append(word.tick)
-        (self.working.add if word.mode == "working" else self.working.discard)(arm)
+    def _receive(self, arm: str, state: State) -> None:
+        self.ticks[arm].append(state.tick)
+        (self.working.add if state.mode == "working" else self.working.discard)(arm)
 
-    def _lease(self, word: LeaseRequest) -> Lease:
-        return Lease(DEALER, LEASE_S, tuple(hold.award for hold in word.entries), ())
+    def _lease(self, request: LeaseRequest) -> Lease:
+        return Lease(DEALER, LEASE_S, tuple(entry.award for entry in request.entries), ())
 
     def _now_s(self) -> float:
         return self._speed * (time.monotonic() - self._began_s)
@@ -217,10 +217,10 @@ def main() -> None:
         dealer.serve(GRACE_S)
         ticks = {name: [t for t in dealer.ticks[name] if first <= t <= last] for name, (first, last) in bounds.items()}
         end(supervisor, dealer, names)
-    came = sum(map(len, ticks.values()))
-    said = sum(last - first + 1 for first, last in bounds.values())
+    arrived = sum(map(len, ticks.values()))
+    published = sum(last - first + 1 for first, last in bounds.values())
     orderly = all(b > a for of in ticks.values() for a, b in pairwise(of))
-    said_hz = [(last - first) / took_s for first, last in bounds.values()]
+    published_hz = [(last - first) / took_s for first, last in bounds.values()]
     arms = [100 * share[name] for name in names]
     print(f"{len(names)} arms, {os.cpu_count()} cores, {given.rate:g} Hz, speed {given.speed:g}, {took_s:.1f} s;")
     print(f"all ready {started_s:.1f} s after the first start; {still} working at the end\n")
@@ -229,14 +229,16 @@ def main() -> None:
     print(row("RSS, MB", [memory[name][0] for name in names], 1))
     print(row("PSS, MB", [memory[name][1] for name in names], 1))
     print(row("threads", [memory[name][2] for name in names], 0))
-    print(row("states per second", said_hz))
+    print(row("states per second", published_hz))
     print(f"\n{'other processes':<36}{'% of core':>10}{'RSS MB':>10}{'PSS MB':>10}")
     for what, name in (("bare publisher", "bare"), ("router", "router"), ("dealer and listener", "this")):
         print(f"{what:<36}{100 * share[name]:>10.2f}{memory[name][0]:>10.1f}{memory[name][1]:>10.1f}")
     print(f"\nall arms: {sum(arms) / 100:.2f} cores, {sum(memory[name][1] for name in names):.0f} MB (PSS)")
-    print(f"delivered: {came} of {said} ({came / max(said, 1):.2%}){'' if orderly else ', out of order'}")
+    print(
+        f"delivered: {arrived} of {published} ({arrived / max(published, 1):.2%}){'' if orderly else ', out of order'}"
+    )
     verdict = {True: "met", False: "missed"}
-    delivered = came == said and orderly and len(bounds) == len(names)
+    delivered = arrived == published and orderly and len(bounds) == len(names)
     print(
         f"targets: 100 % delivered: {verdict[delivered]}; <= 4 % of a core each: {verdict[max(arms) <= 100 * TARGET]}"
     )

@@ -1,12 +1,11 @@
-"""Submissions of one job each, at a constant rate, to an auctioneer with its journal on the disk.
+"""Submissions of one job each, at a constant rate, to an auctioneer with a journal.
 
     python -m benchmarks.bench_submit [--rate 1000] [--seconds 30] [--sessions 4] [--out DIR]
 
-Router and auctioneer are processes of their own. The submitter does not wait for replies, so a slow reply delays no
-later submission. No arm is present, and every job expires `EXPIRES_S` after its submission: it is accepted, written
-through to the disk, given up and forgotten, and never are more than 10,000 jobs open. Prints how many submissions were
-answered and accepted, and the time to the reply. Exit code 1: one was not answered or not accepted, or the rate was not
-reached.
+Router and auctioneer are separate processes. The submitter does not wait for replies, so a slow reply delays no
+later submission. No arm is present, and every job expires `EXPIRES_S` after its submission: it is accepted, durable,
+abandoned and evicted, and at most 10,000 jobs are open. Prints the numbers of answered and accepted submissions, and
+the time to the reply. Exit code 1: one was not answered or not accepted, or the rate was not reached.
 """
 
 import os
@@ -34,7 +33,7 @@ SCENARIO, START_S, REPLY_S, EXPIRES_S = "quickstart", 60.0, 5.0, 2.0
 
 
 class Submitters:
-    """Sends submissions over some sessions, and collects what became of them."""
+    """Sends submissions over some sessions, and counts their replies."""
 
     def __init__(self, links: list[BusClient], clock: Clock) -> None:
         self._links, self._clock, self._clock_s = links, clock, time.monotonic()

@@ -1,14 +1,13 @@
-"""Cost of a twin: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM` and a lower bound.
+"""Cost of a twin: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM`.
 
     python -m benchmarks.bench_twin [--full]
     python -m benchmarks.bench_twin --arms 100
 
 CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
-layers, decoder, loss and backward pass, or the forward pass alone. The lower bound ("floor") is the matrix
-multiplications of the same passes, as `torch.mm` of their shapes. Training is extrapolated from its steps; --full runs
-it on random smooth motion. A job of the target lasts 16 s; a real plan has the median number of the quickstart's.
---arms trains that many twins of the quick size in two processes, and has them score 1 000 jobs each;
-beside it a training of one twin network after network with `nn.LSTM` (peer), extrapolated.
+layers, decoder, loss and backward pass, or the forward pass alone. Training is extrapolated from its steps; --full runs
+it on random smooth motion. A scored job lasts 16 s; a real plan has the median number of windows of quickstart. --arms
+trains that many twins of the quick size in two processes and scores 1 000 jobs with each, beside an extrapolated
+training of `nn.LSTM` network after network.
 """
 
 import os
@@ -31,7 +30,6 @@ from benchmarks.harness import in_turns, options, seconds
 from fleet.motion import RATE_HZ
 from twin.vae.config import TwinConfig
 from twin.vae.model import LstmVae, build, weights_of
-from twin.vae.onnx import export_onnx
 from twin.vae.train import Run, train
 from twin.vae.twin import Fit, Twin, save
 from twin.vae.window import Scaler, cut, resample, starts
@@ -44,7 +42,7 @@ BESIDE = (1, 7, RESTARTED, 28)
 """Numbers of networks trained side by side."""
 JOBS = 1000
 JOB_S = 16.0
-"""Duration of a job that is scored."""
+"""Duration of a scored job."""
 
 
 def medians(calls: dict[str, Callable[[], object]], runs: int) -> dict[str, float]:
@@ -65,18 +63,6 @@ def plain_step(net: LstmVae, x: Tensor, optimizer: torch.optim.Optimizer) -> Non
     optimizer.zero_grad()
     (plain_forward(net, x) - x).square().sum().backward()
     optimizer.step()
-
-
-def floor(config: TwinConfig, batch: int, passes: int, nets: int) -> Callable[[], None]:
-    """The recurrent multiplications of encoder and decoder, step by step, for all passes and networks."""
-    hidden, weight = torch.randn(batch, config.hidden), torch.randn(config.hidden, 4 * config.hidden)
-    out = torch.empty(batch, 4 * config.hidden)
-
-    def multiply() -> None:
-        for _ in range(2 * config.window * passes * nets):
-            torch.mm(hidden, weight, out=out)
-
-    return multiply
 
 
 def smooth(rng: np.random.Generator, length_s: float) -> np.ndarray:
@@ -105,7 +91,6 @@ def training(config: TwinConfig, name: str) -> None:
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, fused=True)
     calls: dict[str, Callable[[], object]] = {
         "plain": lambda: plain_step(net, x, optimizer),
-        "floor": floor(config, config.batch, 3, 1),
     }
     for count in BESIDE:
         calls[str(count)] = _epochs_of(count, config, channels)
@@ -114,7 +99,7 @@ def training(config: TwinConfig, name: str) -> None:
     steps = nets * -(-config.max_windows // config.batch)
     trial = round(config.trial * config.epochs) if config.restarts > 1 else 0
     whole_s = ours[RESTARTED] * steps * (config.epochs + trial * (config.restarts - 1))
-    cells = "".join(f"{1e3 * each:>9.1f}" for each in (*ours.values(), took["plain"], took["floor"]))
+    cells = "".join(f"{1e3 * each:>9.1f}" for each in (*ours.values(), took["plain"]))
     print(f"{name:<26}{cells}{ours[RESTARTED] / took['plain']:>8.2f}   all joints and restarts: {whole_s:.0f} s")
 
 
@@ -127,7 +112,7 @@ def _epochs_of(count: int, config: TwinConfig, channels: int) -> Callable[[], ob
 
 
 def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
-    """Reconstruction beside plain forward passes, the floor and ONNX Runtime."""
+    """Reconstruction beside plain forward passes."""
     twin = untrained(config)
     z = np.random.default_rng(0).standard_normal((windows, config.window, JOINTS, 3)).astype(np.float32)
     parts = [
@@ -147,35 +132,19 @@ def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
         "features": lambda: twin.window_features(z),
         "ours": lambda: twin.networks.reconstruct(z),
         "plain": plain,
-        "floor": floor(config, windows, 1, len(twin.nets)),
     }
-    took = medians({**calls, **_onnx(twin, z)}, runs)
-    cells = "".join(f"{1e3 * took[key]:>11.2f}" if key in took else f"{'-':>11}" for key in (*calls, "onnx"))
+    took = medians(calls, runs)
+    cells = "".join(f"{1e3 * each:>11.2f}" for each in took.values())
     print(f"{name:<34}{cells}{took['ours'] / took['plain']:>8.2f}")
 
 
-def _onnx(twin: Twin, z: np.ndarray) -> dict[str, Callable[[], object]]:
-    """The exported twin, if ONNX Runtime is installed."""
-    try:
-        import onnxruntime
-    except ImportError:
-        return {}
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    with tempfile.TemporaryDirectory() as folder:
-        file = export_onnx(twin, Path(folder))
-        session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    feed = {"windows": z.astype(float)}
-    return {"onnx": lambda: session.run(["errors"], feed)}
-
-
 def windows_in(length_s: float, config: TwinConfig) -> int:
-    """Number of windows in which a twin scores so much motion."""
+    """Number of windows in which a twin scores motion of this length."""
     return len(starts(round(length_s * config.rate_hz), config.window, config.score_stride))
 
 
 def some_arms(first: int, count: int) -> tuple[float, float, int]:
-    """Train twins and have each score 1 000 jobs of its own; CPU time of both, s, and the bytes of a saved twin."""
+    """Train twins and score 1 000 jobs with each; CPU time of both, s, and the bytes of a saved twin."""
     torch.set_num_threads(1)
     config = TwinConfig.quick()
     motions, windows = [], []
@@ -191,8 +160,8 @@ def some_arms(first: int, count: int) -> tuple[float, float, int]:
     training_s = seconds(lambda: twins.extend(train(records, config, draw, arm="arm") for records in motions))
     scoring_s = 0.0
     for twin, own in zip(twins, windows, strict=True):
-        drawn = own[np.random.default_rng(0).integers(0, len(own), JOBS * windows_in(JOB_S, config))]
-        scoring_s += seconds(lambda twin=twin, drawn=drawn: twin.window_features(drawn))
+        sample = own[np.random.default_rng(0).integers(0, len(own), JOBS * windows_in(JOB_S, config))]
+        scoring_s += seconds(lambda twin=twin, sample=sample: twin.window_features(sample))
     with tempfile.TemporaryDirectory() as folder:
         save(twins[0], Path(folder))
         size = sum(file.stat().st_size for file in Path(folder).iterdir())
@@ -213,23 +182,23 @@ def fleet(arms: int) -> None:
     print(f"\n{arms} twins of the quick size, two processes; everything took {wall_s:.0f} s")
     print(f"{'training, CPU s':<34}{sum(training_s):>9.0f}   one after another: {plain_s * steps:.0f}")
     print(f"{'scoring 1 000 jobs each, CPU s':<34}{sum(scoring_s):>9.1f}")
-    print(f"{'a twin on disk, kB':<34}{max(sizes) / 1e3:>9.0f}")
+    print(f"{'a saved twin, kB':<34}{max(sizes) / 1e3:>9.0f}")
 
 
 def main() -> None:
     """Print the tables."""
     full = False, "train seven joints at the default configuration"
-    arguments = options(__doc__, full=full, arms=(0, "train and score with the twins of so many arms"))
+    arguments = options(__doc__, full=full, arms=(0, "number of arms whose twins are trained and scored"))
     torch.set_num_threads(1)
     if arguments.arms > 1:
         fleet(arguments.arms)
         return
     default, arm = TwinConfig(), TwinConfig(scope="arm", hidden=64, latent=8)
     beside = "".join(f"{f'{count} nets':>9}" for count in BESIDE)
-    print(f"{'ms per step and network':<26}{beside}{'plain':>9}{'floor':>9}{'ratio':>8}")
+    print(f"{'ms per step and network':<26}{beside}{'plain':>9}{'ratio':>8}")
     training(default, "one joint of seven")
     training(arm, "whole arm")
-    columns = ("features", "networks", "plain", "floor", "onnx")
+    columns = ("features", "networks", "plain")
     print(f"\n{'scoring, 7 joints, ms':<34}" + "".join(f"{name:>11}" for name in columns) + f"{'ratio':>8}")
     for config, name in ((default, "1 job of 16 s"), (arm, "whole arm, 1 job of 16 s")):
         scoring(config, name, windows_in(JOB_S, config), 200)

@@ -140,9 +140,9 @@ def rss_mb(pid: int | str = "self", *, peak: bool = False) -> float:
 
 @contextmanager
 def spawned(target: Callable[..., None], *arguments: object) -> Iterator[Connection]:
-    """A process of its own that calls `target(pipe, *arguments)`; yields the other end of its pipe.
+    """A separate process that calls `target(pipe, *arguments)`; yields the other end of its pipe.
 
-    At the end it gets a message, upon which the target returns.
+    At the end it gets a message; the target then returns.
     """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()

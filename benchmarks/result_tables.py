@@ -64,7 +64,7 @@ def channel_table(measured: Mapping[str, Any]) -> str:
         base = next(each for (other, _), each in values.items() if other == policy)
         cells = [_channel_cell(name, x[:, names.index(name)], base[:, names.index(name)]) for name in CHANNEL_COLUMNS]
         who = (f"`{policy}`",) if len(policies) > 1 else ()
-        rows.append((*who, channel, *cells, f"{100 * x[:, names.index('heard')].mean():.0f} %"))
+        rows.append((*who, channel, *cells, f"{100 * x[:, names.index('received')].mean():.0f} %"))
     who = ("policy",) if len(policies) > 1 else ()
     return table((*who, "channel", *(heading for heading, _ in CHANNEL_COLUMNS.values()), "received"), rows)
 

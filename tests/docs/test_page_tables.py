@@ -112,21 +112,16 @@ BY_HAND = {
     ): "times of one machine; `make bench-env`",
     ("docs/performance.md", ""): "times of one machine; the commands beside the tables print them",
     ("docs/performance.md", "what"): "times of one machine; the commands in the table print them",
-    ("docs/performance.md", "arms"): "times of one machine; `benchmarks/bench_exchange.py` prints them",
     ("docs/results/twin.md", "scenario"): "`benchmarks.paper reliability` prints it: an hour",
-    ("docs/results/twin.md", "question"): "hours; the commands are beside it",
     ("docs/ros2.md", "ROS 2"): "settings",
     ("docs/scaling.md", ""): "to be made from files",
-    ("docs/scaling.md", "arms, sites"): "to be made from files",
     ("docs/scaling.md", "what fails first"): "calculated from the table above it",
-    ("docs/scaling.md", "asked"): "to be made from files",
-    ("docs/security.md", ""): "times of one machine; `benchmarks/bench_tls.py` prints them",
     ("docs/several_machines.md", "fault"): "`make mesh` prints it: 256 arms",
     ("docs/suite.md", "split"): "the definition of the suite",
     ("docs/suite.md", "axis of a cell"): "the definition of the suite",
     ("docs/trainers.md", "trainer"): "versions",
 }
-"""Tables that are kept by hand, by page and first heading, and why."""
+"""Hand-made tables by page and first heading, with the reason."""
 
 
 def tables_of_figures(text: str) -> list[str]:
