@@ -1,7 +1,7 @@
-"""Every tutorial runs as its page says: commands, files and programs in order, with the outputs that it shows.
+"""Every tutorial runs: commands, files and programs in order, with the outputs that the page shows.
 
 A block of `sh` is run in a shell, one of `python` by Python; with a title it is a file instead. A block of `text` is
-the output of the block before it, where … stands for anything. After `<!-- background -->` a command runs on.
+the output of the block before it, where … matches anything. After `<!-- background -->` a command keeps running.
 """
 
 import os
@@ -116,7 +116,7 @@ def terminal(tmp_path: Path) -> Iterator[Terminal]:
 
 @pytest.mark.ci_slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_tutorial_runs_as_its_page_says(page: Path, terminal: Terminal) -> None:
+def test_a_tutorial_runs_and_prints_the_outputs_of_its_page(page: Path, terminal: Terminal) -> None:
     steps = blocks(page.read_text(encoding="utf-8"))
     assert sum(step.kind == "text" for step in steps) >= 3
     for step, following in zip(steps, [*steps[1:], None], strict=True):
@@ -125,7 +125,7 @@ def test_a_tutorial_runs_as_its_page_says(page: Path, terminal: Terminal) -> Non
             terminal.run(step, shown)
 
 
-def test_an_output_that_differs_is_noticed() -> None:
+def test_another_output_does_not_match() -> None:
     shown = "a 1\n…\nc … 3\n"
     for right in ("a 1\nb\nb\nc 2 3\n", "a 1  \nc  3"):
         assert pattern(shown).search(right), right

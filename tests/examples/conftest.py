@@ -1,4 +1,4 @@
-"""A cache of its own for every example, and a router."""
+"""A separate cache for every example, and a router."""
 
 from contextlib import ExitStack
 
@@ -15,7 +15,7 @@ def own_cache(tmp_path, monkeypatch) -> None:
 
 @pytest.fixture
 def bus():
-    """The port of a router, and what makes lines to it."""
+    """The port of a router, and a function that opens clients of it."""
     with ExitStack() as stack:
         router = stack.enter_context(Router())
         port = int(router.endpoint.rsplit(":", 1)[1])

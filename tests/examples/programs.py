@@ -26,13 +26,13 @@ def killed_afterwards(process):
 
 
 def started(command, **options):
-    """A process that is killed at the end of the block; what it prints can be read."""
+    """A process that is killed at the end of the block; its output can be read."""
     return killed_afterwards(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **options))
 
 
 @contextmanager
 def running(name, *arguments):
-    """An example in a process of its own, from when it says that it is ready."""
+    """An example in a separate process, once it has printed that it is ready."""
     with started(program(name, *arguments), stderr=subprocess.STDOUT) as process:
         line = process.stdout.readline()
         assert line.startswith("ready"), line + process.stdout.read()

@@ -1,4 +1,4 @@
-"""Examples that need no fleet, or only watch one, run as their first lines say."""
+"""Examples that need no fleet, or only watch one, run as their docstrings describe."""
 
 import importlib.util
 import re
@@ -24,9 +24,9 @@ def example(name: str) -> ModuleType:
 
 def test_own_policy_finishes_a_shift(capsys) -> None:
     example("own_policy").main(horizon_s=1800, difficulty="oracle")
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     for name in ("LeastDifficulty", "Careful"):
-        assert re.search(rf"{name}: reward -?[\d.]+, jobs \d+, peaks arm_0 [\d.]+ °C", told)
+        assert re.search(rf"{name}: reward -?[\d.]+, jobs \d+, peaks arm_0 [\d.]+ °C", output)
 
 
 @pytest.mark.ci_slow
@@ -39,15 +39,15 @@ def test_own_policy_is_compared_beside_the_rules() -> None:
 
 
 @pytest.mark.ci_slow
-def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:
+def test_the_monitor_receives_every_arm_from_another_process(tmp_path) -> None:
     port = free_port()
     with started(program("monitor", port)) as monitor:
         options = ["--difficulty", "blind", "--listen", str(port), "--out", str(tmp_path / "run"), "--seed", "1"]
         assert commands.run("run", "quickstart", *options).returncode == 0
-        told, _ = monitor.communicate(timeout=PATIENCE_S)
+        output, _ = monitor.communicate(timeout=PATIENCE_S)
         assert monitor.returncode == 0
-    assert all(f"arm_{i}" in told for i in range(4))
-    assert "hottest motor" in told
+    assert all(f"arm_{i}" in output for i in range(4))
+    assert "hottest motor" in output
 
 
 def test_every_example_for_outsiders_imports_nothing_of_ours():

@@ -14,11 +14,11 @@ from tests.examples.programs import killed_afterwards, program, running, started
 from tests.waiting import PATIENCE_S, serve_until
 
 
-def test_the_examples_make_a_fleet_of_their_own(bus):
+def test_the_examples_alone_make_a_fleet(bus):
     port, link = bus
-    watcher, heard = link(), []
-    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
-    watcher.subscribe(keys.of_every_arm("f", "state"), State, lambda _, word: None)
+    watcher, statuses = link(), []
+    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, result: statuses.append(result.status))
+    watcher.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: None)
     with started(program("monitor", port)) as monitor:
         assert monitor.stdout.readline().startswith("waiting")
         with (
@@ -27,22 +27,22 @@ def test_the_examples_make_a_fleet_of_their_own(bus):
             running("own_allocator", port, "f"),
         ):
             submit_jobs(port)
-            serve_until(lambda: sum(status.state == "finished" for status in heard) >= 3, watcher)
-        told, _ = monitor.communicate(timeout=PATIENCE_S)
-    assert re.search(r"own +outside 1 is finished [ab]\n", told)
-    assert re.search(r" [ab] +difficulty outside 1 0\.10", told)
-    finished = [status.job for status in heard if status.state == "finished"]
+            serve_until(lambda: sum(status.state == "finished" for status in statuses) >= 3, watcher)
+        output, _ = monitor.communicate(timeout=PATIENCE_S)
+    assert re.search(r"own +outside 1 is finished [ab]\n", output)
+    assert re.search(r" [ab] +difficulty outside 1 0\.10", output)
+    finished = [status.job for status in statuses if status.state == "finished"]
     assert sorted(finished) == ["outside 1", "outside 2", "outside 3"]
     assert finished.index("outside 1") < finished.index("outside 3")
     assert watcher.malformed == 0
 
 
 def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
-    """The auctioneer, an arm and a submitter that know it from docs/bus alone."""
+    """The auctioneer, an arm and a submitter written from docs/bus alone."""
     port, link = bus
-    watcher, heard = link(), []
+    watcher, statuses = link(), []
     watcher.subscribe(
-        keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status), history=True
+        keys.of_every_auction("f", "result"), Result, lambda _, result: statuses.append(result.status), history=True
     )
     at = ("--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}")
     started_auction = commands.start(
@@ -50,27 +50,27 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
     )
     with killed_afterwards(started_auction) as auction:
         assert auction.stdout.readline().startswith("ready")
-        for arm in range(4):  # those of the scenario are not there; until then each may be anywhere
+        for arm in range(4):  # they are offline, so their positions are unknown until then
             cleared = commands.run("arm", "clear", f"arm_{arm}", *at)
             assert cleared.stdout == f"arm_{arm}: its space is free until the arm reports its space again.\n"
         with running("own_arm", port, "f", "a"), running("own_arm", port, "f", "b"):
             submit_jobs(port)
         auction.terminate()
-        told = auction.communicate(timeout=PATIENCE_S)[1]
+        output = auction.communicate(timeout=PATIENCE_S)[1]
         assert auction.returncode == 0
-        assert "Dropped invalid message" not in told  # nothing that the examples said was malformed
-        serve_until(lambda: sum(status.state == "finished" for status in heard) == 3, watcher)
-        finished = sorted(status.job for status in heard if status.state == "finished")
+        assert "Dropped invalid message" not in output  # no message of the examples was malformed
+        serve_until(lambda: sum(status.state == "finished" for status in statuses) == 3, watcher)
+        finished = sorted(status.job for status in statuses if status.state == "finished")
         assert finished == ["outside 1", "outside 2", "outside 3"]
 
 
 @pytest.mark.slow
 def test_own_allocator_has_real_arms_do_the_jobs(bus, tmp_path):
-    """An arm that plans and simulates, under an allocator that knows it from docs/bus alone."""
+    """An arm that plans and simulates, under an allocator written from docs/bus alone."""
     port, link = bus
-    watcher, heard = link(), []
-    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
-    watcher.subscribe(keys.of_every_arm("f", "state"), State, lambda _, word: None)
+    watcher, statuses = link(), []
+    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, result: statuses.append(result.status))
+    watcher.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: None)
     with running("own_allocator", port, "f") as allocator, ExitStack() as stack:
         for name in ("arm_0", "arm_1"):
             options = ["--difficulty", "blind", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"]
@@ -81,5 +81,5 @@ def test_own_allocator_has_real_arms_do_the_jobs(bus, tmp_path):
             assert arm.stdout.readline().startswith("ready")
         submit_jobs(port, timeout_s=150.0)
         assert allocator.poll() is None
-    serve_until(lambda: sum(status.state == "finished" for status in heard) == 3, watcher)
+    serve_until(lambda: sum(status.state == "finished" for status in statuses) == 3, watcher)
     assert watcher.malformed == 0
