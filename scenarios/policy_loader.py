@@ -77,7 +77,7 @@ def failure(name: str, error: BaseException, where: str) -> BaseException:
 
 @contextmanager
 def blaming(name: str, where: str) -> Iterator[None]:
-    """Raise the `failure` of a policy for whatever its code in the block raises, SystemExit too."""
+    """Raise the `failure` of a policy for every exception of its code in the block, SystemExit too."""
     try:
         yield
     except KeyboardInterrupt:
@@ -95,10 +95,10 @@ def last_line(error: BaseException, file: Path) -> int | None:
 
 
 def error_text(error: BaseException) -> str:
-    """Kind and text of an error of a policy, whatever it is made of."""
+    """Kind and text of an error of a policy, also of one without a text."""
     try:
         text = str(error).encode("utf-8", "backslashreplace").decode()
-    except Exception as failed:  # whatever its own code raises
+    except Exception as failed:  # of its code
         text = f"(its text raises {type(failed).__name__})"
     return f"{type(error).__name__}: {text}"
 
@@ -335,7 +335,7 @@ def _module(where: str, name: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever the file raises
+    except Exception as error:  # of the file
         syntax = isinstance(error, SyntaxError)
         line = error.lineno if syntax else last_line(error, path)
         raise FleetError(

@@ -16,7 +16,7 @@ from fleet.files import atomic_path
 
 @dataclass(frozen=True, kw_only=True)
 class ResultKind:
-    """How to recognise an earlier result, so that a command replaces only a result of its own kind."""
+    """How to recognise an earlier result, so that a command replaces only a result of the same kind."""
 
     name: str
     """For error messages, as in "a finished run"."""
@@ -129,7 +129,7 @@ def check_file(out: Path, endings: Sequence[str], overwrite: bool, option: str =
 
 
 def _status(card: Path) -> str | None:
-    """The status on a card; None if there is no card or it is not one of ours."""
+    """The status on a card; None without a valid card."""
     try:
         status = json.loads(card.read_text(encoding="utf-8"))["status"]
     except (OSError, ValueError, KeyError, TypeError):

@@ -28,7 +28,7 @@ Claim = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """What came of schedules or of a policy."""
+    """Results of schedules or of policies."""
 
     reward: Array
     """[schedule]."""

@@ -241,7 +241,7 @@ def read(path: Path) -> BoardResult:
     """A result file; `check` tells whether it is one that counts.
 
     Raises:
-        FleetError: it is too large, or has a line that is none of ours.
+        FleetError: it is too large, or a line is no part of a result.
     """
     number = 1
     try:

@@ -25,7 +25,7 @@ class _Runner:
 
 
 class Cluster:
-    """A Ray cluster, and how many actors of ours it has."""
+    """A Ray cluster, and the number of our actors."""
 
     def __init__(self) -> None:
         self._actors = 0
@@ -52,7 +52,7 @@ class RayWorker:
 
     @property
     def started(self) -> bool:
-        """Whether there was a CPU without an actor of ours."""
+        """Whether a CPU was free."""
         return self._actor is not None
 
     @property

@@ -185,7 +185,7 @@ def references(
 
     A row counts if instance, content of the scenario, seed and source of scores are the same. With a larger budget the
     search is repeated, and starts from the known schedule too. At the end the rows are in the order of the instances'
-    names, whatever was computed first.
+    names.
 
     Args:
         workers: Processes.

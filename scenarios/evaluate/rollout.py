@@ -88,7 +88,7 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
 
     Raises:
         PolicyFailed: a user-defined policy raised something, was slower than `DECISION_LIMIT_S`, or returned no action.
-        Exception: whatever a built-in policy raises.
+        Exception: of a built-in policy.
     """
     results = play(fleet, policy, seeds, channel, DECISION_LIMIT_S)
     for seed, result in zip(seeds, results, strict=True):
@@ -136,7 +136,7 @@ def play(
                 yield
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # whatever the policy raises
+        except BaseException as error:  # of the policy
             results[e], running[e] = ShiftResult(None, 0, error, tick * dt_s), False
 
     def after_step(reward: Array, ended: Array) -> None:

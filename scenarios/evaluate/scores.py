@@ -235,7 +235,7 @@ def normalised(
     """The scores of policies on the shifts that have a reference; None if there are fewer than `FEWEST`.
 
     An instance is a scenario and a seed, with the mean reward over trainings of its twins; trainings of a policy, which
-    do all instances, are kept apart. References are of the first fleet.
+    do all instances, are a sample. References are of the first fleet.
 
     Args:
         by_policy: Rows of each policy, of the same shifts.

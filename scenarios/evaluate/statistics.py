@@ -218,7 +218,7 @@ def _checked(values: ArrayLike) -> Array:
     if not np.isfinite(x).all():
         raise ValueError("Values must be finite.")
     x = x if x.ndim == 3 else x[None, None]
-    return x if np.ptp(x, axis=1).any() else x[:, :1]  # without trainings of its own
+    return x if np.ptp(x, axis=1).any() else x[:, :1]  # trainings that change nothing
 
 
 def share_bounds(hits: int, count: int) -> tuple[float, float]:

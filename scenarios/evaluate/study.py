@@ -150,7 +150,7 @@ class Study(StudySpec):
                 check_policy(each, self.decision_limit_s)
             if len(own) > 1 and (self.trainings > 1 or self.fleets > 1):
                 raise FleetError(
-                    f"'{policy}' has {len(own)} trainings of its own: then --trainings and --fleets must be 1."
+                    f"'{policy}' has {len(own)} trainings: then --trainings and --fleets must be 1."
                 )
             if len(own) not in (1, self.most_trainings):
                 raise FleetError(
@@ -231,7 +231,7 @@ class Study(StudySpec):
         return max(map(len, self.own_trainings.values()))
 
     def trainings_of(self, policy: str, source: str) -> int:
-        """How many trainings a policy has with a source of predictions: of its own, or else of the twins."""
+        """Number of trainings of a policy with a source of predictions: its own, or else those of the twins."""
         own = len(self.own_trainings[policy])
         return self.trainings if own == 1 and is_trained(source) else own
 
@@ -290,7 +290,7 @@ def check_policy(name: str, limit_s: float | None = None) -> None:
         return
     except FleetError:
         raise
-    except Exception:  # whatever its own code raises
+    except Exception:  # of its code
         return
 
 

@@ -117,7 +117,7 @@ class Columns(NamedTuple):
     """Seconds lost to faults, int [arm, period]."""
     above: Array
     """Seconds above the warning limit, int [arm, period]."""
-    count: int
+    total: int
     """Of all columns."""
 
 
@@ -249,13 +249,13 @@ class Relaxation:
         ends = np.cumsum([len(self.pieces), self.jobs, arms, arms * self.periods, arms * self.periods])
         jobs, faults, lost, above = (np.arange(begin, end) for begin, end in pairwise(ends.tolist()))
         shape = (arms, self.periods)
-        return Columns(jobs, faults, lost.reshape(shape), above.reshape(shape), count=int(ends[-1]))
+        return Columns(jobs, faults, lost.reshape(shape), above.reshape(shape), total=int(ends[-1]))
 
     @cached_property
     def worth(self) -> Array:
         """Worth per unit of each column, [column]."""
         columns, weights = self.columns, self.weights
-        worth = np.zeros(columns.count)
+        worth = np.zeros(columns.total)
         worth[: len(self.pieces)] = self.pieces.worth
         worth[columns.faults] = weights.faults
         worth[columns.lost] = -weights.energy / 3600.0 * self.base_w.sum(axis=1, keepdims=True)
@@ -313,7 +313,7 @@ class Relaxation:
     def rows(self) -> tuple[csr_array, Array]:
         """The rows A x <= b without heat budgets: A, sparse [row, column], and b, [row]."""
         pieces, count, arms = self.pieces, len(self.pieces), len(self.world.arms)
-        table = _Rows(self.columns.count)
+        table = _Rows(self.columns.total)
         room_s = np.diff(self.edges_s)
         room_s[-1] += self.tail_s
         for clique in self.cliques:
@@ -436,7 +436,7 @@ class HeatBudget:
         columns = np.column_stack([relaxation.columns.lost, relaxation.columns.faults]).ravel()
         values = np.tile(np.append(np.ones(relaxation.periods), -self.longest_loss_s), arms)
         row = np.repeat(np.arange(arms), relaxation.periods + 1)
-        return csr_array((values, (row, columns)), shape=(arms, relaxation.columns.count)), np.zeros(arms)
+        return csr_array((values, (row, columns)), shape=(arms, relaxation.columns.total)), np.zeros(arms)
 
     def violated(self, shares: Array) -> tuple[csr_array, Array]:
         """Budgets that a solution [column] violates most, as rows A x <= b: A, sparse [row, column], and b, [row]."""
@@ -453,11 +453,11 @@ class HeatBudget:
                 for first, last, joint in self._worst(total, above, edges, length_s):
                     found.append(self._budget(arm, joint, first, last))
         if not found:
-            return csr_array((0, self.relaxation.columns.count)), np.zeros(0)
+            return csr_array((0, self.relaxation.columns.total)), np.zeros(0)
         lengths = [len(columns) for columns, _, _ in found]
         row = np.repeat(np.arange(len(found)), lengths)
         columns, values = (np.concatenate([each[i] for each in found]) for i in range(2))
-        matrix = csr_array((values, (row, columns)), shape=(len(found), self.relaxation.columns.count))
+        matrix = csr_array((values, (row, columns)), shape=(len(found), self.relaxation.columns.total))
         return matrix, np.array([bound for _, _, bound in found])
 
     def _heat_of(self, shares: Array) -> Array:
@@ -611,9 +611,9 @@ def _solve(relaxation: Relaxation, rows: csr_array, bounds: Array) -> tuple[floa
 
 def _whole(relaxation: Relaxation, rows: csr_array, bounds: Array, nodes: int) -> float:
     """Bound with whole jobs; inf if branch and bound proved none, or if the program is too large."""
-    if relaxation.columns.count > MOST_COLUMNS:
+    if relaxation.columns.total > MOST_COLUMNS:
         return np.inf
-    whole = np.zeros(relaxation.columns.count)
+    whole = np.zeros(relaxation.columns.total)
     whole[relaxation.columns.jobs] = 1
     result = milp(
         -relaxation.worth,

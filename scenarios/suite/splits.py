@@ -100,7 +100,7 @@ def cell_name(instance: str) -> str:
 
 
 def drawn_rows(name: SplitName) -> Iterator[ManifestLine]:
-    """The lines of a split, drawn anew: in turns from each of its cells."""
+    """Sample the lines of a split again, in turns from each of its cells."""
     cells = [cell for cell in CELLS if cell.split == name]
     turns = range(max(cell.instances for cell in cells))
     chosen = [cell for turn in turns for cell in cells if turn < cell.instances]

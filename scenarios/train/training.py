@@ -1,4 +1,4 @@
-"""A training in its folder, whatever learns: it begins or continues, validates, keeps the best policy, and logs."""
+"""The loop of a training and its folder: begin or resume, validate, keep the best policy, and log."""
 
 import json
 import time
@@ -48,17 +48,9 @@ class Learner(Protocol):
         """Endless iterations, each as a row of the log."""
         ...
 
-    def save(self, path: Path, **numbers: float) -> None:
-        """Write the state and some numbers."""
-        ...
-
-    def load(self, path: Path) -> Mapping[str, float]:
-        """Restore the state and return the numbers."""
-        ...
-
-    def save_policy(self, out: Path, validation: float, **details: Any) -> None:
-        """Write the present policy with the details on its card."""
-        ...
+    def save(self, path: Path, **numbers: float) -> None: ...
+    def load(self, path: Path) -> Mapping[str, float]: ...
+    def save_policy(self, out: Path, validation: float, **details: Any) -> None: ...
 
 
 @dataclass(frozen=True)

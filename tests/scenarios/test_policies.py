@@ -37,10 +37,6 @@ def test_a_rule_by_its_name(name):
     assert (policy.kind if isinstance(policy, EveryArm) else type(policy)) is RULES[name].kind
     assert policy.scope == scope_of(name) == RULES[name].scope
     assert label(name) == name
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_an_arm_policy_can_be_had_alone_and_a_central_one_cannot(name):
     if scope_of(name) == "arm":
         assert type(arm_policy_of(name)) is RULES[name].kind
     else:

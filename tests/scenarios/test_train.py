@@ -89,7 +89,7 @@ WRONG = {
     "--suite validation": "No training split 'validation'. Allowed: train.",
     "test/0017": "No training split 'test'. Allowed: train.",
     "--suite train --algo mappo": "--algo needs a scenario",
-    "quickstart --seeds 2 --out x": "leave --out away",
+    "quickstart --seeds 2 --out x": "leave --out out",
     "quickstart --lr 0": "--lr must be > 0 and at most 10 (got 0).",
     "--suite train --minutes 0": "minutes must be > 0",
 }

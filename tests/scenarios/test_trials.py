@@ -287,7 +287,7 @@ def test_folders_of_trainings_are_one_policy(scenario, plans, tmp_path):
     assert rows[3].outcome != rows[6].outcome
     assert len({policy_hash(each) for each in (every, *apart.policies)}) == 4
     for given, said in (
-        ({"trainings": 2, "difficulties": ["twin"]}, "has 3 trainings of its own: then --trainings and"),
+        ({"trainings": 2, "difficulties": ["twin"]}, "has 3 trainings: then --trainings and"),
         ({"fleets": 2}, "then --trainings and --fleets must be 1"),
         ({"policies": [every, str(tmp_path / "pairs-1*")]}, "has 2 trainings, another policy 3: give as many"),
         ({"policies": [str(tmp_path / "none-*")]}, "There is no folder"),
