@@ -155,7 +155,7 @@ def test_a_training_is_randomised_and_says_so(thermofleet, small_toml, tmp_path)
     for name, more in (("hot", ("--randomise", "ambient_k=[20, 35]")), ("plain", ())):
         assert thermofleet(*how, "--out", tmp_path / name, *more).code == 0
         first = json.loads((tmp_path / name / "progress.jsonl").read_text().splitlines()[0])
-        best[name] = first["validation_reward"]  # of the same network
+        best[name] = first["validation"]  # of the same network
         cards = [json.loads((tmp_path / name / file).read_text()) for file in ("training.json", "policy.json")]
         expected = {"ambient_k": [20.0, 35.0], "arrivals": [1.0, 1.0], "variants": []} if more else None
         assert [card["randomise"] for card in cards] == [expected, expected]
