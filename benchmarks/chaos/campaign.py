@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.chaos.fleet_under_test import Fault, Fleet, Outcome
-from benchmarks.chaos.namespaces import Namespaces
 from benchmarks.chaos.partition import Proxy
 from benchmarks.chaos.wall_clock import WallClocks
 from fleet.bus.client import BusClient
@@ -33,11 +32,8 @@ ROGUE = "rogue"
 
 
 @contextmanager
-def start_fleet(fault: Fault, folder: Path, *, speed: float, namespaces: bool = False) -> Iterator[Fleet]:
+def start_fleet(fault: Fault, folder: Path, *, speed: float) -> Iterator[Fleet]:
     """Start the fleet that a fault needs, and wait until all participants are on the bus.
-
-    Args:
-        namespaces: Partition by network namespaces, with certificates, instead of by a proxy.
 
     Raises:
         RuntimeError: the fleet did not start.
@@ -46,15 +42,10 @@ def start_fleet(fault: Fault, folder: Path, *, speed: float, namespaces: bool = 
     arms, port = tuple(arm.name for arm in load(SCENARIO).arms), free_port()
     cut_arms = arms[-(fault.cut_arms or len(arms) // 2) :]
     with ExitStack() as stack:
-        cut = None
-        if fault.cut:
-            cut = stack.enter_context(
-                Namespaces(cut_arms, port) if namespaces and not fault.no_auctioneer else Proxy(port)
-            )
-        place = folder / "keys" if fault.tls or isinstance(cut, Namespaces) else None
+        cut = stack.enter_context(Proxy(port)) if fault.cut else None
+        place = folder / "keys" if fault.tls else None
         if place is not None:
-            hosts = cut.hosts.values() if isinstance(cut, Namespaces) else ()
-            make(place, of_arms(SCENARIO, arms, [RosterEntry(ROGUE, "arm")]), days=30, hosts=(*HERE, *hosts))
+            make(place, of_arms(SCENARIO, arms, [RosterEntry(ROGUE, "arm")]), days=30, hosts=HERE)
         router, arm_parts, record, auction = parts_of(
             SCENARIO,
             arms,
@@ -69,11 +60,9 @@ def start_fleet(fault: Fault, folder: Path, *, speed: float, namespaces: bool = 
             folder=folder,
             tls=place,
         )
-        if isinstance(cut, Namespaces):
-            router = replace(router, argv=(*router.argv, "--host", "0.0.0.0"))
         clocks = WallClocks(folder / "clocks") if fault.clocks else None
         if cut is not None:
-            arm_parts[-len(cut_arms) :] = map(cut.through, arm_parts[-len(cut_arms) :], cut_arms)
+            arm_parts[-len(cut_arms) :] = map(cut.through, arm_parts[-len(cut_arms) :])
         parts = [record, *([] if auction is None else [auction]), *arm_parts]
         if clocks is not None:
             router = replace(router, env=clocks.env("router"))
@@ -103,9 +92,9 @@ def start_fleet(fault: Fault, folder: Path, *, speed: float, namespaces: bool = 
         yield fleet
 
 
-def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces: bool) -> Outcome:
+def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float) -> Outcome:
     """Run one fault on a new fleet; arguments and errors as for `start_fleet`."""
-    with start_fleet(fault, folder, speed=speed, namespaces=namespaces) as fleet:
+    with start_fleet(fault, folder, speed=speed) as fleet:
         work = tuple(map(short_job, range(jobs)))
         accepted = {job.name for job in work}
         fleet.submit(work)
@@ -118,7 +107,6 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         ended_s = time.monotonic()
         fleet.wait_until(lambda: not _any_unfinished(fleet), LATE_REPORTS_S)
         outcome = fleet.outcome(accepted, fleet.status())
-        outcome.by = getattr(fleet.cut, "by", "")
         outcome.detected_s, outcome.recovered_s = detected_s, recovered_s
         outcome.took_s = ended_s - injected_s if math.isfinite(settled_s) else math.inf
     return outcome

@@ -43,8 +43,6 @@ class CannotInject(Exception):
 class Outcome:
     """Jobs, processes and times after a fault."""
 
-    by: str = ""
-    """How the fault was injected, if there are several ways."""
     finished: int = 0
     unfinished: int = 0
     lost: tuple[str, ...] = ()
@@ -90,13 +88,7 @@ class Fleet:
     tokens: set[str] = field(default_factory=set)
     states: dict[str, tuple[float, State]] = field(default_factory=dict)
     """By arm: real time of the last state, and the state."""
-    results: list[tuple[float, JobStatus]] = field(default_factory=list)
-    each_step: Callable[[], None] = lambda: None
-    """Called at every step, as to submit jobs."""
-    target: str = ""
-    """The arm that a fault hits; "" for any that works."""
-    ended_s: float = -math.inf
-    """Real time of the last kill, and of the last end of a fault that lasts."""
+    results: list[JobStatus] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.journals = JournalFiles(self.folder / "journals")
@@ -127,22 +119,16 @@ class Fleet:
         self.supervisor.poll()
         self.client.serve(time.monotonic() + wait_s)
         self.journals.follow()
-        self.each_step()
-
-    def end_fault(self) -> None:
-        """Note that the cause of a fault has ended now."""
-        self.ended_s = time.monotonic()
 
     def victim(self) -> str:
-        """Return the arm that a fault hits."""
-        return self.target or self.working_arm() or self.arms[0]
+        """Return the arm that a fault hits: one that works, if any does."""
+        return self.working_arm() or self.arms[0]
 
     def send_signal(self, name: str, number: int = signal.SIGKILL) -> None:
         """Send a signal to a participant."""
         pid = self.supervisor.pid(name)
         if pid is not None:
             os.kill(pid, number)
-            self.end_fault()
             if number == signal.SIGKILL:
                 self.killed[name] += 1
 
@@ -209,7 +195,7 @@ class Fleet:
     def _result(self, _auctioneer: str, word: Result) -> None:
         if word.number > self._last_result:  # an auctioneer repeats its last results when it starts
             self._last_result = word.number
-            self.results.append((time.monotonic(), word.status))
+            self.results.append(word.status)
 
 
 Inject = Callable[[Fleet], float]
@@ -223,7 +209,7 @@ class Fault:
     inject: Inject
     tls: bool = False
     cut: bool = False
-    """The connection of some arms can be cut: by network namespaces (with TLS), or by a proxy."""
+    """The connection of some arms can be cut."""
     clocks: bool = False
     """The wall clock of every participant can be set."""
     no_auctioneer: bool = False

@@ -1,17 +1,16 @@
 """Many arms behind two linked routers: kill either router, cut the link, count lost jobs and jobs done twice.
 
-    python -m benchmarks.chaos.mesh [--arms 256] [--jobs 512] [--speed 120] [--keep DIR] [--no-namespaces]
+    python -m benchmarks.chaos.mesh [--arms 256] [--jobs 512] [--speed 120] [--keep DIR]
 
 Host a has a router, the auctioneer and half of the arms, host b a router that is linked to the first, and the other
-arms. As root, host b is a network namespace and the link a virtual cable; otherwise the link passes a proxy. During the
-work router b is killed, the link is cut for 12 s (longer than a lease) and healed, and router a is killed; the
-supervisor starts routers again. TLS, access control and journals are on. A job that was done twice is found in the
-journals of the arms. Exit code 1: a job was lost or done twice, or a process exited that was not killed.
+arms. The link passes a proxy. During the work router b is killed, the link is cut for 12 s (longer than a lease) and
+healed, and router a is killed; the supervisor starts routers again. TLS, access control and journals are on. A job that
+was done twice is found in the journals of the arms. Exit code 1: a job was lost or done twice, or a process exited that
+was not killed.
 """
 
 import logging
 import math
-import signal
 import sys
 import tempfile
 import time
@@ -21,7 +20,6 @@ from pathlib import Path
 
 from benchmarks.chaos.fleet_under_test import AT_ONCE, Fleet, Outcome
 from benchmarks.chaos.mesh_parts import FLEET, SCENARIO, job_of, names_of
-from benchmarks.chaos.namespaces import Namespaces, unavailable_reason
 from benchmarks.chaos.partition import CUT_S, Proxy
 from benchmarks.harness import options
 from fleet.bus.client import BusClient
@@ -40,7 +38,7 @@ START_S, BACK_S, LATE_REPORTS_S = 300.0, 120.0, 20.0
 FAR = "router_b"
 
 
-def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, settle_s: float = 900.0) -> Outcome:
+def mesh(folder: Path, *, arms: int, jobs: int, speed: float, settle_s: float = 900.0) -> Outcome:
     """Run the campaign once.
 
     Raises:
@@ -48,15 +46,13 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
     """
     names, port_a, port_b = names_of(arms), free_port(), free_port()
     with ExitStack() as stack:
-        cable = stack.enter_context(Namespaces(["b"], port_a) if namespaces else Proxy(port_a))
-        hosts = tuple(cable.hosts.values()) if isinstance(cable, Namespaces) else ()
+        cable = stack.enter_context(Proxy(port_a))
         place, at_a, at_b = folder / "keys", f"tls/127.0.0.1:{port_a}", f"tls/127.0.0.1:{port_b}"
-        make(place, of_arms(FLEET, names, [RosterEntry(FAR, "router")]), days=30, hosts=(*HERE, *hosts))
-        beyond = ("--host", "0.0.0.0") if hosts else ()
+        make(place, of_arms(FLEET, names, [RosterEntry(FAR, "router")]), days=30, hosts=HERE)
         router = (*PROGRAM, "bus", "router", "--tls", str(place))
-        near = Part(name="router", argv=(*router, "--port", str(port_a), *beyond), ready=at_a)
+        near = Part(name="router", argv=(*router, "--port", str(port_a)), ready=at_a)
         link = ("--port", str(port_b), "--name", FAR, "--connect", at_a)
-        far = cable.through(Part(name=FAR, argv=(*router, *link), ready=at_b), "b")
+        far = cable.through(Part(name=FAR, argv=(*router, *link), ready=at_b))
 
         def part(name: str, what: str, address: str, rank: int) -> Part:
             words = (what, address, str(place), str(folder / "journals"), str(arms), f"{speed:g}")
@@ -66,7 +62,7 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
         others = [
             part("auction", "auction", at_a, 3),
             part("arms-a", halves[0], at_a, 2),
-            cable.through(part("arms-b", halves[1], at_b, 2), "b"),
+            cable.through(part("arms-b", halves[1], at_b, 2)),
         ]
         supervisor = stack.enter_context(Supervisor(folder / "logs", backoff=Backoff(first_s=0.2)))
         supervisor.start(near, ready_s=START_S)
@@ -97,16 +93,16 @@ def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, 
         settled_s = fleet.wait_until(lambda: _count(fleet, wanted, SETTLED) == jobs, settle_s)
         fleet.wait_until(lambda: _count(fleet, wanted, ("finished",)) == jobs, LATE_REPORTS_S)
         outcome = fleet.outcome(wanted, _statuses(fleet, wanted))
-        outcome.by, outcome.took_s = cable.by, time.monotonic() - began_s if math.isfinite(settled_s) else math.inf
+        outcome.took_s = time.monotonic() - began_s if math.isfinite(settled_s) else math.inf
     return outcome
 
 
-def _kill_far(fleet: Fleet, _: Proxy | Namespaces) -> None:
+def _kill_far(fleet: Fleet, _: Proxy) -> None:
     fleet.send_signal(FAR)
     fleet.wait_until(lambda: any(map(fleet.is_absent, fleet.arms[1::2])), 10.0)
 
 
-def _cut(fleet: Fleet, cable: Proxy | Namespaces) -> None:
+def _cut(fleet: Fleet, cable: Proxy) -> None:
     cable.cut()
     fleet.wait_until(lambda: False, CUT_S)
     if not all(map(fleet.is_absent, fleet.arms[1::2])):
@@ -114,7 +110,7 @@ def _cut(fleet: Fleet, cable: Proxy | Namespaces) -> None:
     cable.heal()
 
 
-def _kill_near(fleet: Fleet, _: Proxy | Namespaces) -> None:
+def _kill_near(fleet: Fleet, _: Proxy) -> None:
     fleet.send_signal("router")
     fleet.wait_until(lambda: any(map(fleet.is_absent, fleet.arms)), 10.0)
 
@@ -146,17 +142,14 @@ def main() -> None:
         jobs=512,
         speed=(120.0, "fleet seconds per real second"),
         keep=(Path, "folder for journals and logs; default: temporary"),
-        no_namespaces=(False, "cut the link by a proxy, also as root"),
     )
     logging.basicConfig(level=logging.ERROR)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # remove the namespaces: they outlive the process
-    reason = "--no-namespaces" if given.no_namespaces else unavailable_reason()
     prepare(load(SCENARIO), difficulty="blind")  # fills the cache
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.keep or Path(temporary)
         amount = {"arms": given.arms, "jobs": given.jobs, "speed": given.speed}
-        outcome = mesh(folder / "mesh", **amount, namespaces=not reason)
-    print(f"{given.arms} arms, two routers, link by {outcome.by}{f' ({reason})' if reason else ''}")
+        outcome = mesh(folder / "mesh", **amount)
+    print(f"{given.arms} arms, two routers")
     print(
         f"{given.jobs} jobs: {outcome.finished} finished, {outcome.unfinished} unfinished, {len(outcome.lost)} lost, "
         f"{len(outcome.twice)} twice; exited: {', '.join(outcome.exited) or 'none'}; {outcome.took_s:.0f} s"

@@ -76,7 +76,7 @@ def malformed(fleet: Fleet) -> float:
 
 def replayed_awards(fleet: Fleet) -> float:
     """Send the awards of an arm again, 50 times."""
-    arm = fleet.target or fleet.arms[0]
+    arm = fleet.arms[0]
     for award in awards_of(fleet, arm) * 50:
         fleet.session.get(
             keys.of_arm(fleet.client.fleet, arm, "award"),

@@ -1,8 +1,7 @@
 """Cut the connection between some arms and the router without closing it, and restore it.
 
-As root, the arms run in network namespaces (`namespaces`) whose links are taken down. Otherwise they reach the router
-through a proxy. While it is cut, it reads from neither side: neither sees a reset, and the system accepts new
-connections, which receive nothing.
+The arms reach the router through a proxy. While it is cut, it reads from neither side: neither sees a reset, and the
+system accepts new connections, which receive nothing.
 """
 
 import selectors
@@ -13,7 +12,6 @@ from dataclasses import replace
 from typing import Self
 
 from benchmarks.chaos.fleet_under_test import Fleet
-from benchmarks.chaos.namespaces import Namespaces
 from fleet.live.supervisor import Part
 
 CUT_S = 12.0
@@ -23,8 +21,6 @@ _LOOK_S = 0.05
 
 class Proxy:
     """`with Proxy(port) as proxy:` forwards connections from `proxy.port` to `port`, until it is cut."""
-
-    by = "proxy"
 
     def __init__(self, to_port: int) -> None:
         self._to, self._listener = ("127.0.0.1", to_port), socket.create_server(("127.0.0.1", 0))
@@ -48,7 +44,7 @@ class Proxy:
             end.close()
         self._ready.close()
 
-    def through(self, part: Part, _arm: str) -> Part:
+    def through(self, part: Part) -> Part:
         """Return the part with the address of this proxy in place of the router's."""
         there, here = f"127.0.0.1:{self._to[1]}", f"127.0.0.1:{self.port}"
         return replace(part, argv=tuple(word.replace(there, here) for word in part.argv))
@@ -102,10 +98,10 @@ class Proxy:
             one.close()
 
 
-def cut_at_work(fleet: Fleet) -> tuple[Proxy | Namespaces, set[str], float]:
+def cut_at_work(fleet: Fleet) -> tuple[Proxy, set[str], float]:
     """Cut off arms during a job; return the cut, its arms, and the seconds until the bus shows it."""
     cut, cut_arms = fleet.cut, set(fleet.cut_arms)
-    assert isinstance(cut, Proxy | Namespaces)
+    assert isinstance(cut, Proxy)
     fleet.wait_until(lambda: any(fleet.states[arm][1].mode == "working" for arm in cut_arms), 20.0)
     cut.cut()
     seen_s = fleet.wait_until(lambda: all(map(fleet.is_absent, cut_arms)), 10.0)
@@ -117,13 +113,10 @@ def partition(fleet: Fleet) -> float:
     cut, cut_arms, seen_s = cut_at_work(fleet)
     fleet.wait_until(lambda: False, CUT_S)
     cut.heal()
-    fleet.end_fault()
     healed_s = fleet.wait_until(lambda: not any(map(fleet.is_absent, cut_arms)), 30.0)
-    how = "each in a network namespace, link down" if cut.by == "netns" else "behind a proxy"
     cut_s = CUT_S + min(seen_s, 10.0)
     fleet.note(
-        f"{', '.join(sorted(cut_arms))} cut off for {cut_s:.0f} s, {how}; "
-        f"present again {healed_s:.1f} s after the cut ended"
+        f"{', '.join(sorted(cut_arms))} cut off for {cut_s:.0f} s; present again {healed_s:.1f} s after the cut ended"
     )
     return seen_s
 

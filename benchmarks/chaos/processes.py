@@ -15,8 +15,8 @@ from benchmarks.chaos.fleet_under_test import Fleet
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, Submission, SubmissionReply
 
-DISK_S, ANSWER_S, STOP_S = 10.0, 3.0, 4.0
-"""Real seconds: of a full disk; in which a submission must be answered once the router is back; of a stop."""
+DISK_S, ANSWER_S = 10.0, 3.0
+"""Real seconds: of a full disk; in which a submission must be answered once the router is back."""
 
 
 def kill_arm(fleet: Fleet) -> float:
@@ -50,20 +50,6 @@ def kill_router(fleet: Fleet) -> float:
     return fleet.wait_until(lambda: not fleet.tokens, 10.0)
 
 
-def kill_recorder(fleet: Fleet) -> float:
-    """SIGKILL the recorder."""
-    fleet.send_signal("record")
-    return math.nan
-
-
-def stop_auctioneer(fleet: Fleet) -> float:
-    """SIGSTOP the auctioneer for a time shorter than a lease, then SIGCONT."""
-    fleet.send_signal(fleet.auction, signal.SIGSTOP)
-    fleet.wait_until(lambda: False, STOP_S)
-    fleet.send_signal(fleet.auction, signal.SIGCONT)
-    return math.nan
-
-
 def stuck_subscriber(fleet: Fleet) -> float:
     """Add two subscribers to all keys: one is stopped, one takes 50 ms for every message."""
     code = (
@@ -92,7 +78,6 @@ def full_disk(fleet: Fleet) -> float:
     arm = fleet.victim()
     with _without_space(_pids(fleet, f"arm-{arm}", fleet.auction)):
         fleet.wait_until(lambda: False, DISK_S)
-    fleet.end_fault()
     return math.nan
 
 

@@ -47,8 +47,7 @@ def measure(arms: int, most_in_hall: int) -> dict[str, object]:
     import numpy as np
 
     from agents.registry import make_policy
-    from benchmarks.scaling.ask import repeated
-    from benchmarks.scaling.hall import hall
+    from benchmarks.scaling.hall import hall, repeated
     from fleet.arm.space import space_table
     from fleet.env.vector import BatchEnv
     from scenarios.prepare.batch import library_of

@@ -1,16 +1,16 @@
 """One simulated life of a fleet: jobs and faults by one seed, rules after every event, and all settled at the end.
 
-Besides the rules of `fleet`: after the faults every job is finished, given up for the reasons that the product names,
-or unfinished because an arm stopped in its last cycle; every wait ends; requests of people have their effect
-(`steering`); the recording has every result once (`recording`).
+Rules besides those of `simulated_fleet`: after the faults every job is finished, given up for the reasons that the
+product names, or unfinished because an arm stopped in its last cycle; every wait ends; requests of people have their
+effect (`steering`); the recording has every result once (`recording`).
 """
 
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.simulation.fleet import FIRST, Fleet, random_conflicts
 from benchmarks.simulation.participants import AUCTIONEER, CLIENT, Watch, simulated_system
 from benchmarks.simulation.recording import RECORDER
+from benchmarks.simulation.simulated_fleet import FIRST, Fleet, random_conflicts
 from benchmarks.simulation.steering import check_steering
 from benchmarks.simulation.world import Process, Violation, World
 from fleet.bus.protocol import keys

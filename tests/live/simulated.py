@@ -4,8 +4,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from benchmarks.simulation.fleet import Fleet
 from benchmarks.simulation.participants import AUCTIONEER, CLIENT
+from benchmarks.simulation.simulated_fleet import Fleet
 from benchmarks.simulation.world import Process, World
 from fleet.bus.client import NoReply
 from fleet.bus.protocol import keys

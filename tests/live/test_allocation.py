@@ -1,7 +1,7 @@
 """Who gets which job, in a fleet with an auctioneer and in one without: leases, space, faults, full disks, restarts.
 
-The rules of `benchmarks.simulation.fleet` are checked after every event: no last cycle is done twice, no two arms have
-one job, and no two are away from home on plans that exclude each other.
+After every event the simulation checks its rules: no last cycle is done twice, no two arms have one job, and no two are
+away from home on plans that exclude each other.
 """
 
 from functools import partial
@@ -296,9 +296,14 @@ def test_an_arm_that_is_online_again_after_it_was_cleared_takes_its_space_until_
     fleet.cut()
     if finishes:
         fleet.until(lambda: bool(fleet.finished))
+        fleet.submit(job("b", 2))
     else:
-        fleet.run(3.0)
-    fleet.submit(job("b", 2))
+        fleet.run(1.5)
+        fleet.cut(arm)  # only some messages arrived, and no quote
+        fleet.submit(job("b", 2))
+        fleet.run(5.0)
+        assert fleet.status("b").state == "waiting"
+        fleet.cut()
     fleet.until(lambda: fleet.finished == {"a": 1, "b": 1})
     fleet.until(lambda: fleet.is_everywhere("a", "finished") and fleet.is_everywhere("b", "finished"))
 

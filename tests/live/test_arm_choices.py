@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from agents.auction import Consensus
 from agents.registry import RULES
-from benchmarks.simulation.fleet import FIRST
 from benchmarks.simulation.machine import SimulatedEstimator
 from benchmarks.simulation.participants import simulated_system
+from benchmarks.simulation.simulated_fleet import FIRST
 from fleet.bus.protocol.auction import Ack, Award
 from fleet.bus.protocol.keys import of_arm
 from tests.live.simulated import SimulatedFleet, job, refused

@@ -5,13 +5,11 @@ import re
 import shutil
 import subprocess
 import sys
-from itertools import islice
 from pathlib import Path
 
 import pytest
 
 from benchmarks.chaos.fleet_under_test import JournalFiles
-from benchmarks.chaos.random_faults import OTHERS, schedule
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted
 from fleet.live.journal import Closed, Journal
@@ -29,15 +27,6 @@ def strike(*faults, jobs, env=None):
         cwd=ROOT,
         env=env,
     )
-
-
-def test_a_seed_repeats_its_faults_and_12_faults_occur():
-    def faults(seed):
-        return list(islice(schedule(seed, ("a", "b")), 60))
-
-    assert faults(1) == faults(1) != faults(2)
-    assert len(OTHERS) >= 12
-    assert OTHERS.keys() <= {step.fault for step in faults(1)}
 
 
 def test_jobs_are_counted_that_a_journal_has_left_out(tmp_path):
