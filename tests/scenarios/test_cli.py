@@ -1,4 +1,4 @@
-"""The command line: options, ranges, help and errors, called as a person calls it."""
+"""The command line: options, ranges, help and errors."""
 
 import json
 import os
@@ -85,7 +85,7 @@ def test_without_out_the_run_goes_into_runs(thermofleet, small_toml, tmp_path, m
     assert (tmp_path / "runs" / "heat-round_robin-5" / "run.json").is_file()
 
 
-def test_a_finished_run_is_kept_until_told_otherwise(thermofleet, small_toml, tmp_path):
+def test_a_finished_run_is_kept_without_overwrite(thermofleet, small_toml, tmp_path):
     out = tmp_path / "run"
     assert thermofleet("run", small_toml, *QUICK, "--out", out).code == 0
     said = thermofleet("run", small_toml, *QUICK, "--seed", 1, "--out", out)
@@ -164,23 +164,7 @@ def too_heavy(text: str) -> str:
 
 BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
     ("unknown key", lambda t: t + "\n[reward]\nfaullts = 1\n", [], "heat.toml: reward: unknown key 'faullts'; did you"),
-    ("wrong type", lambda t: t.replace("= 180", '= "long"'), [], "heat.toml: horizon_s: expected a number, got a text"),
-    (
-        "negative mass",
-        lambda t: t.replace("[2.0]", "[-2.0]"),
-        [],
-        "jobs[0].payload_kg must be between 0 and 10 kg (got -2.0).",
-    ),
     ("one place", lambda t: t.replace("[0.45, 0", "[-0.45, 0"), [], "'right' is 0.00 m from 'left' (arms[0]);"),
-    ("not a number", lambda t: t.replace("= 180", "= nan"), [], "heat.toml: horizon_s: expected a finite number,"),
-    ("bad TOML", lambda t: t + "\n[[", [], "heat.toml: not valid TOML: "),
-    (
-        "no arm",
-        lambda t: t.replace("[[arms]]", "[[places]]").replace("tilt_deg", "tool_deg").replace('home = "retract"', ""),
-        [],
-        "there are no arms",
-    ),
-    ("no trace", lambda t: t.replace('"batch", count = 2', '"trace", file = "t.txt"'), [], "there is no file '"),
     ("unreachable", unreachable, [], "jobs[0].places: no arm can do 'hold' with 2 kg (left at 'bench': reach:"),
     ("too heavy", too_heavy, [], "jobs[0].places: no arm can do 'hold' with 9 kg (left at 'bench': 9 kg at 0."),
     ("policy", None, ["--policy", "raundom"], "No policy 'raundom'; did you mean 'random'? Allowed: "),
@@ -201,9 +185,7 @@ BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
 
 
 @pytest.mark.parametrize(("edit", "options", "sentence"), [row[1:] for row in BAD_INPUT], ids=[r[0] for r in BAD_INPUT])
-def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(
-    thermofleet, small_toml, tmp_path, edit, options, sentence
-):
+def test_bad_input_is_one_sentence_and_nothing_is_written(thermofleet, small_toml, tmp_path, edit, options, sentence):
     if edit is not None:
         small_toml.write_text(edit(small_toml.read_text(encoding="utf-8")), encoding="utf-8")
     options = [option.replace("HERE", str(tmp_path)) for option in options]
@@ -246,7 +228,7 @@ WRONG_WORDS = {
 
 
 @pytest.mark.parametrize("words", WRONG_WORDS)
-def test_every_command_tells_what_is_wrong(thermofleet, small_toml, tmp_path, monkeypatch, words):
+def test_an_error_of_any_command_is_one_sentence(thermofleet, small_toml, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     said = thermofleet(*words.split())
     assert said.code == 2
@@ -254,7 +236,7 @@ def test_every_command_tells_what_is_wrong(thermofleet, small_toml, tmp_path, mo
     assert said.err.count("\n") == 1
 
 
-def test_a_cache_that_cannot_be_written_is_told(thermofleet, small_toml, tmp_path, monkeypatch):
+def test_a_cache_that_cannot_be_written_is_an_error(thermofleet, small_toml, tmp_path, monkeypatch):
     monkeypatch.setenv("THERMOFLEET_CACHE", str(small_toml / "cache"))
     said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run")
     assert said.code == 2
@@ -403,14 +385,14 @@ def run(*words, **defaults) -> Given | BaseException:
     return received[0] if received else done.exception or AssertionError(done.output)
 
 
-def test_a_command_receives_what_is_given_and_no_defaults():
+def test_a_command_receives_given_values_and_no_defaults():
     assert run() == {}
     assert run("--heat-c", "90", "--twice") == {"heat_c": 90.0}
     assert run("--shelf", "1", "--shelf", "3", "--clean") == {"shelves": (1, 3), "clean": True}
     assert run("--mode", "fan") == {"mode": "fan"}  # given, although it is the default
 
 
-def test_a_command_may_have_a_default_of_its_own():
+def test_a_command_may_have_another_default():
     assert run(heat_c=100.0) == {"heat_c": 100.0}
     assert run("--heat-c", "90", heat_c=100.0) == {"heat_c": 90.0}
 
@@ -435,17 +417,9 @@ def test_the_same_bounds_hold_on_the_command_line_and_in_python(word, value, sai
 
 
 def test_words_of_a_command_line_give_the_same_value():
-    spec = LiveSpec(policy="wspt", speed=12345.678e-3, jobs="none", new_epoch=True)
-    names = [name for name in options_of(LiveSpec)]
-    received: list[Given] = []
-
-    def live(given: Annotated[Given, From(LiveSpec)]) -> None:
-        received.append(given)
-
-    app = typer.Typer()
-    app.command()(with_fields(live))
-    assert CliRunner().invoke(app, list(flags_of(spec, *names))).exit_code == 0
-    assert LiveSpec(**received[0]) == spec
+    oven = Oven(heat_c=12345.678e-3 + 80, mode="grill", minutes=5, clean=True)
+    names = ("heat_c", "mode", "minutes", "clean")
+    assert Oven(**run(*flags_of(oven, *names))) == oven
 
 
 @pytest.mark.parametrize("kind", [RunSpec, LiveSpec, StudySpec, Budget, Shot, Channel])
@@ -520,7 +494,7 @@ def test_a_run_records_its_channel_and_is_the_same_over_either_bus(thermofleet, 
     assert 0 < told["memory"]["metrics"]["messages"] < words
 
 
-def test_a_comparison_says_what_lay_between(thermofleet, small_toml):
+def test_a_comparison_states_its_channel(thermofleet, small_toml):
     call = ("compare", small_toml, "--difficulty", "blind", "--seeds", 2, "--policies", "round_robin")
     plain, hard = thermofleet(*call), thermofleet(*call, *HARD)
     assert "Channel" not in plain.out

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -48,7 +47,7 @@ from scenarios.progress import quiet
 from scenarios.spec.load import load
 from scenarios.spec.schema import Ambient
 from tests import commands
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, serve_until, serving
 from twin.logs.reader import read
 from twin.logs.recording import READINGS
 
@@ -92,15 +91,12 @@ class Process:
             self.process.communicate()
 
 
-def heard_from(link, fleet, enough):
-    """State words and the info of an arm, once there are enough."""
+def receive(link, fleet, is_enough):
+    """States and the info of an arm, once there are enough."""
     states, infos = [], []
-    link.subscribe(keys.of_every_arm(fleet, "state"), State, lambda _, word: states.append(word))
-    link.subscribe(keys.of_every_arm(fleet, "info"), Info, lambda _, word: infos.append(word), history=True)
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not (infos and enough(states)):
-        assert time.monotonic() < deadline_s, "waited in vain"
-        link.serve(time.monotonic() + 0.1)
+    link.subscribe(keys.of_every_arm(fleet, "state"), State, lambda _, message: states.append(message))
+    link.subscribe(keys.of_every_arm(fleet, "info"), Info, lambda _, message: infos.append(message), history=True)
+    serve_until(lambda: infos and is_enough(states), link)
     return states, infos[-1]
 
 
@@ -169,7 +165,7 @@ def test_an_arm_runs_as_a_process_and_exits_on_a_signal(small_toml, plans, tmp_p
         options = ["--endpoint", router.endpoint, "--difficulty", "blind", "--rate-hz", 20]
         with Process(small_toml, "left", *options, cache=plans, cwd=tmp_path) as arm:
             assert arm.ready.split() == ["ready", "left", router.endpoint, str(arm.process.pid)]
-            states, info = heard_from(link, "heat", lambda states: len(states) > 5)
+            states, info = receive(link, "heat", lambda states: len(states) > 5)
             assert "torch" not in Path(f"/proc/{arm.process.pid}/maps").read_text()
             returned, said = arm.end(number)
     assert returned == code, said
@@ -184,7 +180,7 @@ def test_a_log_is_replayed_as_an_arm(small_toml, plans, log, tmp_path):
         options = ["--source", "log", "--endpoint", router.endpoint, "--speed", 4, "--rate-hz", 20]
         with Process(small_toml, "museum", log, *options, cache=plans, cwd=tmp_path) as arm:
             assert arm.ready.startswith("ready museum")
-            states, info = heard_from(link, "heat", lambda states: states and states[-1].mode == "idle")
+            states, info = receive(link, "heat", lambda states: states and states[-1].mode == "idle")
             job = JobSpec(name="j", kind="hold", places=("bench",))
             answers = link.query_and_wait(
                 keys.of_every_arm("heat", "quote"), QuoteRequest("q", (job,), dry_run=True), Quote, timeout_s=PATIENCE_S
@@ -195,7 +191,7 @@ def test_a_log_is_replayed_as_an_arm(small_toml, plans, log, tmp_path):
     assert "replays the log 'real.csv'" in quote.estimates[0].reason
     rise = np.arange(1, 8) / 100
     for state in states:
-        into_s = (state.temp_c[0] - 30.0) * 100  # what the first joint says of the time, the others must say too
+        into_s = (state.temp_c[0] - 30.0) * 100  # time by the first joint; the others must agree
         np.testing.assert_allclose(state.temp_c, 30.0 + into_s * rise, atol=1e-9)
         np.testing.assert_allclose(state.q, into_s * rise, atol=1e-9)
         np.testing.assert_allclose(state.tau, 2.0 + into_s * rise, atol=1e-9)
@@ -319,12 +315,11 @@ def test_a_job_is_submitted_after_those_it_waits_for(small_toml):
 
 
 class Stage:
-    """Stands in for a node: an hour passes with every turn, and a job is done in the turn after it was handed in."""
+    """Stands in for a node: an hour passes with every turn, and a job is done in the turn after its submission."""
 
-    def __init__(self) -> None:
-        self.time_s, self.handed_in, self.open, self.ended = 0.0, [], [], False
-        self.alone_s = 0.0
-        ledger = SimpleNamespace(unsettled=lambda: self.open, ended=False)
+    def __init__(self, *, over: bool = False, alone_s: float = 0.0) -> None:
+        self.time_s, self.alone_s, self.submitted, self.open = 0.0, alone_s, [], []
+        ledger = SimpleNamespace(unsettled=lambda: self.open, ended=over)
         self.auctioneer = SimpleNamespace(ledger=ledger, finishing=lambda: False)
 
     @property
@@ -335,41 +330,34 @@ class Stage:
         self.time_s += 3600.0
         self.open = []
 
-    def submit(self, word: Submission) -> SubmissionReply:
-        self.handed_in.append((self.time_s, [job.name for job in word.jobs]))
-        self.open = list(word.jobs)
-        return SubmissionReply("auctioneer", tuple(Admission(job.name, True) for job in word.jobs))
+    def submit(self, submission: Submission) -> SubmissionReply:
+        self.submitted.append((self.time_s, [job.name for job in submission.jobs]))
+        self.open = list(submission.jobs)
+        return SubmissionReply("auctioneer", tuple(Admission(job.name, True) for job in submission.jobs))
 
     def end(self) -> None:
-        self.ended = True
+        self.auctioneer.ledger.ended = True
 
 
-@pytest.mark.parametrize(("horizon_s", "ended"), [(1e6, False), (7200.0, True)])
-def test_a_stream_is_submitted_as_released_until_all_is_done_or_the_shift_is_over(monkeypatch, horizon_s, ended):
+NAMES = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
+ALL = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
+
+
+@pytest.mark.parametrize(
+    ("stage", "horizon_s", "submitted", "ended"),
+    [
+        (Stage(), 1e6, ALL, False),
+        (Stage(), 7200.0, ALL[:2], True),
+        (Stage(over=True), 1.0, [], True),
+        (Stage(alone_s=7200.0), 1e6, [(7200.0, ["a", "b", "c"]), ALL[2]], False),
+    ],
+    ids=["all jobs", "the shift ends", "the shift was over", "another auctioneer is present"],
+)
+def test_a_stream_is_submitted_as_released(monkeypatch, stage, horizon_s, submitted, ended):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
-    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
-    names = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
-    stream = [(at_s, JobSpec(name, "hold", ("x",))) for name, at_s in names.items()]
-    live_auction.submit_stream(stage, stream, horizon_s, never)
-    all_of_it = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
-    assert stage.handed_in == (all_of_it[:2] if ended else all_of_it)
-    assert stage.ended is ended
-
-
-def test_a_finished_shift_submits_no_job_again(monkeypatch):
-    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
-    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
-    stage.auctioneer.ledger.ended = True
-    live_auction.submit_stream(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1.0, never)
-    assert stage.handed_in == []
-
-
-def test_no_job_is_submitted_while_another_auctioneer_is_present(monkeypatch):
-    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
-    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
-    stage.alone_s = 7200.0
-    live_auction.submit_stream(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1e6, never)
-    assert stage.handed_in == [(7200.0, ["a"])]
+    stream = [(at_s, JobSpec(name, "hold", ("x",))) for name, at_s in NAMES.items()]
+    live_auction.submit_stream(stage, stream, horizon_s, SimpleNamespace(is_set=lambda: False))
+    assert (stage.submitted, stage.auctioneer.ledger.ended) == (submitted, ended)
 
 
 def test_a_job_message_has_all_fields():
@@ -390,7 +378,7 @@ OTHER_KIND = {
 
 @pytest.mark.parametrize("words", OTHER_KIND)
 def test_a_shift_is_not_continued_with_the_other_kind_of_allocation(thermofleet, tmp_path, words):
-    """Who goes on from the journals of the other way does not know what is done, and would have it done again."""
+    """The journals of the other kind do not say what is done: jobs would be done twice."""
     files, complaint = OTHER_KIND[words]
     folder = tmp_path / "journals" if words.startswith("up") else tmp_path
     folder.mkdir(exist_ok=True)
@@ -414,7 +402,7 @@ def test_a_shift_is_continued_with_its_own_kind_of_allocation(tmp_path):
 
 @contextmanager
 def auctioneer(endpoint: str, folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
-    """The command as a process that has said that it is ready."""
+    """The command as a process that is ready."""
     with commands.start("bus", "auctioneer", "--endpoint", endpoint, "--journal", folder, *words) as process:
         assert process.stdout is not None
         try:
@@ -521,27 +509,16 @@ def test_a_missing_file_or_auctioneer_is_one_sentence(endpoint, tmp_path, thermo
 
 @contextmanager
 def served(endpoint: str, declare: Callable[[BusClient], None]) -> Iterator[None]:
-    """A participant of fleet f on a thread of its own."""
-    stop = threading.Event()
+    """A participant of fleet f on a thread."""
     with BusClient(endpoint, "f") as link:
         declare(link)
-
-        def serve() -> None:
-            while not stop.is_set():
-                link.serve(time.monotonic() + 0.05)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
+        with serving(link):
             yield
-        finally:
-            stop.set()
-            thread.join(PATIENCE_S)
 
 
 @contextmanager
 def arm(endpoint: str, *, feasible: bool = True) -> Iterator[list[QuoteRequest]]:
-    """An arm that only quotes; gives what it was asked."""
+    """An arm that only quotes; yields its requests."""
     asked: list[QuoteRequest] = []
 
     def answer(request: QuoteRequest) -> Quote:
