@@ -1,6 +1,6 @@
-"""Processes for independent work, here or on a Ray cluster; the work of a process that dies is run again.
+"""Processes for independent units of work, on this machine or a Ray cluster; units of a process that dies are rerun.
 
-The processes end soon after the one that began them, also when that is killed.
+The processes end soon after the one that started them, also if that is killed.
 """
 
 import os
@@ -20,58 +20,58 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 from fleet.errors import FleetError
 
 PARENT_CHECK_S = 1.0
-"""Time between two checks of a process that its parent still runs."""
+"""Seconds between two checks of a worker that its parent still runs."""
 MOST_DEATHS = 3
-"""Processes that may exit during a piece of work before it is given up."""
+"""Number of processes that may exit during a unit before it is abandoned."""
 IDLE_S = 120.0
-"""A process without work ends after this time."""
+"""Seconds after which an idle process ends."""
 Result = TypeVar("Result", covariant=True)  # of protocols and of frozen values
 
 
-class Work(Protocol[Result]):
-    """What one process does at a time."""
+class WorkUnit(Protocol[Result]):
+    """A piece of work for one process."""
 
     @property
     def name(self) -> str:
-        """What it does, in a sentence about a process that died."""
+        """Name in a sentence about a process that died."""
         ...
 
     @property
     def group(self) -> object:
-        """Work of one group shares what a process keeps, such as a prepared fleet."""
+        """Units of one group share what a process caches, such as a prepared fleet."""
         ...
 
     @property
     def deaths(self) -> int:
-        """How many processes died while they did it."""
+        """Number of processes that died during it."""
         ...
 
     def __call__(self) -> Result:
-        """Do it, in whichever process this is."""
+        """Compute the result, in any process."""
         ...
 
-    def after_death(self) -> "Sequence[Work[Result]]":
-        """The same work, perhaps in smaller parts, each with one death more."""
+    def after_death(self) -> "Sequence[WorkUnit[Result]]":
+        """The same work, perhaps in smaller units, each with one death more."""
         ...
 
     def given_up(self) -> Result:
-        """Its result after `MOST_DEATHS`."""
+        """Result after `MOST_DEATHS`."""
         ...
 
 
 class Worker(Protocol):
-    """One process that does a piece of work at a time."""
+    """A process that runs one unit at a time."""
 
-    def submit(self, work: Work[Result]) -> "Future[Result]":
-        """Begin a piece of work."""
+    def submit(self, work: WorkUnit[Result]) -> "Future[Result]":
+        """Start a unit."""
         ...
 
     def died(self, error: BaseException) -> bool:
-        """Whether an error of its work says that the process died."""
+        """Whether an error of a unit means that the process died."""
         ...
 
     def renew(self) -> bool:
-        """Replace a process that died; False if there is no place for another."""
+        """Replace a process that died; False if there is no resource for another."""
         ...
 
     def close(self) -> None:
@@ -80,10 +80,10 @@ class Worker(Protocol):
 
 
 class LocalWorker:
-    """A process of this machine.
+    """A process on this machine.
 
     Args:
-        threads: Of the numerical libraries in it.
+        threads: Number of threads of its numerical libraries.
     """
 
     def __init__(self, threads: int = 1) -> None:
@@ -94,11 +94,10 @@ class LocalWorker:
         how = {"context": get_context("loky"), "env": {"OMP_NUM_THREADS": str(self._threads)}, "timeout": IDLE_S}
         return ProcessPoolExecutor(1, initializer=_begin, initargs=(os.getpid(),), **how)
 
-    def submit(self, work: Work[Result]) -> "Future[Result]":
+    def submit(self, work: WorkUnit[Result]) -> "Future[Result]":
         return self._pool.submit(work)
 
     def died(self, error: BaseException) -> bool:
-        """Whether an error of its work says that the process died."""
         return isinstance(error, BrokenProcessPool)
 
     def renew(self) -> bool:
@@ -111,10 +110,10 @@ class LocalWorker:
 
 
 class Queue(Generic[Result]):
-    """Work that waits, in its groups: a worker stays with its group while there is work in it."""
+    """Waiting units by group: a worker stays with its group until that is empty."""
 
-    def __init__(self, works: Iterable[Work[Result]]) -> None:
-        self._groups: dict[object, deque[Work[Result]]] = {}
+    def __init__(self, works: Iterable[WorkUnit[Result]]) -> None:
+        self._groups: dict[object, deque[WorkUnit[Result]]] = {}
         for work in works:
             self._groups.setdefault(work.group, deque()).append(work)
         self._untouched = deque(self._groups)
@@ -122,9 +121,9 @@ class Queue(Generic[Result]):
     def __bool__(self) -> bool:
         return bool(self._groups)
 
-    def take(self, group: object = None) -> Work[Result]:
-        """The next work for a worker that has what this group shares: of this group, of one that no worker has begun,
-        or of the one with most left."""
+    def take(self, group: object = None) -> WorkUnit[Result]:
+        """The next unit for a worker of this group: of this group, else of one that no worker has started, else of the
+        largest."""
         if group not in self._groups:
             group = next((each for each in self._untouched if each in self._groups), None)
             group = group or max(self._groups, key=lambda each: len(self._groups[each]))
@@ -135,27 +134,27 @@ class Queue(Generic[Result]):
             del self._groups[group]
         return work
 
-    def put_back(self, works: Sequence[Work[Result]]) -> None:
-        """Do these next."""
+    def put_back(self, works: Sequence[WorkUnit[Result]]) -> None:
+        """Put units at the head of their groups."""
         for work in reversed(works):
             self._groups.setdefault(work.group, deque()).appendleft(work)
 
 
 def run_all(
     queue: Queue[Result], workers: Sequence[Worker], tell: Callable[[str], None] = lambda sentence: None
-) -> Iterator[tuple[Work[Result], Result]]:
-    """Every piece of work with its result, in the order in which they end.
+) -> Iterator[tuple[WorkUnit[Result], Result]]:
+    """Every unit with its result, in the order of completion.
 
     Args:
-        workers: The caller closes them.
-        tell: Called with a sentence about each process that dies.
+        workers: Closed by the caller.
+        tell: Receives a sentence about each process that dies.
 
     Raises:
         FleetError: no worker is left.
-        Exception: whatever the work raises.
+        Exception: raised by a unit.
     """
     idle, groups = list(workers), {}
-    running: dict[Future[Result], tuple[Worker, Work[Result]]] = {}
+    running: dict[Future[Result], tuple[Worker, WorkUnit[Result]]] = {}
     while queue or running:
         while queue and idle:
             worker = idle.pop(0)
@@ -186,10 +185,10 @@ def run_all(
 
 @dataclass(frozen=True, eq=False)
 class Call(Generic[Result]):
-    """A call of a function as a piece of work."""
+    """A call of a function as a unit of work."""
 
     number: int
-    """Its place among the calls."""
+    """Index among the calls."""
     function: Callable[..., Result]
     arguments: Sequence[Any]
     options: dict[str, Any] = field(default_factory=dict)
@@ -201,7 +200,7 @@ class Call(Generic[Result]):
 
     @property
     def group(self) -> object:
-        """One for all calls, so that they begin in their order."""
+        """The same for all calls, so that they start in their order."""
         return "calls"
 
     def __call__(self) -> Result:
@@ -211,22 +210,21 @@ class Call(Generic[Result]):
         return [replace(self, deaths=self.deaths + 1)]
 
     def given_up(self) -> Result:
-        """Raise a FleetError."""
         raise FleetError(f"The process that ran {self.name} died {MOST_DEATHS} times.")
 
 
 Delayed = tuple[Callable[..., Any], Sequence[Any], dict[str, Any]]
-"""A call to come, as `joblib.delayed(function)(…)` gives it (Any: of any signature)."""
+"""A call as `joblib.delayed(function)(…)` returns it (Any: of any signature)."""
 _kept: dict[int, list[LocalWorker]] = {}
-"""Processes that wait for the next calls, by their threads."""
+"""Idle processes, by their number of threads."""
 _is_worker = False
 
 
 @contextmanager
 def worker_processes(count: int, *, in_order: bool = False) -> Iterator[Callable[[Iterable[Delayed]], Iterator[Any]]]:
-    """What makes calls on this many processes, or in this one; results come as they are made, or in their order.
+    """A function that runs calls on `count` processes and yields their results, as they complete or in order.
 
-    Processes wait some time for the next use. In a process of another one's work, calls are made in that process.
+    Processes stay idle for some time, for the next use. Inside a worker, calls run in that worker.
     """
 
     def pool(calls: Iterable[Delayed]) -> Iterator[Any]:
@@ -241,7 +239,7 @@ def worker_processes(count: int, *, in_order: bool = False) -> Iterator[Callable
         results = run_all(Queue(works), workers)
         try:
             yield from _in_order(results) if in_order else (result for _, result in results)
-        except BaseException:  # an interruption, or a caller that wants no more
+        except BaseException:  # an interruption, or a caller that stops early
             for worker in workers:
                 worker.close()
             raise
@@ -250,7 +248,7 @@ def worker_processes(count: int, *, in_order: bool = False) -> Iterator[Callable
     yield pool
 
 
-def _in_order(results: Iterator[tuple[Work[Any], Any]]) -> Iterator[Any]:
+def _in_order(results: Iterator[tuple[WorkUnit[Any], Any]]) -> Iterator[Any]:
     """Results of calls, in the order of their numbers."""
     ready: dict[int, Any] = {}
     coming = 0
@@ -263,14 +261,14 @@ def _in_order(results: Iterator[tuple[Work[Any], Any]]) -> Iterator[Any]:
 
 
 def _begin(parent: int) -> None:
-    """Make this process one of another's work, which ends with it."""
+    """Mark this process as a worker that ends with its parent."""
     global _is_worker
     _is_worker = True
     end_with(parent)
 
 
 def end_with(parent: int) -> None:
-    """End this process soon after its parent, also in the middle of its work."""
+    """End this process soon after its parent, also in the middle of a unit."""
     pause = threading.Event()  # never set
 
     def watch() -> None:

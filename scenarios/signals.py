@@ -44,7 +44,7 @@ class StopRequest:
 
 @contextmanager
 def until_stopped() -> Iterator[StopRequest]:
-    """Turn Ctrl-C and SIGTERM into stop requests; in the main thread only."""
+    """Turn Ctrl-C and SIGTERM into stop requests. Call it in the main thread."""
     exit_with_supervisor()
     receiver, sender = socket.socketpair()
     with receiver, sender:

@@ -1,4 +1,4 @@
-"""One arm of a live fleet as a process: simulated, or replayed from a real arm's log; with or without an auctioneer."""
+"""One arm of a live fleet as a process: simulated, or replayed from the log of a real arm."""
 
 import logging
 import os
@@ -43,12 +43,12 @@ from scenarios.terminal import echo, progress_bar
 log = logging.getLogger(__name__)
 
 TURN_S, CLOCK_S, RETIRE_S = 0.25, 2.0, 1.0
-"""Real seconds: between two checks for a signal; for the auctioneer's clock reply; to return awards at the end."""
+"""Real seconds between two checks for a stop request, for the clock reply, and for the return of awards at the end."""
 TOKEN_S, POLL_S = 4.0, 0.1
-"""Real seconds for which the token of an exited process may remain, its session's lease with a margin; and between
-two requests for it."""
+"""Real seconds that the token of an exited process may remain (lease of a session, with a margin), and between two
+requests for tokens."""
 FAREWELL_S = 2.0
-"""Real seconds to serve after all jobs are settled: peers that do not know it yet request the missing outcomes."""
+"""Real seconds to serve after all jobs are settled, for peers that still request outcomes."""
 
 
 def run_arm(
@@ -66,8 +66,8 @@ def run_arm(
     """Run one arm of a fleet until its jobs are done, Ctrl-C or SIGTERM.
 
     Args:
-        alone: Whether it allocates jobs with its peers by the policy of `spec`, without an auctioneer.
-        file: Log that it replays in place of the simulated arm.
+        alone: Allocate jobs with the peers by the policy of `spec`, without an auctioneer.
+        file: Log to replay instead of a simulated arm.
         speed: Fleet seconds per real second; None for that of the auctioneer.
 
     Raises:
@@ -121,13 +121,13 @@ class PreparedArm:
     name: str
     model: DifficultyModel
     plan: Callable[[Work], tuple[Plan, ...]]
-    """Variants of a work; raises InfeasibleJob."""
+    """Plans of a task type; raises InfeasibleJob."""
     body: Callable[[float, float], Body]
-    """Makes its body, from the fleet time and the length of its steps, s."""
+    """Makes the body of the arm from fleet time and step length, s."""
     ambient_c: Callable[[float], float] | None = None
     """Ambient temperature at the arm by fleet time, °C; None: that of the cell."""
     works: tuple[Work, ...] = ()
-    """Works that are planned already."""
+    """Task types with known plans."""
     takes_jobs: bool = True
 
 
@@ -141,7 +141,7 @@ def simulated_arm(
     *,
     risk: RiskName = "rc",
 ) -> PreparedArm:
-    """Prepare the scenario's arm: its body, plans and twin are those of the same arm in `thermofleet run`.
+    """Prepare an arm of a scenario, with the body, plans and twin that it has in `thermofleet run`.
 
     Raises:
         FleetError: the scenario has no such arm.
@@ -158,7 +158,7 @@ def simulated_arm(
         return cell_c(time_s) + offset_k
 
     @lru_cache
-    def planner() -> CellPlanner:  # made for the first unplanned work only: it loads the physics
+    def planner() -> CellPlanner:  # made for the first unplanned task type: it loads the physics
         return CellPlanner(arm.robot, scenario, cache or cache_folder())
 
     def plan(work: Work) -> tuple[Plan, ...]:
@@ -196,7 +196,10 @@ def replayed_arm(name: str, file: Path) -> PreparedArm:
 
     recordings = {each.name.rpartition("/")[2]: each for each in read(file, damaged="skip")}
     if len(recordings) > 1 and name not in recordings:
-        raise FleetError(f"{file} holds several arms: {', '.join(recordings)}. Give one of these names.")
+        raise FleetError(
+            f"'{file}' has the logs of several arms, and none of '{name}'. Give one of these names: "
+            f"{', '.join(recordings)}."
+        )
     recording = recordings[name] if len(recordings) > 1 else next(iter(recordings.values()))
     if recording.temp_c is None:
         raise LogError(str(file), None, "has no motor temperatures; a live arm needs them.")
@@ -212,10 +215,10 @@ def replayed_arm(name: str, file: Path) -> PreparedArm:
 
 
 def wait_for_name(link: BusClient, name: str, *, patience_s: float = TOKEN_S) -> None:
-    """Wait until no arm of that name is present; two of one name would publish and work as one.
+    """Wait until no arm of that name is online; two arms of one name would act as one.
 
     Raises:
-        BusError: one is still present.
+        BusError: one is still online.
     """
     deadline_s = time.monotonic() + patience_s
     while link.tokens(keys.of_arm(link.fleet, name, "alive"), timeout_s=patience_s):
@@ -241,7 +244,7 @@ def make_node(
     """Join the bus with an arm and the history of its journal; link and journal are open.
 
     Args:
-        work_source: Makes its work source, from the arm and `boot`, the boot number; by default auctioneers.
+        work_source: Makes the source of jobs from the arm and its boot number `boot`; by default auctioneers.
     """
     clock = fleet_clock(link, speed)
     history = restart_history(book, arm.name, clock.now_s(time.monotonic()))
@@ -287,7 +290,7 @@ def fleet_clock(link: BusClient, speed: float | None) -> FleetClock:
 
 
 def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed: int) -> Membership:
-    """How the arm `name` of a scenario takes part in the consensus of its fleet, by a policy of scope `arm`.
+    """Membership of an arm in the consensus of its fleet, by a policy of scope `arm`.
 
     Raises:
         FleetError: the scenario has no such arm, or there is no such policy.
@@ -310,7 +313,7 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
 
 
 def refuse_auctioneer(link: BusClient) -> None:
-    """Check that the fleet has no auctioneer: it would award jobs that the arms allocate too.
+    """Check that the fleet has no auctioneer, which would award the jobs that the arms allocate.
 
     Raises:
         BusError: the fleet has one.

@@ -32,19 +32,18 @@ from scenarios.terminal import echo, progress_bar
 _LOG = logging.getLogger(__name__)
 
 ON_BUS_S = 1.0
-"""Most real seconds for a decision of a policy in another process: meanwhile the auctioneer renews no lease."""
+"""Maximum real seconds for a decision of a policy in another process; no lease is renewed meanwhile."""
 TURN_S = 0.1
 """Real seconds between two submissions of released jobs."""
 NONE_LEFT: Mapping[JobState, int] = {}
 FAREWELL_S = (1.0, 10.0)
-"""Real seconds to serve after the end; and at most, while a job is in its last cycle."""
+"""Real seconds to serve after the end, and at most while a job is in its last cycle."""
 
 
 class CentralAllocation:
     """An allocation rule of the auctioneer, made of a central policy."""
 
     def __init__(self, policy: Policy, fleet: LiveFleet) -> None:
-        """Take a policy that was reset."""
         self._policy, self._fleet = policy, fleet
         self._last: dict[str, int] = {}
         self._problem = ""
@@ -52,13 +51,13 @@ class CentralAllocation:
     def __call__(self, bidding: Bidding) -> dict[str, Assignment]:
         """Arm and plan of each job that is assigned: the claims of the policy, resolved as in simulation.
 
-        None if the policy is in another process that does not reply; the auctioneer offers the jobs again.
+        Empty if the policy runs in another process and does not reply; the auctioneer offers the jobs again.
         """
         seen = observe(bidding, self._fleet, last=self._last)
         try:
             actions = actions_of(list(seen), self._policy.act(seen)).tolist()
         except BusError as error:
-            if str(error) != self._problem:  # once, not in every round
+            if str(error) != self._problem:  # logged once, not in every round
                 _LOG.error("Nothing is awarded until the policy replies: %s", error)
             self._problem = str(error)
             return {}
@@ -186,9 +185,9 @@ def submit_stream(
 
 
 def scenario_jobs(scenario: Scenario, seed: int) -> list[tuple[float, JobSpec]]:
-    """Job stream of a scenario for one seed, the same as in `thermofleet run`, each job with the time to submit it.
+    """Jobs of a scenario for one seed, as in `thermofleet run`, each with its submission time, s.
 
-    That is when it and all jobs that it waits for are released.
+    A job is submitted when it and all its predecessors are released.
     """
     # As `ShiftFactory` draws them for the first shift of a seed.
     jobs = {job.name: job for job in draw_jobs(scenario, np.random.SeedSequence(seed, spawn_key=(0,)))}
@@ -220,7 +219,7 @@ def summary(statuses: Sequence[JobStatus], time_s: float, left: Mapping[JobState
     """Number of finished jobs, and one line for each other job.
 
     Args:
-        left: Number of further jobs, by state.
+        left: Number of evicted jobs, by state.
     """
     others = [status for status in statuses if status.state != "finished"]
     finished, total = len(statuses) - len(others) + left.get("finished", 0), len(statuses) + sum(left.values())

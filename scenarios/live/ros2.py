@@ -1,4 +1,4 @@
-"""A fleet and ROS 2 over Zenoh (rmw_zenoh): processes that pass states, jobs and a real arm between them."""
+"""Processes between a fleet and ROS 2 over Zenoh (rmw_zenoh): states, jobs, and a real arm."""
 
 import os
 import time

@@ -1,4 +1,4 @@
-"""A live fleet on the terminal, until its shift has ended."""
+"""A live fleet on the terminal, until the end of its shift."""
 
 import math
 import os
@@ -32,10 +32,10 @@ from scenarios.signals import StopRequest, until_stopped
 from scenarios.terminal import echo, err_console, out_console, say
 
 WAIT_S, GONE_S = 0.5, 3.0
-"""Real seconds: between two looks for a fleet; without any participant, after which a settled shift has ended."""
+"""Real seconds between two searches for a fleet, and without participants until a settled shift counts as ended."""
 OPEN: tuple[JobState, ...] = ("waiting", "awarded", "finishing")
 FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
-"""Real seconds: between two frames; between two lines about every arm; of listening for one snapshot."""
+"""Real seconds between two frames, between two lines about an arm, and of listening for one snapshot."""
 
 
 def watch(
