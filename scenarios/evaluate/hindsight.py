@@ -191,8 +191,6 @@ class Hindsight:
     """The best schedule found."""
 
     reward: float
-    start: float
-    """Reward of the best start."""
     claims: list[Claim]
     """For `ScheduleReplay`."""
     evaluations: int
@@ -222,7 +220,7 @@ def hindsight(
     best, best_claims = float(starts.reward[first]), starts.claims[first]
     changes = simulator.changes(rng)
     if changes.none:
-        return Hindsight(best, best, best_claims, 0, 0.0)
+        return Hindsight(best, best_claims, 0, 0.0)
     chosen = np.argsort(-starts.reward)[: simulator.rows // 4]
     present = changes.of_awards(starts.start_s[chosen], starts.arm[chosen], starts.option[chosen])
     value = float(simulator.world.jobs.value[0][simulator.world.jobs.exists[0]].sum())
@@ -256,4 +254,4 @@ def hindsight(
             result = simulator.run(kicked)
             current, score, since, joint = changes.in_order(kicked, result.start_s, 0), float(result.reward[0]), 0, []
     seconds = time.process_time() - began_s
-    return Hindsight(best, float(starts.reward[first]), best_claims, simulator.evaluations - begun, seconds)
+    return Hindsight(best, best_claims, simulator.evaluations - begun, seconds)

@@ -294,17 +294,6 @@ TRIM = 0.25
 """Share of the scores that the interquartile mean leaves out at each end."""
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """Share of runs with a score above each threshold."""
-
-    threshold: Array
-    share: Array
-    """[threshold]."""
-    low: Array
-    high: Array
-
-
 @dataclass(frozen=True)
 class Aggregate:
     """The figures of one policy over a suite."""
@@ -328,20 +317,23 @@ def aggregates(scores: Mapping[str, ArrayLike], *, groups: ArrayLike | None = No
     return {policy: _aggregate(_checked_scores(each), groups) for policy, each in scores.items()}
 
 
-def profile(scores: ArrayLike, threshold: ArrayLike, *, groups: ArrayLike | None = None) -> Profile:
-    """The performance profile of one policy, with pointwise intervals.
+def profile(scores: ArrayLike, threshold: ArrayLike, *, groups: ArrayLike | None = None) -> tuple[Array, Array, Array]:
+    """The performance profile of one policy: share of runs with a score above each threshold.
 
     Args:
         scores: [run, instance].
         threshold: Scores at which it is given, [threshold].
         groups: As of `aggregates`.
+
+    Returns:
+        Share, and its pointwise lower and upper bound, each [threshold].
     """
     x, at = _checked_scores(scores), np.asarray(threshold, dtype=float)
     above = (x[..., None] > at).astype(float)  # [run, instance, threshold]
     drawn = _weights(x.shape, groups).reshape(DRAWS, -1) @ above.reshape(x.size, -1) / x.size
     share, (low, high) = above.mean(axis=(0, 1)), _percentiles(drawn, _clusters(x.shape, groups))
     most, least = _beyond(x.shape, groups)
-    return Profile(at, share, np.where(share == 1, least, low), np.where(share == 0, most, high))
+    return share, np.where(share == 1, least, low), np.where(share == 0, most, high)
 
 
 def improvement(scores: ArrayLike, base: ArrayLike, *, groups: ArrayLike | None = None) -> Interval:

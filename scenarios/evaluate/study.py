@@ -149,9 +149,7 @@ class Study(StudySpec):
             for each in own:
                 check_policy(each, self.decision_limit_s)
             if len(own) > 1 and (self.trainings > 1 or self.fleets > 1):
-                raise FleetError(
-                    f"'{policy}' has {len(own)} trainings: then --trainings and --fleets must be 1."
-                )
+                raise FleetError(f"'{policy}' has {len(own)} trainings: then --trainings and --fleets must be 1.")
             if len(own) not in (1, self.most_trainings):
                 raise FleetError(
                     f"'{policy}' has {len(own)} trainings, another policy {self.most_trainings}: give as many of each."

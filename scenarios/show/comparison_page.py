@@ -243,8 +243,7 @@ def _score_charts(judged: Judged) -> list[Chart]:
     chosen = order[:MOST_CURVES]
     if judged.baseline not in chosen:
         chosen = [*chosen[:-1], judged.baseline]
-    curves = {name: profile(values.score[name], THRESHOLDS, groups=values.groups) for name in chosen}
-    bands = {label(name): (each.share, each.low, each.high) for name, each in curves.items()}
+    bands = {label(name): profile(values.score[name], THRESHOLDS, groups=values.groups) for name in chosen}
     share = "share of instances above"
     profiles = lines(THRESHOLDS, bands, {label(chosen[0]), base}, "normalised score", share)
     numbers = ", ".join(f"{name} {value:.2f}" for name, value, _, _ in rows)
@@ -308,12 +307,10 @@ def _card_table(card: Mapping[str, Any]) -> Table:
     """Code, versions, settings and policies of a study."""
     rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
     rows += [(name, value_text(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
-    rows += [(f"policy {label(name)}", digest or _without_file(name)) for name, digest in card["policies"].items()]
+    for name, digest in card["policies"].items():
+        without_file = "in another process, no file" if is_on_bus(name) else "of the code"
+        rows.append((f"policy {label(name)}", digest or without_file))
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
-
-
-def _without_file(policy: str) -> str:
-    return "in another process, no file" if is_on_bus(policy) else "of the code"
 
 
 def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least: float, marked: str = "") -> Figure:
