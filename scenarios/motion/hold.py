@@ -24,7 +24,6 @@ from fleet.heat.thermal import (
     steady_state,
     thermal_model,
 )
-from fleet.job import BOUNDS
 from fleet.motion import static_drive
 from fleet.robot import GEN3, JOINTS, RATING, Cooling, Robot, ThermalLimits
 from scenarios.motion.recover import parse_posture
@@ -35,7 +34,6 @@ PerJoint = tuple[float, ...]
 MaybePerJoint = tuple[float | None, ...]
 
 LIMITS_C = (ThermalLimits().warning_c, ThermalLimits().error_c)
-AMBIENT_RANGE_C = (-40.0, 60.0)
 STEP_S = 2.0
 """Time step; heat is taken at its midpoint, so the error is of second order."""
 LONGEST_S = 24 * 3600.0
@@ -50,7 +48,7 @@ class HoldError(FleetError):
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """Effect of a hold on the seven joints from one start; tuples of 7."""
+    """Effect of a hold on the seven joints from one start."""
 
     t60_min: MaybePerJoint
     """Minutes until the motor passes the warning limit, 60 °C; None when never."""
@@ -91,6 +89,8 @@ def hold(
 ) -> HoldResult:
     """Torque, current and temperatures of a nominal Gen3 on the floor that holds a payload still.
 
+    The command line checks the ranges of the numbers.
+
     Args:
         payload_kg: A point mass at the flange.
         posture: A name from `fleet.robot.POSTURES`, or seven comma-separated joint angles in degrees.
@@ -98,19 +98,11 @@ def hold(
         beyond_rating: Accept a load beyond the rating of the Gen3 for a short time.
 
     Raises:
-        HoldError: an argument is out of range, the load is beyond the rating, or the hold needs more torque than a
-            motor has.
+        HoldError: unknown cooling, the load is beyond the rating, or the hold needs more torque than a motor has.
         PostureError: the posture is unknown, or beyond a joint stop.
     """
     from fleet.arm.model import ArmModel
 
-    masses = (("payload", payload_kg, BOUNDS["payload_kg"].high), ("tool mass", tool_kg, RATING.temporary_kg))
-    for name, value, most_kg in masses:
-        if not 0 <= value <= most_kg:
-            raise HoldError(f"The {name} must be a mass between 0 and {most_kg:g} kg (got {value}).")
-    low_c, high_c = AMBIENT_RANGE_C
-    if not low_c <= ambient_c <= high_c:
-        raise HoldError(f"The ambient temperature must lie in {low_c:g} … {high_c:g} °C (got {ambient_c}).")
     if cooling not in get_args(Cooling):
         raise HoldError(f"Unknown cooling '{cooling}'{nearest(cooling, get_args(Cooling))}")
     strategy = cast("Cooling", cooling)

@@ -11,7 +11,7 @@ from urllib.parse import quote
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import Offer, ShiftLog
-from scenarios.run.schedule import JobSpan, Outage, Schedule
+from scenarios.run.schedule import JobSpan, Schedule
 from scenarios.show.page import Chart, Page, Playback, packed
 from scenarios.show.timeline import figure, time_unit
 from scenarios.show.words import CANNOT, by_joint, clock, duration, kind_text, scores_text, value_text
@@ -53,17 +53,18 @@ def verdict(log: ShiftLog) -> Verdict:
     for sentence, fault in about.items():
         sentences += [sentence, *_cause(fault, plan, offers)]
     if len(faults) > MOST_FAULTS:
-        of = sorted({fault.arm for fault in faults})
-        arms = ", ".join(of[:MOST_NAMED_ARMS]) + (
-            f" and {len(of) - MOST_NAMED_ARMS} more" if len(of) > MOST_NAMED_ARMS else ""
-        )
-        sentences.append(f"{len(faults)} faults in all, of {arms}: see the events below.")
+        arms = sorted({fault.arm for fault in faults})
+        more = f" and {len(arms) - MOST_NAMED_ARMS} more" if len(arms) > MOST_NAMED_ARMS else ""
+        named = ", ".join(arms[:MOST_NAMED_ARMS])
+        sentences.append(f"{len(faults)} faults in all, of {named}{more}: see the events below.")
     elif not faults:
         sentences.append(_hottest(metrics))
     if log.policy != WEIGHS_PEAK:
         sentences += _foreseen(faults, plan, offers)
     if contacts:
-        sentences.append(f"Arms touched something {_times(contacts)}: see the events below.")
+        sentences.append(
+            f"Arms touched something {f'{contacts} times' if contacts > 1 else 'once'}: see the events below."
+        )
     status = str(log.card.get("status", "unknown"))
     if status == "interrupted":
         badge = f"Interrupted after {duration(plan.horizon_s)}: everything here covers that part only"
@@ -100,14 +101,11 @@ def _fault(fault: Event, plan: Schedule) -> str:
     outage = next((o for o in plan.outages if o.arm == fault.arm and o.start_s == fault.time_s), None)
     at = f" during {fault.job}" if fault.job else ""
     why = by_joint(fault.reason or f"motor {fault.joint} reached its limit").replace("joint ", "the motor of joint ", 1)
-    return f"{clock(fault.time_s)}: {fault.arm} stopped{at}, {_outage(outage)}: {why}."
-
-
-def _outage(outage: Outage | None) -> str:
-    if outage is None:
-        return "and recovered at once"
-    length = duration(outage.end_s - outage.start_s)
-    return f"out for {length}" if outage.recovered else f"out for the remaining {length}"
+    loss = "and recovered at once"
+    if outage is not None:
+        rest = "" if outage.recovered else "the remaining "
+        loss = f"out for {rest}{duration(outage.end_s - outage.start_s)}"
+    return f"{clock(fault.time_s)}: {fault.arm} stopped{at}, {loss}: {why}."
 
 
 def _award(fault: Event, plan: Schedule) -> JobSpan | None:
@@ -201,10 +199,6 @@ def _occupied(offer: Offer, plan: Schedule) -> str:
     if current.end_s >= plan.horizon_s:
         return "which was busy to the end"
     return f"once it was free, at {clock(current.end_s)}"
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
 
 
 ROWS = 300

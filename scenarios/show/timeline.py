@@ -97,24 +97,27 @@ def figure(log: ShiftLog) -> dict[str, Any]:
     layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
     layout["xaxis"] = time | {"anchor": "y"}
     layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
+    # NaN is ignored, and nothing copied.
+    low_c = float(np.fmin.reduce(telemetry.temp_c, axis=None, initial=warning_c - 20.0))
+    high_c = float(np.fmax.reduce(telemetry.temp_c, axis=None, initial=error_c))
+    room_k = 0.06 * (high_c - low_c)
     temperature = AXIS | {
-        "range": _temperature_range(telemetry.temp_c, warning_c, error_c),
+        "range": [low_c - room_k, high_c + room_k],
         "title": {"text": "°C", "standoff": 8},
         "anchor": "x2",
         "nticks": 6,
     }
+    layout["shapes"] = []
     for lane in range(len(lanes)):
-        layout[f"yaxis{lane + 2}"] = temperature | layout[f"yaxis{lane + 2}"] | ({"matches": "y2"} if lane else {})
-        layout["annotations"] += [_limit_label(lane, name, limit_c, anchor) for name, limit_c, _, anchor, _ in limits]
-    layout["shapes"] = [
-        *(
-            {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": f"y{a + 2}", "y0": limit, "y1": limit}
-            | {"line": {"color": colour, "width": 1, "dash": dash}}
-            for a in range(len(lanes))
-            for _, limit, colour, _, dash in reversed(limits)
-        ),
-        *_outages(plan.outages, [arms[a] for a in lanes], unit_s),
-    ]
+        axis = f"yaxis{lane + 2}"
+        layout[axis] = temperature | layout[axis] | ({"matches": "y2"} if lane else {})
+        for name, limit_c, colour, anchor, dash in limits:
+            at = {"yref": f"y{lane + 2}", "y0": limit_c, "y1": limit_c, "xref": "paper", "x0": 0, "x1": 1}
+            layout["shapes"].append(at | {"type": "line", "line": {"color": colour, "width": 1, "dash": dash}})
+            aside = {"x": 1, "xshift": 4, "y": limit_c, "yref": f"y{lane + 2}", "yanchor": anchor, "font": {"size": 10}}
+            label = {"text": f"{name} {limit_c:g} °C", "yshift": -5 if anchor == "bottom" else 5}
+            layout["annotations"].append(TEXT | aside | label)
+    layout["shapes"] += _outages(plan.outages, [arms[a] for a in lanes], unit_s)
     data = [*bars, *_temperatures(telemetry, arms, lanes, unit, unit_s)]
     if overview:
         number = len(lanes) + 2
@@ -135,25 +138,17 @@ def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
         look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": "x"}}
         traces.append(_bars("out after a fault", outages, _outage_text, arms, unit_s, look))
     if not traces:  # without a trace Plotly draws no rows
-        traces.append(
-            BAR
-            | {"name": "no job was begun", "showlegend": True, "x": [None], "y": [None], "marker": {"color": "#888888"}}
-        )
+        traces.append(_legend_entry("no job was begun", {}) | {"showlegend": True})
     for kind, symbol, colour in MARKS:  # above the bars of their arm
-        own = [e for e in log.events if e.kind == kind and e.arm in arms]
-        if own:
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "name": kind,
-                    "x": [round(e.time_s / unit_s, 5) for e in own],
-                    "y": [arms.index(e.arm) - 0.42 for e in own],
-                    "marker": {"symbol": symbol, "color": colour, "size": 9, "line": {"color": "white", "width": 1}},
-                    **_hover([_event_text(e) for e in own]),
-                    "legend": "legend",
-                }
-            )
+        marked = [e for e in log.events if e.kind == kind and e.arm in arms]
+        if marked:
+            look = {"symbol": symbol, "color": colour, "size": 9, "line": {"color": "white", "width": 1}}
+            at = {
+                "x": [round(e.time_s / unit_s, 5) for e in marked],
+                "y": [arms.index(e.arm) - 0.42 for e in marked],
+            }
+            trace = {"type": "scatter", "mode": "markers", "name": kind, "marker": look, "legend": "legend"}
+            traces.append(trace | at | _hover([_event_text(e) for e in marked]))
     return traces
 
 
@@ -188,17 +183,16 @@ def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
         traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, log.arms, unit_s, look))
     outcomes = {a.outcome for a in assignments}
     samples = (
-        (
-            "late",
-            any(a.late_s for a in assignments),
-            {"color": "#888888", "line": LATE, "pattern": HATCH | {"shape": "."}},
-        ),
-        ("returned", "returned" in outcomes, {"color": "#888888", "pattern": HATCH | {"shape": "/"}}),
-        ("still running", "running" in outcomes, {"color": "#888888", "opacity": UNFINISHED}),
+        ("late", any(a.late_s for a in assignments), {"line": LATE, "pattern": HATCH | {"shape": "."}}),
+        ("returned", "returned" in outcomes, {"pattern": HATCH | {"shape": "/"}}),
+        ("still running", "running" in outcomes, {"opacity": UNFINISHED}),
     )
-    return traces + [
-        BAR | {"name": name, "x": [None], "y": [None], "marker": look} for name, used, look in samples if used
-    ]
+    return traces + [_legend_entry(name, look) for name, used, look in samples if used]
+
+
+def _legend_entry(name: str, look: Trace) -> Trace:
+    """A grey bar in the legend alone."""
+    return BAR | {"name": name, "x": [None], "y": [None], "marker": {"color": "#888888"} | look}
 
 
 def _shape(a: JobSpan) -> str:
@@ -327,7 +321,7 @@ def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict
         place = {"x": 0, "y": paper(from_top_px), "yref": "paper", "yanchor": "bottom"}
         return TEXT | place | {"text": f"<b>{text}</b>", "font": {"size": size}}
 
-    rows = {
+    rows: dict[str, Any] = {
         "domain": [paper(gantt_px), 1.0],
         "range": [len(arms) - 0.4, -0.65],
         "tickvals": list(range(len(arms))),
@@ -336,21 +330,17 @@ def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict
         "fixedrange": True,
         "automargin": True,
     }
-    small: dict[str, Any] = {"tickfont": {"size": 8}} if overview else {}
     heat: dict[str, Any] = {}
     if overview:
-        place = {"domain": [paper(map_top + map_px), paper(map_top)], "anchor": "x3"}
+        rows["tickfont"] = {"size": 8}
+        place = {"domain": [paper(map_top + map_px), paper(map_top)], "anchor": "x3", "range": [len(arms) - 0.5, -0.5]}
         every = slice(None, None, -(-len(arms) // 50))
-        marks = {
-            "tickvals": rows["tickvals"][every],
-            "ticktext": rows["ticktext"][every],
-            "range": [len(arms) - 0.5, -0.5],
-        }
-        heat = {f"yaxis{len(lanes) + 2}": AXIS | rows | small | place | marks}
+        marks = {name: rows[name][every] for name in ("tickvals", "ticktext")}
+        heat = {f"yaxis{len(lanes) + 2}": AXIS | rows | place | marks}
     return {
         "height": round(total_px + legend_px + 44.0 + MARGIN["b"]),
         "margin": MARGIN | {"t": round(legend_px + 44.0)},
-        "yaxis": AXIS | rows | small,
+        "yaxis": AXIS | rows,
         **heat,
         **{f"yaxis{a + 2}": {"domain": [max(0.0, paper(y + lane_px)), paper(y)]} for a, y in enumerate(tops)},
         "legend": LEGEND | {"y": paper(-6.0), "itemclick": "toggle", "title": _heading("Work of each arm")},
@@ -379,27 +369,6 @@ def _legend_height(bars: Sequence[Trace]) -> float:
         return LEGEND_ROW_PX
     per_row = max(1, int(NARROW_PX // max(wide)))
     return LEGEND_ROW_PX * -(-len(wide) // per_row)
-
-
-def _temperature_range(temp_c: Array, warning_c: float, error_c: float) -> list[float]:
-    low = float(np.fmin.reduce(temp_c, axis=None, initial=warning_c - 20.0))  # NaN is ignored, and nothing copied
-    high = float(np.fmax.reduce(temp_c, axis=None, initial=error_c))
-    room = 0.06 * (high - low)
-    return [low - room, high + room]
-
-
-def _limit_label(arm: int, name: str, limit: float, anchor: str) -> dict[str, Any]:
-    """Name of a limit at the right of an arm's lane."""
-    return TEXT | {
-        "text": f"{name} {limit:g} °C",
-        "x": 1,
-        "xshift": 4,
-        "y": limit,
-        "yref": f"y{arm + 2}",
-        "yanchor": anchor,
-        "yshift": -5 if anchor == "bottom" else 5,
-        "font": {"size": 10},
-    }
 
 
 def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
