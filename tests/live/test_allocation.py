@@ -27,7 +27,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.operator import Pause, Resume, Settle
 from fleet.job import reason_to_give_up
-from fleet.live.auction.rounds import Assignment
+from fleet.live.auction.rounds import Assignment, Timing
 from fleet.live.space import ANYWHERE
 from tests.live.simulated import LONG, SPEED, TIMING, SimulatedFleet, job, refused
 
@@ -339,6 +339,14 @@ def test_a_round_closes_with_the_last_quote_or_at_its_time_limit(auctioned, seco
     (took_s,) = rounds(auctioned)
     limit_s = TIMING.window_s - 1e-6
     assert (limit_s <= took_s < limit_s + auctioned.world.late_s) if second == "hangs" else took_s < limit_s
+
+
+def test_a_round_does_not_wait_for_an_arm_that_leaves(fleet_of):
+    fleet = fleet_of(alone=False, timing=Timing(window_s=20.0))
+    fleet.stop("arm_1")
+    fleet.submit(job("a", 2))
+    fleet.until(lambda: bool(fleet.holder("a")))
+    assert rounds(fleet)[0] < 10.0
 
 
 def test_an_award_without_an_answer_is_sent_three_times_and_then_dropped(auctioned):
