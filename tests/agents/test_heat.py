@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from agents.heat import FuzzySpeed, GuardedArm, GuardedFleet, Shutdown, TorqueLimiter, Wsept
 from agents.pairs import Worth, worth_per_second
 from agents.policy import WAIT, for_all_arms
-from agents.registry import RULES, WRAPPERS, make_policy
+from agents.registry import WRAPPERS, make_policy
 from fleet.arm.model import ArmModel
 from fleet.env.allocation_v1 import parallel_env
 from fleet.errors import FleetError
@@ -235,8 +235,8 @@ def test_the_job_that_is_given_back_is_the_one_that_was_claimed() -> None:
 
 
 @pytest.mark.parametrize("wrapper", WRAPPERS)
-@pytest.mark.parametrize("name", [name for name, rule in RULES.items() if not rule.plans])
-def test_every_rule_in_a_wrapper_keeps_its_scope_and_is_legal_all_shift(small, wrapper, name) -> None:
+@pytest.mark.parametrize("name", ["random", "round_robin", "least_difficulty", "least_loaded", "wsept", "wsept_local"])
+def test_a_rule_in_a_wrapper_keeps_its_scope_and_is_legal_all_shift(small, wrapper, name) -> None:
     full = f"{wrapper}:{name}"
     policy = policy_of(full)
     assert scope_of(full) == scope_of(name) == policy.scope

@@ -200,17 +200,25 @@ def _tetrahedron_stl() -> bytes:
     return bytes(80) + struct.pack("<I", len(faces)) + body
 
 
-def _pretend_menagerie(monkeypatch, folder):
-    robot = SimpleNamespace(path=lambda progress=None: folder)
+@pytest.fixture
+def menagerie(monkeypatch, tmp_path):
+    """A package of meshes in this folder, which has none yet."""
+    robot = SimpleNamespace(path=lambda progress=None: tmp_path)
     fake = SimpleNamespace(get=lambda name: robot, MenagerieError=RuntimeError)
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", fake)
+    return tmp_path
 
 
-def test_meshes_change_the_looks_and_nothing_else(monkeypatch, tmp_path):
-    (tmp_path / "assets").mkdir()
+@pytest.fixture
+def meshes(menagerie):
+    """A tetrahedron for every mesh."""
+    (menagerie / "assets").mkdir()
     for mesh in MESH_OF_GEOM.values():
-        (tmp_path / "assets" / f"{mesh}.stl").write_bytes(_tetrahedron_stl())
-    _pretend_menagerie(monkeypatch, tmp_path)
+        (menagerie / "assets" / f"{mesh}.stl").write_bytes(_tetrahedron_stl())
+
+
+@pytest.mark.usefixtures("meshes")
+def test_meshes_change_the_looks_and_nothing_else():
     robots = [Robot(name="a"), Robot(name="b", mount=MOUNTS["wall"])]
     plain, dressed = build_cell(robots), build_cell(robots, meshes=True)
     assert (dressed.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum() == 2 * len(MESH_OF_GEOM)
@@ -218,12 +226,9 @@ def test_meshes_change_the_looks_and_nothing_else(monkeypatch, tmp_path):
     np.testing.assert_array_equal(dressed.body_inertia, plain.body_inertia)
 
 
-def test_a_page_gets_the_surfaces_of_the_meshes(monkeypatch, tmp_path):
+@pytest.mark.usefixtures("meshes")
+def test_a_page_gets_the_surfaces_of_the_meshes():
     """Second method: MuJoCo's own position of a corner of the tetrahedron, from the file."""
-    (tmp_path / "assets").mkdir()
-    for mesh in MESH_OF_GEOM.values():
-        (tmp_path / "assets" / f"{mesh}.stl").write_bytes(_tetrahedron_stl())
-    _pretend_menagerie(monkeypatch, tmp_path)
     shown, plain = (cell_model([Robot(name="a")], meshes=meshes) for meshes in (True, False))
     assert not plain["meshes"]
     assert {shape["kind"] for link in shown["links"] for shape in link["shapes"]} == {"mesh"}
@@ -239,8 +244,8 @@ def test_a_page_gets_the_surfaces_of_the_meshes(monkeypatch, tmp_path):
     assert (len(points), len(triangles)) == (4, 12)
 
 
-def test_missing_mesh_files_are_named(monkeypatch, tmp_path):
-    _pretend_menagerie(monkeypatch, tmp_path)
+@pytest.mark.usefixtures("menagerie")
+def test_missing_mesh_files_are_named():
     with pytest.raises(FleetError, match="base_link"):
         build_cell([Robot(name="a")], meshes=True)
 

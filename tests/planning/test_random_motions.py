@@ -120,16 +120,10 @@ def test_places_are_where_the_tool_really_is(arm):
         assert rotation(place.tool_deg) == pytest.approx(turned, abs=1e-9)
 
 
-@given(st.tuples(*[st.floats(-180, 180)] * 3))
+@given(st.tuples(st.floats(-180, 180), st.floats(-180, 180) | st.sampled_from([90.0, -90.0]), st.floats(-180, 180)))
 def test_angles_give_back_their_rotation(angles):
-    """Peer: scipy's fixed-axes Euler angles."""
+    """Peer: scipy's fixed-axes Euler angles; at a pitch of 90° roll and yaw turn about one axis."""
     turned = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-    assert rotation(angles_deg(turned)) == pytest.approx(turned, abs=1e-6)
-
-
-@pytest.mark.parametrize("pitch", [90.0, -90.0])
-def test_angles_give_back_their_rotation_where_roll_and_yaw_are_one(pitch):
-    turned = rotation((30.0, pitch, 50.0))
     assert rotation(angles_deg(turned)) == pytest.approx(turned, abs=1e-6)
 
 
@@ -274,13 +268,6 @@ def test_the_temporary_time_keeps_an_idle_warm_arm_below_the_warning():
     worst = hold(4.5, "outstretched", 25.0)
     assert worst.idle_warm.t60_min[1] * 60.0 > RATING.temporary_s
     assert worst.idle_warm.t60_min[1] * 60.0 < RATING.temporary_s + 15.0
-
-
-@given(st.floats(0.0, 1.2), st.floats(0.0, 1.2), st.floats(0.0, 1e4), st.floats(0.0, 1e4))
-def test_more_reach_and_more_time_never_allow_more(near_m, far_m, short_s, long_s):
-    near_m, far_m = sorted((near_m, far_m))
-    short_s, long_s = sorted((short_s, long_s))
-    assert RATING.allowed_kg(far_m, long_s) <= RATING.allowed_kg(near_m, short_s)
 
 
 @pytest.mark.parametrize("reach_m", [0.5, 0.6, 0.7])
