@@ -125,19 +125,6 @@ def test_a_rollout_into_old_frames_is_a_rollout(make) -> None:
     assert same(old, frames)
 
 
-def test_every_legal_action_is_drawn_as_often(make) -> None:
-    torch.manual_seed(0)
-    env = make(1)
-    env.reset()
-    mask = torch.tensor([[[True, False, True, True, False], [True] * 5, [True] + [False] * 4]])
-    env._mask = mask
-    drawn = torch.stack([env.rand_action()["arms", "action"][0] for _ in range(4000)])
-    counts = np.stack([np.bincount(drawn[:, arm], minlength=5) for arm in range(ARMS)])
-    shares = (mask[0] / mask[0].sum(-1, keepdim=True)).numpy()
-    spread = np.sqrt(4000 * shares * (1 - shares))  # binomial
-    assert (np.abs(counts - 4000 * shares) <= 4.0 * spread).all()
-
-
 def test_a_seed_repeats_the_shifts_and_another_does_not(make) -> None:
     first = rolled(make(4, seed=0), 40)
     assert same(first, rolled(make(4, seed=0), 40))
