@@ -53,7 +53,7 @@ def write_gltf(path: Path, moments: Moments, speed: float, progress: Progress = 
     Args:
         speed: Shift seconds per second of the animation.
     """
-    file = _File(moments, speed)
+    file = _GltfFile(moments, speed)
     for index, arm in enumerate(moments.model["arms"]):
         progress("writing arms", index / len(moments.model["arms"]))
         file.add_arm(index, arm)
@@ -61,7 +61,7 @@ def write_gltf(path: Path, moments: Moments, speed: float, progress: Progress = 
     file.write(path)
 
 
-class _File:
+class _GltfFile:
     def __init__(self, moments: Moments, speed: float) -> None:
         self.moments, self.buffer, self.speed = moments, Buffer(), speed
         self.nodes: list[Json] = [{"name": "cell", "rotation": Z_UP, "children": []}]
@@ -73,10 +73,10 @@ class _File:
         self._begin_s = float(time_s[0])
         self.pose_s, self.heat_s = self._played(time_s[moments.poses]), self._played(time_s[moments.heats])
         self._shapes = [
-            [self._mesh(self._geometry(_solid(shape)), shape["colour"]) for shape in link["shapes"]]
+            [self._mesh(self._geometry(shape["kind"], shape["size"]), shape["colour"]) for shape in link["shapes"]]
             for link in moments.model["links"]
         ]
-        self._ball, self._box = self._geometry(_ball()), self._geometry(_box([0.5] * 3))
+        self._ball, self._box = self._geometry("sphere", [1.0]), self._geometry("box", [0.5] * 3)
         self._made: dict[tuple[str, float], int] = {}
         """Meshes by kind, and the temperature of a band."""
         limits = moments.limits
@@ -87,14 +87,14 @@ class _File:
         """Times in the animation, s."""
         return (time_s - self._begin_s) / self.speed
 
-    def _geometry(self, shape: tuple[Array, Array, Array]) -> Json:
-        """A primitive without a material, of vertices, normals and faces."""
-        vertices, normals, faces = shape
+    def _geometry(self, kind: str, size: Sequence[float]) -> Json:
+        """A primitive without a material."""
+        solid = _solid(kind, size)
         attributes = {
-            "POSITION": self.buffer.add(vertices, target=VERTICES, bounds=True),
-            "NORMAL": self.buffer.add(normals, target=VERTICES),
+            "POSITION": self.buffer.add(solid.vertices, target=VERTICES, bounds=True),
+            "NORMAL": self.buffer.add(solid.vertex_normals, target=VERTICES),
         }
-        return {"attributes": attributes, "indices": self.buffer.add(faces.ravel(), target=INDICES)}
+        return {"attributes": attributes, "indices": self.buffer.add(solid.faces.ravel(), target=INDICES)}
 
     def _mesh(self, geometry: Json, rgb: Sequence[float], *, unlit: bool = False) -> int:
         """Index of a new mesh of one colour (RGB from 0 to 1, as on a screen)."""
@@ -257,40 +257,20 @@ def keys_of(time_s: Array, angle_rad: Array, same_rad: float = SAME_RAD) -> Arra
     return np.array(kept)
 
 
-def _solid(shape: Mapping[str, Any]) -> tuple[Array, Array, Array]:
-    """Vertices, normals and faces of a shape of a link in its own frame."""
+def _solid(kind: str, size: Sequence[float]) -> Any:
+    """A trimesh of a shape in its own frame."""
     from trimesh import creation
 
-    kind, size = shape["kind"], shape["size"]
-    if kind == "box":
-        return _box(size)
     if kind == "sphere":
-        return _ball(size[0])
-    if kind == "cylinder":
-        return _flat(creation.cylinder(radius=size[0], height=2 * size[1], sections=32))
-    return _smooth(creation.capsule(radius=size[0], height=2 * size[1], count=[24, 12]))
-
-
-def _box(half: Sequence[float]) -> tuple[Array, Array, Array]:
-    from trimesh import creation
-
-    return _flat(creation.box(extents=[2 * length for length in half]))
-
-
-def _ball(radius: float = 1.0) -> tuple[Array, Array, Array]:
-    from trimesh import creation
-
-    return _smooth(creation.icosphere(subdivisions=2, radius=radius))
-
-
-def _smooth(mesh: Any) -> tuple[Array, Array, Array]:
-    return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces)
-
-
-def _flat(mesh: Any) -> tuple[Array, Array, Array]:
-    """With the vertices of each face apart, so that edges stay sharp."""
-    vertices = np.array(mesh.vertices[mesh.faces]).reshape(-1, 3)
-    return vertices, np.repeat(np.array(mesh.face_normals), 3, axis=0), np.arange(len(vertices))
+        return creation.icosphere(subdivisions=2, radius=size[0])
+    if kind == "capsule":
+        return creation.capsule(radius=size[0], height=2 * size[1], count=[24, 12])
+    if kind == "box":
+        solid = creation.box(extents=[2 * length for length in size])
+    else:
+        solid = creation.cylinder(radius=size[0], height=2 * size[1], sections=32)
+    solid.unmerge_vertices()  # edges stay sharp
+    return solid
 
 
 class Buffer:

@@ -6,7 +6,7 @@ Standard messages need no setting in Foxglove: transforms and markers go to its 
 topic are always sent together.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any  # rosbags makes its classes at run time
 
@@ -46,35 +46,29 @@ LATCHED = "- reliability: 1\n  durability: 1\n  history: 1\n  depth: 1\n"
 PLACE_COLOUR, FIXTURE_COLOUR, LOAD_COLOUR = (0.95, 0.55, 0.1), (0.55, 0.5, 0.43), (0.25, 0.45, 0.7)
 PLACE_M = 0.03
 CHUNK_BYTES = 1 << 20
-
-
-Report = Callable[[float], None]
-"""Called with the fraction of a part that is written."""
 ORIGIN = {"position": (0.0, 0.0, 0.0), "quaternion": (1.0, 0.0, 0.0, 0.0)}
 
 
-def write_mcap(path: Path, moments: Moments, progress: Progress = quiet) -> int:
-    """Write a shift and return the number of messages; times count from the beginning of the shift."""
+def write_mcap(path: Path, moments: Moments, progress: Progress = quiet) -> None:
+    """Write a shift; times count from its beginning."""
     with path.open("wb") as stream:
         file = _McapFile(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD), moments)
         file.write_once()
-        for done, (part, name) in enumerate(
-            (
-                (file.write_poses, "postures"),
-                (file.write_heat, "temperatures"),
-                (file.write_loads, "payloads"),
-                (file.write_log, "events"),
-            )
-        ):
-            progress(f"writing {name}", done / 4)
-            part(lambda share, done=done, name=name: progress(f"writing {name}", (done + share) / 4))
+        parts = {
+            "postures": file.write_poses,
+            "temperatures": file.write_heat,
+            "payloads": file.write_loads,
+            "events": file.write_log,
+        }
+        for done, (name, write_part) in enumerate(parts.items()):
+            progress(f"writing {name}", done / len(parts))
+            write_part()
         file.writer.finish()
-        return file.count
 
 
 class _McapFile:
     def __init__(self, writer: Writer, moments: Moments) -> None:
-        self.writer, self.moments, self.count = writer, moments, 0
+        self.writer, self.moments = writer, moments
         run = moments.run
         self.arms = run.arms
         names = unique_names(self.arms)
@@ -94,7 +88,6 @@ class _McapFile:
             self._channels[topic] = self.writer.register_channel(topic, "cdr", self._schemas[kind], metadata)
         at_ns = round(time_s * NS)
         self.writer.add_message(self._channels[topic], at_ns, content, at_ns)
-        self.count += 1
 
     def write_once(self) -> None:
         """Mounts, shapes and limits."""
@@ -134,14 +127,14 @@ class _McapFile:
             if link["parent"] >= 0
         ]
 
-    def write_poses(self, report: Report) -> None:
+    def write_poses(self) -> None:
         """Joint states, and the transforms of all links of all arms."""
         moments, readings = self.moments, self.moments.run.readings
         names = joint_names(readings.q.shape[2])
         moving = [i for i, link in enumerate(moments.model["links"]) if link["parent"] >= 0]
         stamped = [each for arm in range(len(self.arms)) for each in self.link_transforms(arm, 0)]
         everything = message(TRANSFORMS, transforms=stamped)
-        for done, sample in enumerate(moments.poses.tolist()):
+        for sample in moments.poses.tolist():
             time_s = float(readings.time_s[sample])
             quaternions = moments.link_quaternions(readings.q[sample])[:, moving].reshape(-1, 4).tolist()
             now = stamp(time_s)
@@ -153,10 +146,8 @@ class _McapFile:
             for arm, topic in enumerate(self.topics):
                 values = (tuple(getattr(readings, name)[sample, arm].tolist()) for name in ("q", "qd", "tau"))
                 self.put(f"{topic}/joint_states", JOINT_STATE, time_s, write_joints(Joints(time_s, names, *values)))
-            if done % 500 == 0:
-                report(done / len(moments.poses))
 
-    def write_heat(self, report: Report) -> None:
+    def write_heat(self) -> None:
         """Temperatures, the spheres of the motors, and diagnostics."""
         moments, readings = self.moments, self.moments.run.readings
         turned = moments.joint_links
@@ -198,10 +189,8 @@ class _McapFile:
                 statuses += diagnostics_of(fleet, state, None, moments.limits, 0.0, 1.0)
             self.put("/motors", MARKERS, time_s, write(everything, MARKERS))
             self.put("/diagnostics", DIAGNOSTICS, time_s, write_diagnostics(time_s, statuses))
-            if done % 50 == 0:
-                report(done / len(moments.heats))
 
-    def write_loads(self, _report: Report) -> None:
+    def write_loads(self) -> None:
         """The balls in the hands, whenever one changes."""
         moments, time_s = self.moments, self.moments.run.readings.time_s
         radii, hand = moments.payload_m, moments.model["hand"]
@@ -217,7 +206,7 @@ class _McapFile:
                 balls.append(ball)
             self.put("/payloads", MARKERS, float(time_s[sample]), write(message(MARKERS, markers=balls), MARKERS))
 
-    def write_log(self, _report: Report) -> None:
+    def write_log(self) -> None:
         """Events, and the offers behind each award."""
         for entry in self.moments.log():
             line = message(

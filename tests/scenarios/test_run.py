@@ -12,6 +12,7 @@ import pytest
 
 from agents.registry import RULES
 from fleet.bus.protocol.auction import ArmEvent, ArmOffer, JobStatus, PlanQuote, Result
+from fleet.bus.protocol.messages import State
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import ThermalLimits
@@ -29,19 +30,29 @@ from scenarios.spec.load import load
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import scenario_hash
 from scenarios.terminal import out_console
+from tests.scenarios.conftest import SMALL
 
 
 @pytest.fixture(scope="module")
-def fleet(plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
-    folder = tmp_path_factory.mktemp("small")
-    path = folder / "heat.toml"
-    path.write_text(_small(), encoding="utf-8")
-    return prepare(load(path), difficulty="blind", cache=plans)
+def small_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("small") / "heat.toml"
+    path.write_text(SMALL, encoding="utf-8")
+    return path
 
 
-def _small() -> str:
-    text = (Path(__file__).parent / "conftest.py").read_text(encoding="utf-8")
-    return text.split('SMALL = """')[1].split('"""')[0]
+@pytest.fixture(scope="module")
+def fleet(plans: Path, small_file: Path) -> Fleet:
+    return prepare(load(small_file), difficulty="blind", cache=plans)
+
+
+@pytest.fixture(scope="module")
+def oracle(plans: Path, small_file: Path) -> Fleet:
+    return prepare(load(small_file), difficulty="oracle", cache=plans)
+
+
+@pytest.fixture(scope="module")
+def result(fleet: Fleet) -> RunLog:
+    return run(fleet, spec())
 
 
 def spec(policy: str = "round_robin", seed: int = 0, **changes) -> RunSpec:
@@ -59,37 +70,26 @@ def test_the_same_seed_gives_the_same_shift(fleet, policy):
     assert same(run(fleet, spec(policy, 7)), run(fleet, spec(policy, 7)))
 
 
-def test_another_seed_gives_another_shift(fleet):
-    assert not same(run(fleet, spec(seed=0)), run(fleet, spec(seed=1)))
+def test_another_seed_gives_another_shift(fleet, result):
+    assert not same(result, run(fleet, spec(seed=1)))
 
 
-def test_zenoh_and_memory_give_the_same_shift(fleet):
-    over_zenoh, in_memory = run(fleet, spec(bus="zenoh")), run(fleet, spec())
-    assert same(over_zenoh, in_memory)
+def test_zenoh_and_memory_give_the_same_shift_with_its_progress(fleet, result):
+    shares: list[tuple[str, float]] = []
+    over_zenoh = run(fleet, spec(bus="zenoh"), progress=lambda *report: shares.append(report))
+    assert same(over_zenoh, result)
     assert over_zenoh.metrics.messages > 0
+    assert shares == [("working", pytest.approx((tick + 1) / 18)) for tick in range(round(result.time_s / 10))]
 
 
-def test_progress_runs_from_the_first_step_to_one(fleet):
-    heard: list[tuple[str, float]] = []
-    result = run(fleet, spec(), progress=lambda stage, share: heard.append((stage, share)))
-    assert result.finished
-    assert {stage for stage, _ in heard} == {"working"}
-    shares = [share for _, share in heard]
-    assert shares == sorted(shares)
-    assert shares[-1] <= 1.0
-
-
-def test_a_stopped_shift_is_the_beginning_of_the_whole_one(fleet):
+def test_a_stopped_shift_is_the_beginning_of_the_whole_one(fleet, result):
     counted = iter(range(100))
     part = run(fleet, spec(), stopped=lambda: next(counted) >= 5)
-    whole = run(fleet, spec())
     assert not part.finished
-    assert part.time_s == 50.0
-    assert whole.finished
-    n = len(part.readings.time_s)
-    assert part.readings.time_s[-1] == 50.0
-    assert np.array_equal(part.readings.temp_c, whole.readings.temp_c[:n])
-    assert repr(part.events) == repr(whole.events[: len(part.events)])
+    assert result.finished
+    assert part.time_s == part.readings.time_s[-1] == 50.0
+    assert np.array_equal(part.readings.temp_c, result.readings.temp_c[: len(part.readings.time_s)])
+    assert repr(part.events) == repr(result.events[: len(part.events)])
 
 
 def test_a_shift_stopped_before_it_begins_has_no_telemetry(fleet):
@@ -113,8 +113,7 @@ def test_ctrl_c_outside_the_steps_is_not_taken_for_a_result(fleet, monkeypatch):
         run(fleet, spec())
 
 
-def test_telemetry_is_read_once_a_second_from_every_arm(fleet):
-    result = run(fleet, spec())
+def test_telemetry_is_read_once_a_second_from_every_arm(fleet, result):
     assert np.array_equal(result.readings.time_s, np.arange(1, len(result.readings.time_s) + 1))
     assert result.readings.temp_c.shape == (len(result.readings.time_s), 2, 7)
     assert run(fleet, spec(), record=False).telemetry.num_rows == 0
@@ -140,8 +139,7 @@ def test_telemetry_at_the_end_of_a_step_is_what_the_policy_observes_next(fleet, 
     np.testing.assert_allclose(telemetry.temp_c[ends][: len(seen) - 1], seen[1:], rtol=1e-6, atol=0)
 
 
-def test_awards_state_what_the_chosen_plan_promised(fleet, plans):
-    oracle = prepare(fleet.scenario, difficulty="oracle", cache=plans)
+def test_awards_state_what_the_chosen_plan_promised(fleet, oracle):
     events = run(oracle, spec("round_robin", 2)).events
     ends = {event.job: event for event in events if event.kind == "finish"}
     stated = [event for event in events if event.kind == "award" and event.job in ends]
@@ -174,22 +172,12 @@ def test_the_summary_says_how_the_run_was_made_and_holds_no_clock_time(fleet):
     assert page["policy"] == "round_robin"
     assert page["bus"] == "memory"
     assert page["difficulty"] == "blind"
-    assert page["scenario_hash"] == scenario_hash(fleet.scenario)
+    assert (
+        page["scenario_hash"] == scenario_hash(fleet.scenario) != scenario_hash(replace(fleet.scenario, horizon_s=190))
+    )
     assert {"thermofleet", "mujoco", "python"} <= set(page["versions"])
     assert page["twins"] == {"left": {"version": "blind"}, "right": {"version": "blind"}}
     assert json.loads(json.dumps(page, allow_nan=False))["metrics"] == page["metrics"]
-
-
-def test_the_hash_names_the_content_of_a_scenario(fleet):
-    scenario = fleet.scenario
-    assert scenario_hash(scenario) == scenario_hash(replace(scenario))
-    assert scenario_hash(scenario) != scenario_hash(replace(scenario, horizon_s=190.0))
-
-
-@pytest.fixture
-def result(small_toml: Path, plans: Path) -> RunLog:
-    fleet = prepare(load(small_toml), difficulty="blind", cache=plans)
-    return run(fleet, RunSpec(policy="round_robin", bus="memory", difficulty="blind"))
 
 
 def test_a_disk_that_refuses_at_the_end_is_told(result, tmp_path):
@@ -245,12 +233,11 @@ LOG = [
 ]  # fmt: skip
 
 
-@pytest.fixture
-def folder(small_toml: Path, plans: Path, tmp_path: Path) -> Path:
-    out = tmp_path / "runs" / "one"
+@pytest.fixture(scope="module")
+def folder(oracle: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("traced") / "runs" / "one"
     out.mkdir(parents=True)
-    fleet = prepare(load(small_toml), difficulty="oracle", cache=plans)
-    run(fleet, RunSpec(policy="least_difficulty", bus="memory", difficulty="oracle")).write(out)
+    run(oracle, spec("least_difficulty", difficulty="oracle")).write(out)
     return out
 
 
@@ -343,6 +330,7 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
         ("warning", "hot"),
         ("finish", ""),
     )
+    recorder.add("a", State(arm="a", tick=0, time_s=0.0, mode="idle", temp_c=(), headroom_k=0.0))
     for number, (kind, reason) in enumerate(log):
         recorder.add("a", ArmEvent(arm="a", number=number, time_s=10.0 * number, kind=kind, job="j", reason=reason))
     status = JobStatus(job="j", state="awarded", arm="a", value=2.0)

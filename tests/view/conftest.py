@@ -1,18 +1,51 @@
 """A recorded shift with a hot arm, shared by the tests that show it."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from scenarios.cli.main import main
+from scenarios.run.log import RunLog, open_run
+from scenarios.show.film import Film
 
 
 @pytest.fixture(scope="session")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def thermofleet() -> Callable[..., None]:
+    """The command line, called in place; it must succeed."""
+
+    def call(*args: object) -> None:
+        with pytest.raises(SystemExit) as ended:
+            main([str(arg) for arg in args])
+        assert ended.value.code in (0, None)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def run_folder(tmp_path_factory: pytest.TempPathFactory, thermofleet: Callable[..., None]) -> Path:
     """Folder of a run of quickstart."""
     folder = tmp_path_factory.mktemp("shift") / "run"
-    options = ["--policy", "round_robin", "--seed", "11", "--difficulty", "blind", "--bus", "memory"]
-    with pytest.raises(SystemExit) as ended:
-        main(["run", "quickstart", *options, "--out", str(folder)])
-    assert ended.value.code in (0, None)
+    options = ["--policy", "round_robin", "--seed", 11, "--difficulty", "blind", "--bus", "memory"]
+    thermofleet("run", "quickstart", *options, "--out", folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def run(run_folder: Path) -> RunLog:
+    return open_run(run_folder)
+
+
+@pytest.fixture(scope="session")
+def motors_in_mujoco(run: RunLog) -> Callable[[float], np.ndarray]:
+    """Positions of the motors in the world at a time, as MuJoCo has them, [arm, joint, 3]."""
+    film = Film(run)
+    data, model = film.player.data, film.player.model
+    sites = np.array([[model.site(f"{arm}/motor_{j + 1}").id for j in range(7)] for arm in run.arms])
+
+    def positions(time_s: float) -> np.ndarray:
+        film.show(time_s)
+        return data.site_xpos[sites]
+
+    return positions

@@ -1,44 +1,30 @@
-"""A recorded shift as glTF, read back by a reader of its own and by three.js, and compared with MuJoCo."""
+"""A recorded shift as glTF, read back from the specification alone and by trimesh, and compared with MuJoCo."""
 
-import base64
-import io
 import json
-import re
 import struct
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile
 
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
+from scipy.spatial.transform import Rotation, Slerp
 
-from scenarios.cli.main import main
-from scenarios.run.log import RunLog, open_run
-from scenarios.show.film import Film
+from scenarios.run.log import RunLog
 from scenarios.show.gltf import LONGEST_TURN_RAD, SAME_RAD, Z_UP, divided, keys_of
 from scenarios.show.moments import motor_spheres
-from tests.view.test_pages import CHROMIUM, browser  # noqa: F401  # a fixture
 
 SPEED = 60.0
 NEAR_M = 1e-4
 
 
 @pytest.fixture(scope="module")
-def run(run_folder: Path) -> RunLog:
-    return open_run(run_folder)
-
-
-@pytest.fixture(scope="module")
-def file(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(run_folder: Path, thermofleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("gltf") / "shift.glb"
-    with pytest.raises(SystemExit) as ended:
-        main(["view", str(run_folder), "--out", str(path), "--speed", str(SPEED)])
-    assert ended.value.code in (0, None)
+    thermofleet("view", run_folder, "--out", path, "--speed", SPEED)
     return path
 
 
@@ -79,7 +65,7 @@ class Reader:
             before = values[after - 1].astype(float)
             if sampler["interpolation"] == "LINEAR" and after < len(times):
                 share = np.clip((time_s - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0)
-                before = slerp(before, values[after].astype(float), float(share))
+                before = Slerp([0.0, 1.0], Rotation.from_quat([before, values[after]]))(share).as_quat()
             nodes[channel["target"]["node"]][channel["target"]["path"]] = before
         return nodes
 
@@ -95,35 +81,13 @@ class Reader:
         return point
 
 
-def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
-    dot = float(a @ b)
-    b, dot = (b, dot) if dot >= 0 else (-b, -dot)
-    angle = np.arccos(min(dot, 1.0))
-    if angle < 1e-6:
-        return a + share * (b - a)
-    return (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
-
-
-def motors_in_mujoco(run: RunLog, time_s: float) -> np.ndarray:
-    """Motors in the world, [arm, joint, 3]."""
-    film = Film(run)
-    film.show(time_s)
-    data, model = film.player.data, film.player.model
-    return np.array([[data.site_xpos[model.site(f"{arm}/motor_{j + 1}").id] for j in range(7)] for arm in run.arms])
-
-
-def moments_of(run: RunLog, count: int) -> np.ndarray:
-    """Times at which some arm moves, s."""
-    moving = np.abs(run.readings.qd).max(axis=(1, 2)) > 0.2
-    return np.random.default_rng(5).choice(run.readings.time_s[moving], count, replace=False)
-
-
-def test_the_motors_are_where_mujoco_has_them(file: Path, run: RunLog) -> None:
+def test_the_motors_are_where_mujoco_has_them(file: Path, run: RunLog, motors_in_mujoco) -> None:
     reader, begin_s = Reader(file), float(run.readings.time_s[0])
-    for time_s in moments_of(run, 12):
+    moving = np.abs(run.readings.qd).max(axis=(1, 2)) > 0.2
+    for time_s in np.random.default_rng(5).choice(run.readings.time_s[moving], 12, replace=False):
         nodes = reader.at((time_s - begin_s) / SPEED)
         found = np.array([[reader.place(nodes, f"{arm}/link_{j + 1}") for j in range(7)] for arm in run.arms])
-        assert np.abs(found - motors_in_mujoco(run, float(time_s))).max() < NEAR_M
+        assert np.abs(found - motors_in_mujoco(float(time_s))).max() < NEAR_M
 
 
 def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path, run: RunLog) -> None:
@@ -148,8 +112,6 @@ def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path
 
 
 def test_trimesh_reads_the_shapes(file: Path, run: RunLog) -> None:
-    import trimesh
-
     scene = trimesh.load_scene(file)
     assert np.isfinite(scene.bounds).all()
     assert scene.extents.max() < 5.0
@@ -175,63 +137,3 @@ def test_a_resting_joint_has_two_keys_and_a_long_turn_goes_the_right_way() -> No
     finer_s, angle_rad = divided(np.array([0.0, 1.0, 2.0]), np.array([0.0, 5.0, 5.0]))
     assert np.abs(np.diff(angle_rad)).max() <= LONGEST_TURN_RAD
     assert angle_rad == pytest.approx(np.interp(finer_s, [0.0, 1.0, 2.0], [0.0, 5.0, 5.0]))
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
-def test_three_js_plays_it_as_mujoco_has_it(browser, file: Path, run: RunLog, tmp_path: Path) -> None:  # noqa: F811
-    """The loader and the mixer of three.js, which trimesh carries for its own viewer."""
-    package = find_spec("trimesh")
-    assert package is not None
-    assert package.origin is not None
-    with ZipFile(Path(package.origin).parent / "resources/templates/viewer.zip") as packed:
-        template = packed.read("viewer.html.template").decode()
-    (library,) = re.findall(r"<script>(.*)</script>", template, re.S)
-    page, html = browser.new_page(viewport={"width": 900, "height": 600}), tmp_path / "play.html"
-    scripts = f"<script>{library.removesuffix('init();')}</script><script>{PLAYER}</script>"
-    html.write_text(f"<meta charset='utf-8'><body style='margin:0'>{scripts}", encoding="utf-8")
-    page.goto(html.as_uri())
-    page.evaluate("text => begin(text)", base64.b64encode(file.read_bytes()).decode())
-    times_s = moments_of(run, 4)
-    names = [f"{arm}/link_{j + 1}" for arm in run.arms for j in range(7)]
-    for time_s in times_s.tolist():
-        played_s = (time_s - float(run.readings.time_s[0])) / SPEED
-        shown = page.evaluate("([time_s, names]) => show(time_s, names)", [played_s, names])
-        x, y, z = np.array(shown).reshape(len(run.arms), 7, 3).transpose(2, 0, 1)
-        found = np.stack([x, -z, y], axis=-1)  # back to z up
-        assert np.abs(found - motors_in_mujoco(run, time_s)).max() < NEAR_M
-    picture = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"))
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100  # shaded links and coloured spheres
-    assert (np.abs(picture.astype(int) - BACKGROUND).max(axis=-1) > 8).mean() > 0.02
-    page.close()
-
-
-PLAYER = """
-{
-let gltf, mixer, renderer, camera, scene;
-window.begin = async text => {
-  const raw = Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
-  gltf = await new Promise((done, failed) => new THREE.GLTFLoader().parse(raw, "", done, failed));
-  scene = new THREE.Scene();
-  scene.background = new THREE.Color(0xf4f4f0);
-  scene.add(gltf.scene, new THREE.HemisphereLight(0xffffff, 0x888888, 1.2));
-  mixer = new THREE.AnimationMixer(gltf.scene);
-  mixer.clipAction(gltf.animations[0]).play();
-  camera = new THREE.PerspectiveCamera(45, 1.5, 0.01, 50);
-  camera.position.set(2.2, 1.8, 2.2);
-  camera.lookAt(0, 0.5, 0);
-  renderer = new THREE.WebGLRenderer({preserveDrawingBuffer: true});
-  renderer.outputEncoding = THREE.sRGBEncoding;
-  renderer.setSize(900, 600);
-  document.body.appendChild(renderer.domElement);
-};
-window.show = (time_s, names) => {
-  mixer.setTime(time_s);
-  gltf.scene.updateMatrixWorld(true);
-  renderer.render(scene, camera);
-  const byName = {};
-  gltf.scene.traverse(node => { byName[node.userData.name || node.name] = node; });
-  return names.map(name => new THREE.Vector3().setFromMatrixPosition(byName[name].matrixWorld).toArray());
-};
-}
-"""
-BACKGROUND = (0xF4, 0xF4, 0xF0)

@@ -40,8 +40,7 @@ def unpacked(text: str) -> dict[str, tuple[dict, np.ndarray]]:
     return out
 
 
-def test_the_readings_are_those_of_the_file(run_folder: Path) -> None:
-    run = open_run(run_folder)
+def test_the_readings_are_those_of_the_file(run: RunLog, run_folder: Path) -> None:
     again = telemetry_table(run.readings, list(run.arms))
     assert again.drop_columns(["arm", "mode"]).equals(
         pq.read_table(run_folder / "telemetry.parquet").drop_columns(["arm", "mode"])
@@ -52,15 +51,13 @@ def test_the_readings_are_those_of_the_file(run_folder: Path) -> None:
     assert [(o.time_s, o.job, o.arm) for o in run.offers if o.awarded] == [(e.time_s, e.job, e.arm) for e in awards]
 
 
-def test_a_page_gets_the_shift_within_its_resolution(run_folder: Path) -> None:
-    readings = open_run(run_folder).readings
+def test_a_page_gets_the_shift_within_its_resolution(run: RunLog) -> None:
+    readings = run.readings
     arrays = unpacked(packed(readings))
-    entry, q = arrays["q"]
-    stride = round(entry["step_s"] / float(readings.time_s[1] - readings.time_s[0]))
-    np.testing.assert_allclose(np.moveaxis(q, -1, 0), readings.q[::stride], atol=0.51e-3)
-    entry, temp_c = arrays["temp_c"]
-    stride = round(entry["step_s"] / float(readings.time_s[1] - readings.time_s[0]))
-    np.testing.assert_allclose(np.moveaxis(temp_c, -1, 0), readings.temp_c[::stride], atol=0.051)
+    for name, resolution in (("q", 0.51e-3), ("temp_c", 0.051)):
+        entry, values = arrays[name]
+        stride = round(entry["step_s"] / float(readings.time_s[1] - readings.time_s[0]))
+        np.testing.assert_allclose(np.moveaxis(values, -1, 0), getattr(readings, name)[::stride], atol=resolution)
 
 
 def test_an_absent_arm_keeps_its_last_posture() -> None:
@@ -94,10 +91,8 @@ def test_a_run_without_readings_or_with_events_of_another_fleet_is_refused(run_f
             open_run(copied)
 
 
-def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["report", str(run_folder), "--out", str(tmp_path / "again.html")])
-    assert ended.value.code in (0, None)
+def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path, thermofleet) -> None:
+    thermofleet("report", run_folder, "--out", tmp_path / "again.html")
     assert (tmp_path / "again.html").read_bytes() == (run_folder / "report.html").read_bytes()
 
 
@@ -115,8 +110,7 @@ def has_egl() -> bool:
     return done.returncode == 0
 
 
-def test_the_cell_takes_the_recorded_postures_and_heat(run_folder: Path) -> None:
-    run = open_run(run_folder)
+def test_the_cell_takes_the_recorded_postures_and_heat(run: RunLog) -> None:
     shown, readings = Film(run), run.readings
     model, data = shown.player.model, shown.player.data
     hottest = int(readings.temp_c.max(axis=(1, 2)).argmax())
@@ -167,8 +161,7 @@ def test_the_camera_holds_every_posture_and_sees_no_edge_of_the_floor(run_folder
 
 
 @pytest.mark.parametrize(("begin_s", "end_s"), [(0.0, 1e9), (600.0, 700.0)])
-def test_the_pictures_follow_the_clock(run_folder: Path, begin_s: float, end_s: float) -> None:
-    run = open_run(run_folder)
+def test_the_pictures_follow_the_clock(run: RunLog, begin_s: float, end_s: float) -> None:
     at_s = times(run, Shot(begin_s=begin_s, end_s=end_s, speed=60, fps=30))
     assert np.diff(at_s) == pytest.approx(2.0)
     assert at_s[0] >= begin_s
@@ -193,14 +186,15 @@ def test_a_film_that_cannot_be_is_refused(run_folder: Path, tmp_path: Path, name
 
 
 @pytest.mark.parametrize("kind", ["mp4", "webm", "gif"])
-def test_a_film_can_be_read_by_ffmpeg_and_shows_the_heat(run_folder: Path, tmp_path: Path, kind: str) -> None:
+def test_a_film_can_be_read_by_ffmpeg_and_shows_the_heat(
+    run: RunLog, run_folder: Path, tmp_path: Path, kind: str
+) -> None:
     if not has_egl():
         done = film(run_folder, tmp_path / f"shift.{kind}", "--size", "320x240")
         assert "No OpenGL without a display" in done.stderr
         pytest.skip("this machine has no EGL")
     import av
 
-    run = open_run(run_folder)
     hottest_s = float(run.readings.time_s[run.readings.temp_c.max(axis=(1, 2)).argmax()])
     options = ["--size", "480x270", "--speed", "60", "--fps", "10"]
     span = ["--begin", f"{hottest_s - 60}", "--end", f"{hottest_s}"]
@@ -218,33 +212,6 @@ def test_a_film_can_be_read_by_ffmpeg_and_shows_the_heat(run_folder: Path, tmp_p
 EVERY_S = 20
 
 
-def written(run_folder: Path, path: Path) -> Path:
-    with pytest.raises(SystemExit) as ended:
-        main(["view", str(run_folder), "--out", str(path), "--every", "20"])
-    assert ended.value.code in (0, None)
-    return path
-
-
-@pytest.fixture(scope="module")
-def opened_run(run_folder: Path) -> RunLog:
-    return open_run(run_folder)
-
-
-def hottest_moment(run: RunLog) -> tuple[int, float]:
-    """A kept sample at which an arm works and is hot, and its time."""
-    kept = Moments(run, EVERY_S).heats
-    sample = int(kept[run.readings.temp_c[kept].max(axis=(1, 2)).argmax()])
-    return sample, float(run.readings.time_s[sample])
-
-
-def positions_in_mujoco(run: RunLog, time_s: float) -> np.ndarray:
-    """Motors in the world as MuJoCo has them, [arm, joint, 3]."""
-    film = Film(run)
-    film.show(time_s)
-    data, model = film.player.data, film.player.model
-    return np.array([[data.site_xpos[model.site(f"{arm}/motor_{j + 1}").id] for j in range(7)] for arm in run.arms])
-
-
 def along(parents: dict[str, str], poses: dict[str, tuple[list[float], list[float]]], frame: str) -> np.ndarray:
     """Origin of a frame in the world; poses are positions and quaternions w, x, y, z."""
     point = np.zeros(3)
@@ -256,10 +223,13 @@ def along(parents: dict[str, str], poses: dict[str, tuple[list[float], list[floa
     return point
 
 
-def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, opened_run: RunLog, tmp_path: Path) -> None:
+def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(
+    run_folder: Path, run: RunLog, motors_in_mujoco, thermofleet, tmp_path: Path
+) -> None:
     from mcap.reader import make_reader
 
-    path = written(run_folder, tmp_path / "shift.mcap")
+    path = tmp_path / "shift.mcap"
+    thermofleet("view", run_folder, "--out", path, "--every", EVERY_S)
     messages: dict[str, list[tuple[float, object]]] = defaultdict(list)
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
@@ -268,8 +238,8 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, opene
             if channel.topic == "/diagnostics":
                 content = read_diagnostics(message.data)
             messages[channel.topic].append((message.log_time / 1e9, content))
-    readings, moments = opened_run.readings, Moments(opened_run, EVERY_S)
-    for index, arm in enumerate(opened_run.arms):
+    readings, moments = run.readings, Moments(run, EVERY_S)
+    for index, arm in enumerate(run.arms):
         joints = [read_joints(payload) for _, payload in messages[f"/quickstart/{arm}/joint_states"]]
         assert np.array([each.q for each in joints]) == pytest.approx(readings.q[moments.poses, index])
         assert np.array([each.tau for each in joints]) == pytest.approx(readings.tau[moments.poses, index])
@@ -277,7 +247,8 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, opene
             heat = messages[f"/quickstart/{arm}/joint_{joint + 1}/temperature"]
             assert [time_s for time_s, _ in heat] == pytest.approx(readings.time_s[moments.heats])
             assert [each.temperature for _, each in heat] == pytest.approx(readings.temp_c[moments.heats, index, joint])
-    sample, time_s = hottest_moment(opened_run)
+    sample = int(moments.heats[readings.temp_c[moments.heats].max(axis=(1, 2)).argmax()])
+    time_s = float(readings.time_s[sample])
     parents, poses = {}, {}
     for topic in ("/tf_static", "/tf"):
         last = [content for at_s, content in messages[topic] if at_s <= time_s][-1]
@@ -285,24 +256,23 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, opene
             move, turn = each.transform.translation, each.transform.rotation
             parents[each.child_frame_id] = each.header.frame_id
             poses[each.child_frame_id] = ([move.x, move.y, move.z], [turn.w, turn.x, turn.y, turn.z])
-    expected = positions_in_mujoco(opened_run, time_s)
     spheres = next(content for at_s, content in messages["/motors"] if at_s == time_s).markers
     found = np.array([along(parents, poses, sphere.header.frame_id) for sphere in spheres])
-    assert found == pytest.approx(expected.reshape(-1, 3), abs=1e-4)
+    assert found == pytest.approx(motors_in_mujoco(time_s).reshape(-1, 3), abs=1e-4)
     hottest, coolest = readings.temp_c[sample].argmax(), readings.temp_c[sample].argmin()
     assert spheres[hottest].scale.x > spheres[coolest].scale.x
     assert spheres[hottest].color.r - spheres[hottest].color.g > spheres[coolest].color.r - spheres[coolest].color.g
     statuses = {each.hardware: each for each in dict(messages["/diagnostics"])[time_s]}
-    for index, arm in enumerate(opened_run.arms):
+    for index, arm in enumerate(run.arms):
         assert dict(statuses[f"quickstart/{arm}"].values)["mode"] == MODES[readings.mode[sample, index]]
     log = [(at_s, line.name, line.msg) for at_s, line in messages["/rosout"]]
     for kind in ("award", "fault"):
         assert [(at_s, arm) for at_s, arm, text in log if text.startswith(kind)] == [
-            (pytest.approx(event.time_s), event.arm) for event in opened_run.events if event.kind == kind
+            (pytest.approx(event.time_s), event.arm) for event in run.events if event.kind == kind
         ]
-    awards = sum(event.kind == "award" for event in opened_run.events)
+    awards = sum(event.kind == "award" for event in run.events)
     assert sum(text.startswith("offers for ") for *_, text in log) == awards > 0
-    assert [each.temperature for _, each in messages["/limits/error"]] == [opened_run.scenario.limits.error_c] * 2
+    assert [each.temperature for _, each in messages["/limits/error"]] == [run.scenario.limits.error_c] * 2
 
 
 @pytest.mark.parametrize(
