@@ -1,8 +1,8 @@
-"""The thread of one event of a run or a recording: everything that led to it, as far as it was recorded."""
+"""Causes of one event of a run or a recording, as far as they were recorded."""
 
 import re
 from bisect import bisect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -10,10 +10,10 @@ from typing import Any  # values of run.json
 
 from fleet.errors import FleetError, nearest
 from fleet.events import EVENT_KINDS, MEANINGS, Event
-from scenarios.live.recording import CARD, read_card, read_parts
-from scenarios.live.recording_report import arm_events, offers_of
-from scenarios.run.log import RunLog, open_run
-from scenarios.run.records import JobRecord, Offer
+from scenarios.live.recording import CARD, read_parts
+from scenarios.live.recording_report import open_recording
+from scenarios.run.log import open_run
+from scenarios.run.records import Offer, ShiftLog
 from scenarios.show.words import CANNOT, by_joint, clock, value_text
 from scenarios.table import Table
 
@@ -25,18 +25,18 @@ MOST_OFFERS, MOST_HISTORY = 8, 8
 
 @dataclass(frozen=True)
 class Thread:
-    """What is recorded about one event."""
+    """Records about one event."""
 
     folder: str
     row: int
-    """Of the event log, from 0."""
+    """Row of the event log, from 0."""
     alike: tuple[int, ...]
-    """Rows of all events that were asked for; the first of them is shown."""
+    """Rows of all events that fit the request; the first one is shown."""
     event: Event
     job: Mapping[str, Any]
-    """Of the event's job; empty if it has none, or if the job is not recorded."""
+    """Record of the job; empty if the event has none, or it was not recorded."""
     award: Event | None
-    """By which the arm had the job; None for none."""
+    """Award of the job to the arm, if any."""
     offers: tuple[Offer, ...]
     """Of all arms at the award."""
     history: tuple[Event, ...]
@@ -55,21 +55,6 @@ class Thread:
         return asdict(self) | events
 
 
-@dataclass(frozen=True)
-class _Log:
-    """Events of a run or a recording, in the order of their file, and what else is known."""
-
-    events: Sequence[Event]
-    job: Callable[[str], Mapping[str, Any]]
-    holder: Callable[[Event], str]
-    """Job that the arm of an event without a job worked on; "" for none."""
-    offers: Callable[[Event], Sequence[Offer]]
-    """Of all arms, at an award."""
-    twins: Mapping[str, Mapping[str, Any]]
-    configuration: Mapping[str, Any]
-    code: Mapping[str, Any]
-
-
 def thread_of(folder: Path, asked: str) -> Thread:
     """The thread of an event in the folder of a run or a recording.
 
@@ -80,32 +65,60 @@ def thread_of(folder: Path, asked: str) -> Thread:
     Raises:
         FleetError: no run or recording, or no such event.
     """
+    log: ShiftLog
     if (folder / "run.json").exists():
-        log = _of_run(open_run(folder))
+        log = open_run(folder)
+        events, jobs = log.events, {record.job: asdict(record) for record in log.jobs}
     elif (folder / CARD).exists():
-        log = _of_recording(folder)
+        log = open_recording(folder)
+        events, jobs = tuple(sorted(log.events, key=lambda event: event.time_s)), _recorded_jobs(folder)
     else:
         raise FleetError(f"'{folder}' is neither a folder of `thermofleet run` nor of `thermofleet bus record`.")
-    rows = rows_of(log.events, asked)
-    event = log.events[rows[0]]
-    job = event.job or log.holder(event)
-    history = tuple(e for e in log.events if job and e.job == job)
+    rows = rows_of(events, asked)
+    event = events[rows[0]]
+    job = event.job or _job_at(log, event)
+    history = tuple(e for e in events if job and e.job == job)
     award = _award_of(history, event)
-    offers = () if award is None else tuple(log.offers(award))
     arm = event.arm or (award.arm if award else "")
+    twins = log.card.get("twins", {})
+    scenario = {"scenario": log.card["scenario"]["name"], "status": log.card["status"]}
     return Thread(
         folder=str(folder),
         row=rows[0],
         alike=tuple(rows),
         event=replace(event, job=job),
-        job=log.job(job) if job else {},
+        job=jobs.get(job, {}),
         award=award,
-        offers=offers,
+        offers=() if award is None else _offers_at(log.offers, award),
         history=history,
-        twin={"arm": arm} | dict(log.twins.get(arm) or {"version": _live_twin(award)}) if arm else {},
-        configuration=log.configuration,
-        code=log.code,
+        twin={"arm": arm} | dict(twins.get(arm) or {"version": _live_twin(award)}) if arm else {},
+        configuration=scenario | {name: log.card.get(name, NOT_RECORDED) for name in CONFIGURATION},
+        code={"hash": log.card.get("code_hash", NOT_RECORDED)} | log.card.get("versions", {}),
     )
+
+
+def _job_at(log: ShiftLog, event: Event) -> str:
+    """Job of the arm of an event at its time; "" for none."""
+    own = (each for each in log.plan.assignments if each.arm == event.arm)
+    return next((each.job for each in own if each.start_s <= event.time_s <= each.end_s), "")
+
+
+def _offers_at(offers: Sequence[Offer], award: Event) -> tuple[Offer, ...]:
+    """Offers behind an award; in a recording their times are those of another clock, so the nearest ones."""
+    times_s = [o.time_s for o in offers if o.awarded and (o.job, o.arm) == (award.job, award.arm)]
+    time_s = min(times_s, key=lambda each: abs(each - award.time_s), default=None)
+    return tuple(o for o in offers if (o.job, o.time_s) == (award.job, time_s))
+
+
+def _recorded_jobs(folder: Path) -> dict[str, dict[str, Any]]:
+    """Last state and last award of each job of a recording."""
+    jobs: dict[str, dict[str, Any]] = {}
+    for row in read_parts(folder, "results").to_pylist():
+        job = jobs.setdefault(row["job"], {})
+        job |= {name: row[name] for name in ("job", "state", "due_s", "finished_s", "value", "cycles", "repetitions")}
+        if row["award"]:
+            job |= {name: row[name] for name in ("award", "auctioneer", "difficulty", "p_saturation", "peak_c")}
+    return jobs
 
 
 def rows_of(events: Sequence[Event], asked: str) -> list[int]:
@@ -153,64 +166,6 @@ def _live_twin(award: Event | None) -> str:
     """Version of the twin that a live arm stated in its award."""
     _, stated, version = award.reason.partition(", twin ") if award else ("", "", "")
     return version if stated else NOT_RECORDED
-
-
-def _of_run(run: RunLog) -> _Log:
-    card = run.card
-    records: dict[str, JobRecord] = {record.job: record for record in run.jobs}
-
-    def holder(event: Event) -> str:
-        if not event.arm:
-            return ""
-        return next(
-            (w.job for w in run.plan.assignments if w.arm == event.arm and w.start_s <= event.time_s <= w.end_s), ""
-        )
-
-    configuration = {"scenario": run.scenario.name} | {name: card.get(name, NOT_RECORDED) for name in CONFIGURATION}
-    return _Log(
-        events=run.events,
-        job=lambda name: asdict(records[name]) if name in records else {},
-        holder=holder,
-        offers=lambda award: [o for o in run.offers if (o.time_s, o.job) == (award.time_s, award.job)],
-        twins=card["twins"],
-        configuration=configuration,
-        code={"hash": card.get("code_hash", NOT_RECORDED)} | card["versions"],
-    )
-
-
-def _of_recording(folder: Path) -> _Log:
-    card = read_card(folder)
-    results = read_parts(folder, "results").to_pylist()
-    events = arm_events(read_parts(folder, "events"))
-    last = {row["job"]: row for row in results}
-    busy = read_parts(folder, "telemetry").select(["time_s", "arm", "job"]).to_pylist()
-
-    def job(name: str) -> Mapping[str, Any]:
-        shown = ("job", "state", "due_s", "finished_s", "value", "cycles", "repetitions")
-        awarded = [row for row in results if row["job"] == name and row["award"]]
-        quoted = ("award", "auction", "auctioneer", "difficulty", "p_saturation", "peak_c")
-        own = {key: last[name][key] for key in shown} if name in last else {"job": name}
-        return own | ({key: awarded[-1][key] for key in quoted} if awarded else {})
-
-    def offers(award: Event) -> list[Offer]:
-        """Those of the award to the arm that is the next one in time: auctioneer and arm have clocks of their own."""
-        own = [row for row in results if (row["job"], row["arm"]) == (award.job, award.arm) and row["offers"]]
-        row = min(own, key=lambda row: abs(row["time_s"] - award.time_s), default=None)
-        return [] if row is None else list(offers_of(row))
-
-    def holder(event: Event) -> str:
-        before = (row for row in reversed(busy) if row["arm"] == event.arm and row["time_s"] <= event.time_s)
-        return next((row["job"] for row in before), "")
-
-    return _Log(
-        events=events,
-        job=job,
-        holder=holder,
-        offers=offers,
-        twins={},
-        configuration={"fleet": card.fleet, "status": card.status, "recording format": card.format},
-        code={"hash": NOT_RECORDED},
-    )
 
 
 def _plain(event: Event) -> dict[str, Any]:
