@@ -44,7 +44,7 @@ MOVING_RAD_S = 0.01
 
 
 @dataclass(eq=False)
-class _Arm:
+class _PublishedArm:
     publisher: Publisher
     state: State
     received_s: float
@@ -67,7 +67,7 @@ class Bridge:
         self.skipped: dict[str, str] = {}
         self._link, self._node = link, node
         self._limits, self._humble = limits or ThermalLimits(), humble
-        self._arms: dict[str, _Arm] = {}
+        self._arms: dict[str, _PublishedArm] = {}
         self._topics: dict[str, str] = {}
         """Arm of each topic: two arms may get the same topic."""
         self._difficulty: Recent[str, DifficultyScores] = Recent(MAX_ARMS)
@@ -102,7 +102,7 @@ class Bridge:
             publisher = self._publisher(name)
             if publisher is None:
                 return
-            arm = self._arms[name] = _Arm(publisher, state, 0.0)
+            arm = self._arms[name] = _PublishedArm(publisher, state, 0.0)
         arm.state, arm.received_s = state, time.monotonic()
         arm.publisher.put(payload)
 

@@ -9,6 +9,7 @@ are generated from it. Names of fleets, arms and auctioneers are percent-encoded
 wildcard, a `/` or a leading `@` (no wildcard matches a chunk that begins with `@`, so its history would be lost).
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -147,6 +148,10 @@ STATES = f"{PREFIX}/*/arm/*/state"
 """Key expression of the telemetry of every arm of every fleet; for router rules, not for publications."""
 MAX_CACHED, MAX_CACHED_CHARACTERS = 4096, 256
 """Parsed keys that are cached, and characters of the longest of them."""
+_KEY = re.compile(
+    rf"{PREFIX}/(?P<fleet>[^/]*)/((?P<nameless>jobs|clock)|(?P<role>arm|auction|policy)/(?P<name>[^/]*))"
+    r"/(?P<topic>[^/]*)(/(?P<asker>[^/]*))?"
+)
 
 
 @dataclass(frozen=True)
@@ -162,67 +167,72 @@ class ParsedKey:
     """The querying arm, for the topics in `ASKED`; "" for all others."""
 
     def __str__(self) -> str:
-        """The key as text.
+        """The key as text; raises as `build`."""
+        return build(self.fleet, self.role, self.topic, self.name, self.asker)
 
-        Raises:
-            ValueError: a name is empty or no valid Unicode, or what is given does not belong together.
-        """
-        if self.role not in TOPICS:
-            raise ValueError(f"Unknown role '{self.role}' of a key. Allowed: {', '.join(TOPICS)}.")
-        if self.topic not in TOPICS[self.role]:
-            raise ValueError(f"Unknown topic '{self.topic}' of '{self.role}'. Allowed: {', '.join(TOPICS[self.role])}.")
-        start = f"{PREFIX}/{chunk(self.fleet)}/{self.role}"
-        if self.topic in ASKED:
-            return f"{start}/{chunk(self.name)}/{self.topic}/{chunk(self.asker)}"
-        if self.asker:
-            raise ValueError(f"Keys of '{self.topic}' do not end in a querier's name (got {self.asker!r}).")
-        if self.role not in NAMELESS:
-            return f"{start}/{chunk(self.name)}/{self.topic}"
-        if self.name:
-            raise ValueError(f"Keys under '{self.role}' contain no participant's name (got {self.name!r}).")
-        return f"{start}/{self.topic}"
+
+def build(fleet: str, role: Role, topic: str, name: str | None = "", querier: str | None = "") -> str:
+    """A key, or with None for a name the key expression of every participant; that is not for publications.
+
+    Raises:
+        ValueError: a name is empty or no valid Unicode, or what is given does not belong together.
+    """
+    if (role, topic) not in CHANNEL:
+        allowed = ", ".join(f"{role} {topic}" for role, topic in CHANNEL)
+        raise ValueError(f"Unknown role and topic of a key '{role} {topic}'. Allowed: {allowed}.")
+    parts = [PREFIX, chunk(fleet), role]
+    if role not in NAMELESS:
+        parts.append("*" if name is None else chunk(name))
+    elif name:
+        raise ValueError(f"Keys under '{role}' contain no participant's name (got {name!r}).")
+    parts.append(topic)
+    if topic in ASKED:
+        parts.append("*" if querier is None else chunk(querier))
+    elif querier:
+        raise ValueError(f"Keys of '{topic}' do not end in a querier's name (got {querier!r}).")
+    return "/".join(parts)
 
 
 def of_arm(fleet: str, arm: str, topic: str) -> str:
     """Key of one arm: `thermofleet/v4/{fleet}/arm/{arm}/{topic}`."""
-    return str(ParsedKey(fleet, "arm", arm, topic))
+    return build(fleet, "arm", topic, arm)
 
 
 def of_every(fleet: str, role: Role, topic: str) -> str:
     """Key expression that matches a topic of every participant of a role in one fleet; not for publications."""
-    return str(ParsedKey(fleet, role, "x", topic)).replace(f"/{role}/x/", f"/{role}/*/")
+    return build(fleet, role, topic, None)
 
 
 def of_every_arm(fleet: str, topic: str) -> str:
     """Key expression that matches the topic of every arm of one fleet; for subscribers and queries alone."""
-    return of_every(fleet, "arm", topic)
+    return build(fleet, "arm", topic, None)
 
 
 def of_auction(fleet: str, auctioneer: str, topic: str) -> str:
     """Key of one auctioneer: `thermofleet/v4/{fleet}/auction/{auctioneer}/{topic}`."""
-    return str(ParsedKey(fleet, "auction", auctioneer, topic))
+    return build(fleet, "auction", topic, auctioneer)
 
 
 def of_every_auction(fleet: str, topic: str) -> str:
     """Key expression that matches the topic of every auctioneer of one fleet; not for publications."""
-    return of_every(fleet, "auction", topic)
+    return build(fleet, "auction", topic, None)
 
 
 def asked_by(fleet: str, asked: str, topic: str, arm: str) -> str:
     """Key under which an arm queries another participant: `thermofleet/v4/{fleet}/auction/{asked}/{topic}/{arm}`
     for an auctioneer, `…/arm/{asked}/…` for an arm.
     """
-    return str(ParsedKey(fleet, ASKED[topic], asked, topic, arm))
+    return build(fleet, ASKED[topic], topic, asked, arm)
 
 
 def asked_by_every_arm(fleet: str, asked: str, topic: str) -> str:
     """Key expression of the queryable of an auctioneer, or arm, for all arms; not for replies (see `answered`)."""
-    return asked_by(fleet, asked, topic, "x").removesuffix("x") + "*"
+    return build(fleet, ASKED[topic], topic, asked, None)
 
 
 def asked_of_all(fleet: str, topic: str, arm: str) -> str:
     """Key expression of the queries of one arm to any auctioneer, or any arm."""
-    return asked_by(fleet, "x", topic, arm).replace(f"/{ASKED[topic]}/x/", f"/{ASKED[topic]}/*/")
+    return build(fleet, ASKED[topic], topic, None, arm)
 
 
 def answered(expression: str, asked: str) -> str:
@@ -242,17 +252,17 @@ def answered(expression: str, asked: str) -> str:
 
 def of_jobs(fleet: str, topic: str) -> str:
     """Key at which outsiders submit jobs, query their status or free space: `thermofleet/v4/{fleet}/jobs/{topic}`."""
-    return str(ParsedKey(fleet, "jobs", "", topic))
+    return build(fleet, "jobs", topic)
 
 
 def of_clock(fleet: str) -> str:
     """Key at which fleet time is queried: `thermofleet/v4/{fleet}/clock/now`."""
-    return str(ParsedKey(fleet, "clock", "", "now"))
+    return build(fleet, "clock", "now")
 
 
 def of_policy(fleet: str, policy: str) -> str:
     """Key at which a policy in another process is queried: `thermofleet/v4/{fleet}/policy/{policy}/act`."""
-    return str(ParsedKey(fleet, "policy", policy, "act"))
+    return build(fleet, "policy", "act", policy)
 
 
 def all_of_fleet(fleet: str) -> str:
@@ -298,25 +308,18 @@ def parse(key: str) -> ParsedKey:
 
 
 def _parse(key: str) -> ParsedKey:
-    parts = key.split("/")
-    asked = len(parts) == 7 and parts[5] in ASKED
-    named = len(parts) == 6 or asked
-    if "/".join(parts[:2]) != PREFIX or not (named or len(parts) == 5):
-        raise ValueError(f"'{key}' is no key of this bus: expected {PREFIX}/{{fleet}}/{{{'|'.join(TOPICS)}}}/….")
-    role = cast(Role, parts[3])
-    if role not in TOPICS or named == (role in NAMELESS):
+    match = _KEY.fullmatch(key)
+    if match is None:
         raise ValueError(
-            f"'{key}' is not a key of this bus: expected arm/{{arm}}/…, auction/{{auctioneer}}/…, policy/{{policy}}/…, "
-            "jobs/… or clock/now."
+            f"'{key}' is no key of this bus: expected {PREFIX}/{{fleet}}/… with arm/{{arm}}/…, "
+            "auction/{auctioneer}/…, policy/{policy}/…, jobs/… or clock/now."
         )
     try:
-        chunks = (parts[2], parts[4] if named else "", parts[6] if asked else "")
-        names = [unquote(part, errors="strict") for part in chunks]
+        fleet, name, asker = (unquote(match[part] or "", errors="strict") for part in ("fleet", "name", "asker"))
+        parsed = ParsedKey(fleet, cast(Role, match["nameless"] or match["role"]), name, match["topic"], asker)
+        written = str(parsed)
     except UnicodeDecodeError as error:
         raise ValueError(f"'{key}' holds a percent escape that is no UTF-8.") from error
-    parsed = ParsedKey(names[0], role, names[1], parts[5] if named else parts[4], names[2])
-    try:
-        written = str(parsed)
     except ValueError as error:
         raise ValueError(f"'{key}' is no key of this bus: {error}") from error
     if written != key:

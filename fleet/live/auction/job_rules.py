@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
 from fleet.bus.protocol.messages import encode
-from fleet.bus.protocol.operator import Change as ChangeJob
+from fleet.bus.protocol.operator import Change
 from fleet.live.auction.records import PastJobs
 
 MAX_OPEN_JOBS = 10_000
@@ -114,7 +114,7 @@ def is_late(job: JobSpec, time_s: float) -> bool:
     return job.expires and job.due_s is not None and job.due_s < time_s
 
 
-def changed_spec(job: JobSpec, change: ChangeJob) -> JobSpec:
+def changed_spec(job: JobSpec, change: Change) -> JobSpec:
     """Return a job with the due date and value that a person has requested.
 
     Raises:

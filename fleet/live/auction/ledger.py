@@ -25,8 +25,7 @@ from msgspec.structs import asdict, replace
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus, Offers
 from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.messages import encode
-from fleet.bus.protocol.operator import ALL_ARMS, Cancel, ControlRequest, Pause, Resume, Settle
-from fleet.bus.protocol.operator import Change as ChangeJob
+from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, ControlRequest, Pause, Resume, Settle
 from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import (
     EXPIRED,
@@ -45,12 +44,12 @@ from fleet.live.auction.records import (
     AuctionRecord,
     Awarded,
     AwardState,
-    Change,
     Checked,
     ContactLost,
     ContactRegained,
     Expired,
     HistoryAdopted,
+    JobChange,
     JobEntry,
     JobsPutAside,
     LedgerSnapshot,
@@ -111,7 +110,7 @@ class LedgerView:
     number: int = 0
     """Of the next change."""
     ended: bool = False
-    recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
+    recent: deque[JobChange] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
     operated: int = 0
     """Number of the next request of a person."""
     operations: deque[Operated] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
@@ -547,7 +546,7 @@ class Ledger(LedgerState):
             self._change(self.status((name,))[0], self.time_s, "", self.jobs.get(name))
         return self
 
-    def apply(self, record: AuctionRecord) -> list[Change]:
+    def apply(self, record: AuctionRecord) -> list[JobChange]:
         """Apply a record that is on disk, and return the changes of job states."""
         changed: list[JobEntry] = []
         match record:
@@ -741,7 +740,7 @@ class Ledger(LedgerState):
                 del self.aside[name]
                 if outcome == "done":
                     self.past.add(name, finished=True)
-            case Cancel(name) | Settle(name) | ChangeJob(name):
+            case Cancel(name) | Settle(name) | Change(name):
                 if (entry := self.jobs.get(name)) is not None:
                     _count(entry, record.cycles)
                     return self._operate_job(entry, request, time_s)
@@ -768,7 +767,7 @@ class Ledger(LedgerState):
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)
             self._move(entry, "waiting", f"To be redone, by '{request.by}'.")
             return self._give_up(entry) or [entry]
-        if isinstance(action, ChangeJob) and before not in SETTLED:
+        if isinstance(action, Change) and before not in SETTLED:
             changed = changed_spec(entry.spec, action)
             if changed != entry.spec:
                 entry.submitted, entry.spec, entry.changed_by = entry.original, changed, request.by
@@ -818,8 +817,10 @@ class Ledger(LedgerState):
             arm = award.record.arm
             self.space[arm] = self.space.get(arm, frozenset()) | {award.record.space}
 
-    def _change(self, status: JobStatus, time_s: float, by: str, entry: JobEntry | None, offers: Offers = ()) -> Change:
-        change = Change(self.number, time_s, status, by=by, offers=offers)
+    def _change(
+        self, status: JobStatus, time_s: float, by: str, entry: JobEntry | None, offers: Offers = ()
+    ) -> JobChange:
+        change = JobChange(self.number, time_s, status, by=by, offers=offers)
         if entry is not None and entry.award in self.awards:
             award = asdict(self.awards[entry.award].record)
             change = replace(

@@ -107,7 +107,7 @@ class Operated(msgspec.Struct, frozen=True, tag="operated"):
     """Last reported progress of its job."""
 
 
-class Change(msgspec.Struct, frozen=True):
+class JobChange(msgspec.Struct, frozen=True):
     """A job's state has changed; fields as in `fleet.bus.protocol.auction.Result`."""
 
     number: int
@@ -200,7 +200,7 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     """Awards on which a report could still change something."""
     open: tuple[str, ...]
     """Names of open awards."""
-    recent: tuple[Change, ...]
+    recent: tuple[JobChange, ...]
     space: dict[str, tuple[str, ...]] = {}
     """As in `Ledger`, as are the next ones."""
     settled: tuple[str, ...] = ()
@@ -257,14 +257,14 @@ def rest_of(raw: bytes, reason: str) -> list[AuctionRecord]:
         return []
     fields, bad = cast(dict[str, object], content), set[str]()
     snapshot = fields.get("type") == "ledger_snapshot"
-    parts = {"jobs": JobEntry if snapshot else JobSpec, "finished": JobSpec, "awards": AwardState, "recent": Change}
+    parts = {"jobs": JobEntry if snapshot else JobSpec, "finished": JobSpec, "awards": AwardState, "recent": JobChange}
     for key, kind in parts.items():
         if isinstance(items := fields.get(key), list):
             kept: list[object] = []
             for item in cast(list[object], items):
                 if _is_readable(item, kind):
                     kept.append(item)
-                elif kind is not Change:  # of the last messages none is needed
+                elif kind is not JobChange:  # of the last messages none is needed
                     bad.add(_job_in(item))
             fields[key] = kept
     rest: list[AuctionRecord] = []

@@ -38,8 +38,7 @@ from fleet.bus.protocol.operator import ALL_ARMS, ClearRequest, Operation
 from fleet.errors import JournalFull, Refused
 from fleet.live.auction.job_rules import is_same_work
 from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted, Operated
-from fleet.live.auction.records import Change as RecordChange
+from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted, JobChange, Operated
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, SpaceCleared, SpaceTaken
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
@@ -418,7 +417,7 @@ class LedgerWriter:
             return False
         return True
 
-    def _result(self, change: RecordChange) -> Result:
+    def _result(self, change: JobChange) -> Result:
         return Result(self._name, epoch=self.ledger.epoch, **asdict(change))
 
     def _operation(self, record: Operated, number: int) -> Operation:
