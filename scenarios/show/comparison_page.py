@@ -395,7 +395,7 @@ def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str)
     return {"data": data, "layout": LAYOUT | LEGEND_ABOVE | axes}
 
 
-def _dots(x: Array, y: Array, names: Sequence[str], look: Mapping[str, Any]) -> dict[str, Any]:
+def _dots(x: Array, y: Array, names: Sequence[str], look: dict[str, Any]) -> dict[str, Any]:
     """Markers with their intervals, and their names as hover texts.
 
     Args:

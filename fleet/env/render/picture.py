@@ -216,7 +216,8 @@ def _draw_cell(axes: Axes, scene: Scene, plan: FloorPlan) -> None:
         axes.add_patch(Polygon(outline, facecolor=BOX, edgecolor=FAINT, clip_path=floor))
         low, high = (np.clip(end, (left, top), (right, bottom)) for end in (outline.min(axis=0), outline.max(axis=0)))
         if high[1] - low[1] > 2 * TEXT:
-            _write(axes, *(low + high) / 2, shorten(fixture.name, high[0] - low[0] - TEXT), FAINT, ha="center")
+            x, y = (low + high) / 2
+            _write(axes, x, y, shorten(fixture.name, high[0] - low[0] - TEXT), FAINT, ha="center")
     moved = np.hypot(*(plan.bases - plan.centres).T) > 0.5 * plan.reach  # drawn beside their true position
     axes.add_collection(
         LineCollection([*np.stack([plan.bases, plan.centres], axis=1)[moved]], color="#9a9a9a", zorder=LINES)
@@ -227,8 +228,9 @@ def _draw_cell(axes: Axes, scene: Scene, plan: FloorPlan) -> None:
     axes.add_collection(LineCollection(routes, color=WORK, linewidth=3, zorder=LINES))
     used = {tuple(at) for ends in stops for at in ends}
     for x, y in plan.stations:
-        look = {"facecolor": WORK, "edgecolor": INK} if (x, y) in used else {"facecolor": PAPER, "edgecolor": FAINT}
-        axes.add_patch(Rectangle((x - STATION, y - STATION), 2 * STATION, 2 * STATION, zorder=PLATE, **look))
+        square = Rectangle((x - STATION, y - STATION), 2 * STATION, 2 * STATION, zorder=PLATE)
+        square.set(facecolor=WORK if (x, y) in used else PAPER, edgecolor=INK if (x, y) in used else FAINT)
+        axes.add_patch(square)
     for text, x, y in plan.labels:
         _write(axes, x, y, text, FAINT, ground=True)
 
