@@ -27,7 +27,7 @@ from scenarios.live.arm import PreparedArm, make_node, simulated_arm
 from scenarios.live.auctioneer import CentralAllocation
 from scenarios.policy_loader import policy_at
 from scenarios.progress import quiet
-from scenarios.signals import Stop, until_stopped
+from scenarios.signals import StopRequest, until_stopped
 from scenarios.spec.load import load
 
 SCENARIO, FLEET = "quickstart", "mesh"
@@ -53,7 +53,7 @@ def job_of(number: int, arms: int) -> JobSpec:
     return JobSpec(name=name, kind="sort", places=places, payload_kg=0.1, repetitions=repetitions)
 
 
-def auction(endpoint: str, journals: Path, arms: int, speed: float, stop: Stop) -> None:
+def auction(endpoint: str, journals: Path, arms: int, speed: float, stop: StopRequest) -> None:
     """Run the auctioneer."""
     with (
         BusClient(endpoint, FLEET, stopped=stop.is_set) as link,
@@ -68,7 +68,7 @@ def auction(endpoint: str, journals: Path, arms: int, speed: float, stop: Stop) 
             node.serve(time.monotonic() + 0.25)
 
 
-def work_arms(numbers: list[int], address: str, keys: Path, journals: Path, speed: float, stop: Stop) -> None:
+def work_arms(numbers: list[int], address: str, keys: Path, journals: Path, speed: float, stop: StopRequest) -> None:
     """Run arms."""
     scenario = load(SCENARIO)
     places = {place.name: place for place in scenario.places}
