@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from twin.thermal.identify import Identified
     from twin.vae.twin import Twin
 
-KNOWN_TWINS = option("A folder of twins; default: the scenario's own, from the cache.", None, flag="--twins")
+KNOWN_TWINS = option("A folder of twins. Default: those of the scenario, from the cache.", None, flag="--twins")
 SEED = option("Random seed.", 0, low=0, high=MAX_SEED)
 _VERDICT = "Verdicts"
 
@@ -124,7 +124,7 @@ def generate_command(
     cool = f"{made.truly_cool:.1%} truly stay below {made.verification.cool_c:g} °C"
     say(f"{len(made.motions)} motions of {made.arm} in {out}; {cool}; rejected: {reasons}.", out_console)
     if len(made.motions) < count:
-        say(f"Only {len(made.motions)} of {count} passed; choose a smaller --s or lighter work.")
+        say(f"Only {len(made.motions)} of {count} passed; choose a smaller --s or a lighter task.")
 
 
 def recover_command(
@@ -206,7 +206,7 @@ def train_command(
     arm: str | None = option("Train only this arm; default: every arm of the scenario.", None),
     *,
     given: Annotated[Given, From(TwinConfig)],
-    size: Literal["quick", "full"] | None = option("quick or full; default: as the scenario says.", None),
+    size: Literal["quick", "full"] | None = option("quick or full. Default: as in the scenario; for logs quick.", None),
     cool: float = option("--log: temperature limit of joints 1 to 4 for training data, °C.", 40.0, low=0, high=200),
     hold_out: float = option(
         "--log: share of the cool recordings held out to calibrate verdicts.", 0.3, low=0, high=0.9
@@ -259,7 +259,7 @@ def score_command(
     skip_damaged: bool = options.SKIP_DAMAGED,
     as_json: bool = options.JSON,
     verdict: bool = option(
-        "Call each job of a scenario, or each recording of a log, uncritical or anomalous.", False, panel=_VERDICT
+        "Judge each job of a scenario, or each recording of a log: uncritical or anomalous.", False, panel=_VERDICT
     ),
     alpha: float | None = option(
         "Largest share of cool jobs that may be called anomalous; default: 0.05.",
