@@ -59,7 +59,6 @@ ERROR_HEADS = ("position, rad", "velocity, rad/s", "torque, N·m")
 CHANNEL_LABELS = ("q (rad)", "dq/dt (rad/s)", "τ (N·m)")
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"
 """Cool or the twin, hot, untrained, other; of Okabe and Ito, for colour-blind readers."""
-EPOCH_COLOURS = (("trained on", BLUE), ("held out", GREY))
 LEAST_ERROR = 1e-6
 """Errors below it, in z units, count as equal."""
 MOST_POINTS = 1500
@@ -240,6 +239,7 @@ def scenario_subjects(
     kind = np.where(hottest_c <= spec.cool_c, COOL, np.where(hottest_c < warning_c, BETWEEN, HOT))
     repetitions = [max(1, int(np.ceil(spec.horizon_s / plan.cycle.duration_s))) for plan in plans]
     shown = np.flatnonzero(kind != BETWEEN)
+    profiles = [np.concatenate([phase.profile for phase in plan.phases]) for plan in plans]
     trained_on = [*records(own), *exploration_records(scenario, planned)]
     verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
 
@@ -272,7 +272,7 @@ def scenario_subjects(
                 untrained_features=untrained.features(plans, repetitions), windows=cut_up.windows[few],
                 window_hot=kind[shown][cut_up.job[few]] == HOT, names=[_job_name(plans[i]) for i in shown],
                 recorded_hot=kind[shown] == HOT, recorded=twin.features([plans[i] for i in shown], [1] * len(shown)),
-                motion=lambda i, twin=twin: _profile(plans[shown[i]], twin.config),
+                motion=lambda i, rate_hz=twin.config.rate_hz: resample(profiles[shown[i]], RATE_HZ, rate_hz),
                 cool_jobs=[records([plans[i]]) for i in np.flatnonzero(kind == COOL)],
                 epoch_records=5, make=make,
             )
@@ -282,11 +282,6 @@ def scenario_subjects(
 
 def _job_name(plan: Plan) -> str:
     return f"{plan.work.places[0].name.partition('/')[0]} ({plan.work.kind}, {plan.work.payload_kg:.1f} kg)"
-
-
-def _profile(plan: Plan, config: TwinConfig) -> Array:
-    """One repetition of a plan at the rate of a twin, [time, 3, joint]."""
-    return resample(np.concatenate([phase.profile for phase in plan.phases]), RATE_HZ, config.rate_hz)
 
 
 def _untrained(trained_on: Sequence[Array], config: TwinConfig, seed: int, arm: str, folder: Path) -> Twin:
@@ -576,11 +571,10 @@ def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     ranks = [{name: auroc(each.kind == HOT, v) for name, v in each.scores().items()} for each in subjects]
     by_name = {name: [rank[name] for rank in ranks] for name in ranks[0]}
     first, *_, torque, other = by_name
-    ours, theirs = spread(by_name[first]), spread(by_name[torque])
     return Section(
         sentences=(
-            f"Hot against all other {s.item}s: {first} has AUROC {ours}, RMS torque {theirs}, the untrained network "
-            f"{spread(by_name[other])}.",
+            f"Hot against all other {s.item}s: {first} has AUROC {spread(by_name[first])}, RMS torque "
+            f"{spread(by_name[torque])}, the untrained network {spread(by_name[other])}.",
         ),
         how="d_k = 1 − exp(−e_k), e_k the mean absolute error of joint k summed over the channels; d is their sum with "
         f"the weights of the twin. {len(subjects)} seeds, mean ± standard deviation; figure: the first.",
@@ -610,11 +604,13 @@ def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     torque = auroc(hot, np.square(windows[:, :, s.joint, TAU], dtype=float).mean(axis=1))
     x, cells = [f"{n}" if n else "untrained" for n in size.epochs], Cells()
     for c in range(3):
-        cells[0, c] = [_over_epochs(x, of_joint[kind][:, :, c], kind, colour) for kind, colour in EPOCH_COLOURS]
+        cells[0, c] = [
+            _over_epochs(x, values[:, :, c], kind, colour)
+            for (kind, values), colour in zip(of_joint.items(), (BLUE, GREY), strict=True)
+        ]
     cells[0, 3] = [_over_epochs(x, ranks, "error of the test windows", ORANGE)]
     cells[0, 3].append(_over_epochs(x, np.full((1, len(x)), torque), "RMS torque", GREEN))
-    held_out = of_joint["held out"].mean(axis=0)
-    left = held_out[-1] / held_out[0]
+    left = of_joint["held out"][:, -1].mean(axis=0) / of_joint["held out"][:, 0].mean(axis=0)
     rows = [
         (f"{name}, {kind}", *(spread(seeds_of, 2) for seeds_of in values[:, :, c].T))
         for c, name in enumerate(CHANNEL_NAMES)
@@ -645,12 +641,10 @@ def generation_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     made = [s.make(name, twin, strength, size.generated) for name, twin, all_of in networks for strength in all_of]
     rows = []
     for each in made:
-        load = [np.sqrt(np.mean([np.square(pair[k][:, TAU, s.joint]).mean() for pair in each.pairs] or [np.nan]))
-                for k in (0, 1)]  # fmt: skip
-        cool = float("nan") if each.cool_share is None else each.cool_share
-        numbers = (f"{each.distance_rad:.3f}", f"{load[0]:.1f}", f"{load[1]:.1f}", f"{cool:.0%}")
-        texts = (value.replace("nan%", "–").replace("nan", "–") for value in numbers)
-        rows.append((f"{each.network}, s = {each.strength:g}", each.outcome, *texts))
+        load = (np.sqrt(np.mean([np.square(pair[k][:, TAU, s.joint]).mean() for pair in each.pairs])) for k in (0, 1))
+        numbers = (f"{each.distance_rad:.3f}", *(f"{v:.1f}" for v in load)) if each.pairs else ("–", "–", "–")
+        cool = "–" if each.cool_share is None else f"{each.cool_share:.0%}"
+        rows.append((f"{each.network}, s = {each.strength:g}", each.outcome, *numbers, cool))
         column = int(each.network != "twin")
         for source, motion in each.pairs[:1] if each.strength == size.strengths[1] else ():
             for row, c in enumerate((0, TAU)):
@@ -818,8 +812,7 @@ def write(chapters: Sequence[Section], origin: Mapping[str, str], folder: Path, 
             for each in chapters
         },
     }
-    text = json.dumps(plain(card), indent=1, allow_nan=False) + "\n"
-    (folder / CARD).write_text(text, encoding="utf-8")
+    (folder / CARD).write_text(json.dumps(plain(card), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return card
 
 
