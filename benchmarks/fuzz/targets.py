@@ -140,7 +140,7 @@ def journal(data: bytes) -> None:
     path = written("journal", content)
     with (
         suppress(FleetError),
-        Journal[Any](path, kind, sync=lambda file: None, put_aside=lambda record, reason: ()) as book,
+        Journal[Any](path, kind, sync=lambda file: None, quarantine=lambda record, reason: ()) as book,
     ):
         records = list(book.records())
         if kind is ArmRecord:

@@ -157,11 +157,11 @@ def _ends_free(end: Any) -> Any:
 def _reads_torn_lines(lines: Any) -> Any:
     """Take an unfinished last line for a record."""
 
-    def patched(self: Any, put_aside: Any) -> Any:
+    def patched(self: Any, quarantine: Any) -> Any:
         size = sum(len(line) for line, _ in lines(self, None))
         if size < journal_module.os.fstat(self._file).st_size:
             raise JournalError("damaged")
-        yield from lines(self, put_aside)
+        yield from lines(self, quarantine)
 
     return patched
 

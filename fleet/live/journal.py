@@ -31,7 +31,7 @@ COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
 """A journal needs compaction once it has grown by this factor since the last one, and to this size."""
 
 Record = TypeVar("Record", bound=msgspec.Struct)
-PutAside = Callable[[bytes, str], object]
+Quarantine = Callable[[bytes, str], object]
 """Quarantines a record that cannot be applied, with the reason."""
 Salvage = Callable[[bytes, str], Sequence[Record]]
 """Quarantines an unreadable record, with the reason, and returns its replacement."""
@@ -57,19 +57,19 @@ class JournalState(ABC, Generic[Record]):
     def compact(self) -> tuple[Record, ...]:
         """Return the fewest records that give the same state."""
 
-    def replay(self, records: Iterable[Record], put_aside: PutAside | None = None) -> Self:
+    def replay(self, records: Iterable[Record], quarantine: Quarantine | None = None) -> Self:
         """Apply records, oldest first, and return the state.
 
         Args:
-            put_aside: Quarantines each record that cannot be applied; None: such a record is an error.
+            quarantine: Quarantines each record that cannot be applied; None: such a record is an error.
         """
         for record in records:
             try:
                 self.apply(record)
             except (KeyError, ValueError, msgspec.ValidationError) as error:
-                if put_aside is None:
+                if quarantine is None:
                     raise
-                put_aside(msgspec.json.encode(record), str(error))
+                quarantine(msgspec.json.encode(record), str(error))
         return self
 
 
@@ -90,7 +90,7 @@ class Journal(Generic[Record]):
     Attributes:
         path: The file.
         torn: Bytes of an unfinished last line that were removed on opening.
-        put_aside: Quarantines records that cannot be applied.
+        quarantine: Quarantines records that cannot be applied.
     """
 
     def __init__(
@@ -99,20 +99,20 @@ class Journal(Generic[Record]):
         kind: type[Record] | UnionType,
         *,
         sync: Callable[[int], None] = os.fsync,
-        put_aside: Salvage[Record] | None = None,
+        quarantine: Salvage[Record] | None = None,
     ) -> None:
         """Prepare a journal of records of one `msgspec.Struct`, or of a union of tagged ones.
 
         Args:
             sync: Writes an open file through to the disk.
-            put_aside: Quarantines each undamaged record of another version, with the reason; `records` yields its
+            quarantine: Quarantines each undamaged record of another version, with the reason; `records` yields its
                 replacement. None: the journal refuses to open.
         """
         self.path = path
         self.torn = 0
         self._decoder = msgspec.json.Decoder(cast(type[list[Record]], list[kind]))
         self._encoder = msgspec.json.Encoder()
-        self._sync, self.put_aside = sync, put_aside
+        self._sync, self.quarantine = sync, quarantine
         self._file = self._lock = -1
         self._end = self._compacted = 0
         self._broken = ""
@@ -132,7 +132,7 @@ class Journal(Generic[Record]):
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
             if fresh:
                 self._sync_folder()
-            self._end = sum(len(line) for line, _ in self._lines(_ignore if self.put_aside else None))
+            self._end = sum(len(line) for line, _ in self._lines(_ignore if self.quarantine else None))
             self.torn = os.fstat(self._file).st_size - self._end
             if self.torn:
                 _LOG.warning("%s: removed an unfinished last line (%d bytes).", self.path, self.torn)
@@ -166,7 +166,7 @@ class Journal(Generic[Record]):
         Raises:
             JournalError: the file was damaged while it was open.
         """
-        for _, records in self._lines(self.put_aside):
+        for _, records in self._lines(self.quarantine):
             yield from records
 
     def append(self, *records: Record) -> None:
@@ -255,15 +255,15 @@ class Journal(Generic[Record]):
         body = self._encoder.encode(records)
         return b"".join((_HEAD, b"%08x" % zlib.crc32(body), _MIDDLE, body, _TAIL))
 
-    def _lines(self, put_aside: Salvage[Record] | None) -> Iterator[tuple[bytes, list[Record]]]:
+    def _lines(self, quarantine: Salvage[Record] | None) -> Iterator[tuple[bytes, list[Record]]]:
         """Yield every complete line with its records."""
         with open(os.dup(self._opened()), "rb") as file:
             file.seek(0)
             for number, line in enumerate(file, start=1):
                 if line.endswith(b"\n"):
-                    yield line, self._decode(line, number, put_aside)
+                    yield line, self._decode(line, number, quarantine)
 
-    def _decode(self, line: bytes, number: int, put_aside: Salvage[Record] | None) -> list[Record]:
+    def _decode(self, line: bytes, number: int, quarantine: Salvage[Record] | None) -> list[Record]:
         body = line[_START : -len(_TAIL)]
         complete = line.startswith(_HEAD) and line[_CRC_END:_START] == _MIDDLE and line.endswith(_TAIL)
         if not complete or line[len(_HEAD) : _CRC_END] != b"%08x" % zlib.crc32(body):
@@ -273,13 +273,13 @@ class Journal(Generic[Record]):
         try:
             return self._decoder.decode(body)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            if put_aside is not None and (records := self._some_of(body, put_aside)) is not None:
+            if quarantine is not None and (records := self._some_of(body, quarantine)) is not None:
                 return records
             raise JournalError(
                 f"{self.path}, line {number}: not a record of this version ({error}). {_REMEDY}"
             ) from error
 
-    def _some_of(self, body: bytes, put_aside: Salvage[Record]) -> list[Record] | None:
+    def _some_of(self, body: bytes, quarantine: Salvage[Record]) -> list[Record] | None:
         """Decode records one by one; None if it is no list."""
         try:
             raws = msgspec.json.decode(body, type=list[msgspec.Raw])
@@ -290,7 +290,7 @@ class Journal(Generic[Record]):
             try:
                 records += self._decoder.decode(b"[" + bytes(raw) + b"]")
             except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-                records += put_aside(bytes(raw), str(error))
+                records += quarantine(bytes(raw), str(error))
         return records
 
     def _write(self, file: int, line: bytes) -> None:
@@ -436,7 +436,7 @@ TICK_S = 2.0
 """Real seconds between two records of the fleet's time."""
 
 
-def put_aside(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
+def quarantine(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
     """Return a function that quarantines a journal record: it appends the record to a file, and logs the reason.
 
     Args:

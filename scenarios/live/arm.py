@@ -28,7 +28,7 @@ from fleet.live.clock import FleetClock
 from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
-from fleet.live.journal import CompactingJournal, Journal, own_records, put_aside
+from fleet.live.journal import CompactingJournal, Journal, own_records, quarantine
 from fleet.motion import Plan
 from scenarios.live.auctioneer import live_fleet, scenario_jobs, summary
 from scenarios.live.cell import cell_message, cell_space
@@ -89,11 +89,11 @@ def run_arm(
         arm = replayed_arm(name, file) if file else simulated()
     # A quarantined award is not executed again: its lease expires at the auctioneer, which awards the job again or, if
     # it had permitted the last cycle, marks it unfinished.
-    aside = put_aside(folder / f"{name}.aside", name)
+    aside = quarantine(folder / f"{name}.aside", name)
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[ArmRecord](folder / f"{name}.journal", ArmRecord, put_aside=aside) as book,
+        Journal[ArmRecord](folder / f"{name}.journal", ArmRecord, quarantine=aside) as book,
         ExitStack() as resources,
     ):
         wait_for_name(link, name)
@@ -269,7 +269,7 @@ def make_node(
 
 def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHistory:
     """History of the arm at this start, written to its journal."""
-    before = ArmHistory().replay(own_records(book, name), book.put_aside)
+    before = ArmHistory().replay(own_records(book, name), book.quarantine)
     for active in before.active.values():
         log.warning("'%s' was unfinished at the last exit of the arm: returned.", active.job)
     history = before.after_restart(name, time_s)

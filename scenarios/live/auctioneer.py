@@ -19,7 +19,7 @@ from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.rounds import Allocate, Assignment, Bidding, Timing, resolve_claims
-from fleet.live.journal import Journal, put_aside
+from fleet.live.journal import Journal, quarantine
 from scenarios.live.cell import cell_message, cell_space
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
@@ -119,11 +119,11 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
     refuse_other_way(folder, (arm.name for arm in scenario.arms), alone=False)
     with progress_bar() as progress:
         excludes, cell = cell_space(scenario, progress=progress), cell_message(scenario, name, progress=progress)
-    aside = salvage(put_aside(folder / f"{name}.aside", name))
+    aside = salvage(quarantine(folder / f"{name}.aside", name))
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord, put_aside=aside) as book,
+        Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord, quarantine=aside) as book,
     ):
         places = frozenset(place.name for place in scenario.places)
         timing = Timing(max_jobs=scenario.slots)

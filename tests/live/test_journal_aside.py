@@ -1,4 +1,4 @@
-"""Journals of an auctioneer with one wrong record: it goes on, and what it cannot rely on is put aside and reported."""
+"""Journals of an auctioneer with one wrong record: it goes on, quarantines what is not reliable, and reports it."""
 
 import json
 import random
@@ -21,7 +21,7 @@ from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, ReportRe
 from fleet.live.auction.auctioneer import objection
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, Awarded, Operated, salvage
-from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted, Journal, Progress, Started, put_aside
+from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted, Journal, Progress, Started, quarantine
 from tests.live.simulated import SimulatedFleet
 from tests.profiles import examples
 
@@ -153,7 +153,7 @@ def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice
     ledger = Ledger(arms=arms).replay(journal, lambda record, reason: kept.append(record))
     before, after = ({each.job: each for each in book.status()} for book in (whole, ledger))
     touched = names_in(records[index], journal[min(index, len(journal) - 1)])
-    aside = {name for name, status in after.items() if status.reason.startswith("Put aside")}
+    aside = {name for name, status in after.items() if status.reason.startswith("Quarantined")}
     for name, status in before.items():
         assert name in after, f"'{name}' is lost without a report"
         if name not in touched:
@@ -179,7 +179,7 @@ def journal_of(path, records: list[dict]):
     """Write records with a right checksum, as another version may have written them; return the journal."""
     body = json.dumps(records).encode()
     path.write_bytes(b'{"crc":"%08x","records":%s}\n' % (zlib.crc32(body), body))
-    return Journal[AuctionRecord](path, AuctionRecord, put_aside=salvage(put_aside(path.with_suffix(".aside"), "au")))
+    return Journal[AuctionRecord](path, AuctionRecord, quarantine=salvage(quarantine(path.with_suffix(".aside"), "au")))
 
 
 def as_json(record) -> dict:
@@ -187,7 +187,7 @@ def as_json(record) -> dict:
 
 
 @pytest.mark.parametrize("in_snapshot", [False, True])
-def test_a_job_that_cannot_be_read_is_put_aside_alone_and_settled_by_a_person(tmp_path, in_snapshot):
+def test_a_job_that_cannot_be_read_is_quarantined_alone_and_settled_by_a_person(tmp_path, in_snapshot):
     """`dwell_s` in milliseconds, from a version that had no bounds; an award of it follows."""
     jobs = JobsAccepted((spec("good"), spec("poison"), spec("after", "poison")))
     record = as_json(Ledger().replay([jobs]).compact()[0] if in_snapshot else jobs)
@@ -196,7 +196,7 @@ def test_a_job_that_cannot_be_read_is_put_aside_alone_and_settled_by_a_person(tm
     awarded = as_json(Awarded("r:poison", "r", "poison", "arm_0", "q", 0, 1.0))
     path = tmp_path / "au.journal"
     with journal_of(path, [record, awarded]) as book:
-        ledger = Ledger().replay(book.records(), book.put_aside)
+        ledger = Ledger().replay(book.records(), book.quarantine)
         book.compact(*ledger.compact())
     assert "60000" in path.with_suffix(".aside").read_text()
     with Journal[AuctionRecord](path, AuctionRecord) as book:
@@ -211,7 +211,7 @@ def test_a_job_that_cannot_be_read_is_put_aside_alone_and_settled_by_a_person(tm
     assert [job.name for job in ledger.ready(1.0, 9)] == ["good"]
     refused = ledger.admit([spec("poison")])[0]
     assert (refused.accepted, "settle it first" in refused.reason) == (False, True)
-    with pytest.raises(Refused, match="put aside"):
+    with pytest.raises(Refused, match="quarantined"):
         objection(ledger, ControlRequest("1", Cancel("poison")), frozenset())
     done, redo = (Ledger().replay(ledger.compact()) for _ in range(2))
     done.apply(Operated(ControlRequest("1", Settle("poison", "done")), 2.0))
@@ -220,7 +220,7 @@ def test_a_job_that_cannot_be_read_is_put_aside_alone_and_settled_by_a_person(tm
     assert redo.admit([spec("poison")])[0].accepted
 
 
-def test_a_job_put_aside_by_contradiction_waits_again_after_it_was_settled():
+def test_a_job_quarantined_by_contradiction_waits_again_after_it_was_settled():
     twice = [Awarded(f"r{i}:a", f"r{i}", "a", "arm_0", "q", 0, 1.0) for i in range(2)]
     ledger = Ledger().replay([JobsAccepted((spec("a"), spec("b"))), *twice])
     assert [(each.job, each.state) for each in ledger.status()] == [("a", "unfinished"), ("b", "waiting")]

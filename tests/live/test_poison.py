@@ -48,7 +48,7 @@ from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Assignment
 from fleet.live.clock import FleetClock
-from fleet.live.journal import Journal, put_aside
+from fleet.live.journal import Journal, quarantine
 from fleet.motion import Plan
 from fleet.robot import ThermalLimits
 from tests.profiles import examples
@@ -290,7 +290,7 @@ def test_a_plan_that_takes_too_long_is_the_reason_and_the_next_job_is_quoted(sma
     assert len(steps) > 2
 
 
-def test_a_poisonous_award_in_a_journal_is_put_aside_and_the_rest_is_reported(tmp_path):
+def test_a_poisonous_award_in_a_journal_is_quarantined_and_the_rest_is_reported(tmp_path):
     """A journal of an earlier version, which had no bounds."""
     good = AwardAccepted(Award("good", "r", "x", "q", JOB))
     poison = json.loads(encode(AwardAccepted(Award("poison", "r", "x", "q", JOB))))
@@ -299,7 +299,7 @@ def test_a_poisonous_award_in_a_journal_is_put_aside_and_the_rest_is_reported(tm
     path, aside = tmp_path / "a.journal", tmp_path / "a.aside"
     path.write_bytes(b'{"crc":"%08x","records":%s}\n' % (zlib.crc32(records), records))
     for _ in range(2):
-        with Journal(path, ArmRecord, put_aside=put_aside(aside, "a")) as book:
+        with Journal(path, ArmRecord, quarantine=quarantine(aside, "a")) as book:
             history = ArmHistory().replay(book.records()).after_restart("a", 0.0)
             book.rewrite(*history.compact())
     assert set(history.reports) == {"good"}

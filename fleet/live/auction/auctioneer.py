@@ -167,7 +167,7 @@ def _objection_to_job(fleet: SteeredFleet, action: Cancel | Settle | Change) -> 
         if action.job in fleet.aside:
             if isinstance(action, Settle):
                 return ""
-            raise Refused(f"'{action.job}' is put aside, and its description is lost: settle it as done or redo.")
+            raise Refused(f"'{action.job}' is quarantined, and its description is lost: settle it as done or redo.")
         raise Refused(f"There is no job '{action.job}'.")
     state = entry.state
     match action:

@@ -1,9 +1,9 @@
 """Jobs and awards of an auctioneer, and what can be asked about them; `fleet.live.auction.ledger` changes them.
 
-State of a ledger: how a snapshot holds it, which records contradict it, and jobs that are put aside.
+State of a ledger: how a snapshot holds it, which records contradict it, and jobs that are quarantined.
 
 A journal can be undamaged and yet wrong: written by a version with an error or other bounds, or edited by hand. What
-contradicts is put aside with its jobs, which no arm does until a person has settled them; the rest goes on. Each line
+contradicts is quarantined with its jobs, which no arm does until a person has settled them; the rest goes on. Each line
 begins with what the line before has changed (`Checked`), so a missing record is noticed, too.
 
 Ledger of an auctioneer: journal records of its jobs and awards, and the state that follows from them alone.
@@ -51,7 +51,7 @@ from fleet.live.auction.records import (
     HistoryAdopted,
     JobChange,
     JobEntry,
-    JobsPutAside,
+    JobsQuarantined,
     LedgerSnapshot,
     Operated,
     PastJobs,
@@ -65,7 +65,7 @@ from fleet.live.journal import (
     CommitPermitted,
     EpochBegun,
     JobsAccepted,
-    PutAside,
+    Quarantine,
     SpaceCleared,
     SpaceTaken,
     Started,
@@ -78,8 +78,8 @@ MAX_RECENT = HISTORY
 
 
 def reason_of_aside(reason: str) -> str:
-    """Return why a job is unfinished that is put aside."""
-    return f"Put aside, because the journal is wrong about it: {reason}. Settle it as done or redo."
+    """Return why a job is unfinished that is quarantined."""
+    return f"Quarantined, because the journal is wrong about it: {reason}. Settle it as done or redo."
 
 
 @dataclass
@@ -131,7 +131,7 @@ class LedgerView:
     """Hashes of the last requests of people that were carried out, by name, oldest first; 0 for unknown."""
 
     aside: dict[str, str] = field(default_factory=dict[str, str])
-    """Why jobs are put aside of which only the name is known, by name."""
+    """Why jobs are quarantined of which only the name is known, by name."""
     checks: int = 0
     """Number of the last `Checked` record."""
     unchecked: set[str] = field(default_factory=set[str], repr=False, compare=False)
@@ -304,7 +304,7 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
     def _aside_jobs(self) -> list[str]:
         return [*self.aside, *(name for name, entry in self.jobs.items() if entry.aside)]
 
-    def _put_aside(self, reasons: Mapping[str, str]) -> None:
+    def _quarantine(self, reasons: Mapping[str, str]) -> None:
         """Have no arm do these jobs until a person has settled them, except for one that may have it already.
 
         As it is unknown where that arm is, every arm may be anywhere until it says where it is.
@@ -356,7 +356,7 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
             for name in broken.keys() & self.jobs.keys():
                 if self.jobs[name].award not in self.awards:
                     self.jobs[name].award = ""
-            self._put_aside(broken)
+            self._quarantine(broken)
 
     def _note_followers(self, entries: Iterable[JobEntry]) -> None:
         """Note which jobs these wait for."""
@@ -518,13 +518,13 @@ MAX_AWARDS = 16
 class Ledger(LedgerState):
     """Jobs and awards; only `apply` changes it."""
 
-    def replay(self, records: Iterable[AuctionRecord], put_aside: PutAside | None = None) -> Self:
+    def replay(self, records: Iterable[AuctionRecord], quarantine: Quarantine | None = None) -> Self:
         """Apply records, oldest first, and return the ledger.
 
-        Records that contradict those before are not applied, and their jobs are put aside.
+        Records that contradict those before are not applied, and their jobs are quarantined.
 
         Args:
-            put_aside: Gets each of these records, with the reason; None: it is logged.
+            quarantine: Gets each of these records, with the reason; None: it is logged.
         """
         before, doubts = set(self._aside_jobs()), 0
         for record in records:
@@ -533,9 +533,9 @@ class Ledger(LedgerState):
                 continue
             doubts += 1
             _LOG.error("A record of the journal is wrong, %s: %s", found.reason, record)
-            if put_aside is not None:
-                put_aside(encode(record), found.reason)
-            self._put_aside(dict.fromkeys(found.jobs, found.reason))
+            if quarantine is not None:
+                quarantine(encode(record), found.reason)
+            self._quarantine(dict.fromkeys(found.jobs, found.reason))
             if isinstance(record, Checked):
                 self._apply_check(record)
         aside = [name for name in self._aside_jobs() if name not in before]
@@ -601,8 +601,8 @@ class Ledger(LedgerState):
                 self.operated += 1
                 self.operations.append(record)
                 changed = self._operate(record)
-            case JobsPutAside():
-                self._put_aside(record.jobs)
+            case JobsQuarantined():
+                self._quarantine(record.jobs)
             case Checked():
                 self._apply_check(record)
             case LedgerSnapshot():

@@ -205,7 +205,7 @@ class AuctionNode:
         self._timing = timing or Timing()
         self._cell = cell
         self._check_no_auctioneer()
-        ledger = Ledger(places, arms).replay(own_records(journal, name), journal.put_aside)
+        ledger = Ledger(places, arms).replay(own_records(journal, name), journal.quarantine)
         if not (ledger.epoch or new_epoch):
             check_begin(link.fleet, ask_arms(link))
         real_s = time.monotonic()

@@ -25,7 +25,7 @@ from fleet.live.journal import (
     CommitPermitted,
     EpochBegun,
     JobsAccepted,
-    PutAside,
+    Quarantine,
     Salvage,
     SpaceCleared,
     SpaceTaken,
@@ -34,7 +34,7 @@ from fleet.live.journal import (
 from fleet.live.space import ANYWHERE
 
 MAX_REASON = 300
-"""Characters of the reason for which a job is put aside."""
+"""Characters of the reason for which a job is quarantined."""
 
 
 class HistoryAdopted(msgspec.Struct, frozen=True, tag="history_adopted"):
@@ -149,7 +149,7 @@ class JobEntry(msgspec.Struct):
     arm: str = ""
     """The arm that had it last, if `award` does not say."""
     aside: str = ""
-    """Why it is put aside; "" if it is not. It stays unfinished until an arm reports it finished, or a person settles
+    """Why it is quarantined; "" if it is not. It stays unfinished until an arm reports it finished, or a person settles
     it."""
 
     @property
@@ -171,7 +171,7 @@ class Checked(msgspec.Struct, frozen=True, tag="checked"):
     paused: dict[str, str] = {}
 
 
-class JobsPutAside(msgspec.Struct, frozen=True, tag="jobs_put_aside"):
+class JobsQuarantined(msgspec.Struct, frozen=True, tag="jobs_put_aside"):
     """Jobs whose records cannot be read, with the reason."""
 
     jobs: dict[str, str]
@@ -218,7 +218,7 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
 
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
-JobRecord = JobsAccepted | JobsPutAside | Expired | HistoryAdopted | Operated
+JobRecord = JobsAccepted | JobsQuarantined | Expired | HistoryAdopted | Operated
 SpaceRecord = SpaceTaken | SpaceCleared
 AuctionRecord = (
     Started | EpochBegun | ClockTick | Checked | JobRecord | AwardRecord | SpaceRecord | ShiftEnded | LedgerSnapshot
@@ -233,11 +233,11 @@ def job_of(award: str) -> str:
 # Records that cannot be read
 
 
-def salvage(put_aside: PutAside) -> Salvage[AuctionRecord]:
+def salvage(quarantine: Quarantine) -> Salvage[AuctionRecord]:
     """Return what to do with a record that cannot be read: put it aside, and go on with its other jobs."""
 
     def put(record: bytes, reason: str) -> list[AuctionRecord]:
-        put_aside(record, reason)
+        quarantine(record, reason)
         return rest_of(record, reason)
 
     return put
@@ -275,7 +275,7 @@ def rest_of(raw: bytes, reason: str) -> list[AuctionRecord]:
             raise JournalError(f"The journal's record of all jobs cannot be read: {error}.") from error
         bad.add(_job_in(fields))
     bad.discard("")
-    return [*rest, JobsPutAside(dict.fromkeys(sorted(bad), reason[:MAX_REASON]))] if bad else rest
+    return [*rest, JobsQuarantined(dict.fromkeys(sorted(bad), reason[:MAX_REASON]))] if bad else rest
 
 
 def _is_readable(item: object, kind: type[msgspec.Struct]) -> bool:

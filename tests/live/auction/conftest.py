@@ -28,7 +28,7 @@ from fleet.bus.router import Router
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.rounds import Assignment
-from fleet.live.journal import Journal, put_aside
+from fleet.live.journal import Journal, quarantine
 from tests.waiting import PATIENCE_S
 
 
@@ -119,7 +119,7 @@ class Bus:
         with ExitStack() as resources:
             link = resources.enter_context(BusClient(self.endpoint, "f"))
             path = self.folder / folder / name
-            extra["put_aside"] = salvage(put_aside(path.with_suffix(".aside"), name))
+            extra["quarantine"] = salvage(quarantine(path.with_suffix(".aside"), name))
             journal = resources.enter_context(Journal[AuctionRecord](path, AuctionRecord, **extra))
             node = AuctionNode(link, name, journal, **{"allocate": first_come, "speed": 60.0, **options})
             node.resources = self.stack.enter_context(resources.pop_all())

@@ -200,7 +200,7 @@ def test_an_auctioneer_with_a_poisonous_job_goes_on_reports_it_and_has_it_settle
         node = bus.auctioneer()
         bus.until(lambda: arm.done == ["good"])
         (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(("poison",)), Status).messages.values()
-        assert [(job.state, job.reason.startswith("Put aside")) for job in status.jobs] == [("unfinished", True)]
+        assert [(job.state, job.reason.startswith("Quarantined")) for job in status.jobs] == [("unfinished", True)]
         assert not node.submit(Submission(bus.jobs("poison", place="bin"))).jobs[0].accepted
         bus.kill(node)
     assert "60000" in path.with_suffix(".aside").read_text()
