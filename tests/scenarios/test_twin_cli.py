@@ -146,7 +146,6 @@ def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_to
         (["report", "--log", "HERE"], "holds no log; a log ends in"),
         (["identify", "--log", "HERE/nowhere"], "nowhere"),
         (["generate", "quickstart", "--twins", "HERE"], "holds no twin"),
-        (["generate", "quickstart", "--format", "npz"], "No format 'npz'."),
         (["recover", "quickstart", "--posture", "raisd"], "No posture 'raisd'; did you mean 'raised'?"),
     ],
 )
