@@ -211,7 +211,7 @@ def test_a_killed_training_blocks_nothing(tmp_path, ground, monkeypatch, calls) 
 def test_ctrl_c_before_the_first_state_leaves_no_training(tmp_path, cache, monkeypatch) -> None:
     out = tmp_path / "ppo"
 
-    def interrupt(*args):
+    def interrupt(*args, **options):
         raise KeyboardInterrupt
 
     def trained_after(**more):
