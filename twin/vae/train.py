@@ -364,8 +364,8 @@ def train(
     still = [bool(part.all()) for part in np.split(scaler.still, len(names))]
     checked = [_checked(*each, arm, config) for each in zip(names, results, still, strict=True)]
     fits, nets = zip(*checked, strict=True)
-    about = {"arm": arm, "data_hash": hash_records(records), "seed": seed_text(seed)}
-    return Twin(config, scaler, list(nets), fits=fits, **about)
+    data_hash = hash_records(records)
+    return Twin(config, scaler, list(nets), arm=arm, data_hash=data_hash, seed=seed_text(seed), fits=fits)
 
 
 def _checked(
