@@ -1,4 +1,4 @@
-"""Grants, claims and space, step by step; random faults are in `test_council_storm`."""
+"""Grants, claims and space, step by step; random faults are in `test_simulation`."""
 
 import re
 from contextlib import nullcontext
