@@ -18,7 +18,7 @@ from fleet.live.auction import auctioneer as auctioneer_module
 from fleet.live.auction import rounds as round_module
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.ledger import Ledger, LedgerView
-from fleet.live.auction.records import Awarded, Checked, Operated, PastJobs
+from fleet.live.auction.records import Awarded, Checked, Operated, PastJobs, content_hash
 from fleet.live.auction.rounds import LedgerWriter, Timing
 from fleet.live.consensus.grants import Claimant, Granter
 from fleet.live.consensus.jobs import JobGranted
@@ -293,11 +293,11 @@ def _ignores(action: type) -> Callable[[Any], Any]:
     """Record a request of this kind, and change nothing."""
 
     def make(operate: Any) -> Any:
-        def patched(self: Any, request: ControlRequest, time_s: float) -> Any:
-            if isinstance(request.action, action):
-                self.requests[request.request] = None
+        def patched(self: Any, record: Operated) -> Any:
+            if isinstance(record.request.action, action):
+                self.requests[record.request.request] = content_hash(record.request)
                 return []
-            return operate(self, request, time_s)
+            return operate(self, record)
 
         return patched
 
@@ -356,7 +356,7 @@ add_mutation(
         Ledger,
         "_operate",
         lambda operate: (
-            lambda self, request, time_s: (operate(self, request, time_s), self.requests.pop(request.request, None))[0]
+            lambda self, record: (operate(self, record), self.requests.pop(record.request.request, None))[0]
         ),
     ),
     alone=False,
