@@ -182,7 +182,7 @@ def soak(path: Path, jobs: int, arms: int) -> tuple[list[Sample], int]:
 
 
 def restart_s(folder: Path) -> float:
-    """Return how long an auctioneer with as many open jobs as it may have takes to start, s."""
+    """Return the start-up time of an auctioneer with the largest number of open jobs, s."""
     path = folder / "open.journal"
     with Journal[AuctionRecord](path, AuctionRecord, sync=lambda file: None) as journal:
         week = Week(journal, Disk(), 4, MAX_OPEN_JOBS)
