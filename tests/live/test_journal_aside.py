@@ -20,7 +20,7 @@ from fleet.live import journal as journal_module
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, ReportReceived
 from fleet.live.auction.auctioneer import objection
 from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.records import AuctionRecord, Awarded, Operated, salvage
+from fleet.live.auction.records import AuctionRecord, Awarded, Checked, Operated, salvage
 from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted, Journal, Progress, Started, quarantine
 from tests.live.simulated import SimulatedFleet
 from tests.profiles import examples
@@ -33,12 +33,19 @@ def spec(name: str, *after: str, repetitions: int = 3) -> JobSpec:
     return JobSpec(name=name, kind="hold", places=(f"place of {name}",), after=after, **terms)
 
 
+class WronglyRemembered(SimulatedFleet):
+    """A fleet in which two arms may have a quarantined job for a while, which only one of them finishes."""
+
+    def _check_holders(self) -> None:
+        pass
+
+
 class Worked:
     """A fleet that has worked, and the records of its auctioneer, which are compacted at most once."""
 
     def __init__(self, seed: int) -> None:
         rng = random.Random(seed)
-        self.fleet = fleet = SimulatedFleet(False, 2, seed=seed)
+        self.fleet = fleet = WronglyRemembered(False, 2, seed=seed)
         with self.running():
             fleet.start()
             fleet.submit(*(spec(f"j{i}", repetitions=rng.randint(1, 4)) for i in range(3)))
@@ -60,6 +67,8 @@ class Worked:
         self.file = fleet.world.processes[AUCTIONEER].disk.names["auction"]
         lines = [msgspec.json.decode(line)["records"] for line in self.file.data.splitlines()]
         self.journal = [record for line in lines for record in msgspec.convert(line, list[AuctionRecord])]
+        self.checked = max(i for i, record in enumerate(self.journal) if isinstance(record, Checked))
+        """Place of the last check: no journal can tell that a later record is missing."""
 
     @contextmanager
     def running(self):
@@ -145,7 +154,7 @@ def names_in(*records) -> set[str]:
 def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice(seed, kind, index, rng):
     records, arms = worked(seed).journal, worked(seed).fleet.arms
     whole = Ledger(arms=arms).replay(records)
-    index = 1 + index % (len(records) - 1)  # without the snapshot, which is the whole journal
+    index = 1 + index % worked(seed).checked  # without the snapshot, which is the whole journal
     journal = wrong_journal(records, kind, index, rng)
     if journal is None:
         return
@@ -168,8 +177,8 @@ def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice
 
     again = Worked(seed)
     sent = again.fleet.sent.messages
-    for key in list(sent):  # a result may repeat the field that was changed, and a request its number
-        if kind == "changed" or key[0] == "operations":
+    for key in list(sent):  # results may repeat a changed field, or the number of a missing one, and requests a number
+        if kind in ("changed", "deleted") or key[0] == "operations":
             del sent[key]
     again.go_on(journal)  # the rules of the simulation are checked
     assert max(again.fleet.finished.values(), default=0) <= 1
