@@ -201,6 +201,7 @@ for name in sys.argv[1:]:
 """
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize(
     "names", [("scenario", "message", "key", "jobs", "journal", "log", "settings"), ("checkpoint",)]
 )

@@ -168,6 +168,7 @@ def played(world, policy, *, seed=0, weights=WEIGHTS):
     return ShiftSimulator(world, weights, 1, simulator=lambda: simulator_of(world, weights)).follow([policy])
 
 
+@pytest.mark.ci_slow
 @settings(max_examples=15)
 @given(seed=st.integers(0, 10_000), hot=st.booleans(), moment=st.sampled_from([50.0, 100.0]))
 def test_no_job_before_its_release_changes_a_claim(small, seed, hot, moment):
@@ -185,6 +186,7 @@ def test_no_job_before_its_release_changes_a_claim(small, seed, hot, moment):
     assert early[0] == early[1] == early[2]
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("seed", range(5))
 def test_it_finds_the_proven_optimum_where_all_jobs_are_known(small, seed):
     """Without a price of time: the whole reward of the shift is before its eyes."""

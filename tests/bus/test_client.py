@@ -289,6 +289,7 @@ def test_a_closed_line_says_so(bus):
         link.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=0, time_s=0.0, kind="finish"))
 
 
+@pytest.mark.ci_slow
 def test_a_line_closes_soon_though_a_router_that_stands_still_has_taken_its_call():
     """In place of the router is somebody who accepts and never says a word; Zenoh itself would wait for ten seconds."""
 

@@ -515,6 +515,7 @@ def test_a_key_is_used_as_the_registry_says_or_not_at_all(channel):
         client.reply_to(key, messages.Refusal, print)
 
 
+@pytest.mark.ci_slow
 def test_the_committed_documents_are_current(capsys):
     assert main(["--check"]) == 0
     names = (

@@ -231,6 +231,7 @@ def outside(port: int, fleet: str) -> Iterator[Outsider]:
         yield Outsider(session, fleet)
 
 
+@pytest.mark.ci_slow
 def test_a_simulated_shift_is_as_the_contract_says(folder, port):
     words = ("run", folder / "cell.toml", "--difficulty", "blind", "--listen", port, "--out", folder / "run")
     with started(folder, *words) as shift, outside(port, "cell") as outsider:
@@ -243,6 +244,7 @@ def test_a_simulated_shift_is_as_the_contract_says(folder, port):
     assert not any(seen for name, seen in outsider.seen.items() if name not in ARM)
 
 
+@pytest.mark.ci_slow
 def test_a_live_fleet_is_as_the_contract_says(folder, port):
     words = ("up", folder / "cell.toml", "--difficulty", "blind", "--speed", 20, "--jobs", "none", "--port", port)
     words += ("--policy", "bus:mine", "--out", folder / "up")
@@ -263,6 +265,7 @@ def test_a_live_fleet_is_as_the_contract_says(folder, port):
     assert not any(outsider.seen[name] for name in CONSENSUS)
 
 
+@pytest.mark.ci_slow
 def test_a_fleet_without_an_auctioneer_is_as_the_contract_says(folder, port):
     """Two of three arms are there, a majority; in the name of the third the outsider claims nothing."""
     at = ("--endpoint", f"tcp/127.0.0.1:{port}", "--difficulty", "blind", "--speed", 20, "--policy", "consensus")

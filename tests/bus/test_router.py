@@ -146,6 +146,7 @@ def test_a_port_is_a_port(port):
         Router(port)
 
 
+@pytest.mark.ci_slow
 def test_a_client_waits_for_a_router_until_it_is_stopped():
     with Router() as first:
         endpoint = first.endpoint

@@ -171,6 +171,7 @@ def test_a_router_with_tls_may_listen_elsewhere_and_without_it_not(folder):
         Router(host="a b/c", tls=Tls(folder, "router"))
 
 
+@pytest.mark.ci_slow
 def test_rubbish_at_the_door_harms_no_line_that_is_open_and_delays_new_ones_alone(guarded, folder):
     """Zenoh waits 0.1 s after every handshake that fails."""
     host, port = guarded.endpoint.removeprefix("tls/").split(":")

@@ -111,6 +111,7 @@ def test_global_generators_are_neither_read_nor_changed(make, batch, play) -> No
     assert results[0] == results[1]
 
 
+@pytest.mark.ci_slow
 def test_processes_with_different_hash_seeds_agree(small, play) -> None:
     runs = [
         subprocess.run(

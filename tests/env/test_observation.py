@@ -441,6 +441,7 @@ def test_the_peers_are_the_nearest_in_space(name, peers) -> None:
         np.testing.assert_allclose(np.linalg.norm(mounts_m[list(own)] - mounts_m[a], axis=1), far_m[a, 1:])
 
 
+@pytest.mark.ci_slow
 def test_fields_of_the_nearest_peers_equal_those_of_all_peers(plans) -> None:
     options = {"difficulty": "blind", "cache": plans, "horizon_s": 600}
     all_, few = (make_batch("quickstart", 3, seed=5, peers=n, **options) for n in (None, 2))

@@ -253,6 +253,7 @@ def test_pictures_have_one_size_and_repeat(arms) -> None:
 words = st.text(max_size=60)
 
 
+@pytest.mark.ci_slow
 @example("\U000e0000", "press", "crate", "")  # a name without any outline
 @given(words, words, words, words)
 def test_any_name_can_be_drawn(arm, station, job, title) -> None:

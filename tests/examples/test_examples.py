@@ -22,6 +22,7 @@ def example(name: str) -> ModuleType:
     return module
 
 
+@pytest.mark.ci_slow
 def test_own_policy_finishes_a_shift(capsys) -> None:
     example("own_policy").main(horizon_s=1800, difficulty="oracle")
     output = capsys.readouterr().out

@@ -14,6 +14,7 @@ from tests.examples.programs import killed_afterwards, program, running, started
 from tests.waiting import PATIENCE_S, serve_until
 
 
+@pytest.mark.ci_slow
 def test_the_examples_alone_make_a_fleet(bus):
     port, link = bus
     watcher, statuses = link(), []
@@ -37,6 +38,7 @@ def test_the_examples_alone_make_a_fleet(bus):
     assert watcher.malformed == 0
 
 
+@pytest.mark.ci_slow
 def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
     """The auctioneer, an arm and a submitter written from docs/bus alone."""
     port, link = bus

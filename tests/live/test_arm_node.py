@@ -201,6 +201,7 @@ def test_a_dry_run_changes_nothing(bus):
     assert list(arm.book.records()) == before
 
 
+@pytest.mark.ci_slow
 def test_the_cycle_in_progress_counts_when_the_award_is_revoked_and_the_arm_is_at_home_then(bus):
     auctioneer, line = Auctioneer(bus.link()), bus.link()
     arm = bus.arm(speed=5.0)  # a cycle of 11 s takes more than three lease requests
@@ -236,6 +237,7 @@ def test_a_stopped_arm_returns_its_job_as_sure(bus):
     assert not bus.ask(line, "award", award(again.quote, name="w2"), Ack).accepted
 
 
+@pytest.mark.ci_slow
 def test_a_faulted_arm_returns_its_job_with_the_cycles(bus):
     auctioneer, line, events = Auctioneer(bus.link()), bus.link(), []
     line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
@@ -254,6 +256,7 @@ def test_a_faulted_arm_returns_its_job_with_the_cycles(bus):
     assert bus.ask(line, "quote", request(), Quote).capacity == 0
 
 
+@pytest.mark.ci_slow
 def test_a_person_clears_the_fault_of_an_arm_and_journal_and_event_name_the_person(bus):
     auctioneer, line, events = Auctioneer(bus.link()), bus.link(), []
     line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)

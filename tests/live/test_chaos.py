@@ -66,6 +66,7 @@ def test_a_fleet_with_certificates_refuses_intruders():
     assert opened == 0
 
 
+@pytest.mark.ci_slow
 def test_a_fault_that_this_machine_cannot_inject_is_skipped_and_not_passed():
     told = strike("clock-jump", jobs=12, env=os.environ | {"PATH": ""})
     assert told.returncode == 2, told.stdout + told.stderr

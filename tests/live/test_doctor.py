@@ -184,6 +184,7 @@ def doctor(endpoint, *options):
     return done.returncode, " ".join((done.stdout + done.stderr).split())
 
 
+@pytest.mark.ci_slow
 def test_a_healthy_fleet_gives_exit_code_0():
     with Router() as router, participants(router.endpoint):
         code, output = doctor(router.endpoint)
@@ -204,6 +205,7 @@ def test_an_unhealthy_fleet_gives_exit_code_1_and_all_reasons():
         assert says in output
 
 
+@pytest.mark.ci_slow
 def test_the_option_no_auctioneer_expects_none():
     with Router() as router, participants(router.endpoint, clocks=0):
         code, output = doctor(router.endpoint)
@@ -219,6 +221,7 @@ def test_a_router_without_a_fleet_is_not_healthy():
     assert "replies. No fleet found" in output
 
 
+@pytest.mark.ci_slow
 def test_a_missing_router_gives_exit_code_2_and_the_command_to_start_one():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -228,6 +231,7 @@ def test_a_missing_router_gives_exit_code_2_and_the_command_to_start_one():
     assert f"thermofleet bus router --port {port}" in output
 
 
+@pytest.mark.ci_slow
 def test_another_server_at_the_port_is_recognised():
     with socket.create_server(("127.0.0.1", 0)) as other:
         code, output = doctor(f"tcp/127.0.0.1:{other.getsockname()[1]}")

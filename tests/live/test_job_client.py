@@ -216,6 +216,7 @@ def told(done: subprocess.CompletedProcess[str]) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
+@pytest.mark.ci_slow
 def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
     def command(*words):
         return told(commands.run(*words, "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"))

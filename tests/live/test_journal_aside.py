@@ -149,6 +149,7 @@ def names_in(*records) -> set[str]:
     return named | ({"next"} if "j0" in named else set())
 
 
+@pytest.mark.ci_slow
 @examples(300)
 @given(st.integers(0, 5), st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
 def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice(seed, kind, index, rng):

@@ -245,6 +245,7 @@ def slower(small, plan):
     return replace(plan, speed=0.6, cycle=small.phase(1.5 * plan.cycle.duration_s, tau))
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize(("error_c", "crowding"), [(75.0, 0.4), (40.0, 0.2)])
 def test_a_live_policy_observes_what_it_observes_in_simulation(small, error_c, crowding):
     works = [small.work(place, kg) for place in ("bench", "press", "rack") for kg in (small.LIGHT, small.HOT)]

@@ -252,6 +252,7 @@ def test_no_message_is_lost_when_the_router_restarts(tmp_path):
     assert recording.recorder.counts["telemetry of a"].missed == 0
 
 
+@pytest.mark.ci_slow
 def test_gaps_are_fetched_from_the_publishers_cache_or_become_rows(tmp_path):
     """A publisher sends numbers 0 and 3 live; its cache has 1, and nobody has 2."""
     with Router() as router, BusClient(router.endpoint, "f") as boss, Recording(router.endpoint, tmp_path) as recording:

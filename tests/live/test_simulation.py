@@ -26,12 +26,14 @@ def simulate(*arguments, hash_seed="0"):
     )
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("first", [0, 8])
 def test_no_rule_is_broken_under_faults(first):
     done = simulate("--first", str(first), "--seeds", "8")
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.ci_slow
 def test_a_seed_repeats_the_same_events_in_every_process():
     one, other = (simulate("--seed", "3", hash_seed=seed) for seed in ("1", "2"))
     assert one.returncode == 0, one.stdout[-2000:] + one.stderr

@@ -209,6 +209,7 @@ SLOW = ("plain", "another authority")
 """Tried until the time for it is over: with one command each."""
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize(
     ("command", "how"),
     [(command, how) for command in COMMANDS for how in WRONG if how not in SLOW or command == "doctor"],

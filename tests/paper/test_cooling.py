@@ -108,6 +108,7 @@ def test_a_joint_settles_lower_with_every_active_cooling_and_later_with_every_pa
     assert rows["immersion"]["whole_w_per_k"] / rows["liquid"]["whole_w_per_k"] == pytest.approx(3.7)
 
 
+@pytest.mark.ci_slow
 def test_an_immersed_fleet_is_cooler_on_the_same_seeds(plans):
     rows = fleet_rows(
         override(load("active_waiting"), horizon_s=1800.0),
@@ -123,6 +124,7 @@ def test_an_immersed_fleet_is_cooler_on_the_same_seeds(plans):
     assert immersed["value"]["mean"] >= still["value"]["mean"]
 
 
+@pytest.mark.ci_slow
 def test_where_people_are_near_a_careful_policy_keeps_the_surfaces_touchable(plans):
     """Margins from seeds 100 to 119: 4 minutes a shift under `thermometer`, 23 under `round_robin`, equal value."""
     fleet, seeds = prepare(load("people_near"), difficulty="blind", cache=plans), range(8)

@@ -38,6 +38,7 @@ def squares(numbers, missing):
 UNITS = [Unit(("1", "2"), partial(squares, (1, 2))), Unit(("3",), partial(squares, (3,)))]
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_stopped_study_continues_with_the_missing_rows(tmp_path, workers, capsys) -> None:
     file = tmp_path / "rows.jsonl"
@@ -173,6 +174,7 @@ def rows_of(subject, configurations):
     return [row for _, row in sweep_rows(subject, configurations, keys)]
 
 
+@pytest.mark.ci_slow
 def test_only_the_asked_rows_are_trained(subjects, monkeypatch):
     trained = []
     monkeypatch.setattr(sweep, "train", lambda *args, **names: trained.append(1) or train(*args, **names))
@@ -187,6 +189,7 @@ def test_only_the_asked_rows_are_trained(subjects, monkeypatch):
 train = sweep.train
 
 
+@pytest.mark.ci_slow
 def test_networks_up_to_the_carrier_only(subjects):
     """Joint 2 of a standing arm carries, so two networks are trained, and d of that joint is all there is."""
     alone = replace(subjects[0], carrier_only=True)
@@ -276,6 +279,7 @@ def test_the_regressor_learns_heat_from_torque(make_heat_jobs):
         train_regressor(plans[:40], [1] * 40, rise_k[:3], TwinConfig(), 0, steps=1)
 
 
+@pytest.mark.ci_slow
 def test_rows_of_each_model_and_amount(monkeypatch, subjects):
     monkeypatch.setattr(sweep, "JOBS", (3, 6))
     monkeypatch.setattr(sweep, "STEPS", 3)

@@ -40,6 +40,7 @@ def made_up(file: list[str], d: list[float], rms: list[float], temp_c: list[floa
     )
 
 
+@pytest.mark.ci_slow
 def test_a_lead_over_rms_torque_has_an_interval_over_files() -> None:
     """d ranks every window rightly, RMS torque is constant: AUROC 1 and ½ in every resample of the files."""
     file = [name for name in "abcdef" for _ in range(4)]
@@ -57,6 +58,7 @@ def test_a_lead_over_rms_torque_has_an_interval_over_files() -> None:
     assert answers(made_up(file, alone, alone, alone)) == {}
 
 
+@pytest.mark.ci_slow
 def test_the_forecast_is_judged_where_the_network_predicts() -> None:
     file = [name for name in "abcd" for _ in range(4)]
     before, after = np.full(16, 35.0), np.array([45.0, 35.0] * 8)
@@ -126,6 +128,7 @@ def heated(name: str, load: float, rng: np.random.Generator) -> Recording:
     )
 
 
+@pytest.mark.ci_slow
 def test_a_known_load_tells_more_than_the_present_temperature():
     rng = np.random.default_rng(1)
     recordings = [heated(f"log {i}", load, rng) for i, load in enumerate(np.linspace(2.0, 6.0, 6))]

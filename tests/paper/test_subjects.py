@@ -81,6 +81,7 @@ def test_what_is_learned_from_stays_cool_and_the_test_does_not(study):
     assert np.array_equal(study.critical, (study.test.peak_c >= 60.0).any(axis=1))
 
 
+@pytest.mark.ci_slow
 def test_the_same_seed_makes_the_same_study_and_another_another(study):
     again = make_study(SEED, **SIZES)
     assert np.array_equal(again.test.peak_c, study.test.peak_c)
@@ -90,6 +91,7 @@ def test_the_same_seed_makes_the_same_study_and_another_another(study):
     assert not np.allclose(other.motors.idle_w, study.motors.idle_w)
 
 
+@pytest.mark.ci_slow
 def test_exploration_takes_the_place_of_work_and_leaves_the_rest_as_it_is(study):
     explored = make_study(SEED, **SIZES, exploration=5)
     assert len(explored.train) == SIZES["train"]
@@ -230,6 +232,7 @@ def test_invalid_scores_are_refused(score, peak_c, reference, says):
         detection(score, peak_c, limit_c=60.0, reference=reference)
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("draw", ["normal", "exponential", "coarse"])
 @pytest.mark.parametrize("n", [19, 150])
 def test_false_alarms_have_the_stated_rate_for_any_distribution(draw, n):
@@ -253,6 +256,7 @@ def test_jobs_fill_the_horizon(study):
         assert (times - 1) * plan.cycle.duration_s < study.horizon_s
 
 
+@pytest.mark.ci_slow
 def test_logs_of_cool_jobs_identify_the_arm(study):
     """Nearer to the truth than a nominal arm, for jobs that overheat too, none of which was logged."""
     jobs, start_c = study.test, np.full(NODES, study.ambient_c)

@@ -229,6 +229,7 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
         references(tasks, path, Budget(seconds=1.0), difficulty="blind")
 
 
+@pytest.mark.ci_slow
 def test_a_budget_of_evaluations_gives_the_same_file_in_any_order(fleet: Fleet, tmp_path: Path):
     tasks = [Instance(f"three/{seed}", fleet.scenario, seed) for seed in (2, 10)]
     budget, plans = Budget(seconds=np.inf, evaluations=64, nodes=5), tmp_path / "plans"

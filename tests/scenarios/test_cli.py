@@ -57,6 +57,7 @@ def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml,
     assert said.err == ""
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("plant", ["profile", "mujoco"])
 def test_the_same_seed_gives_the_same_files_also_in_another_process(thermofleet, small_toml, tmp_path, plans, plant):
     one, two = tmp_path / "one", tmp_path / "two"

@@ -57,6 +57,7 @@ def printed(result: Comparison) -> str:
     return page.getvalue()
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("channel", [PERFECT, Channel(topology="line", delay_s=10.0)], ids=["perfect", "late"])
 def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, monkeypatch, channel):
     how = {"seeds": range(6), "channel": channel}
@@ -412,6 +413,7 @@ def rewards(thermofleet, file: Path, out: Path, names: Iterable[str]) -> dict[st
     return found
 
 
+@pytest.mark.ci_slow
 def test_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path) -> None:
     assert rewards(thermofleet, small_toml, tmp_path / "out", QUICK) == QUICK
 

@@ -259,6 +259,7 @@ def test_the_ambient_temperature_is_that_of_the_scenario(points):
         assert ambient_of(scenario)(time_s) == np.interp(time_s, *zip(*points, strict=True))
 
 
+@pytest.mark.ci_slow
 def test_a_blind_arm_whose_plans_are_known_loads_no_physics(tmp_path):
     """64 of them on one machine would each take 50 MB more."""
     prepare(load("quickstart"), difficulty="blind", cache=tmp_path)

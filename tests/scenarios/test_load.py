@@ -363,6 +363,7 @@ LIBRARY = [pytest.param(name, marks=pytest.mark.slow if name == "scale_64" else 
 PLACES = {"middle": (0.0, 0.0, 0.25), "left": (-0.9, 0.3, 0.25), "moon": (9.0, 0.0, 0.2)}
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("name", LIBRARY)
 def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
     report = layout_report(load(name))
@@ -440,6 +441,7 @@ def test_problems_are_reported_all_at_once(cache):
         prepare_arm(cell(*TOGETHER, places=PLACES), "west", difficulty="blind", cache=cache)
 
 
+@pytest.mark.ci_slow
 def test_the_command_shows_the_cell_and_fails_if_there_are_problems(cache, tmp_path, capsys):
     def call(*arguments):
         with pytest.raises(SystemExit) as stop:

@@ -157,6 +157,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize(
     ("policy", "expected"),
     [

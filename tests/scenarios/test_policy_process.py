@@ -84,6 +84,7 @@ def test_the_process_does_what_the_same_rule_does_in_python(fleet, served, same_
     assert one.metrics.finished
 
 
+@pytest.mark.ci_slow
 def test_rows_are_the_same_on_one_and_two_processes_and_after_an_interruption(
     small_toml, plans, served, same_rule, tmp_path, monkeypatch
 ):
@@ -144,6 +145,7 @@ def test_few_requests_wait_for_a_process_and_the_oldest_are_dropped():
             assert ended.empty()
 
 
+@pytest.mark.ci_slow
 def test_compare_tells_the_failure_and_goes_on(small_toml):
     with Router() as router:
         options = ["--policies", f"wspt,bus:mine@{router.endpoint}", "--difficulty", "blind", "--seeds", "2", "--json"]

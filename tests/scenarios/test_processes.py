@@ -184,6 +184,7 @@ def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plan
     assert all(p.name.startswith(".run.") for p in where.iterdir())
 
 
+@pytest.mark.ci_slow
 def test_the_processes_of_a_killed_comparison_end_with_it(small_toml, tmp_path, plans):
     policy = tmp_path / "killer.py"
     policy.write_text(

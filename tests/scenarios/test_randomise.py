@@ -46,6 +46,7 @@ def test_a_constant_offset_equals_a_scenario_with_a_warmer_cell(thermofleet, sma
         assert one.reward != without.reward
 
 
+@pytest.mark.ci_slow
 def test_rows_do_not_depend_on_the_number_of_workers(small_toml, plans, monkeypatch):
     scenario = load(small_toml)
     study = study_of(scenario)

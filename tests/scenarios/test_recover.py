@@ -68,6 +68,7 @@ def test_the_hottest_motor_cools_and_is_cooler_than_without(subject, asked, name
     assert found.error_rad < 1e-3
 
 
+@pytest.mark.ci_slow
 def test_nothing_better_near_is_said(subject, asked):
     q = np.deg2rad(HOLDS["reaching"][0])
     start_c = hold_until(subject.arm, q, 3.0, ambient_c=23.0, until_c=50.0)
@@ -77,6 +78,7 @@ def test_nothing_better_near_is_said(subject, asked):
     assert "put the payload down" in str(said.value)
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("hold_s", [120.0, 240.0, 600.0])
 def test_every_allowed_time_of_a_hold_can_be_recovered(subject, asked, hold_s):
     """Also those longer than a hand takes to close or open, LONGEST_GRASP_S."""
@@ -99,6 +101,7 @@ def test_a_hold_of_another_time_is_refused(subject, asked, hold_s, said):
         recover(subject.twin, subject.arm, q, 3.0, start_c=np.full(14, 50.0), verification=asked, hold_s=hold_s)
 
 
+@pytest.mark.ci_slow
 def test_the_documented_command_recovers_an_arm(thermofleet, small_toml, subject, tmp_path):
     """`thermofleet twin recover quickstart --payload 3 --posture raised`, with a small cell and a small twin."""
     save(replace(subject.twin, arm="left"), tmp_path / "left.twin")

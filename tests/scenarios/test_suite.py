@@ -119,6 +119,7 @@ def test_three_quarters_of_the_arms_of_a_cell_can_work_at_once(cell) -> None:
 RESULTS = Path(__file__).parents[2] / "docs" / "results" / "leaderboard"
 
 
+@pytest.mark.ci_slow
 def test_stored_results_of_built_in_policies_repeat():
     """One shift of each, with the present code: a change of a policy needs new results."""
     found = [each for each in read_all(RESULTS, "test") if not each.card.policy_hash]

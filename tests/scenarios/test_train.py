@@ -47,6 +47,7 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
+@pytest.mark.ci_slow
 def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> None:
     out = tmp_path / "learned"
     done, told = trained(out, cache)

@@ -76,6 +76,7 @@ def study_of(scenario: Scenario, *policies: str, seeds: int = 3, **more) -> Stud
     return Study(**(how | more))
 
 
+@pytest.mark.ci_slow
 def test_rows_do_not_depend_on_processes_folders_and_blocks(scenario, plans, tmp_path, monkeypatch):
     study = study_of(scenario, seeds=5, fleets=2)
     alone = runner.run_study(study, cache_dir=plans, workers=1)
@@ -156,6 +157,7 @@ def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
         runner.run_study(study, out=tmp_path, cache_dir=plans, workers=1)
 
 
+@pytest.mark.ci_slow
 def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, tmp_path):
     names = {name: f"{bad}:{name}" for name in ("Raises", "Nonsense", "Needs", "Stuck", "Illegal", "Idle")}
     study = study_of(scenario, "round_robin", *names.values(), seeds=2, decision_limit_s=2.5)
@@ -207,6 +209,7 @@ with limit.watching(), limit.decision():
     assert "longer than 0.05 s, and the policy catches what should end it" in ended.stderr
 
 
+@pytest.mark.ci_slow
 def test_shifts_of_a_process_that_dies_are_run_again(scenario, plans, bad, monkeypatch):
     monkeypatch.setattr(runner, "HERE_S", 0.0)
     told: list[str] = []
@@ -275,6 +278,7 @@ def test_several_instances_are_told_apart_or_together(scenario, plans):
         comparisons(study, rows, "random")
 
 
+@pytest.mark.ci_slow
 def test_folders_of_trainings_are_one_policy(scenario, plans, tmp_path):
     for k in (0, 1, 10):
         save_pairs(np.eye(1, PARAMETERS)[0] * -9.0 * k, tmp_path / f"pairs-{k}")  # refuses warm jobs, then all
@@ -329,6 +333,7 @@ def test_a_row_without_outcome_has_a_sentence():
     assert row_of(columns(row)) == row
 
 
+@pytest.mark.ci_slow
 def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet, small_toml, bad, tmp_path):
     out = tmp_path / "study"
     how = ("--difficulty", "blind", "--seeds", "2", "--workers", "1", "--out", out)

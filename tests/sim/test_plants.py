@@ -458,6 +458,7 @@ def mixed_jobs(cell):
     )
 
 
+@pytest.mark.ci_slow
 def test_motor_temperatures_of_both_plants_agree_after_twenty_minutes(cell):
     world, plants = cell.shift(*mixed_jobs(cell), ticks=120)
     profile, simulated = (cell.work_through(world, plant, first=(2, 1)) for plant in plants.values())
@@ -469,6 +470,7 @@ def test_motor_temperatures_of_both_plants_agree_after_twenty_minutes(cell):
         np.testing.assert_array_equal(one.finished_s, other.finished_s)
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("kind", ["hold", "pick_place"])
 @pytest.mark.parametrize("name", ["profile", "mujoco"])
 def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_the_arm_goes_home(cell, name, kind):

@@ -366,6 +366,7 @@ def twin_of(windows: np.ndarray, config: TwinConfig, seed: int) -> Twin:
     return train(records, config, np.random.SeedSequence(seed), arm="swing")
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_training_is_worth_something(seed: int) -> None:
     rng = np.random.default_rng(seed)

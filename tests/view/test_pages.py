@@ -128,6 +128,7 @@ def luminance(rgb: np.ndarray) -> np.ndarray:
     return linear @ (0.2126, 0.7152, 0.0722)
 
 
+@pytest.mark.ci_slow
 def test_words_have_contrast_in_light_and_dark(browser: Browser, run_folder: Path) -> None:
     for scheme in ("light", "dark"):
         page = browser.new_page(color_scheme=scheme)  # pyright: ignore[reportArgumentType]

@@ -145,6 +145,7 @@ print(*places.min(axis=0), *places.max(axis=0), red - green, picture.max(axis=2)
 """
 
 
+@pytest.mark.ci_slow
 @pytest.mark.skipif(not has_egl(), reason="this machine has no EGL")
 def test_the_camera_holds_every_posture_and_sees_no_edge_of_the_floor(run_folder: Path) -> None:
     done = subprocess.run(
@@ -170,6 +171,7 @@ def test_the_pictures_follow_the_clock(run: RunLog, begin_s: float, end_s: float
         times(run, Shot(begin_s=1e8))
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize(
     ("name", "options", "needed"),
     [
@@ -185,6 +187,7 @@ def test_a_film_that_cannot_be_is_refused(run_folder: Path, tmp_path: Path, name
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("kind", ["mp4", "webm", "gif"])
 def test_a_film_can_be_read_by_ffmpeg_and_shows_the_heat(
     run: RunLog, run_folder: Path, tmp_path: Path, kind: str
@@ -223,6 +226,7 @@ def along(parents: dict[str, str], poses: dict[str, tuple[list[float], list[floa
     return point
 
 
+@pytest.mark.ci_slow
 def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(
     run_folder: Path, run: RunLog, motors_in_mujoco, thermofleet, tmp_path: Path
 ) -> None:

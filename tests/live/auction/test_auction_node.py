@@ -457,6 +457,7 @@ def test_jobs_accepted_before_a_second_auctioneer_started_are_awarded_after_it_s
 ARMS = ("arm_0", "arm_1")
 
 
+@pytest.mark.ci_slow
 def test_nothing_is_awarded_and_the_arms_stay_present_until_the_policy_replies(bus, caplog):
     policy = PolicyClient("mine", fleet="f", endpoint=bus.endpoint, limit_s=ON_BUS_S)
     node = bus.auctioneer(allocate=CentralAllocation(policy, LiveFleet(arms=ARMS)))

@@ -155,6 +155,7 @@ def settled(bus, *names):
     return all(set(names) <= one.work_source.participant.granter.register.settled.keys() for one in bus.arms.values())
 
 
+@pytest.mark.ci_slow
 def test_submitted_jobs_are_allocated_to_several_arms_and_done_once(bus):
     for name in ROSTER:
         bus.arm(name)
@@ -183,6 +184,7 @@ def test_people_pause_arms_and_ask_for_the_cell_also_after_the_arm_that_replied_
     assert bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).paused == {"*": "ann"}
 
 
+@pytest.mark.ci_slow
 def test_all_jobs_of_a_common_stream_are_done(bus):
     stream = tuple((10.0 * i, hold(f"job {i}", place, release_s=10.0 * i)) for i, place in enumerate(PLACES))
     for name in ROSTER:
@@ -194,6 +196,7 @@ def test_all_jobs_of_a_common_stream_are_done(bus):
     assert bus.done_by_journals() == Counter(job.name for _, job in stream)
 
 
+@pytest.mark.ci_slow
 def test_at_the_end_of_the_shift_last_cycles_are_completed_and_other_jobs_reported_unfinished(bus):
     stream = ((0.0, hold("brief", repetitions=1)), (0.0, hold("long", "rack", repetitions=10_000)))
     for name in ROSTER:
@@ -205,6 +208,7 @@ def test_at_the_end_of_the_shift_last_cycles_are_completed_and_other_jobs_report
     assert not any(one.node.executor.active for one in bus.arms.values())
 
 
+@pytest.mark.ci_slow
 def test_an_arm_that_lost_its_journals_does_not_join_unless_a_person_requests_it(bus):
     for name in ROSTER:
         bus.arm(name)

@@ -466,6 +466,7 @@ def test_the_command_waits_for_a_router():
         started.communicate(timeout=PATIENCE_S)
 
 
+@pytest.mark.ci_slow
 @pytest.mark.skipif(shutil.which("node") is None, reason="no Node")
 def test_the_monitor_in_javascript_shows_the_fleet(router, arm, tmp_path):
     log = tmp_path / "log"  # a pipe that nobody reads would stop it

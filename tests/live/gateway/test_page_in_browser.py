@@ -96,6 +96,7 @@ def answer(page):
     return expect(page.locator("#answer"))
 
 
+@pytest.mark.ci_slow
 def test_the_arms_are_shown_and_move(served, fleet, open_page):
     page = open_page(served)
     rows = page.locator("#arms tbody tr")
@@ -109,6 +110,7 @@ def test_the_arms_are_shown_and_move(served, fleet, open_page):
     assert page.evaluate("dashboard.states") - counted["states"] >= 30  # of 40 that are published
 
 
+@pytest.mark.ci_slow
 def test_a_job_of_the_form_is_quoted_submitted_and_finished(served, fleet, open_page):
     page = open_page(served)
     page.locator("#work").select_option(index=1)
@@ -135,6 +137,7 @@ def test_a_job_of_the_form_is_quoted_submitted_and_finished(served, fleet, open_
     expect(page.locator("#journal")).to_contain_text("my crate: finished by arm_0")
 
 
+@pytest.mark.ci_slow
 def test_a_job_is_cancelled_and_the_fleet_paused_with_the_name_of_the_person(served, fleet, open_page):
     served.ask(
         "POST", "/v4/jobs", {"jobs": [{"name": "long", "kind": "hold", "places": ["clamp"], "repetitions": 9999}]}
@@ -191,6 +194,7 @@ def test_a_fault_is_told_in_words_and_reset(served, fleet, open_page):
     assert fleet.requests[-1] == ResetRequest("ann")
 
 
+@pytest.mark.ci_slow
 def test_the_keyboard_is_enough(served, fleet, open_page):
     page = open_page(served)
     for _ in range(2):  # a link that skips, then the first button
@@ -231,6 +235,7 @@ def test_a_phone_shows_all_of_it(served, fleet, open_page, scheme):
     assert (sum(map(int, re.findall(r"\d+", paper)[:3])) < 200) == (scheme == "dark")
 
 
+@pytest.mark.ci_slow
 def test_hostile_names_stay_text(router, open_page):
     with MovingFleet(router, (EVIL_ARM,), fleet="f") as fleet, Served(router, page=LivePage()) as served:
         page = open_page(served)
@@ -249,6 +254,7 @@ def test_hostile_names_stay_text(router, open_page):
         page.close()  # before its gateway ends: it would try to connect again
 
 
+@pytest.mark.ci_slow
 def test_long_names_and_names_of_javascript_s_own_leave_the_page_as_it_is(router, open_page):
     names = ("constructor", "__proto__", "W" * 120)
     with MovingFleet(router, names, fleet="f") as fleet, Served(router, page=LivePage()) as served:
@@ -280,6 +286,7 @@ def test_without_webgl_the_tables_and_requests_still_work(browser, served, fleet
     flat.close()
 
 
+@pytest.mark.ci_slow
 def test_a_page_asks_for_a_token_and_allows_what_its_role_may(router, fleet, open_page):
     with Served(router, page=LivePage(), tokens={WATCHER: "monitor", BOSS: "operator"}) as served:
         page = open_page(served, errors=True, wait=False)  # Chromium logs every 401
@@ -302,6 +309,7 @@ def test_a_page_asks_for_a_token_and_allows_what_its_role_may(router, fleet, ope
         expect(page.locator("#pause-all")).to_be_enabled()
 
 
+@pytest.mark.ci_slow
 def test_the_page_connects_again_to_a_gateway_and_a_router_that_return(browser, open_page):
     with Router() as router:
         endpoint, port = router.endpoint, int(router.endpoint.rpartition(":")[2])

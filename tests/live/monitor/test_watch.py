@@ -173,6 +173,7 @@ def test_ages_and_times_are_short():
     assert "no token" in arm_line(arm_now(token=False))
 
 
+@pytest.mark.ci_slow
 def test_without_a_terminal_lines_are_printed_until_stopped(fleet):
     for number, code in ((signal.SIGTERM, 0), (signal.SIGINT, 130)):
         process = commands.start("bus", "watch", "--endpoint", fleet.endpoint, stderr=subprocess.DEVNULL)
@@ -208,6 +209,7 @@ def test_the_end_of_a_shift_is_told_when_all_have_left():
     assert end.check(settled, 100.0 + GONE_S) == "The shift has ended: 3 of 4 jobs finished, 1 given up."
 
 
+@pytest.mark.ci_slow
 def test_watch_waits_for_a_router_and_a_fleet():
     port = free_port()
     with commands.start("bus", "watch", "--endpoint", f"tcp/127.0.0.1:{port}", stderr=None) as process:
