@@ -471,6 +471,7 @@ def test_the_command_waits_for_a_router():
 def test_the_monitor_in_javascript_shows_the_fleet(router, arm, tmp_path):
     log = tmp_path / "log"  # a pipe that nobody reads would stop it
     with process(router) as (_, address), log.open("w") as out:
+        arm.post(lambda: arm.set("crate 1", state="waiting", repetitions=1, cycles=0))
         arm.happens(7)
         command = ["node", str(ROOT / "examples" / "monitor.mjs"), address, "3"]
         node = subprocess.Popen(command, stdout=out, env=os.environ | {"NO_COLOR": "1"})
