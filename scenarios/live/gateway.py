@@ -439,7 +439,7 @@ class EventStream(StreamingResponse):
         entries, gap = self._feed.since(seen)
         gap_text = "event: gap\ndata: {}\n\n" if gap and self._last_event else ""
         yield "retry: 1000\n\n" + gap_text + "".join(map(self._event, entries))
-        seen = entries[-1].number if entries else 0
+        seen = entries[-1].number if entries else seen
         while not self._readers.closed:
             try:
                 await asyncio.wait_for(self._woken.wait(), self._heartbeat_s)
