@@ -318,8 +318,6 @@ def bounds_command(
 def leaderboard_command(
     folder: Path = argument("Folder of results, one file for each policy.", FOLDER),
     split: str = option("Split of the suite: test, sizes or validation.", "test"),
-    verify: int = option("Number of shifts to repeat of each result of a built-in policy.", 0, low=0, high=200),
-    markdown: bool = option("Print the table in Markdown.", False),
     as_json: bool = options.JSON,
     submit: Path | None = option("Folder of `thermofleet compare --suite test --out`.", None, panel=_SUBMIT),
     author: str = option("--submit: name of the author.", "", panel=_SUBMIT),

@@ -1,5 +1,6 @@
 """The command line: options, ranges, help and errors."""
 
+import ast
 import json
 import os
 import re
@@ -502,3 +503,15 @@ def test_a_comparison_states_its_channel(thermofleet, small_toml):
     said = "Channel: line, 20 to 25 s late, 20 % lost, cut from 30 to 60 s."
     assert said in " ".join(hard.out.split())
     assert json.loads(thermofleet(*call, *HARD, "--json").out)["channel"]["delay_s"] == 20.0
+
+
+def test_every_option_of_a_command_is_read():
+    unread: list[str] = []
+    for path in sorted((Path(__file__).parents[2] / "scenarios" / "cli").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                read = {each.id for part in node.body for each in ast.walk(part) if isinstance(each, ast.Name)}
+                names = [each.arg for each in (*node.args.args, *node.args.kwonlyargs)]
+                ignored = [name for name in names if not name.startswith("_") and name not in read | {"self"}]
+                unread += [f"{path.name}: {node.name}({name})" for name in ignored]
+    assert unread == []
