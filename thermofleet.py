@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from scenarios.prepare.batch import make_batch as make_batch
     from scenarios.prepare.fleet import make_env as make_env
     from scenarios.prepare.fleet import prepare as prepare
+    from scenarios.prepare.twins import train_log as train_twin  # noqa: F401 -- a public name
     from scenarios.run.log import open_run as open_run
     from scenarios.run.shift import run as run
     from scenarios.spec.load import load as load

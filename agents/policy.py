@@ -80,7 +80,7 @@ class PlanningPolicy(Protocol):
 def no_simulator(name: str) -> FleetError:
     """The error of a policy that plans, where there is no simulator of its cell."""
     return FleetError(
-        f"The policy '{name}' plans in a simulator of its cell, and there is none here: it works in `run`, `compare` "
+        f"The policy '{name}' needs a simulator of its cell, which is not available here. Use it in `run`, `compare` "
         "and `bounds`. Choose another, for example wsept_learned."
     )
 

@@ -124,6 +124,18 @@ def arm_policy_of(name: str) -> ArmPolicy:
     return _maker(name, ON_BUS)()  # pyright: ignore[reportReturnType]  # by its scope
 
 
+def check_name(policy: object) -> None:
+    """Check that a policy is given by its name.
+
+    Raises:
+        FleetError: it is a class or an object.
+    """
+    if not isinstance(policy, str):
+        raise FleetError(
+            f"A policy is given by name: 'wspt', or 'mine.py:Mine' for a class in a file (got {policy!r})."
+        )
+
+
 def scope_of(name: str) -> str:
     """The scope of a policy; no trained one is loaded for it.
 
@@ -302,7 +314,7 @@ def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy],
     scope = getattr(example, "scope", None)
     if scope not in SCOPES:
         raise FleetError(
-            f"The policy '{name}' has no scope (got {scope!r}). Add to the class: scope = \"central\" if its "
+            f"The policy '{name}' has no valid scope (got {scope!r}). Set in the class: scope = \"central\" if its "
             'act(observations) sees all arms, or scope = "arm" if its choose(observation, place) sees one.'
         )
     missing = [method for method in METHODS[scope] if not callable(getattr(example, method, None))]

@@ -138,6 +138,13 @@ class Table:
         body = [table] if self.rows or table.show_header else []
         return Group(*above, *body, *map(text, self.notes))
 
+    def __str__(self) -> str:
+        from rich.console import Console
+
+        text = io.StringIO()
+        Console(file=text, width=120).print(self.rich())
+        return text.getvalue().rstrip("\n")
+
     def __rich__(self) -> "Group":
         return self.rich()
 

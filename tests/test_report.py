@@ -46,9 +46,9 @@ EVENTS = (
     Event(time_s=0.0, kind="lost", arm="arm_1", job="hold-001", reason="another arm claimed it"),
     Event(time_s=300.0, kind="finish", arm="arm_1", job=HOSTILE, value=12.0),
     Event(time_s=310.0, kind="home", arm="arm_1", job=HOSTILE),
-    Event(time_s=600.0, kind="warning", arm="arm_0", job="hold-001", joint=2, reason="motor 2 passed 60 °C"),
-    Event(time_s=650.0, kind="warning", arm="arm_1", joint=7, reason="motor 7 passed 60 °C"),
-    Event(time_s=1200.0, kind="fault", arm="arm_0", job="hold-001", joint=2, reason="motor 2 passed 75 °C"),
+    Event(time_s=600.0, kind="warning", arm="arm_0", job="hold-001", joint=2, reason="joint 2 passed 60 °C"),
+    Event(time_s=650.0, kind="warning", arm="arm_1", joint=7, reason="joint 7 passed 60 °C"),
+    Event(time_s=1200.0, kind="fault", arm="arm_0", job="hold-001", joint=2, reason="joint 2 passed 75 °C"),
     Event(time_s=1200.0, kind="return", arm="arm_0", job="hold-001", value=3.0, reason="3 of 9 cycles kept"),
     Event(time_s=3000.0, kind="recover", arm="arm_0", reason="cool again"),
     Event(time_s=7000.0, kind="award", arm="arm_1", job="hold-001"),
@@ -314,7 +314,7 @@ def event(time_s, kind, arm="arm_a", job="crate", **more):
 BURNED = side(
     "round_robin",
     event(10.0, "award"),
-    event(100.0, "fault", joint=2, reason="motor 2 passed 75 °C"),
+    event(100.0, "fault", joint=2, reason="joint 2 passed 75 °C"),
     event(100.0, "return", value=1.0),
     event(900.0, "recover", job=""),
 )

@@ -97,14 +97,14 @@ def _described(
         case 2:
             return "illegal", math.nan, "action outside the mask: a wait"
         case 3:
-            return "warning", limits.warning_c, f"motor {joint + 1} passed {limits.warning_c:g} °C"
+            return "warning", limits.warning_c, f"joint {joint + 1} passed {limits.warning_c:g} °C"
         case 4:
             late_s = max(0.0, float(state.finished_s[e, j] - world.jobs.due_s[e, j]))
             return "finish", late_s, f"late by {late_s:.0f} s" if late_s else "on time"
         case 5:
             return "home", math.nan, ""
         case 6:
-            return "fault", limits.error_c, f"motor {joint + 1} passed {limits.error_c:g} °C"
+            return "fault", limits.error_c, f"joint {joint + 1} passed {limits.error_c:g} °C"
         case 7:
             return "return", value, f"{state.cycles[e, j]} of {world.jobs.repetitions[e, j]} cycles kept"
         case 8:

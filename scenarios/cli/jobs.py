@@ -181,7 +181,7 @@ def reset_command(arm: str = ARM, by: str = BY, endpoint: str = options.ENDPOINT
 
 
 def clear_command(arm: str = ARM, by: str = BY, endpoint: str = options.ENDPOINT, fleet: str = options.FLEET) -> None:
-    """Free the space of an absent arm for other arms.
+    """Free the space of an offline arm for other arms.
 
     First stop the process of the arm, and make sure that the arm is at home or
     removed, and switched off. Start the process again only when the arm is at

@@ -177,7 +177,7 @@ def record_command(
         "Real seconds between two parts; a message is durable once it is in a part.", 10.0, low=0.1, high=86_400
     ),
 ) -> None:
-    """Record the messages of arms and auctioneer as Parquet parts, which can be read meanwhile."""
+    """Record the messages of arms and auctioneer as Parquet parts, readable while the recording continues."""
     from fleet.bus.client import BusClient
     from fleet.live.policy_client import CONNECT_S
     from scenarios.live.recorder import BACKLOG, record

@@ -66,9 +66,9 @@ COMMANDS = {
     "job change": LazyCommand(_LIVE, "jobs:change_command", "Change due date and value of a job."),
     "job settle": LazyCommand(_LIVE, "jobs:settle_command", "Resolve a job with unknown outcome."),
     "arm run": LazyCommand(_LIVE, "live:arm_command", "Run one arm of a fleet."),
-    "arm pause": LazyCommand(_LIVE, "jobs:pause_command", "Pause one arm or all arms; or resume."),
+    "arm pause": LazyCommand(_LIVE, "jobs:pause_command", "Pause or resume one arm or all arms."),
     "arm reset": LazyCommand(_LIVE, "jobs:reset_command", "Clear the fault of an arm."),
-    "arm clear": LazyCommand(_LIVE, "jobs:clear_command", "Free the space of an absent arm."),
+    "arm clear": LazyCommand(_LIVE, "jobs:clear_command", "Free the space of an offline arm."),
     "bus router": LazyCommand(_LIVE, "live:router_command", "Run the Zenoh router of a fleet."),
     "bus auctioneer": LazyCommand(_LIVE, "live:auctioneer_command", "Run the auctioneer of a fleet."),
     "bus watch": LazyCommand(_LIVE, "live:watch_command", "Watch a fleet in the terminal."),
@@ -161,7 +161,7 @@ def load_command(name: str) -> Any:
 
 app = typer.Typer(
     cls=LazyGroup,
-    help="Simulate and run fleets of robot arms that allocate jobs by thermal difficulty.",
+    help="Simulate and run fleets of robot arms that allocate jobs by predicted motor temperatures.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )

@@ -295,7 +295,7 @@ def score_command(
         check_file(map_, (".png",), overwrite, "--map")
     import numpy as np
 
-    from scenarios.motion.latent_map import verdict_png
+    from scenarios.motion.verdict_map import verdict_png
     from scenarios.prepare.twins import open_twin
     from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, render, window_rows, with_verdicts
     from scenarios.spec.load import load
@@ -359,16 +359,16 @@ def report_command(
     log: Path | None = options.LOG,
     out: Path = option("Folder of report.html and report.json.", Path("runs/twin_report")),
     arm: str | None = options.SCENARIO_ARM,
-    seeds: int = option("Number of trainings, whose results give the spread.", 3, low=1, high=100),
+    seeds: int = option("Number of training seeds; the report gives the spread of their results.", 3, low=1, high=100),
     skip_damaged: bool = options.SKIP_DAMAGED,
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
 ) -> None:
     """Write the paper's figures and tables as one offline HTML page, with all numbers in report.json.
 
-    RMS torque and an untrained network stand beside each result of the twin. A
-    scenario takes up to two minutes, a day of logs a minute for each seed. A
-    chapter that fails gives its reason in the page, and the exit code is 1.
+    RMS torque and an untrained network are the baselines of each result. A
+    scenario takes up to two minutes, a day of logs a minute for each seed. A failed
+    section shows its reason; the exit code is then 1.
     """
     check_source(scenario, log, arm)
     from fleet.files import cache_folder
@@ -415,7 +415,8 @@ def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> Twin
 
 def quality_table(twin: dict[str, Any]) -> Table:  # JSON of twins.json
     """Fit of each network of a twin, with the version and the data of the twin."""
-    note = f"data {twin['data_hash']}, seed {twin['seed']}, calibrated on {twin['calibrated_on']} held-out jobs"
+    seed = twin["seed"].rstrip("/")
+    note = f"data {twin['data_hash']}, seed {seed}, calibrated on {twin['calibrated_on']} held-out jobs"
     title = f"Twin of {twin['arm']}: version {twin['version']}"
     rows = tuple(
         (

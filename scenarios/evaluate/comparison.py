@@ -1,5 +1,6 @@
 """Several policies on the same seeds: figures with paired differences, and scores."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Normalised, Shift, SuiteScores, and_trainings, normalised, scores_of
 from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, fewest, figure_rows, figures_of, remarks, unit
 from scenarios.evaluate.study import Case, Row, Study, suite_label
-from scenarios.policy_loader import has_trainings, label, scope_of
+from scenarios.policy_loader import check_name, has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, quiet
 from scenarios.spec.load import scenario_with
@@ -121,6 +122,8 @@ def compare(
     Args:
         scenario: A library name, a .toml file, or a `Scenario`.
         policies: Names, FILE.py:CLASS, or folders of trained policies.
+        seeds: Of the shifts. `thermofleet compare` takes ten by default, and round_robin as baseline if it is compared.
+        difficulty, risk: Source of the predictions and of P(saturation), as in `make_env`.
         baseline: The policy that differences refer to; default: the first.
         randomise: Varies the shifts beyond what the scenario draws, the same for every policy.
         channel: Topology, delay and loss of the arms' messages, the same for every policy.
@@ -134,6 +137,14 @@ def compare(
     from scenarios.evaluate.runner import run_study
 
     chosen = scenario_with(scenario, {}, compare)
+    if isinstance(policies, str) or not isinstance(policies, Sequence):
+        raise FleetError(f"policies must be a list of names, for example ['wspt', 'mine.py:Mine'] (got {policies!r}).")
+    for policy in policies:
+        check_name(policy)
+    if isinstance(seeds, str) or not isinstance(seeds, Sequence):
+        raise FleetError(f"seeds must be a list of integers, for example range(3) (got {seeds!r}).")
+    if twice := [seed for seed, count in Counter(seeds).items() if count > 1]:
+        raise FleetError(f"Seed {twice[0]} is given twice: a repeated shift is no new evidence. Give each seed once.")
     if not policies or not seeds:
         raise FleetError(f"A comparison needs a policy and a seed (got {len(policies)} policies, {len(seeds)} seeds).")
     study = Study(

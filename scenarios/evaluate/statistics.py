@@ -590,7 +590,7 @@ def remarks(figures: Mapping[str, Mapping[str, Figure]], draws: int) -> Iterator
     notes = [note for each in figures.values() for f in each.values() for note in (f.note, f.difference_note)]
     if any(np.isnan(f.low + f.difference_low) for each in figures.values() for f in each.values()):
         most = share_bounds(0, draws)[1]
-        yield f"{EQUAL}: no variation in {draws}, which is not certainty; up to {most:.0%} of all may differ."
+        yield f"{EQUAL}: no variation in {draws}, at 95 % confidence up to {most:.0%} of all may differ."
     if any(note.endswith("Poisson") for note in notes):
         yield "Counts without an event have the exact bound of a Poisson mean."
 

@@ -397,7 +397,7 @@ def application(
         ("GET", "/v4/cell", "monitor", get_cell, "Places, arms, kinds of jobs and limits."),
         ("GET", "/v4/scene", "monitor", get_scene, "Arms, places and colours in three dimensions."),
         ("POST", "/v4/control", "operator", control, "Cancel, settle, change, pause, resume: a ControlRequest."),
-        ("POST", "/v4/clear", "operator", clear, "Free the space of an absent arm: a ClearRequest."),
+        ("POST", "/v4/clear", "operator", clear, "Free the space of an offline arm: a ClearRequest."),
         ("POST", "/v4/reset", "operator", post_reset, 'Clear the fault of an arm: {"arm": …, "by": …}.'),
         ("POST", "/v4/ask", "submitter", post_ask, 'Quotes without submitting: {"jobs": […]}.'),
     ]

@@ -14,7 +14,7 @@ from scenarios.live.recording import CARD, read_parts
 from scenarios.live.recording_report import open_recording
 from scenarios.run.log import open_run
 from scenarios.run.records import Offer, ShiftLog
-from scenarios.show.words import CANNOT, by_joint, clock, value_text
+from scenarios.show.words import CANNOT, clock, value_text
 from scenarios.table import Table
 
 CONFIGURATION = ("scenario_hash", "policy", "seed", "plant", "bus", "difficulty", "risk", "environment", "channel")
@@ -237,7 +237,7 @@ def _words(event: Event) -> list[str]:
         event.job,
         joint,
         value,
-        by_joint(event.reason),
+        event.reason,
     ]
 
 

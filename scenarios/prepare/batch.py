@@ -48,7 +48,7 @@ def make_batch(
     Args:
         scenario, difficulty, risk, cache, peers, overrides: As in `make_env`.
         seed: Env e begins the shift of `seed + e` (or of `seed[e]`): that of `make_env(…).reset(seed=…)`.
-        randomise: Beyond what a scenario draws: ambient temperature, arrivals, fleets.
+        randomise: In addition to what a scenario samples: ambient temperature, arrivals, fleets.
         max_cycles, autoreset, stagger, threads: As in `fleet.env.vector.BatchEnv`.
 
     Raises:

@@ -81,13 +81,13 @@ def prepare(
     progress: Progress = quiet,
     like: Fleet | None = None,
 ) -> Fleet:
-    """Plan every work for every arm, and give each arm its difficulty model; both are cached by content.
+    """Plan every task type for every arm, and assign each arm its difficulty model; both are cached by content.
 
     Args:
         scenario: A library name, a .toml file, or a `Scenario`.
-        randomise: Beyond what a scenario draws for a shift: ambient temperature, arrivals, fleets.
+        randomise: In addition to what a scenario samples for a shift: ambient temperature, arrivals, fleets.
         training: Which training of the twins, from 0.
-        like: Prepared from a scenario with the same arms, cell and works: its plans and space, too, are this fleet's.
+        like: Prepared from a scenario with the same arms, cell and task types; its plans and space table are reused.
 
     Raises:
         ScenarioError: no such scenario, no arm can do some work, arms at home are too close to each other, or a
@@ -377,7 +377,7 @@ def make_env(
         scenario: A library name, a .toml file, or a `Scenario`.
         difficulty: Source of the scores: `twin` (from the cache, or trained), `blind` (none) or `oracle` (true values).
         risk: Model of the twins' P(saturation); see `RiskName`.
-        randomise: Beyond what a scenario draws: ambient temperature, arrivals, fleets.
+        randomise: In addition to what a scenario samples: ambient temperature, arrivals, fleets.
         plant: Motion of the arms: `profile` (exactly as planned) or `mujoco` (closed loop).
         bus: Transport of the messages between arms.
         channel: Topology, delay, loss and partitions of the messages; if it is perfect, those of the scenario.

@@ -314,7 +314,7 @@ def train_log(
     hold_out: float = HOLD_OUT,
     progress: Progress = quiet,
 ) -> Twin:
-    """The twin of the arm of some recordings, trained on the parts after which no large motor got warm.
+    """Train an arm's twin on the parts of its recordings after which no large motor became warm.
 
     Some of the recordings that are cool from start to end are held out, sampled by the seed, and calibrate the twin.
 

@@ -16,7 +16,7 @@ from fleet.errors import FleetError, nearest
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
-from scenarios.policy_loader import OnBus, blaming, policy_at
+from scenarios.policy_loader import OnBus, blaming, check_name, policy_at
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.result_folder import new_folder
@@ -45,7 +45,9 @@ def run(
 
     Args:
         fleet: A prepared fleet, or a scenario (a library name, a .toml file, a `Scenario`), which is prepared first.
-        spec: What to run; without it, `options` are its fields, and nothing is published (`bus="memory"`).
+        spec: What to run; without it, `options` are its fields: policy, seed, plant, bus ("memory" here: nothing is
+            published), difficulty, risk, channel; `thermofleet run --help` explains them.
+        progress: Called with a stage and a share. The first run of a scenario prepares its arms for minutes.
         record: Keep telemetry.
         endpoint: Zenoh router on loopback that publishes the shift; by default a router in this process.
         out: Folder for the files of the run; it must not exist yet.
@@ -64,6 +66,7 @@ def run(
             ) from error
     elif options:
         raise FleetError(f"Give either a RunSpec or single options, not both (got {', '.join(options)}).")
+    check_name(spec.policy)
     if not isinstance(fleet, Fleet):
         fleet = prepare(fleet, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
     if out is not None:

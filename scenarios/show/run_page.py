@@ -14,7 +14,7 @@ from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import JobSpan, Schedule
 from scenarios.show.page import Chart, Page, Playback, packed
 from scenarios.show.timeline import figure, time_unit
-from scenarios.show.words import CANNOT, by_joint, clock, duration, kind_text, scores_text, value_text
+from scenarios.show.words import CANNOT, clock, duration, kind_text, scores_text, value_text
 from scenarios.table import Moment, Table, render
 
 MOST_FAULTS = 2
@@ -100,7 +100,7 @@ def _hottest(metrics: Mapping[str, Any]) -> str:
 def _fault(fault: Event, plan: Schedule) -> str:
     outage = next((o for o in plan.outages if o.arm == fault.arm and o.start_s == fault.time_s), None)
     at = f" during {fault.job}" if fault.job else ""
-    why = by_joint(fault.reason or f"motor {fault.joint} reached its limit").replace("joint ", "the motor of joint ", 1)
+    why = (fault.reason or f"joint {fault.joint} reached its limit").replace("joint ", "the motor of joint ", 1)
     loss = "and recovered at once"
     if outage is not None:
         rest = "" if outage.recovered else "the remaining "
@@ -327,7 +327,7 @@ def _event_table(events: Sequence[Event]) -> Mapping[str, object] | None:
     listed.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
     table = Table(
         head=("time", "event", "arm", "job", "reason"),
-        rows=tuple((clock(e.time_s), kind_text(e.kind), e.arm, e.job, by_joint(e.reason)) for e in listed),
+        rows=tuple((clock(e.time_s), kind_text(e.kind), e.arm, e.job, e.reason) for e in listed),
         numbers=False,
     )
     kinds, moments = [e.kind for e in listed], [_before(event) for event in listed]

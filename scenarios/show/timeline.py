@@ -17,7 +17,7 @@ from scenarios.run.records import ShiftLog
 from scenarios.run.schedule import JobSpan, Outage
 from scenarios.show import page
 from scenarios.show.page import AXIS, INK, plain
-from scenarios.show.words import by_joint, clock
+from scenarios.show.words import clock
 
 Array = np.ndarray
 Trace = dict[str, Any]
@@ -238,13 +238,13 @@ def _assignment_text(a: JobSpan) -> str:
 def _outage_text(o: Outage) -> str:
     """Hover text of one outage."""
     end = "recovered" if o.recovered else "not recovered"
-    return f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s)} – {clock(o.end_s)}, {end}<br>{plain(by_joint(o.reason))}"
+    return f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s)} – {clock(o.end_s)}, {end}<br>{plain(o.reason)}"
 
 
 def _event_text(e: Event) -> str:
     """Hover text of one event."""
     job = f"<br>{plain(e.job)}" if e.job else ""
-    return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s)}<br>{plain(by_joint(e.reason))}{job}"
+    return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s)}<br>{plain(e.reason)}{job}"
 
 
 def _lanes(telemetry: Telemetry, arms: int) -> list[int]:

@@ -21,7 +21,7 @@ Array = np.ndarray
 ScoreRow = dict[str, str | float | None]
 LOADED = 2
 """Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
-OMITTED = ("twin", "data", "log", "elbow", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+OMITTED = ("twin", "data", "log", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
 OMITTED_WITH_VERDICT = (f"d_{LOADED}", "latent", "d_cal")
 """Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
 

@@ -1,6 +1,5 @@
 """Times, events and offers in words."""
 
-import re
 from collections.abc import Mapping, Sequence
 
 from fleet.events import Event
@@ -41,11 +40,6 @@ def value_text(value: object) -> str:
     return str(value)
 
 
-def by_joint(reason: str) -> str:
-    """A reason of an event that numbers motors, with the joints instead: both count from 1."""
-    return re.sub(r"\bmotor (?=\d)", "joint ", reason)
-
-
 def kind_text(kind: str) -> str:
     """A kind of event."""
     return LABELS.get(kind, kind.replace("_", " "))
@@ -54,7 +48,7 @@ def kind_text(kind: str) -> str:
 def event_text(event: Event) -> str:
     """An event in words."""
     joint = f", joint {event.joint}" if event.joint else ""
-    reason = f": {by_joint(event.reason)}" if event.reason else ""
+    reason = f": {event.reason}" if event.reason else ""
     return f"{event.kind.replace('_', ' ')}{f' {event.job}' if event.job else ''}{joint}{reason}"
 
 

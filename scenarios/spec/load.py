@@ -37,7 +37,7 @@ def load(name_or_path: str | Path) -> Scenario:
     """The scenario of a library name, of a .toml file, or of an instance of the suite, as `test/0017`.
 
     Raises:
-        ScenarioError: file, place, what was given and what is allowed.
+        ScenarioError: the scenario is unknown or invalid; the message names file, field and allowed values.
     """
     if INSTANCE.fullmatch(str(name_or_path)):
         from scenarios.suite.splits import instance

@@ -17,7 +17,7 @@ RiskName = Literal["rc", "rc-nominal"]
 RISK: RiskName = "rc"
 PlantName = Literal["profile", "mujoco"]
 BusName = Literal["zenoh", "memory"]
-DIFFICULTY_HELP = "Source of the difficulty scores: twin, oracle (simulator) or blind (none)."
+DIFFICULTY_HELP = "Source of the predictions: twin, oracle (simulator) or blind (none)."
 RISK_HELP = (
     "With --difficulty twin, model of P(saturation): rc (peak predicted by the arm's own thermal network) or "
     "rc-nominal (peak predicted by that of a nominal arm)."
@@ -34,7 +34,7 @@ class RunSpec:
         0,
         low=0,
         high=MAX_SEED,
-        shown="0, or of an instance of the suite its own",
+        shown="0; for a suite instance, its own seed",
     )
     plant: PlantName = option(
         "profile (arms follow their plans exactly) or mujoco (all arms in closed loop in MuJoCo).",
@@ -117,7 +117,7 @@ class LiveSpec:
         "matching",
     )
     speed: float = option("Fleet seconds per real second.", 1.0, low=MIN_SPEED, high=MAX_SPEED)
-    difficulty: LiveModel = option("Difficulty model.", "twin")
+    difficulty: LiveModel = option("Source of the predictions: twin or blind (none).", "twin")
     risk: RiskName = option(RISK_HELP, RISK)
     jobs: JobSource = option(
         "scenario: the scenario's job stream; none: submitted jobs only.",
@@ -127,7 +127,9 @@ class LiveSpec:
     seed: int = option("Random seed of the scenario's jobs, the sensor noise and the policy.", 0, low=0, high=MAX_SEED)
     fleet: str = option("Name of the fleet. Default: the scenario's name.", "", is_name=True)
     journal: Path | None = option("Folder of the journals; an existing journal is continued.", None)
-    new_epoch: bool = option("Begin with empty journals although other participants know older ones.", False)
+    new_epoch: bool = option(
+        "Start a new epoch with empty journals, even if other participants have state of an older epoch.", False
+    )
 
     def __post_init__(self) -> None:
         check(self)

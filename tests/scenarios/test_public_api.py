@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 import thermofleet as tf
+from fleet.errors import FleetError
+from scenarios.table import Table
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,3 +53,34 @@ def test_a_shift_and_a_comparison_from_the_file_of_a_scenario(small_toml, plans,
     assert "wspt" in result.table.markdown()
     with pytest.raises(Exception, match=r"run\(\) has no option 'polcy'; did you mean 'policy'\?"):
         tf.run(small_toml, polcy="wspt")
+
+
+class Mine:
+    """A policy in a notebook."""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"policies": "wsept"}, r"policies must be a list of names, .* \(got 'wsept'\)"),
+        (
+            {"policies": ["wsept", Mine]},
+            r"A policy is given by name: .*'mine.py:Mine' for a class in a file \(got <class",
+        ),
+        ({"policies": ["wsept"], "seeds": [0, 1, 0]}, "Seed 0 is given twice"),
+        ({"policies": ["wsept"], "seeds": 3}, r"seeds must be a list of integers, for example range\(3\) \(got 3\)"),
+    ],
+)
+def test_arguments_of_a_comparison_are_checked(arguments, says):
+    with pytest.raises(FleetError, match=says):
+        tf.compare("quickstart", **arguments)
+
+
+def test_a_shift_takes_the_name_of_a_policy():
+    with pytest.raises(FleetError, match="A policy is given by name"):
+        tf.run("quickstart", policy=Mine)
+
+
+def test_a_table_is_printed_as_the_command_prints_it():
+    table = Table(head=("policy", "jobs"), rows=(("wspt", "71"), ("wsept", "79")), notes=("Two shifts.",))
+    assert str(table).split() == ["policy", "jobs", "wspt", "71", "wsept", "79", "Two", "shifts."]

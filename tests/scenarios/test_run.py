@@ -365,7 +365,7 @@ EVENTS = (
     event(20, "home", "hot", "hold-1"),
     event(20.5, "award", "hot", "hold-2"),
     event(25, "award", "cool", "sort-1"),
-    event(30, "fault", "hot", "hold-2", joint=2, value=75.0, reason="motor 2 passed 75 °C"),
+    event(30, "fault", "hot", "hold-2", joint=2, value=75.0, reason="joint 2 passed 75 °C"),
     event(30, "return", "hot", "hold-2", value=1.0),
     event(50, "recover", "hot", ""),
     event(55, "finish", "cool", "sort-1", value=0.0),

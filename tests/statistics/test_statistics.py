@@ -275,7 +275,7 @@ def test_a_baseline_differs_by_nothing_and_cells_without_variation_say_so(paired
     assert rows["same"][-3:] == ["+2.0", EQUAL, ""]
     assert rows["better"][-1] == "**"
     assert list(remarks(found, 10)) == [
-        "all equal: no variation in 10, which is not certainty; up to 31% of all may differ.",
+        "all equal: no variation in 10, at 95 % confidence up to 31% of all may differ.",
         "Counts without an event have the exact bound of a Poisson mean.",
     ]
 

@@ -285,6 +285,7 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(
         (["--out", "shift.bag"], "--out must end in .mp4, .webm, .gif, .mcap, .glb (got 'shift.bag')"),
         (["--out", "there.mcap"], "'there.mcap' exists; give another --out"),
         (["--every", "5"], "--every is for --out FILE.mcap and FILE.glb"),
+        (["--out", "all.glb", "--end", "60"], "--end is for the viewer and films; .glb files hold the whole shift"),
     ],
 )
 def test_a_file_that_cannot_be_is_refused(

@@ -461,8 +461,8 @@ def identify(
         free: Names of `twin.thermal.identify.PRIOR_SD`; the others keep their nominal values.
 
     Raises:
-        IdentificationError: the recordings are too little: none, other joints, no temperatures, too short, no motor
-            that warms or cools, no current.
+        IdentificationError: the recordings are insufficient: none, wrong number of joints, no temperatures, too
+            short, no motor that warms or cools, no current.
     """
     nominal = nominal or nominal_heat_model()
     sd_k = thermal_data()["spread"]["ambient_k"] if ambient_sd_k is None else ambient_sd_k

@@ -40,7 +40,7 @@ from fleet.live.monitor.snapshot import FleetListener
 from fleet.live.policy_client import PolicyClient
 from scenarios.live.auctioneer import ON_BUS_S, CentralAllocation
 from tests.bus.test_policy_client import Server
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 TWICE = ("Started", "Started")
 """Of the owner, which compaction keeps, and of the start."""
@@ -352,6 +352,8 @@ def test_a_participant_that_replies_without_a_token_counts_as_an_auctioneer(bus,
     early = bus.link()
     early.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))
     early.watch_tokens(keys.of_every_arm("f", "alive"), lambda *_: None)
+    probe, request = bus.link(), StatusRequest(("?",))
+    wait_until(lambda: probe.query_and_wait(keys.of_jobs("f", "status"), request, Status, timeout_s=2.0).refused)
     with pytest.raises(BusError, match="has an auctioneer already, which does not reply"):
         bus.auctioneer("two")
     stop = threading.Event()
