@@ -207,8 +207,6 @@ def view_command(
     if suffix in SCENES and (unread := sorted({"begin_s", "end_s", "fps", "meshes"} & set(given))):
         flag = unread[0].removesuffix("_s")
         raise FleetError(f"--{flag} is for the viewer and films; {suffix} files hold the whole shift: leave it out.")
-            f"--{flag} is for the viewer and for films; {suffix} files hold the whole shift: leave it out."
-        )
     if out is None:
         _play(what, shot)
         return
