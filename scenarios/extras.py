@@ -9,7 +9,7 @@ EXTRAS = {
     "twin": ("joblib", "safetensors", "sklearn", "torch"),
     "bus": ("zenoh",),
     "tls": ("cryptography",),
-    "report": ("jinja2", "matplotlib", "PIL", "plotly", "pyarrow", "trimesh"),
+    "report": ("jinja2", "matplotlib", "pandas", "PIL", "plotly", "pyarrow", "trimesh"),
     "film": ("av",),
     "gateway": ("starlette", "uvicorn"),
     "learn": ("tensordict", "torchrl"),

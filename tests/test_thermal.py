@@ -510,6 +510,7 @@ def residuals(log: Recording, motors: Motors = MOTORS) -> np.ndarray:
 needs_logs = pytest.mark.skipif(not LOGS.is_dir(), reason="the Gen3 logs are not beside this checkout")
 
 
+@pytest.mark.ci_slow
 @needs_logs
 def test_real_arm_within_a_seventh_of_a_kelvin():
     logs = read_folder(LOGS)

@@ -249,7 +249,9 @@ def test_where_there_is_no_simulator_an_error_says_so(small):
     for name in ("mpc", "limited:mpc"):
         assert isinstance(policy_of(name), PlanningPolicy)
         for refused in (alone, lambda name: central_allocation(name, load("quickstart"), 0)):
-            with pytest.raises(FleetError, match=f"'{name}' plans in a simulator of its cell, and there is none here"):
+            with pytest.raises(
+                FleetError, match=f"'{name}' needs a simulator of its cell, which is not available here"
+            ):
                 refused(name)
     assert not isinstance(policy_of("limited:wsept"), PlanningPolicy)
     world, _ = small.Shifts().shop(small.Shifts().drawn(np.random.SeedSequence(1))[0])

@@ -313,6 +313,7 @@ def test_a_link_needs_tls(place):
         Router(tls=Tls(place, "router"), connect=["tcp/127.0.0.1:7447"])
 
 
+@pytest.mark.ci_slow
 def test_a_router_in_no_roster_has_no_rights(place, tmp_path):
     """Nor has one with the name of the router itself: only other routers are linked."""
     rogue = tmp_path / "rogue"

@@ -226,6 +226,7 @@ def compare_with_reference(play, episode: Episode, seed: int) -> tuple[State, in
         runner.step(play.chosen(runner.mask, rng.random((len(world.arms), 2))))
 
 
+@pytest.mark.ci_slow
 @examples(40)
 @given(draft=drafts(), two_plans=st.booleans())
 def test_vectors_equal_the_reference(small, play, draft, two_plans) -> None:

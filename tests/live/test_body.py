@@ -37,6 +37,7 @@ def started(small, allowed, *, done=0, repetitions=3, payload=None, **options):
     return body
 
 
+@pytest.mark.ci_slow
 @settings(max_examples=15, phases=[Phase.generate])
 @given(st.data())
 def test_a_body_passes_the_same_shift_as_the_simulator(small, data):

@@ -224,6 +224,7 @@ def rows(folder, kind="telemetry"):
     return read_parts(folder, kind).num_rows if (folder / CARD).exists() else 0
 
 
+@pytest.mark.ci_slow
 def test_no_message_is_lost_when_the_router_restarts(tmp_path):
     with ExitStack() as stack:
         router = Router().open()

@@ -163,6 +163,7 @@ def test_processes_of_one_rank_are_stopped_together_and_lower_ranks_after_them(t
     assert ({first, second}, third) == ({"one", "two"}, "low")
 
 
+@pytest.mark.ci_slow
 def test_four_processes_that_ignore_sigterm_take_no_longer_than_one(tmp_path):
     def seconds_to_stop() -> float:
         with Supervisor(tmp_path, patience_s=2.0) as supervisor:

@@ -424,6 +424,7 @@ def test_trained_sources_have_the_rewards_that_they_always_had(thermofleet, smal
     assert rewards(thermofleet, small_toml, tmp_path / "out", TRAINED) == TRAINED
 
 
+@pytest.mark.ci_slow
 def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monkeypatch) -> None:
     out = tmp_path / "sources"
     how = ("--fleets", 2, "--trainings", 2, "--first-seed", 10_000, "--workers", 1)

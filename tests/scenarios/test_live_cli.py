@@ -443,6 +443,7 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         assert "Continuing from" in err
 
 
+@pytest.mark.ci_slow
 def test_the_end_of_a_shift_lists_unfinished_jobs(endpoint, tmp_path):
     short = tmp_path / "short.toml"
     text = (ROOT / "scenarios" / "library" / "quickstart.toml").read_text(encoding="utf-8")

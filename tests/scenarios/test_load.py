@@ -413,6 +413,7 @@ def test_a_work_that_comes_too_close_to_a_home_is_infeasible_and_says_so(cache):
     assert alone.infeasible == ()
 
 
+@pytest.mark.ci_slow
 def test_clearance_changes_the_space(cache):
     scenario = load("quickstart")
     shares = []

@@ -38,6 +38,7 @@ def test_work_inside_work_is_done(count):
         assert list(pool(delayed(nested)(n) for n in range(4))) == [list(range(n)) for n in range(4)]
 
 
+@pytest.mark.ci_slow
 def test_processes_end_with_the_one_that_began_them(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(

@@ -244,6 +244,7 @@ def test_time_of_a_session_or_in_total() -> None:
     assert each.share(9, 75.0, 45.0) == pytest.approx(0.9)
 
 
+@pytest.mark.ci_slow
 def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pairs, "training_instances", lambda *args, **options: [ground])

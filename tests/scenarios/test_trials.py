@@ -134,6 +134,7 @@ def test_an_interrupted_study_goes_on_where_it_was(scenario, plans, tmp_path, mo
     assert {row.key.policy for row in read_rows(out)} == {"random", "round_robin", "wspt"}
 
 
+@pytest.mark.ci_slow
 def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
     out = tmp_path / "out"
     own = f"{bad}:Idle"
@@ -191,6 +192,7 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     assert result_text(failed)
 
 
+@pytest.mark.ci_slow
 def test_a_policy_that_catches_every_alarm_ends_with_its_process():
     code = """
 from scenarios.evaluate import rollout as decision_limit

@@ -109,6 +109,7 @@ def test_a_finished_training_is_kept_until_told_otherwise(thermofleet, logs, twi
     assert (twins / "twins.json").read_bytes() != before
 
 
+@pytest.mark.ci_slow
 def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_toml, tmp_path):
     out = tmp_path / "twins"
     said = thermofleet("twin", "train", small_toml, "--arm", "right", *TINY, "--out", out)

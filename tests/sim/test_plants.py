@@ -191,6 +191,7 @@ def test_only_faulted_arms_heat_nothing(cell):
     assert not rubs[modes == FAULTED].any()
 
 
+@pytest.mark.ci_slow
 def test_looking_at_the_sensors_changes_nothing(cell):
     seen, unseen = [], []
     for states, watched in ((seen, True), (unseen, False)):

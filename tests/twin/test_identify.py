@@ -405,6 +405,7 @@ def test_the_true_arm_simulates_a_recording_down_to_the_sensor_noise(rng):
     np.testing.assert_allclose(simulated[-1][-1, HOUSING], temp[-1, HOUSING], atol=0.5)
 
 
+@pytest.mark.ci_slow
 def test_true_values_lie_in_the_intervals_about_as_often_as_they_say():
     inside, shrunk = [], []
     for seed in range(4):

@@ -104,6 +104,7 @@ def test_the_keyboard_plays_and_turns(page: Page) -> None:
     assert (np.abs(canvas(page) - still).max(axis=2) > 60).sum() > 200
 
 
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("width", [390, 500])
 def test_a_narrow_page_overprints_nothing(page: Page, width: int) -> None:
     page.set_viewport_size({"width": width, "height": 850})

@@ -348,6 +348,7 @@ def test_a_fleet_has_one_auctioneer(bus, token_reaches):
     assert bus.states(bus.auctioneer("one")) == []
 
 
+@pytest.mark.ci_slow
 def test_a_participant_that_replies_without_a_token_counts_as_an_auctioneer(bus, token_reaches):
     early = bus.link()
     early.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))

@@ -172,6 +172,7 @@ def test_submitted_jobs_are_allocated_to_several_arms_and_done_once(bus):
     assert bus.submit(hold("a")).jobs[0].accepted, "an identical job is accepted again"
 
 
+@pytest.mark.ci_slow
 def test_people_pause_arms_and_ask_for_the_cell_also_after_the_arm_that_replied_was_killed(bus):
     cell = EXAMPLES[Cell]
     for name in ROSTER:

@@ -451,6 +451,7 @@ def test_the_command_exits_on_a_signal_even_while_a_reader_is_connected(router, 
         assert "Traceback" not in started.stderr.read()
 
 
+@pytest.mark.ci_slow
 def test_the_command_waits_for_a_router():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

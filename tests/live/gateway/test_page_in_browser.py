@@ -157,6 +157,7 @@ def test_a_job_is_cancelled_and_the_fleet_paused_with_the_name_of_the_person(ser
     expect(page.locator("#alert-list")).not_to_contain_text("paused")
 
 
+@pytest.mark.ci_slow
 def test_a_job_is_changed_and_settled_and_the_space_of_an_absent_arm_freed(served, fleet, router, open_page):
     with BusClient(router, "f") as other:  # an arm that leaves
         other.declare_token(keys.of_arm("f", "gone", "alive"))
