@@ -459,8 +459,8 @@ class LeastLoaded:
     """The oldest job goes to the able arm with the least working time in this shift, by the durations of its claimed
     plans.
 
-    The observation does not contain the work so far, so the rule adds
-    the durations of its claims; a claim that lost is subtracted.
+    The observation does not contain the working time, so the rule adds up the durations of its claims, without those
+    that lost.
     """
 
     scope: ClassVar = "central"

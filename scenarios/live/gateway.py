@@ -449,7 +449,7 @@ class EventStream(StreamingResponse):
             self._woken.clear()
             entries, gap = self._feed.since(seen)
             if gap:
-                break  # it has missed events: it reconnects, and is told of the gap
+                break  # it has missed events: it reconnects and receives `gap`
             if entries:
                 seen = entries[-1].number
                 yield "".join(map(self._event, entries))
