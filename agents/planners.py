@@ -162,7 +162,7 @@ def _inserted(
 def _claims(
     schedule: Schedules, slot_job: Array, observations: Mapping[str, Observation], now_s: float
 ) -> dict[str, int]:
-    """Of each arm with a legal claim for a job of its own, the first in the schedule; see `fleet.engine.play`."""
+    """Of each arm with a legal claim for a job of its own, the first in the schedule; see `choose_claims`."""
     arms, first, actions = list(observations), dict[str, float](), dict[str, int]()
     for slot, job in enumerate(slot_job.tolist()):
         if job < 0 or schedule.not_before_s[0, job] > now_s:

@@ -7,9 +7,12 @@ Decorated functions are plain Python over arrays and scalars. Numba is imported,
 import hashlib
 import logging
 import os
+import platform
+import sys
 from collections.abc import Callable
-from functools import cache, cached_property
+from functools import cache, cached_property, wraps
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
@@ -47,7 +50,7 @@ def fused(function: Function) -> Function:
 @jit_inline
 def nonnegative(index: Any) -> Any:  # any integer type
     """Return the same index; the compiler then omits the check for negative indices."""
-    return index & 0x7FFFFFFF
+    return int(index) & 0x7FFFFFFF
 
 
 class Kernel:
@@ -58,13 +61,13 @@ class Kernel:
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
+        self.function = function
         self.__doc__, self.__name__ = function.__doc__, function.__name__
 
     @cached_property
     def compiled(self) -> Callable[..., Any]:
         """The compiled function; the first call in a process loads it, the first on a machine compiles it."""
-        return compile_cached(self._function)
+        return compile_cached(self.function)
 
     @cached_property
     def interpreted(self) -> Callable[..., Any]:
@@ -72,7 +75,7 @@ class Kernel:
 
         def call(*arguments: Any) -> Any:  # as the function
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # as compiled: integers wrap around
-                return self._function(*arguments)
+                return self.function(*arguments)
 
         return call
 
@@ -115,8 +118,26 @@ def cache_of_this_code() -> Path:
     return user_cache_folder() / "compiled" / digest.hexdigest()[:16]
 
 
+def is_compiled(*kernels: Kernel) -> bool:
+    """Whether the cache has these kernels, for this Python and this copy of the source."""
+    return all(_note_of(each.function).exists() for each in kernels)
+
+
+def _note_of(function: Callable[..., Any]) -> Path:
+    """The empty file that is there once a kernel is compiled; numba compiles anew where any of these parts differs."""
+    source = Path(function.__code__.co_filename)
+    parts = (sys.implementation.cache_tag, platform.machine(), source, source.stat().st_mtime_ns)
+    key = hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:16]
+    return cache_of_this_code() / f"{function.__name__}-{key}"
+
+
+@cache
+def _announce(folder: Path) -> None:
+    log.warning("Compiling the simulation engine (once, up to a minute of one core); cached in %s.", folder)
+
+
 def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function, and keep its code in the user's cache folder."""
+    """Compile a function at its first call, which logs a line, and keep its code in the user's cache folder."""
     from numba import config, njit
     from numba.extending import register_jitable
 
@@ -126,15 +147,28 @@ def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
     while _called:
         register_jitable(**_OPTIONS)(_called.pop())
     options: Any = config  # numba sets its options by name
-    folder = cache_of_this_code()
-    if not folder.exists():
-        log.warning("Compiling the simulation engine (about a minute of one core, once); cached in %s.", folder)
-        folder.mkdir(parents=True, exist_ok=True)
-    before, options.CACHE_DIR = options.CACHE_DIR, str(folder)
+    note = _note_of(function)
+    note.parent.mkdir(parents=True, exist_ok=True)
+    before, options.CACHE_DIR = options.CACHE_DIR, str(note.parent)
     try:
-        return njit(function, cache=True, nogil=True, **_options_of(function))
+        compiled = njit(function, cache=True, nogil=True, **_options_of(function))
     finally:
         options.CACHE_DIR = before
+    if note.exists():
+        return compiled
+    once = Lock()
+
+    @wraps(function)
+    def compile_first(*arguments: Any) -> Any:  # as the function
+        with once:
+            if not note.exists():
+                _announce(note.parent)
+                result = compiled(*arguments)
+                note.touch()
+                return result
+        return compiled(*arguments)
+
+    return compile_first
 
 
 def _options_of(function: Callable[..., Any]) -> dict[str, Any]:

@@ -15,17 +15,17 @@ Array = np.ndarray
 Bits = Any
 """np.uint64 or an array of them, which numba compiles alike."""
 
-LEVELS = 4096
-"""Normal quantiles in the table: two of them, 12 bits each, give 2²³ values up to 5 standard deviations."""
+LEVELS = 256
+"""Normal quantiles in the table, 1 kB: the sum of two of them has 2¹⁵ values, up to 4 standard deviations."""
 
 
 def _quantiles() -> Array:
     values = np.array([NormalDist().inv_cdf((level + 0.5) / LEVELS) for level in range(LEVELS)])
-    return values / np.sqrt(2.0 * np.mean(values**2))
+    return (values / np.sqrt(2.0 * np.mean(values**2))).astype(np.float32)
 
 
 QUANTILES: Array = _quantiles()
-"""[level], of standard deviation 1/√2."""
+"""float32 [level], of standard deviation 1/√2."""
 _GOLDEN, _FIRST, _SECOND = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _11, _27, _30, _31, _32 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(32)
 _MASK = np.uint64(LEVELS - 1)
@@ -53,7 +53,7 @@ def random_uniform(key: Bits, count: Bits) -> Any:  # a float or an array
 
 @jit_inline
 def random_normal(key: Bits, count: Bits) -> Any:  # a float or an array
-    """A standard normal value for a key and a count, uint64; elementwise over arrays."""
+    """A standard normal value, float32, for a key and a count, uint64; elementwise over arrays."""
     word = random_word(key, count)
     return QUANTILES[word & _MASK] + QUANTILES[(word >> _32) & _MASK]
 

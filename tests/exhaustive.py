@@ -83,6 +83,6 @@ def _state_of(state: State, row: int) -> State:
 def _load(engine: Engine, states: list[State], vectors: Array) -> None:
     """Put states into the first rows, and find their legal actions."""
     for name, values in engine.state._asdict().items():
-        values[: len(states)] = [getattr(state, name) for state in states]
+        values[: len(states)] = np.stack([getattr(state, name) for state in states])
     engine.refresh()
     engine.observe(np.arange(engine.envs), vectors)

@@ -10,8 +10,7 @@ from scipy.integrate import simpson, solve_ivp
 
 from fleet.arm.cell import cell_model
 from fleet.arm.model import ArmModel
-from fleet.engine.shift import step
-from fleet.engine.state import initial
+from fleet.engine.shift import initial, step
 from fleet.heat.effects import (
     ACTIVATION_K,
     ALUMINIUM_PER_K,

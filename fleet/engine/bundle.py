@@ -32,8 +32,8 @@ class Bundle(structref.StructRefProxy):
 structref.define_proxy(Bundle, BundleType, list(Simulation._fields))
 
 
-def _make(tables, jobs, state, offers, events, trace, drive, form):  # pyright: ignore
-    return Bundle(tables, jobs, state, offers, events, trace, drive, form)
+def _make(tables, state, offers, events, trace, drive, form):  # pyright: ignore
+    return Bundle(tables, state, offers, events, trace, drive, form)
 
 
 _compiled_make = compile_cached(_make)

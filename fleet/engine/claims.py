@@ -10,18 +10,7 @@ An arm takes the space of its whole plan from the award until it is home again, 
 import numpy as np
 
 from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State
-from fleet.engine.tables import (
-    AWARD,
-    EXPIRE,
-    ILLEGAL,
-    LOST,
-    EventBuffer,
-    Jobs,
-    OpenJobs,
-    Simulation,
-    Tables,
-    record_event,
-)
+from fleet.engine.tables import AWARD, EXPIRE, ILLEGAL, LOST, EventBuffer, Simulation, Tables, record_event
 from fleet.jit import jit, jit_inline, nonnegative
 from fleet.telemetry import IDLE, WORKING
 
@@ -29,113 +18,150 @@ Array = np.ndarray
 
 ROUNDING = 1e-9
 """A cycle counts as begun when more than this share of it is over."""
-LARGEST = float(np.finfo(float).max)
+LARGEST = float(np.finfo(np.float32).max)
 """Claims without a difficulty are ordered behind all others."""
 
 
-@jit_inline
-def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer, rows: Array) -> None:
+@jit
+def update_offers(sim: Simulation, rows: Array) -> None:
     """Fill the slots of some envs, oldest job in the queue first, and their action masks; late jobs expire.
 
     Args:
         rows: Envs, int [row].
     """
-    fleets, kinds, count, release_s, after = d.fleet, d.kind, d.number, d.release_s, d.after
-    due_s, expires = d.due_s, d.expires
-    pending, times_s, away, progress_s, todo = o.pending, t.times_s, s.plan, s.progress_s, s.todo
-    tick, modes, status = s.tick, s.mode, s.status
-    slot_job, mask, queue, head, current = o.slot_job, o.mask, o.queue, o.head, o.current_kind
-    stations, work, closed, excluded, station_free = t.stations, t.work, o.closed, t.excluded, o.station_free
-    options = nonnegative(work.shape[3])
-    arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
-    waits, words, last = nonnegative(after.shape[2]), nonnegative(stations.shape[2]), nonnegative(mask.shape[2] - 1)
-    busy, slot_kind = np.empty(words, np.uint64), np.empty(slots, np.int64)
+    t, s, mask = sim.tables, sim.state, sim.offers.mask
+    arms, last = nonnegative(s.arms.shape[1]), nonnegative(mask.shape[2] - 1)
+    busy, slot_kind = np.empty(t.stations.shape[2], np.uint64), np.empty(sim.offers.slot_job.shape[1], np.int64)
     for row in rows:
         e = nonnegative(row)
-        fleet, now_s, filled = nonnegative(fleets[e]), tick[e] * t.dt_s, 0
-        mark_busy_stations(fleet, e, current, stations, busy)
-        mark_closed_space(away, excluded, closed, e)
-        place = nonnegative(head[e])
-        while place < count[e]:
-            j = nonnegative(queue[e, place])
-            place += 1
-            if release_s[e, j] > now_s:
-                break
-            if expires[e, j] and due_s[e, j] < now_s:
-                remove_from_queue(queue, head, e, j)
-                give_up(d, s, o, e, j, EXPIRED)
-                if len(events.what) > 0:
-                    record_event(events, EXPIRE, e, -1, j, -1, 0.0, 0.0)
-                place, filled = nonnegative(head[e]), 0  # jobs in the queue have moved
-                continue
-            if filled == slots:  # of the jobs behind, only the late ones matter
-                continue
-            ready = True
-            for n in range(waits):
-                before = after[e, j, n]
-                if before >= 0 and status[e, before] != DONE:
-                    ready = False
-            if not ready:
-                continue
-            kind, free = nonnegative(kinds[e, j]), True
-            for w in range(words):
-                free = free and (stations[fleet, kind, w] & busy[w]) == 0
-            slot_job[e, filled], station_free[e, filled], slot_kind[filled] = j, free, kind
-            filled += 1
-        for k in range(filled, slots):
-            slot_job[e, k], station_free[e, k] = -1, False
+        env = s.env[e]
+        if env["changed"] or env["next_s"] <= env["tick"] * t.dt_s:
+            filled = fill_slots(t, s, sim.offers.slot_job, sim.events, e, slot_kind)
+            fill_masks(sim, e, filled, slot_kind, busy)
+            env["changed"] = False
         for a in range(arms):
-            for action in range(1, last):
-                mask[e, a, action] = 0
-            mask[e, a, last] = (
-                modes[e, a] == WORKING
-                and pending[e, a]
-                and cycles_begun(times_s, away, progress_s, todo, e, a) < todo[e, a]
-            )
-            if modes[e, a] == IDLE:
-                for k in range(filled):
-                    for n in range(options):
-                        own = work[fleet, a, slot_kind[k], n]
-                        taken = is_closed(closed, e, nonnegative(own["volume"]))
-                        mask[e, a, 1 + k * options + n] = station_free[e, k] & (own["plan"] >= 0) & (not taken)
+            arm = s.arms[e, a]
+            mask[e, a, last] = arm["pending"] and cycles_begun(t.plans, arm) < arm["todo"]
 
 
 @jit_inline
-def mark_busy_stations(fleet: int, e: int, current: Array, stations: Array, busy: Array) -> None:
-    """Put the stations of an env with an arm at work into `busy`, one bit each, uint64 [word]."""
-    for w in range(len(busy)):
-        busy[w] = 0
-        for a in range(current.shape[1]):
-            busy[w] |= stations[fleet, nonnegative(current[e, a]), w]
+def fill_slots(t: Tables, s: State, slot_job: Array, events: EventBuffer, e: int, slot_kind: Array) -> int:
+    """Fill the slots of an env; late jobs expire.
+
+    Args:
+        slot_kind: Receives the kinds of their jobs, int [slot].
+
+    Returns:
+        The number of filled slots.
+    """
+    env, jobs, queue, slots = s.env[e], s.jobs[e], s.queue[e], nonnegative(slot_job.shape[1])
+    now_s, filled, place, next_s = env["tick"] * t.dt_s, 0, nonnegative(env["head"]), np.inf
+    while place < env["number"]:
+        j = nonnegative(queue[place])
+        job = jobs[j]
+        place += 1
+        if job["release_s"] > now_s:
+            next_s = min(next_s, job["release_s"])
+            break
+        if job["expires"] and job["due_s"] < now_s:
+            remove_from_queue(s, e, j)
+            give_up(s, e, j, EXPIRED)
+            if len(events.what) > 0:
+                record_event(events, EXPIRE, e, -1, j, -1, 0.0, 0.0)
+            place, filled = nonnegative(env["head"]), 0  # jobs in the queue have moved
+            continue
+        if job["expires"]:
+            next_s = min(next_s, job["due_s"])
+        if filled == slots:  # of the jobs behind, only the late ones matter
+            continue
+        ready = True
+        for n in range(s.after.shape[2]):
+            before = s.after[e, j, n]
+            if before >= 0 and jobs[before]["status"] != DONE:
+                ready = False
+        if ready:
+            slot_job[e, filled], slot_kind[filled] = j, job["kind"]
+            filled += 1
+    for k in range(filled, slots):
+        slot_job[e, k] = -1
+    env["next_s"] = next_s
+    return filled
 
 
 @jit_inline
-def mark_closed_space(plans: Array, excluded: Array, closed: Array, e: int) -> None:
+def fill_masks(sim: Simulation, e: int, filled: int, slot_kind: Array, busy: Array) -> None:
+    """Find out which stations of an env are free, and which options its idle arms may claim.
+
+    Args:
+        filled: Number of filled slots.
+        slot_kind: Kinds of their jobs, int [slot].
+        busy: Room for the stations that are taken, uint64 [word].
+    """
+    t, s, o = sim.tables, sim.state, sim.offers
+    fleet, arms = nonnegative(s.env[e]["fleet"]), nonnegative(s.arms.shape[1])
+    mark_busy_stations(t, s.arms[e], fleet, busy)
+    mark_closed_space(t, s.arms[e], o.closed[e])
+    for k in range(o.slot_job.shape[1]):
+        o.station_free[e, k] = k < filled and are_free(t.stations[fleet, slot_kind[k]], busy)
+    for a in range(arms):
+        mask = o.mask[e, a]
+        mask[1:-1] = 0
+        if s.arms[e, a]["mode"] != IDLE:
+            continue
+        action = 1
+        for k in range(filled):
+            free, offered = o.station_free[e, k], t.work[fleet, slot_kind[k], a]
+            for n in range(len(offered)):
+                can = offered[n]["plan"] >= 0
+                mask[action] = free & can & (not is_closed(o.closed[e], offered[n]["volume"]))
+                action += 1
+
+
+@jit_inline
+def mark_busy_stations(t: Tables, arms: Array, fleet: int, busy: Array) -> None:
+    """Put the stations with an arm of an env at work into `busy`, one bit each, uint64 [word]."""
+    busy[:] = 0
+    for a in range(len(arms)):
+        for w in range(len(busy)):
+            busy[w] |= t.stations[fleet, nonnegative(arms[a]["kind"]), w]
+
+
+@jit_inline
+def mark_closed_space(t: Tables, arms: Array, closed: Array) -> None:
     """Put the volumes that the arms of an env exclude into `closed`; none excludes a volume of the same arm."""
-    for w in range(closed.shape[1]):
-        closed[e, w] = 0
-    for a in range(plans.shape[1]):
-        plan = plans[e, a]
+    closed[:] = 0
+    for a in range(len(arms)):
+        plan = arms[a]["plan"]
         if plan >= 0:
-            for w in range(closed.shape[1]):
-                closed[e, w] |= excluded[plan, w]
+            for w in range(len(closed)):
+                closed[w] |= t.excluded[plan, w]
 
 
 @jit_inline
-def cycles_begun(times_s: Array, plans: Array, progress_s: Array, todo: Array, e: int, a: int) -> int:
+def are_free(stations: Array, busy: Array) -> bool:
+    """Whether none of the stations is busy, both uint64 [word]."""
+    free = True
+    for w in range(len(busy)):
+        free = free and (stations[w] & busy[w]) == 0
+    return free
+
+
+@jit_inline
+def cycles_begun(plans: Array, arm: Array) -> int:
     """Cycles of its plan that an arm at work has begun."""
-    plan = nonnegative(plans[e, a])
-    into_s = progress_s[e, a] - times_s[plan, 0]
-    return 0 if into_s <= 0.0 else min(int(np.ceil(into_s / times_s[plan, 1] - ROUNDING)), todo[e, a])
+    plan = plans[nonnegative(arm["plan"])]
+    into_s = arm["progress_s"] - plan["times_s"][0]
+    return 0 if into_s <= 0.0 else min(int(np.ceil(into_s / plan["times_s"][1] - ROUNDING)), arm["todo"])
 
 
 @jit_inline
-def is_closed(bits: Array, row: int, volume: int) -> bool:
-    """Whether a volume is among the bits, uint64 [row, word]."""
-    return (bits[row, volume >> 6] >> np.uint64(volume & 63)) & np.uint64(1) != 0
+def is_closed(bits: Array, volume: int) -> bool:
+    """Whether a volume is among the bits, uint64 [word]."""
+    place = nonnegative(volume)
+    return (bits[place >> 6] >> np.uint64(place & 63)) & np.uint64(1) != 0
 
 
-@jit_inline
+@jit
 def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     """Award every claimed job to one arm, and note who gives a job back; an illegal action is counted and waits.
 
@@ -143,34 +169,29 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
         actions: int [env, arm].
         rows: Envs, int [row].
     """
-    t, d, s, o, events = sim.tables, sim.jobs, sim.state, sim.offers, sim.events
-    fleets, kinds, repetitions = d.fleet, d.kind, d.repetitions
-    modes, jobs, status, last, illegal = s.mode, s.job, s.status, s.last_award, s.illegal
-    progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
-    slot_job, mask, queue, head, current, pending = o.slot_job, o.mask, o.queue, o.head, o.current_kind, o.pending
-    stations, work, recording = t.stations, t.work, len(events.what) > 0
-    plans, excluded, closed = s.plan, t.excluded, o.closed
-    arms, options, words = nonnegative(modes.shape[1]), nonnegative(work.shape[3]), nonnegative(stations.shape[2])
-    give_back = mask.shape[2] - 1
-    busy, key, order = np.empty(words, np.uint64), np.empty(arms), np.empty(arms, np.int64)
+    t, s, mask, events = sim.tables, sim.state, sim.offers.mask, sim.events
+    arms, options = nonnegative(s.arms.shape[1]), nonnegative(t.work.shape[3])
+    give_back, recording = mask.shape[2] - 1, len(events.what) > 0
+    busy, key, order = np.empty(t.stations.shape[2], np.uint64), np.empty(arms), np.empty(arms, np.int64)
     for row in rows:
         e = nonnegative(row)
-        fleet, claims = nonnegative(fleets[e]), 0
+        fleet, claims = nonnegative(s.env[e]["fleet"]), 0
         for a in range(arms):
-            action = actions[e, a]
-            last[e, a] = 0
+            arm, action = s.arms[e, a], actions[e, a]
+            arm["last_award"] = 0
             if action == 0:
                 continue
             if action < 0 or action > give_back or mask[e, a, action] == 0:
-                illegal[e, a] += 1
+                arm["illegal"] += 1
                 if recording:
                     record_event(events, ILLEGAL, e, a, -1, -1, 0.0, 0.0)
                 continue
             if action == give_back:
-                todo[e, a] = cycles_begun(t.times_s, plans, progress_s, todo, e, a)
+                arm["todo"] = cycles_begun(t.plans, arm)
+                set_phase(t.plans, arm)
                 continue
             slot, option = divmod(action - 1, options)
-            score = work[fleet, a, kinds[e, slot_job[e, slot]], option]["difficulty"]
+            score = t.work[fleet, s.jobs[e, sim.offers.slot_job[e, slot]]["kind"], a, option]["difficulty"]
             if not score < np.inf:
                 score = LARGEST
             place = claims
@@ -179,87 +200,111 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
                 place -= 1
             key[place], order[place] = score, a
             claims += 1
-        if claims == 0:
-            continue
-        mark_busy_stations(fleet, e, current, stations, busy)
-        for rank in range(claims):
-            a = order[rank]
-            slot, option = divmod(actions[e, a] - 1, options)
-            j, option = nonnegative(slot_job[e, slot]), nonnegative(option)
-            kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
-            own = work[fleet, a, kind, option]
-            plan = nonnegative(own["plan"])
-            free = free and not is_closed(closed, e, nonnegative(own["volume"]))
-            for w in range(words):
-                free = free and (stations[fleet, kind, w] & busy[w]) == 0
-            if not free:
-                last[e, a] = -1
-                if recording:
-                    record_event(events, LOST, e, a, j, -1, 0.0, 0.0)
-                continue
-            for w in range(words):
-                busy[w] |= stations[fleet, kind, w]
-            remove_from_queue(queue, head, e, j)
-            last[e, a], status[e, j] = 1, RUNNING
-            modes[e, a], jobs[e, a], plans[e, a], progress_s[e, a] = WORKING, j, plan, 0.0
-            for w in range(closed.shape[1]):
-                closed[e, w] |= excluded[plan, w]
-            current[e, a], pending[e, a] = kind, True
-            todo[e, a] = repetitions[e, j] - cycles[e, j]
-            if recording:
-                record_event(events, AWARD, e, a, j, plan, 0.0, float(own["difficulty"]))
+        if claims > 0:
+            mark_busy_stations(t, s.arms[e], fleet, busy)
+            for rank in range(claims):
+                award(sim, e, order[rank], actions[e, order[rank]], busy)
 
 
 @jit_inline
-def remove_from_queue(queue: Array, head: Array, e: int, j: int) -> None:
-    """Remove a job from the queue: those before it move up."""
-    place = head[e]
-    ahead = queue[e, place]
-    while ahead != j:
-        place += 1
-        ahead, queue[e, place] = queue[e, place], ahead
-    head[e] += 1
+def award(sim: Simulation, e: int, a: int, action: int, busy: Array) -> None:
+    """Award a claimed job to an arm, unless the job, a station or the space was awarded before.
+
+    Args:
+        busy: Stations that are taken, uint64 [word]; gets those of the job.
+    """
+    t, s, o, events = sim.tables, sim.state, sim.offers, sim.events
+    recording = len(events.what) > 0
+    slot, option = divmod(action - 1, t.work.shape[3])
+    j = nonnegative(o.slot_job[e, slot])
+    env, arm, job = s.env[e], s.arms[e, a], s.jobs[e, j]
+    fleet, kind = nonnegative(env["fleet"]), nonnegative(job["kind"])
+    own, stations = t.work[fleet, kind, a, nonnegative(option)], t.stations[fleet, kind]
+    if job["status"] != WAITING or is_closed(o.closed[e], own["volume"]) or not are_free(stations, busy):
+        arm["last_award"] = -1
+        if recording:
+            record_event(events, LOST, e, a, j, -1, 0.0, 0.0)
+        return
+    for w in range(len(busy)):
+        busy[w] |= stations[w]
+    for w in range(o.closed.shape[1]):
+        o.closed[e, w] |= t.excluded[own["plan"], w]
+    remove_from_queue(s, e, j)
+    env["changed"] = True
+    job["status"] = RUNNING
+    arm["last_award"], arm["mode"], arm["job"], arm["kind"], arm["pending"] = 1, WORKING, j, kind, True
+    arm["plan"], arm["progress_s"], arm["todo"] = own["plan"], 0.0, job["repetitions"] - job["cycles"]
+    set_phase(t.plans, arm)
+    if recording:
+        record_event(events, AWARD, e, a, j, own["plan"], 0.0, float(own["difficulty"]))
+
+
+@jit_inline
+def set_phase(plans: Array, arm: Array) -> None:
+    """Give an arm at work the heat drive of the phase that begins or goes on now, and note when it ends."""
+    plan = plans[nonnegative(arm["plan"])]
+    first_s = plan["times_s"][0]
+    last_s = first_s + plan["times_s"][1] * arm["todo"]
+    phase, end_s = 2, last_s + plan["times_s"][2]
+    if arm["progress_s"] < first_s:
+        phase, end_s = 0, first_s
+    elif arm["progress_s"] < last_s:
+        phase, end_s = 1, last_s
+    arm["phase_end_s"] = end_s
+    for k in range(len(arm["current_sq"])):
+        arm["current_sq"][k], arm["friction_w"][k] = plan["current_sq"][phase, k], plan["friction_w"][phase, k]
 
 
 @jit
-def return_to_queue(d: Jobs, s: State, o: OpenJobs, e: int, j: int, until_s: float) -> None:
+def remove_from_queue(s: State, e: int, j: int) -> None:
+    """Remove a job from the queue: those before it move up."""
+    queue, place = s.queue[e], s.env[e]["head"]
+    ahead = queue[place]
+    while ahead != j:
+        place += 1
+        ahead, queue[place] = queue[place], ahead
+    s.env[e]["head"] += 1
+
+
+@jit
+def return_to_queue(s: State, e: int, j: int, until_s: float) -> None:
     """Put a job back into the queue, behind all that were released or returned before it.
 
     Args:
         until_s: End of the step: what is released later comes later.
     """
-    queue, queued_s = o.queue, s.queued_s
-    since_s, place = queued_s[e, j], o.head[e] - 1
-    o.head[e] = place
-    while place + 1 < d.number[e]:
-        ahead = queue[e, place + 1]
-        came_s = queued_s[e, ahead]
-        if d.release_s[e, ahead] > until_s or came_s > since_s or (came_s == since_s and ahead > j):
+    env, queue, jobs = s.env[e], s.queue[e], s.jobs[e]
+    since_s, place = jobs[j]["queued_s"], env["head"] - 1
+    env["head"] = place
+    while place + 1 < env["number"]:
+        ahead = queue[place + 1]
+        came_s = jobs[ahead]["queued_s"]
+        if jobs[ahead]["release_s"] > until_s or came_s > since_s or (came_s == since_s and ahead > j):
             break
-        queue[e, place] = ahead
+        queue[place] = ahead
         place += 1
-    queue[e, place] = j
+    queue[place] = j
 
 
 @jit
-def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int, why: int) -> None:
+def give_up(s: State, e: int, j: int, why: int) -> None:
     """Give a job up that is not in the queue, and with it all that wait for it.
 
     Args:
         why: Its status from now on, GIVEN_UP or EXPIRED.
     """
-    status, after = s.status, d.after
-    status[e, j] = why
-    o.unfinished[e] -= 1
-    o.given_up[e] += 1
-    found = after.shape[2] > 0
+    env, jobs, after = s.env[e], s.jobs[e], s.after[e]
+    jobs[j]["status"] = why
+    env["unfinished"] -= 1
+    env["given_up"] += 1
+    found = after.shape[1] > 0
     while found:
         found = False
-        for i in range(d.number[e]):
-            for n in range(after.shape[2]):
-                before = after[e, i, n]
-                if status[e, i] == WAITING and before >= 0 and status[e, before] > DONE:
-                    status[e, i], found = GIVEN_UP, True
-                    remove_from_queue(o.queue, o.head, e, i)
-                    o.unfinished[e] -= 1
-                    o.given_up[e] += 1
+        for i in range(env["number"]):
+            for n in range(after.shape[1]):
+                before = after[i, n]
+                if jobs[i]["status"] == WAITING and before >= 0 and jobs[before]["status"] > DONE:
+                    jobs[i]["status"], found = GIVEN_UP, True
+                    remove_from_queue(s, e, i)
+                    env["unfinished"] -= 1
+                    env["given_up"] += 1

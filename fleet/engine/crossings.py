@@ -53,55 +53,54 @@ def hottest(temp_c: Array) -> float:
 
 
 @jit
-def to_modes(t: Tables, fleet: int, a: int, temp_c: Array, load_w: Array, modal: Array) -> None:
+def to_modes(net: Array, temp_c: Array, load_w: Array, modal: Array) -> None:
     """Put y and z of an interval that begins at these temperatures into `modal` [2, mode].
 
     Args:
+        net: A `MODAL` record.
         load_w: Heat plus conductance to ambient times ambient temperature, W, [node].
     """
     modal[:] = 0.0
     for n in range(NODES):
-        root = t.root_capacity[fleet, a, n]
+        root = net["root_capacity"][n]
         warm = root * temp_c[n]
         load = load_w[n] / root
         for m in range(NODES):
-            modal[0, m] += t.modes[fleet, a, n, m] * warm
-            modal[1, m] += t.modes[fleet, a, n, m] * load
+            modal[0, m] += net["modes"][n, m] * warm
+            modal[1, m] += net["modes"][n, m] * load
 
 
 @jit
-def temperatures_at(t: Tables, fleet: int, a: int, modal: Array, time_s: float, out: Array) -> None:
+def temperatures_at(net: Array, modal: Array, time_s: float, out: Array) -> None:
     """Put the temperatures at a moment of an interval into `out` [node]."""
     out[:] = 0.0
     for m in range(NODES):
-        rate = t.rates[fleet, a, m]
+        rate = net["rates"][m]
         now = modal[0, m] + math.expm1(-rate * time_s) * (modal[0, m] - modal[1, m] / rate)
         for n in range(NODES):
-            out[n] += t.modes[fleet, a, n, m] * now
+            out[n] += net["modes"][n, m] * now
     for n in range(NODES):
-        out[n] /= t.root_capacity[fleet, a, n]
+        out[n] /= net["root_capacity"][n]
 
 
 @jit
-def hottest_at(t: Tables, fleet: int, a: int, modal: Array, time_s: float) -> float:
+def hottest_at(net: Array, modal: Array, time_s: float) -> float:
     """Return the temperature of the hottest motor at a moment of an interval."""
     now = np.empty(NODES)
-    temperatures_at(t, fleet, a, modal, time_s, now)
+    temperatures_at(net, modal, time_s, now)
     return hottest(now)
 
 
 @jit
-def hottest_joint_at(t: Tables, fleet: int, a: int, modal: Array, time_s: float) -> int:
+def hottest_joint_at(net: Array, modal: Array, time_s: float) -> int:
     """Return the index of the hottest motor at a moment of an interval."""
     now = np.empty(NODES)
-    temperatures_at(t, fleet, a, modal, time_s, now)
+    temperatures_at(net, modal, time_s, now)
     return int(np.argmax(now[:JOINTS]))
 
 
 @jit
-def crossing_s(
-    t: Tables, fleet: int, a: int, modal: Array, length_s: float, limit_c: float, first_c: float, last_c: float
-) -> float:
+def crossing_s(net: Array, modal: Array, length_s: float, limit_c: float, first_c: float, last_c: float) -> float:
     """Return when the hottest motor crosses a limit that lies between its first and last temperature.
 
     Inverse quadratic interpolation where it is safe, else bisection: Chandrupatla (1997), Advances in Engineering
@@ -120,7 +119,7 @@ def crossing_s(
         if least > 0.25:
             break
         new = x + min(max(share, least), 1.0 - least) * (other - x)
-        f_new = hottest_at(t, fleet, a, modal, new) - limit_c
+        f_new = hottest_at(net, modal, new) - limit_c
         if (f_new >= 0.0) == (y >= 0.0):
             third, f_third = x, y
         else:
@@ -136,72 +135,76 @@ def crossing_s(
 
 
 @jit
-def braked_load(t: Tables, fleet: int, a: int, ambient_c: float, out: Array) -> float:
+def braked_load(net: Array, power_off: bool, ambient_c: float, out: Array) -> float:
     """Put the load of an arm on its brakes into `out`, W, [node]; return the heat in it."""
     heat_w = 0.0
     for n in range(NODES):
-        out[n] = t.to_ambient[fleet, a, n] * ambient_c
-    if not t.power_off:
+        out[n] = net["to_ambient"][n] * ambient_c
+    if not power_off:
         for j in range(JOINTS):
-            out[JOINTS + j] += t.idle_w[fleet, a, j]
-            heat_w += t.idle_w[fleet, a, j]
+            out[JOINTS + j] += net["idle_w"][j]
+            heat_w += net["idle_w"][j]
     return heat_w
 
 
 @jit
 def step_with_crossing(
-    t: Tables, fleet: int, a: int, mode: int, begin: Array, heat_w: float, ambient_c: float, end: Array
+    t: Tables, net: Array, mode: int, begin: Array, heat_w: float, ambient_c: float, end: Array
 ) -> Crossed:
     """Step an arm that crosses a limit or is faulted; `end` becomes its true temperatures at the end.
 
     Args:
+        net: A `MODAL` record.
         begin: Temperatures, then loads (heat, and conductance times ambient temperature), [from].
         heat_w: Total heat until a fault.
     """
-    dt_s, modal, faulted = t.dt_s, np.empty((2, NODES)), mode == FAULTED
-    to_modes(t, fleet, a, begin, begin[NODES:], modal)
-    first_c, last_c = hottest(begin), hottest(end)
+    dt_s, modal, faulted, last = t.dt_s, np.empty((2, NODES)), mode == FAULTED, np.empty(NODES)
+    to_modes(net, begin, begin[NODES:], modal)
+    temperatures_at(net, modal, dt_s, last)
+    first_c, last_c = np.float64(hottest(begin)), hottest(last)
     if faulted or last_c < t.error_c:
         cool_s = np.inf
         if faulted and last_c < t.restart_c:
             cool_s = 0.0
             if first_c >= t.restart_c:
-                cool_s = crossing_s(t, fleet, a, modal, dt_s, t.restart_c, first_c, last_c)
-        above, warned_s, joint = warning_in(t, fleet, a, modal, dt_s, first_c, last_c)
+                cool_s = crossing_s(net, modal, dt_s, t.restart_c, first_c, last_c)
+        above, warned_s, joint = warning_in(t.warning_c, net, modal, dt_s, first_c, last_c)
+        end[:NODES] = last
         return Crossed(dt_s, above, heat_w * dt_s, last_c, cool_s, warned_s, joint, -1)
     cut_s = 0.0
     if first_c < t.error_c:
-        cut_s = crossing_s(t, fleet, a, modal, dt_s, t.error_c, first_c, last_c)
+        cut_s = crossing_s(net, modal, dt_s, t.error_c, first_c, last_c)
     stopped, brakes = np.empty(NODES), np.empty(NODES)
-    temperatures_at(t, fleet, a, modal, cut_s, stopped)
+    temperatures_at(net, modal, cut_s, stopped)
     stopped_c, fault_joint = hottest(stopped), int(np.argmax(stopped[:JOINTS]))
-    above, warned_s, joint = warning_in(t, fleet, a, modal, cut_s, first_c, stopped_c)
-    brakes_w = braked_load(t, fleet, a, ambient_c, brakes)
-    to_modes(t, fleet, a, stopped, brakes, modal)
+    above, warned_s, joint = warning_in(t.warning_c, net, modal, cut_s, first_c, stopped_c)
+    brakes_w = braked_load(net, t.power_off, ambient_c, brakes)
+    to_modes(net, stopped, brakes, modal)
     left_s = dt_s - cut_s
-    temperatures_at(t, fleet, a, modal, left_s, end)
-    last_c = hottest(end)
-    above_braked, warned_braked_s, joint_braked = warning_in(t, fleet, a, modal, left_s, stopped_c, last_c)
+    temperatures_at(net, modal, left_s, last)
+    last_c = hottest(last)
+    above_braked, warned_braked_s, joint_braked = warning_in(t.warning_c, net, modal, left_s, stopped_c, last_c)
     if warned_braked_s < np.inf:
         warned_s, joint = cut_s + warned_braked_s, joint_braked
     peak, cool_s = max(stopped_c, last_c), np.inf
     if last_c < t.restart_c:
         cool_s = cut_s
         if peak >= t.restart_c:
-            cool_s = cut_s + crossing_s(t, fleet, a, modal, left_s, t.restart_c, stopped_c, last_c)
+            cool_s = cut_s + crossing_s(net, modal, left_s, t.restart_c, stopped_c, last_c)
     energy_j = heat_w * cut_s + brakes_w * left_s
+    end[:NODES] = last
     return Crossed(cut_s, above + above_braked, energy_j, peak, cool_s, warned_s, joint, fault_joint)
 
 
 @jit
 def warning_in(
-    t: Tables, fleet: int, a: int, modal: Array, length_s: float, first_c: float, last_c: float
+    warning_c: float, net: Array, modal: Array, length_s: float, first_c: float, last_c: float
 ) -> tuple[float, float, int]:
     """Return seconds above the warning limit in an interval, the moment it is crossed upwards (inf), and the motor."""
-    begins = first_c >= t.warning_c
-    if begins == (last_c >= t.warning_c):
+    begins = first_c >= warning_c
+    if begins == (last_c >= warning_c):
         return (length_s if begins else 0.0), np.inf, -1
-    passed_s = crossing_s(t, fleet, a, modal, length_s, t.warning_c, first_c, last_c)
+    passed_s = crossing_s(net, modal, length_s, warning_c, first_c, last_c)
     if begins:
         return passed_s, np.inf, -1
-    return length_s - passed_s, passed_s, hottest_joint_at(t, fleet, a, modal, passed_s)
+    return length_s - passed_s, passed_s, hottest_joint_at(net, modal, passed_s)

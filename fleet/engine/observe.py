@@ -32,30 +32,22 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
         rows: Envs, int [row].
         out: float32 [env, arm, size].
     """
-    t, d, s, o, form = sim.tables, sim.jobs, sim.state, sim.offers, sim.form
-    fleets, kinds, keys, repetitions, due_s = d.fleet, d.kind, d.noise_key, d.repetitions, d.due_s
-    ticks, temp_c, modes, progress_s, todo = s.tick, s.temp_c, s.mode, s.progress_s, s.todo
-    last, queued_s, cycles, returns = s.last_award, s.queued_s, s.cycles, s.returns
-    slot_job, station_free, plans, times_s = o.slot_job, o.station_free, s.plan, t.times_s
-    excluded, closed = t.excluded, o.closed
-    noise_k, payload_kg, values, work = t.sensor_noise_k, t.payload_kg, t.value, t.work
-    arms, slots, options = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1]), nonnegative(work.shape[3])
+    t, s, o, form = sim.tables, sim.state, sim.offers, sim.form
+    slot_job, station_free, work = o.slot_job, o.station_free, t.work
+    arms, slots, options = nonnegative(s.arms.shape[1]), nonnegative(slot_job.shape[1]), nonnegative(work.shape[3])
     at, low, high, first, change = form.offsets, form.low, form.high, form.first_change, form.change
-    size = nonnegative(out.shape[2])
-    jobs, pending, who = s.job, o.pending, form.who
+    size, who = nonnegative(out.shape[2]), form.who
     peers = nonnegative((size - at.peer_heard) // (6 + 3 * slots))
     low_c, high_c, low_k, high_k = low[at.temp_c], high[at.temp_c], low[at.headroom_k], high[at.headroom_k]
     most_kg, most_value, most_returns = high[at.payload_kg], high[at.value], high[at.returns]
-    true_c, measured_c, hottest_c = np.empty(LANES), np.empty((arms, LANES)), np.empty(arms)
+    true_c, measured_c, hottest_c = np.empty(LANES, np.float32), np.empty((arms, LANES), np.float32), np.empty(arms)
     headroom_k = np.empty(arms, np.float32)
     left, slack_s, slot_kind = np.empty(slots), np.empty(slots), np.empty(slots, np.int64)
     fast_volume, fast_can = np.empty(slots, np.int64), np.empty(slots, np.bool_)
     known, shared = np.zeros((arms, slots), np.float32), np.zeros((arms, slots), np.float32)
     first_block, block, curve = t.forecast_first, t.forecast_block, t.forecast_curve
     warning_c, error_c, forecasts = t.warning_c, t.error_c, len(curve) > 0
-    known_c, values_c, left_s = np.zeros(KNOWN), np.empty(LANES), np.zeros(arms)
-    housing_c, ambient, offsets_k = s.housing_c, t.ambient_c, d.ambient_offset_k
-    too_heavy, expires = t.too_heavy, d.expires
+    known_c, values_c, left_s = np.zeros(KNOWN, np.float32), np.empty(LANES, np.float32), np.zeros(arms)
     # The vector of an arm but for its own fields: filled slots and peers.
     frame = np.zeros(size, np.float32)
     for k in range(slots * options):
@@ -65,22 +57,24 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     filled_before = 0
     for row in rows:
         e = nonnegative(row)
-        fleet, now_s, key = nonnegative(fleets[e]), ticks[e] * t.dt_s, keys[e]
-        count = np.uint64(nonnegative(ticks[e]) * arms * JOINTS)
+        env, closed = s.env[e], o.closed[e]
+        fleet, tick, key = nonnegative(env["fleet"]), nonnegative(env["tick"]), env["noise_key"]
+        now_s, count = tick * t.dt_s, np.uint64(tick * arms * JOINTS)
         frame[at.clock] = now_s / (t.ticks * t.dt_s)
-        frame[at.left_s] = min((t.ticks - ticks[e]) * t.dt_s, LONG_S)
+        frame[at.left_s] = min((t.ticks - tick) * t.dt_s, LONG_S)
         filled = 0
         while filled < slots and slot_job[e, filled] >= 0:
             j = nonnegative(slot_job[e, filled])
-            kind = nonnegative(kinds[e, j])
+            job = s.jobs[e, j]
+            kind = nonnegative(job["kind"])
             slot_kind[filled] = kind
-            left[filled], slack_s[filled] = repetitions[e, j] - cycles[e, j], due_s[e, j] - now_s
+            left[filled], slack_s[filled] = job["repetitions"] - job["cycles"], job["due_s"] - now_s
             frame[at.offered + filled], frame[at.station_free + filled] = 1.0, station_free[e, filled]
-            frame[at.age_s + filled] = min(max(now_s - queued_s[e, j], 0.0), LONG_S)
-            frame[at.payload_kg + filled] = min(payload_kg[fleet, kind], most_kg)
-            frame[at.value + filled] = min(max(values[fleet, kind], 0.0), most_value)
-            frame[at.returns + filled] = min(returns[e, j], most_returns)
-            frame[at.expires + filled] = expires[e, j]
+            frame[at.age_s + filled] = min(max(now_s - job["queued_s"], 0.0), LONG_S)
+            frame[at.payload_kg + filled] = min(t.payload_kg[fleet, kind], most_kg)
+            frame[at.value + filled] = min(max(t.value[fleet, kind], 0.0), most_value)
+            frame[at.returns + filled] = min(job["returns"], most_returns)
+            frame[at.expires + filled] = job["expires"]
             filled += 1
         for k in range(filled, filled_before):
             frame[at.offered + k] = frame[at.age_s + k] = frame[at.payload_kg + k] = 0.0
@@ -89,54 +83,56 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                 frame[at.peer_known + peer * slots + k] = frame[at.peer_difficulty + peer * slots + k] = 0.0
         filled_before = filled
         for a in range(arms):
-            for k in range(LANES):
-                true_c[k] = temp_c[e, a, k] + noise_k[fleet, a, k] * random_normal(key, count + np.uint64(k + 1))
+            arm, noise_k = s.arms[e, a], t.law[fleet, a]["sensor_noise_k"]
+            for k in range(JOINTS):
+                true_c[k] = arm["temp_c"][k] + noise_k[k] * random_normal(key, count + np.uint64(k + 1))
                 measured_c[a, k] = true_c[k]
             count += np.uint64(JOINTS)
             hottest_c[a] = hottest(true_c)
             headroom_k[a] = min(max(warning_c - hottest_c[a], low_k), high_k)
             left_s[a] = 0.0
-            if modes[e, a] == WORKING:
-                plan = nonnegative(plans[e, a])
-                busy_s = times_s[plan, 0] + times_s[plan, 2] + todo[e, a] * times_s[plan, 1] - progress_s[e, a]
+            if arm["mode"] == WORKING:
+                times_s = t.plans[nonnegative(arm["plan"])]["times_s"]
+                busy_s = times_s[0] + times_s[2] + arm["todo"] * times_s[1] - arm["progress_s"]
                 left_s[a] = min(max(busy_s, 0.0), LONG_S)
             for k in range(filled):
                 known[a, k] = shared[a, k] = 0.0
                 for n in range(options):
-                    score = work[fleet, a, slot_kind[k], n]["difficulty"]
+                    score = work[fleet, slot_kind[k], a, n]["difficulty"]
                     if not np.isnan(score) and (known[a, k] == 0.0 or score < shared[a, k]):
                         known[a, k], shared[a, k] = 1.0, score
         for a in range(arms):
             for n in range(first[a], first[a + 1]):
                 peer, b = nonnegative(change[n, 0]), nonnegative(change[n, 1])
-                frame[at.peer_working + peer] = modes[e, b] == WORKING
-                frame[at.peer_faulted + peer] = modes[e, b] == FAULTED
+                frame[at.peer_working + peer] = s.arms[e, b]["mode"] == WORKING
+                frame[at.peer_faulted + peer] = s.arms[e, b]["mode"] == FAULTED
                 frame[at.peer_headroom_k + peer], frame[at.peer_busy_s + peer] = headroom_k[b], left_s[b]
                 for k in range(filled):
                     frame[at.peer_known + peer * slots + k] = known[b, k]
                     frame[at.peer_difficulty + peer * slots + k] = shared[b, k]
             for i in range(size):
                 out[e, a, i] = frame[i]
-            mode = nonnegative(modes[e, a])
+            arm = s.arms[e, a]
+            mode = nonnegative(arm["mode"])
             out[e, a, at.idle + mode] = 1.0
-            out[e, a, at.busy_s], out[e, a, at.last_award] = left_s[a], last[e, a]
-            air_c = ambient[fleet, min(ticks[e], t.ticks - 1), a] + offsets_k[e]
+            out[e, a, at.busy_s], out[e, a, at.last_award] = left_s[a], arm["last_award"]
+            air_c = t.ambient_c[fleet, min(tick, t.ticks - 1), a] + env["ambient_offset_k"]
             for k in range(JOINTS):
                 out[e, a, at.temp_c + k] = min(max(measured_c[a, k], low_c), high_c)
-                out[e, a, at.housing_c + k] = min(max(housing_c[e, a, k], low_c), high_c)
-                known_c[k], known_c[JOINTS + k] = measured_c[a, k], housing_c[e, a, k]
+                out[e, a, at.housing_c + k] = min(max(arm["housing_c"][k], low_c), high_c)
+                known_c[k], known_c[JOINTS + k] = measured_c[a, k], arm["housing_c"][k]
             known_c[2 * JOINTS] = air_c
             out[e, a, at.headroom_k], out[e, a, at.ambient_c] = headroom_k[a], min(max(air_c, low_c), high_c)
             out[e, a, at.error_headroom_k] = min(max(error_c - hottest_c[a], low_k), high_k)
-            if mode == WORKING and pending[e, a]:
-                j = nonnegative(jobs[e, a])
-                kind, plan = nonnegative(kinds[e, j]), nonnegative(plans[e, a])
-                out[e, a, at.job_value] = min(max(values[fleet, kind], 0.0), most_value)
-                over_s = max(progress_s[e, a] - times_s[plan, 0], 0.0)
-                cycles_over = min(int(over_s / max(times_s[plan, 1], 1e-9) + 1e-9), todo[e, a])
-                out[e, a, at.job_cycles] = min(repetitions[e, j] - cycles[e, j] - cycles_over, LONG_S)
+            if mode == WORKING and arm["pending"]:
+                job, plan = s.jobs[e, nonnegative(arm["job"])], nonnegative(arm["plan"])
+                kind, times_s = nonnegative(job["kind"]), t.plans[plan]["times_s"]
+                out[e, a, at.job_value] = min(max(t.value[fleet, kind], 0.0), most_value)
+                over_s = max(arm["progress_s"] - times_s[0], 0.0)
+                cycles_over = min(int(over_s / max(times_s[1], 1e-9) + 1e-9), arm["todo"])
+                out[e, a, at.job_cycles] = min(job["repetitions"] - job["cycles"] - cycles_over, LONG_S)
                 for n in range(options):
-                    own = work[fleet, a, kind, n]
+                    own = work[fleet, kind, a, n]
                     if own["plan"] == plan:
                         p, risk, peak, peak_c = own["p_saturation"], own["risk"], own["peak"], 0.0
                         if risk >= 0 or peak >= 0:
@@ -147,10 +143,10 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                         out[e, a, at.job_peak_c] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
             for k in range(filled):
                 kind = nonnegative(slot_kind[k])
-                out[e, a, at.too_heavy + k] = too_heavy[fleet, kind, a]
+                out[e, a, at.too_heavy + k] = t.too_heavy[fleet, kind, a]
                 for n in range(options):  # without branches: few of these conditions can be guessed
-                    own, option = work[fleet, a, kind, n], k * options + n
-                    can, open_space = own["plan"] >= 0, not is_closed(closed, e, nonnegative(own["volume"]))
+                    own, option = work[fleet, kind, a, n], k * options + n
+                    can, open_space = own["plan"] >= 0, not is_closed(closed, own["volume"])
                     duration_s, score, p = (
                         own["travel_s"] + left[k] * own["cycle_s"],
                         own["difficulty"],
@@ -166,18 +162,18 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                     )
                     out[e, a, at.p_saturation + option] = p if p == p else 0.5
             for k in range(filled):
-                own = work[fleet, a, slot_kind[k], 0]
+                own = work[fleet, slot_kind[k], a, 0]
                 fast_volume[k], fast_can[k] = nonnegative(own["volume"]), own["plan"] >= 0
             for peer in range(peers):
-                other = plans[e, who[a, peer]]
+                other = s.arms[e, who[a, peer]]["plan"]
                 if other >= 0:
                     for k in range(filled):
-                        blocked = is_closed(excluded, nonnegative(other), fast_volume[k]) & fast_can[k]
+                        blocked = is_closed(t.excluded[other], fast_volume[k]) & fast_can[k]
                         out[e, a, at.peer_blocks + peer * slots + k] = blocked
             if forecasts:
                 for k in range(filled):
                     for n in range(options):
-                        own, option = work[fleet, a, slot_kind[k], n], k * options + n
+                        own, option = work[fleet, slot_kind[k], a, n], k * options + n
                         p, risk, peak = own["p_saturation"], own["risk"], own["peak"]
                         if risk >= 0 or peak >= 0:
                             # All cycles, also of a job that came back: moments in between are not predicted.

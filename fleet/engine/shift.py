@@ -12,8 +12,8 @@ import numpy as np
 
 from fleet.bus.exchange.memory import Broadcast, Exchange, PeerView
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
-from fleet.engine.state import PER_JOB, State, World
-from fleet.engine.tables import events_of, tables_of
+from fleet.engine.state import State, World
+from fleet.engine.tables import TRACE, events_of, tables_of
 from fleet.events import Event
 from fleet.motion import Drive
 from fleet.observation import LONG_S, Layout
@@ -40,10 +40,10 @@ def deliver(
 def broadcast(engine: Engine, vectors: Array, names: Sequence[str], twins: tuple[str, ...], env: int = 0) -> Broadcast:
     """What the arms of an env broadcast at this moment; arguments as in `deliver`."""
     known, slots = engine.layout.read(vectors, engine.mask[env]), engine.offers.slot_job[env]
-    tables, fleet = engine.tables, engine.jobs.fleet[env]
-    kinds = np.where(slots >= 0, engine.jobs.kind[env, slots], 0)
+    tables, fleet = engine.tables, engine.state.fleet[env]
+    kinds = np.where(slots >= 0, engine.state.kind[env, slots], 0)
     filled = slots[:, None] >= 0
-    work = {name: tables.work[name][fleet][:, kinds] for name in ("difficulty", "p_saturation", "risk", "peak")}
+    work = tables.work[fleet, kinds].swapaxes(0, 1)
     unknown = (work["risk"] < 0) & (work["peak"] < 0) & np.isnan(work["p_saturation"])  # [arm, slot, plan]
     p_saturation = known.p_saturation.reshape(unknown.shape)
     return Broadcast(
@@ -242,7 +242,7 @@ class ShiftRunner:
     @property
     def jobs_done(self) -> int:
         """Finished so far."""
-        return int(self._engine.done[0])
+        return int(self._engine.state.done[0])
 
     @property
     def tick(self) -> int:
@@ -294,14 +294,18 @@ def _stepped(
 def _without_room(state: State, world: World) -> State:
     """Views of the state with as many jobs as the world has; an engine may have room for more."""
     jobs = world.jobs.exists.shape[1]
-    return state._replace(**{name: getattr(state, name)[:, :jobs] for name in PER_JOB})
+    return State(state.env, state.arms, *(values[:, :jobs] for values in state[2:]))
 
 
 def record_of(engine: Engine, env: int = 0) -> StepRecord:
     """The record of the last step of one env, with one step."""
     row = slice(env, env + 1)
-    traced = {name: values[row].copy() for name, values in engine.trace._asdict().items()}
-    return StepRecord(tick=engine.state.tick[row] - 1, end_c=engine.state.temp_c[row].copy(), **traced)
+    return _recorded(engine, engine.state.tick[row] - 1, row)
+
+
+def _recorded(engine: Engine, tick: Array, rows: slice = slice(None)) -> StepRecord:
+    traced = {name: engine.trace[name][rows].copy() for name in TRACE.names or ()}
+    return StepRecord(tick=tick, end_c=engine.state.temp_c[rows].astype(float), **traced)
 
 
 def stack_records(records: list[StepRecord]) -> StepRecord:
@@ -341,9 +345,14 @@ def step(
     _stepped(engine, world, plant, np.ascontiguousarray(actions, dtype=np.int64), out)
     if log is not None:
         log += events_of(world, engine.state, engine.events)
-    traced = {name: values.copy() for name, values in engine.trace._asdict().items()}
-    record = StepRecord(tick=before.tick.copy(), end_c=engine.state.temp_c.copy(), **traced)
-    return Stepped(_without_room(engine.state, world).copy(), record)
+    return Stepped(_without_room(engine.state, world).copy(), _recorded(engine, before.tick.copy()))
+
+
+def initial(world: World) -> State:
+    """Every arm at home, at its start temperature; every job waiting."""
+    engine, _ = _engine_of(world, False)
+    engine.reset(np.arange(world.envs), shifts_of(tables_of(world)[1], [0] * world.envs))
+    return _without_room(engine.state, world).copy()
 
 
 def open_jobs(world: World, state: State, *, compiled: bool | None = None) -> tuple[Array, Array]:

@@ -11,10 +11,8 @@ import numpy as np
 from fleet.difficulty import Forecast
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import NODES, HousingObserver, ThermalModel
-from fleet.job import MOST_FAULTS
 from fleet.motion import Drive
 from fleet.robot import JOINTS, ThermalLimits
-from fleet.telemetry import IDLE
 
 Array = np.ndarray
 
@@ -134,99 +132,269 @@ class World:
         return len(self.jobs.exists)
 
 
+LANES = JOINTS + 1
+"""Joints padded to what a processor takes at once."""
+
+ARM = np.dtype(
+    [
+        ("temp_c", "f4", NODES),
+        ("housing_c", "f4", LANES),
+        ("current_sq", "f4", LANES),
+        ("friction_w", "f4", LANES),
+        ("peak_c", "f4"),
+        ("plan", "i4"),
+        ("progress_s", "f8"),
+        ("phase_end_s", "f8"),
+        ("clear_at_s", "f8"),
+        ("moved_at_s", "f8"),
+        ("above_warning_s", "f8"),
+        ("busy_s", "f8"),
+        ("lost_s", "f8"),
+        ("energy_j", "f8"),
+        ("job", "i4"),
+        ("kind", "i4"),
+        ("todo", "i4"),
+        ("faults", "i4"),
+        ("illegal", "i4"),
+        ("mode", "i1"),
+        ("last_award", "i1"),
+        ("pending", "?"),
+        ("unused", "i1", 9),
+    ],
+    align=True,
+)
+"""All that changes of an arm, four cache lines; see the properties of `State`. `current_sq` and `friction_w` are the
+heat drive of the present phase of its plan, which ends when `progress_s` is `phase_end_s`; `kind` is that of its job,
+and `pending` whether the job is still to be finished (False on the way home)."""
+
+JOB = np.dtype(
+    [
+        ("release_s", "f4"),
+        ("due_s", "f4"),
+        ("queued_s", "f4"),
+        ("finished_s", "f4"),
+        ("kind", "i4"),
+        ("repetitions", "i4"),
+        ("cycles", "i4"),
+        ("returns", "i1"),
+        ("status", "i1"),
+        ("expires", "?"),
+        ("unused", "i1"),
+    ],
+    align=True,
+)
+"""A job of a shift, half a cache line; see the properties of `State`."""
+
+ENV = np.dtype(
+    [
+        ("noise_key", "u8"),
+        ("ambient_offset_k", "f8"),
+        ("next_s", "f8"),
+        ("tick", "i4"),
+        ("fleet", "i4"),
+        ("number", "i4"),
+        ("unfinished", "i4"),
+        ("given_up", "i4"),
+        ("head", "i4"),
+        ("alarm", "?"),
+        ("changed", "?"),
+        ("unused", "i1", 14),
+    ],
+    align=True,
+)
+"""A shift. `number` counts its jobs, `unfinished` those neither done nor given up; `head` is where its queue begins.
+What is on offer stays as it is until `next_s`, the next release or due date, unless something has `changed`. `alarm`:
+an arm at work has passed the warning limit in the last step."""
+
+
 class State(NamedTuple):
-    """All that changes during a shift; kernels write into its arrays."""
+    """All that changes during the shifts; kernels write into the records, whose fields the properties show."""
 
-    tick: Array
-    """int [env]."""
-    temp_c: Array
-    """[env, arm, node]."""
-    housing_c: Array
-    """What each arm estimates its housing temperatures to be, [env, arm, joint]."""
-    mode: Array
-    """IDLE, WORKING or FAULTED, int [env, arm]."""
-    job: Array
-    """Index of the current job, int [env, arm], −1 for none."""
-    plan: Array
-    """Row of the `PlanTable` along which the arm is away from home, int [env, arm]; −1 at home."""
-    progress_s: Array
-    """How far along it, in its time since leaving home, [env, arm]; a fault stops it."""
-    todo: Array
-    """Cycles the arm set out to do, int [env, arm]."""
-    clear_at_s: Array
-    """When the fault will be cleared, inf while too hot or not faulted, [env, arm]."""
-    moved_at_s: Array
-    """When a person will move the faulted arm home, inf if it is there or not faulted, [env, arm]."""
-    last_award: Array
-    """1 the last claim was won, −1 lost, 0 none was made, int [env, arm]."""
-    faults: Array
-    """Count so far, int [env, arm]."""
-    illegal: Array
-    """Illegal actions so far, int [env, arm]."""
-    peak_c: Array
-    """Hottest motor so far, [env, arm]."""
-    above_warning_s: Array
-    """[env, arm]."""
-    busy_s: Array
-    """Time away from home, [env, arm]."""
-    lost_s: Array
-    """Time faulted, [env, arm]."""
-    energy_j: Array
-    """Electrical energy turned to heat, [env, arm]. Over closed cycles mechanical work sums to zero."""
-    status: Array
-    """WAITING, RUNNING, DONE, GIVEN_UP or EXPIRED, int [env, job]."""
-    queued_s: Array
-    """When the job was released or last returned, [env, job]."""
-    cycles: Array
-    """Cycles finished and kept, int [env, job]."""
-    returns: Array
-    """How many times a fault returned it to the queue, int [env, job]."""
+    env: Array
+    """`ENV` [env]."""
+    arms: Array
+    """`ARM` [env, arm]."""
+    jobs: Array
+    """`JOB` [env, job]; the jobs of a shift are the first of its row."""
     failed_arm: Array
-    """Arms that it faulted so far, int [env, job, MOST_FAULTS - 1], −1 for none."""
-    finished_s: Array
-    """NaN until done, [env, job]."""
+    """Arms that a job faulted so far, int [env, job, MOST_FAULTS - 1], −1 for none."""
+    after: Array
+    """Jobs that must be done first, int [env, job, n], −1 for none."""
+    queue: Array
+    """Waiting jobs, released or not, by queueing time, int [env, job], from `head` to the number of jobs."""
 
-    def copy(self, envs: slice = slice(None)) -> Self:
-        """The state of some envs in arrays of its own."""
-        return type(self)(*(values[envs].copy() for values in self))
+    def copy(self, envs: slice = slice(None), jobs: slice = slice(None)) -> Self:
+        """The state of some envs and of their first jobs in arrays of its own."""
+        per_job = (values[envs, jobs].copy() for values in (self.jobs, self.failed_arm, self.after, self.queue))
+        return type(self)(self.env[envs].copy(), self.arms[envs].copy(), *per_job)
 
+    def changed(self, **fields: Array | float) -> Self:
+        """A copy in which some of the properties have other values."""
+        other = self.copy()
+        for name, value in fields.items():
+            getattr(other, name)[...] = value
+        return other
 
-PER_JOB = ("status", "queued_s", "cycles", "returns", "failed_arm", "finished_s")
-"""Arrays of a state with the axes [env, job, ...]; the others have [env, arm, ...] or [env]."""
+    def named(self) -> dict[str, Array]:
+        """The properties by name."""
+        return {name: getattr(self, name) for name, kind in vars(State).items() if isinstance(kind, property)}
 
+    @property
+    def tick(self) -> Array:
+        """Decision intervals that are over, int [env]."""
+        return self.env["tick"]
 
-def initial(world: World) -> State:
-    """Every arm at home, at its start temperature; every job waiting."""
-    envs, arms, jobs = world.envs, len(world.arms), world.jobs.exists.shape[1]
+    @property
+    def fleet(self) -> Array:
+        """Which fleet of the tables, int [env]."""
+        return self.env["fleet"]
 
-    def per_arm(value: float, dtype: type = float) -> Array:
-        return np.full((envs, arms), value, dtype=dtype)
+    @property
+    def number(self) -> Array:
+        """Number of jobs, int [env]."""
+        return self.env["number"]
 
-    temp = np.broadcast_to(world.start_c, (envs, arms, NODES)).copy()
-    peak = temp[..., : NODES // 2].max(axis=-1)
-    return State(
-        tick=np.zeros(envs, dtype=int),
-        temp_c=temp,
-        housing_c=np.broadcast_to(world.start_housing_c, (envs, arms, JOINTS)).copy(),
-        mode=per_arm(IDLE, int),
-        job=per_arm(-1, int),
-        plan=per_arm(-1, int),
-        progress_s=per_arm(0.0),
-        todo=per_arm(0, int),
-        clear_at_s=per_arm(np.inf),
-        moved_at_s=per_arm(np.inf),
-        last_award=per_arm(0, int),
-        faults=per_arm(0, int),
-        illegal=per_arm(0, int),
-        peak_c=peak,
-        above_warning_s=per_arm(0.0),
-        busy_s=per_arm(0.0),
-        lost_s=per_arm(0.0),
-        energy_j=per_arm(0.0),
-        status=np.full((envs, jobs), WAITING),
-        queued_s=world.jobs.release_s.copy(),
-        cycles=np.zeros((envs, jobs), dtype=int),
-        returns=np.zeros((envs, jobs), dtype=int),
-        failed_arm=np.full((envs, jobs, MOST_FAULTS - 1), -1),
-        finished_s=np.full((envs, jobs), np.nan),
-    )
+    @property
+    def unfinished(self) -> Array:
+        """Jobs neither done nor given up, int [env]."""
+        return self.env["unfinished"]
+
+    @property
+    def done(self) -> Array:
+        """Jobs done, int [env]."""
+        return self.env["number"] - self.env["unfinished"] - self.env["given_up"]
+
+    @property
+    def temp_c(self) -> Array:
+        """[env, arm, node]."""
+        return self.arms["temp_c"]
+
+    @property
+    def housing_c(self) -> Array:
+        """What each arm estimates its housing temperatures to be, [env, arm, joint]."""
+        return self.arms["housing_c"][..., :JOINTS]
+
+    @property
+    def mode(self) -> Array:
+        """IDLE, WORKING or FAULTED, int [env, arm]."""
+        return self.arms["mode"]
+
+    @property
+    def job(self) -> Array:
+        """Index of the current job, int [env, arm], −1 for none."""
+        return self.arms["job"]
+
+    @property
+    def plan(self) -> Array:
+        """Row of the plan table along which the arm is away from home, int [env, arm]; −1 at home."""
+        return self.arms["plan"]
+
+    @property
+    def progress_s(self) -> Array:
+        """How far along it, in its time since leaving home, [env, arm]; a fault stops it."""
+        return self.arms["progress_s"]
+
+    @property
+    def todo(self) -> Array:
+        """Cycles the arm set out to do, int [env, arm]."""
+        return self.arms["todo"]
+
+    @property
+    def clear_at_s(self) -> Array:
+        """When the fault will be cleared, inf while too hot or not faulted, [env, arm]."""
+        return self.arms["clear_at_s"]
+
+    @property
+    def moved_at_s(self) -> Array:
+        """When a person will move the faulted arm home, inf if it is there or not faulted, [env, arm]."""
+        return self.arms["moved_at_s"]
+
+    @property
+    def last_award(self) -> Array:
+        """1 the last claim was won, −1 lost, 0 none was made, int [env, arm]."""
+        return self.arms["last_award"]
+
+    @property
+    def faults(self) -> Array:
+        """Count so far, int [env, arm]."""
+        return self.arms["faults"]
+
+    @property
+    def illegal(self) -> Array:
+        """Illegal actions so far, int [env, arm]."""
+        return self.arms["illegal"]
+
+    @property
+    def peak_c(self) -> Array:
+        """Hottest motor so far, [env, arm]."""
+        return self.arms["peak_c"]
+
+    @property
+    def above_warning_s(self) -> Array:
+        """[env, arm]."""
+        return self.arms["above_warning_s"]
+
+    @property
+    def busy_s(self) -> Array:
+        """Time away from home, [env, arm]."""
+        return self.arms["busy_s"]
+
+    @property
+    def lost_s(self) -> Array:
+        """Time faulted, [env, arm]."""
+        return self.arms["lost_s"]
+
+    @property
+    def energy_j(self) -> Array:
+        """Electrical energy turned to heat, [env, arm]. Over closed cycles mechanical work sums to zero."""
+        return self.arms["energy_j"]
+
+    @property
+    def kind(self) -> Array:
+        """Kind of job, int [env, job]."""
+        return self.jobs["kind"]
+
+    @property
+    def release_s(self) -> Array:
+        """[env, job]."""
+        return self.jobs["release_s"]
+
+    @property
+    def due_s(self) -> Array:
+        """[env, job]."""
+        return self.jobs["due_s"]
+
+    @property
+    def repetitions(self) -> Array:
+        """int [env, job]."""
+        return self.jobs["repetitions"]
+
+    @property
+    def expires(self) -> Array:
+        """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
+        return self.jobs["expires"]
+
+    @property
+    def status(self) -> Array:
+        """WAITING, RUNNING, DONE, GIVEN_UP or EXPIRED, int [env, job]."""
+        return self.jobs["status"]
+
+    @property
+    def queued_s(self) -> Array:
+        """When the job was released or last returned, [env, job]."""
+        return self.jobs["queued_s"]
+
+    @property
+    def cycles(self) -> Array:
+        """Cycles finished and kept, int [env, job]."""
+        return self.jobs["cycles"]
+
+    @property
+    def returns(self) -> Array:
+        """How many times a fault returned it to the queue, int [env, job]."""
+        return self.jobs["returns"]
+
+    @property
+    def finished_s(self) -> Array:
+        """NaN until done, [env, job]."""
+        return self.jobs["finished_s"]

@@ -3,27 +3,31 @@
 Heat is constant over a step (the mean of what the motors do in it, with losses from the temperatures at its start) and
 the thermal step is exact for it, so the moments at which a limit is crossed are exact too. A row's result does not
 depend on how many rows there are.
+
+Temperatures are float32 (8·10⁻⁶ K at 75 °C); moments, progress and totals are float64.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
-from fleet.engine.claims import give_up, resolve_claims, return_to_queue, update_offers
-from fleet.engine.crossings import hottest, step_with_crossing
+from fleet.engine.claims import give_up, resolve_claims, return_to_queue, set_phase, update_offers
+from fleet.engine.crossings import Crossed, hottest, step_with_crossing
 from fleet.engine.observe import observe
-from fleet.engine.state import DONE, GIVEN_UP, WAITING
+from fleet.engine.state import DONE, GIVEN_UP, LANES, WAITING, State
 from fleet.engine.tables import (
     FAULT,
     FINISH,
     GIVE_BACK,
     GIVE_UP,
     HOME,
-    LANES,
     MOVED,
     RECOVER,
     RETURN,
     WARNING,
     WIDE,
     Simulation,
+    Tables,
     record_event,
 )
 from fleet.heat.motor import magnet_factor, winding_heat
@@ -37,263 +41,497 @@ Array = np.ndarray
 
 ROUNDING_S = 1e-9
 """Sums of phases may be off by this much; a whole step must not be lost to it."""
+_HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 
 
-@jit_inline
+class Script(NamedTuple):
+    """Schedules (`agents.schedules.Schedules`), one for each env, and their results; without rows there is none."""
+
+    arm: Array
+    """int [env, job]."""
+    option: Array
+    """int [env, job]."""
+    order: Array
+    """[env, job]."""
+    not_before_s: Array
+    """[env, job]."""
+    discount: Array
+    """Factor on the reward of each step of a shift, [tick]."""
+    reward: Array
+    """Discounted, [env]."""
+    start_s: Array
+    """When each job was last awarded, inf if never, [env, job]."""
+    claims: Array
+    """The claims that were won, in the order of time: decision interval, arm and action, int [env, claim, 3]."""
+    won: Array
+    """Their number, int [env]."""
+
+
+def script_of(schedules: "Plans", discount: Array) -> Script:
+    """A script of schedules [schedule, job], not yet played."""
+    given, jobs = schedules[0].shape
+    claims, won = np.zeros((given, MOST_FAULTS * jobs, 3), np.int64), np.zeros(given, np.int64)
+    return Script(*schedules, discount, np.zeros(given), np.full((given, jobs), np.inf), claims, won)
+
+
+Plans = tuple[Array, Array, Array, Array]
+"""Arm, option, order and earliest time of each job of schedules, [schedule, job]."""
+NO_SCRIPT = script_of((np.zeros((0, 0), int), np.zeros((0, 0), int), np.zeros((0, 0)), np.zeros((0, 0))), np.zeros(0))
+
+
+class Spent(NamedTuple):
+    """What an arm does in a step, unless a fault stops it."""
+
+    away_s: float
+    """Seconds away from home."""
+    done_s: float
+    """When its job is done; inf if not in this step."""
+    home_s: float
+    """When it is home; inf if not in this step."""
+
+
+@jit
 def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> None:
     """Take every arm of some envs through one step.
 
     Args:
         weights: Reward per unit of each term, [term], in the order of `fleet.engine.batch.TERMS`.
-        terms: Receives the reward terms and their sum, [env, term + 1].
+        terms: Reward terms and their sum, [env, term + 1], to which those of the step are added.
         rows: Envs, int [row].
     """
-    t, d, s, o, events, trace, measured = sim.tables, sim.jobs, sim.state, sim.offers, sim.events, sim.trace, sim.drive
-    # Arrays under local names: the compiler then loads their addresses once.
-    fleets, offsets_k, repetitions, due_s = d.fleet, d.ambient_offset_k, d.repetitions, d.due_s
-    ticks, temp_c, modes, jobs, progress_s, todo = s.tick, s.temp_c, s.mode, s.job, s.progress_s, s.todo
-    clear_at_s, faults, peak_c, above_warning_s = s.clear_at_s, s.faults, s.peak_c, s.above_warning_s
-    busy_s, lost_s, energy_j, status, queued_s = s.busy_s, s.lost_s, s.energy_j, s.status, s.queued_s
-    cycles, returns, finished_s = s.cycles, s.returns, s.finished_s
-    housing_c, alarm = s.housing_c, o.alarm
-    keep, gain, from_winding = t.housing_keep, t.housing_gain, t.housing_winding
-    from_ambient, known_idle_w = t.housing_ambient, t.housing_idle_w
-    unfinished, current, pending = o.unfinished, o.current_kind, o.pending
-    ambient, thermal_step, to_ambient = t.ambient_c, t.thermal_step, t.to_ambient
-    copper, idle_w, rest_sq, rest_w = t.copper_w_per_a2, t.idle_w, t.rest_current_sq, t.rest_friction_w
-    plan_sq, plan_w, times_s, values = t.current_sq, t.friction_w, t.times_s, t.value
-    plans, moved_at_s, failed_arm = s.plan, s.moved_at_s, s.failed_arm
-    dt_s, warning_c, error_c, restart_c = t.dt_s, t.warning_c, t.error_c, t.restart_c
-    recording, tracing, driven = len(events.what) > 0, len(trace.plan) > 0, len(measured.current_sq) > 0
-    copper_w, other_w, fold = np.empty(LANES), np.empty(LANES), np.empty(4)
-    begin, end = np.zeros(2 * NODES + LANES), np.empty(WIDE)  # temperatures, loads, padding
-    friction_w, estimate_c = np.empty(LANES), np.empty(LANES)
-    arms, no_kind = nonnegative(modes.shape[1]), nonnegative(t.feasible.shape[1])
+    t, s, dt_s = sim.tables, sim.state, sim.tables.dt_s
+    tracing, measured = len(sim.trace) > 0, len(sim.drive) > 0
+    current_sq, friction_w = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    load_w, end = np.empty(LANES, np.float32), np.empty(WIDE, np.float32)
+    begin = np.zeros(2 * NODES + LANES, np.float32)  # temperatures, loads, padding
     for row in rows:
         e = nonnegative(row)
-        fleet, tick = nonnegative(fleets[e]), nonnegative(ticks[e])
-        now_s, moment = tick * dt_s, min(tick, t.ticks - 1)
-        value = late = above_s = count = energy = 0.0
-        alarm[e] = False
-        for a in range(arms):
-            mode = modes[e, a]
-            plan, spent_s, done_s, home_s = 0, 0.0, np.inf, np.inf
-            first_s = cycle_s = share_0 = share_1 = share_2 = 0.0
-            if mode == WORKING:
-                plan = nonnegative(plans[e, a])
-                begin_s = progress_s[e, a]
-                until_s = begin_s + dt_s
-                first_s, cycle_s = times_s[plan, 0], times_s[plan, 1]
-                last_s = first_s + cycle_s * todo[e, a]
-                back_s = last_s + times_s[plan, 2]
-                span_0 = max(min(until_s, first_s) - begin_s, 0.0)
-                span_1 = max(min(until_s, last_s) - max(begin_s, first_s), 0.0)
-                span_2 = max(min(until_s, back_s) - max(begin_s, last_s), 0.0)
-                spent_s = span_0 + span_1 + span_2
-                share_0, share_1, share_2 = span_0 / dt_s, span_1 / dt_s, span_2 / dt_s
-                if pending[e, a] and last_s - begin_s <= dt_s + ROUNDING_S:
-                    done_s = min(max(last_s - begin_s, 0.0), dt_s)
-                if back_s - begin_s <= dt_s + ROUNDING_S:
-                    home_s = min(max(back_s - begin_s, 0.0), dt_s)
-            rest = 0.0 if mode == FAULTED else (dt_s - spent_s) / dt_s
-            powered = 0.0 if t.power_off and mode == FAULTED else 1.0
-            ambient_c = ambient[fleet, moment, a] + offsets_k[e]
-            for n in range(NODES):
-                begin[n] = temp_c[e, a, n]
+        env = s.env[e]
+        fleet, moment = nonnegative(env["fleet"]), nonnegative(min(env["tick"], t.ticks - 1))
+        above_s = energy_j = 0.0
+        env["alarm"] = False
+        for a in range(nonnegative(s.arms.shape[1])):
+            arm, law, mode = s.arms[e, a], t.law[fleet, a], s.arms[e, a]["mode"]
+            ambient_c = np.float32(t.ambient_c[fleet, moment, a] + env["ambient_offset_k"])
+            powered = mode != FAULTED or not t.power_off
+            spent = Spent(dt_s if mode == WORKING else 0.0, np.inf, np.inf)
             for k in range(LANES):
-                amps_sq = share_0 * plan_sq[plan, 0, k] + share_1 * plan_sq[plan, 1, k]
-                copper_w[k] = amps_sq + (share_2 * plan_sq[plan, 2, k] + rest * rest_sq[fleet, a, k])
-                moving_w = share_0 * plan_w[plan, 0, k] + share_1 * plan_w[plan, 1, k]
-                other_w[k] = moving_w + (share_2 * plan_w[plan, 2, k] + rest * rest_w[fleet, a, k])
-            if driven:
+                current_sq[k], friction_w[k] = arm["current_sq"][k], arm["friction_w"][k]
+            next_phase = arm["progress_s"] + dt_s >= arm["phase_end_s"] - ROUNDING_S
+            if next_phase:
+                spent = mix_phases(t.plans, t.start[fleet, a], arm, dt_s, current_sq, friction_w)
+            if measured:
                 for k in range(LANES):
-                    copper_w[k], other_w[k] = measured.current_sq[e, a, k], measured.friction_w[e, a, k]
-            for k in range(LANES):
-                friction_w[k] = other_w[k]
-                factor = magnet_factor(begin[JOINTS + k], t)
-                copper_w[k] = winding_heat(copper[fleet, a, k], copper_w[k] / (factor * factor), begin[k], t)
-                other_w[k] += powered * idle_w[fleet, a, k]
-            for k in range(4):
-                fold[k] = (copper_w[k] + other_w[k]) + (copper_w[4 + k] + other_w[4 + k])
-            heat_w = (fold[0] + fold[1]) + (fold[2] + fold[3])
-            for k in range(JOINTS):
-                begin[NODES + k] = copper_w[k] + to_ambient[fleet, a, k] * ambient_c
-                begin[NODES + JOINTS + k] = other_w[k] + to_ambient[fleet, a, JOINTS + k] * ambient_c
-            for m in range(WIDE):
-                total = 0.0
-                for n in range(2 * NODES):
-                    total += thermal_step[fleet, a, n, m] * begin[n]
-                end[m] = total
+                    current_sq[k], friction_w[k] = sim.drive[e, a]["current_sq"][k], sim.drive[e, a]["friction_w"][k]
+            heat_w = load_nodes(t, law, arm, current_sq, friction_w, powered, ambient_c, begin)
+            advance(law, begin, end)
             first_c, last_c = hottest(begin), hottest(end)
-            cut_s, here_s, here_j, top_c, cool_s = dt_s, 0.0, heat_w * dt_s, last_c, np.inf
-            fault_joint = -1
+            hot = first_c >= t.warning_c
+            crossed = Crossed(dt_s, dt_s if hot else 0.0, heat_w * dt_s, np.float64(last_c), np.inf, np.inf, -1, -1)
             if tracing:
-                trace.mode[e, a], trace.plan[e, a], trace.progress_s[e, a] = mode, plans[e, a], progress_s[e, a]
-                trace.todo[e, a], trace.home_s[e, a] = todo[e, a], home_s
-                for n in range(NODES):
-                    trace.start_c[e, a, n] = begin[n]
-                    trace.heat_w[e, a, n] = copper_w[n] if n < JOINTS else other_w[n - JOINTS]
-            hot, same = first_c >= warning_c, (first_c >= warning_c) == (last_c >= warning_c)
-            if same and (first_c < restart_c or last_c >= restart_c if mode == FAULTED else last_c < error_c):
-                here_s = dt_s if hot else 0.0
-                if mode == FAULTED and last_c < restart_c:
-                    cool_s = 0.0
-            else:
-                crossed = step_with_crossing(t, fleet, a, mode, begin, heat_w, ambient_c, end)
-                cut_s, here_s, here_j = crossed.cut_s, crossed.above_s, crossed.energy_j
-                top_c, cool_s, fault_joint = crossed.peak_c, crossed.cool_s, crossed.fault_joint
-                if recording and crossed.warned_s < np.inf:
-                    j = jobs[e, a]
-                    record_event(events, WARNING, e, a, j, crossed.warned_joint, crossed.warned_s, warning_c)
-            if tracing:
-                trace.cut_s[e, a] = cut_s
-            energy_j[e, a] += here_j
-            above_warning_s[e, a] += here_s
-            peak_c[e, a] = max(peak_c[e, a], top_c)
-            busy_s[e, a] += min(spent_s, cut_s)
-            above_s += here_s
-            energy += here_j
+                trace_arm(t, sim.trace[e, a], law, arm, current_sq, friction_w, powered, spent.home_s)
+            at_limit = mode == FAULTED or last_c >= t.error_c or hot != (last_c >= t.warning_c)
+            if at_limit:
+                crossed = step_with_crossing(t, t.modal[fleet, a], mode, begin, heat_w, ambient_c, end)
+                env["alarm"] = env["alarm"] or (mode == WORKING and not hot and hottest(end) >= t.warning_c)
             for n in range(NODES):
-                temp_c[e, a, n] = end[n]
-            # The arm's own estimate of its housings, from its motor temperatures. Their noise is left out: over the
-            # time constants of housings it averages out to a tenth.
-            for m in range(LANES):
-                estimate_c[m] = 0.0
-            for k in range(JOINTS):
-                load_w = 0.5 * from_winding[fleet, a, k] * (begin[k] + end[k]) + from_ambient[fleet, a, k] * ambient_c
-                load_w += friction_w[k] + powered * known_idle_w[fleet, a, k]
-                before_c = housing_c[e, a, k]
-                for m in range(LANES):
-                    estimate_c[m] += keep[fleet, a, k, m] * before_c + gain[fleet, a, k, m] * load_w
-            for k in range(JOINTS):
-                housing_c[e, a, k] = estimate_c[k]
+                arm["temp_c"][n] = end[n]
+            follow_housings(law, arm, begin, end, friction_w, powered, ambient_c, load_w)
+            arm["energy_j"] += crossed.energy_j
+            arm["above_warning_s"] += crossed.above_s
+            arm["peak_c"] = max(arm["peak_c"], np.float32(crossed.peak_c))
+            above_s += crossed.above_s
+            energy_j += crossed.energy_j
             if mode == WORKING:
-                alarm[e] = alarm[e] or (first_c < warning_c and last_c >= warning_c)
-                if done_s <= cut_s:
-                    j, pending[e, a] = nonnegative(jobs[e, a]), False
-                    if cycles[e, j] + todo[e, a] < repetitions[e, j]:
-                        cycles[e, j] += todo[e, a]
-                        status[e, j], queued_s[e, j] = WAITING, now_s + done_s
-                        return_to_queue(d, s, o, e, j, now_s + dt_s)
-                        if recording:
-                            record_event(events, GIVE_BACK, e, a, j, -1, done_s, todo[e, a])
-                    else:
-                        status[e, j], cycles[e, j], finished_s[e, j] = DONE, repetitions[e, j], now_s + done_s
-                        unfinished[e] -= 1
-                        gained = values[fleet, nonnegative(current[e, a])]
-                        value += gained
-                        late += gained * (max(finished_s[e, j] - due_s[e, j], 0.0) / 60.0)
-                        if recording:
-                            record_event(events, FINISH, e, a, j, -1, done_s, 0.0)
-                progress_s[e, a] += cut_s
-                if home_s <= cut_s:
-                    if recording:
-                        record_event(events, HOME, e, a, jobs[e, a], -1, home_s, 0.0)
-                    modes[e, a], jobs[e, a], plans[e, a], progress_s[e, a], todo[e, a] = IDLE, -1, -1, 0.0, 0
-                    current[e, a] = no_kind
-            if mode == FAULTED:
-                lost_s[e, a] += dt_s
-            if cut_s < dt_s:
-                if recording:
-                    record_event(events, FAULT, e, a, jobs[e, a], fault_joint, cut_s, error_c)
-                if mode == WORKING and pending[e, a]:
-                    j = nonnegative(jobs[e, a])
-                    kept = int((progress_s[e, a] - first_s) // cycle_s)
-                    kept = min(max(kept, 0), todo[e, a])
-                    cycles[e, j] += kept
-                    # Once it may move again the arm ends the cycle in which it stopped, which does not count.
-                    todo[e, a] = min(kept + 1, todo[e, a]) if progress_s[e, a] > first_s else 0
-                    before, again = nonnegative(returns[e, j]), False
-                    for n in range(before):
-                        again = again or failed_arm[e, j, n] == a
-                    returns[e, j] += 1
-                    again = again or before + 1 == MOST_FAULTS
-                    if again:
-                        give_up(d, s, o, e, j, GIVEN_UP)
-                    else:
-                        failed_arm[e, j, before] = a
-                        status[e, j], queued_s[e, j] = WAITING, now_s + cut_s
-                        return_to_queue(d, s, o, e, j, now_s + dt_s)
-                    pending[e, a] = False
-                    if recording:
-                        record_event(events, GIVE_UP if again else RETURN, e, a, j, -1, cut_s, kept)
-                count += 1.0
-                faults[e, a] += 1
-                lost_s[e, a] += dt_s - cut_s
-                modes[e, a], jobs[e, a], current[e, a] = FAULTED, -1, no_kind
-                if plans[e, a] >= 0:
-                    moved_at_s[e, a] = now_s + cut_s + t.move_home_s
-            if modes[e, a] == FAULTED:
-                if clear_at_s[e, a] == np.inf and cool_s < np.inf:
-                    clear_at_s[e, a] = now_s + cool_s + t.clear_s
-                if clear_at_s[e, a] <= (tick + 1) * dt_s:
-                    recovered_s = clear_at_s[e, a] - now_s
-                    lost_s[e, a] -= dt_s - recovered_s
-                    modes[e, a], clear_at_s[e, a] = IDLE if plans[e, a] < 0 else WORKING, np.inf
-                    if moved_at_s[e, a] > now_s + recovered_s:
-                        moved_at_s[e, a] = np.inf
-                    if recording:
-                        record_event(events, RECOVER, e, a, -1, -1, recovered_s, restart_c)
-                if moved_at_s[e, a] <= (tick + 1) * dt_s:
-                    if recording:
-                        record_event(events, MOVED, e, a, -1, -1, moved_at_s[e, a] - now_s, 0.0)
-                    plans[e, a], progress_s[e, a], todo[e, a], moved_at_s[e, a] = -1, 0.0, 0, np.inf
-                    modes[e, a] = IDLE if modes[e, a] == WORKING else FAULTED
-        terms[e, 0], terms[e, 1], terms[e, 2] = value * weights[0], late * weights[1], above_s * weights[2]
-        terms[e, 3], terms[e, 4] = count * weights[3], energy * weights[4]
+                arm["busy_s"] += min(spent.away_s, crossed.cut_s)
+            if next_phase or at_limit:
+                settle(sim, weights, terms, e, a, spent, crossed)
+            elif mode == WORKING:
+                arm["progress_s"] += dt_s
+        terms[e, 2] += above_s * weights[2]
+        terms[e, 4] += energy_j * weights[4]
         terms[e, 5] = terms[e, 0] + terms[e, 1] + terms[e, 2] + terms[e, 3] + terms[e, 4]
-        ticks[e] += 1
+        env["tick"] += 1
+
+
+@jit
+def mix_phases(plans: Array, home: Array, arm: Array, dt_s: float, current_sq: Array, friction_w: Array) -> Spent:
+    """Find the mean heat drive of an arm at work that changes phases within a step.
+
+    Args:
+        home: The arm at home, with the drive of standing there.
+        current_sq: Receives the mean squared current, A², [lane].
+        friction_w: Receives the mean friction heat, W, [lane].
+    """
+    plan, begin_s = plans[nonnegative(arm["plan"])], arm["progress_s"]
+    until_s, first_s = begin_s + dt_s, plan["times_s"][0]
+    last_s = first_s + plan["times_s"][1] * arm["todo"]
+    back_s = last_s + plan["times_s"][2]
+    span_0 = max(min(until_s, first_s) - begin_s, 0.0)
+    span_1 = max(min(until_s, last_s) - max(begin_s, first_s), 0.0)
+    span_2 = max(min(until_s, back_s) - max(begin_s, last_s), 0.0)
+    away_s, done_s, home_s = span_0 + span_1 + span_2, np.inf, np.inf
+    if arm["pending"] and last_s - begin_s <= dt_s + ROUNDING_S:
+        done_s = min(max(last_s - begin_s, 0.0), dt_s)
+    if back_s - begin_s <= dt_s + ROUNDING_S:
+        home_s = min(max(back_s - begin_s, 0.0), dt_s)
+    share_0, share_1, share_2, rest = span_0 / dt_s, span_1 / dt_s, span_2 / dt_s, (dt_s - away_s) / dt_s
+    sq, w = plan["current_sq"], plan["friction_w"]
+    for k in range(LANES):
+        current_sq[k] = (share_0 * sq[0, k] + share_1 * sq[1, k]) + (share_2 * sq[2, k] + rest * home["current_sq"][k])
+        friction_w[k] = (share_0 * w[0, k] + share_1 * w[1, k]) + (share_2 * w[2, k] + rest * home["friction_w"][k])
+    return Spent(away_s, done_s, home_s)
+
+
+@jit_inline
+def load_nodes(
+    t: Tables,
+    law: Array,
+    arm: Array,
+    current_sq: Array,
+    friction_w: Array,
+    powered: bool,
+    ambient_c: float,
+    begin: Array,
+) -> float:
+    """Put an arm's temperatures and the loads of its nodes into `begin`; return its heat, W.
+
+    The load of a node is its heat plus its conductance to ambient times the ambient temperature.
+    """
+    heat_w = 0.0
+    for k in range(JOINTS):
+        copper_w, housing_w = heat_of(t, law, arm, k, current_sq[k], friction_w[k], powered)
+        begin[k], begin[JOINTS + k] = arm["temp_c"][k], arm["temp_c"][JOINTS + k]
+        begin[NODES + k] = np.float32(copper_w) + law["to_ambient"][k] * ambient_c
+        begin[NODES + JOINTS + k] = np.float32(housing_w) + law["to_ambient"][JOINTS + k] * ambient_c
+        heat_w += copper_w + housing_w
+    return heat_w
+
+
+@jit_inline
+def heat_of(
+    t: Tables, law: Array, arm: Array, k: int, current_sq: float, friction_w: float, powered: bool
+) -> tuple[float, float]:
+    """Heat in the winding and in the housing of a joint, W; see `fleet.heat.thermal.drive_heat`."""
+    factor = magnet_factor(np.float64(arm["temp_c"][JOINTS + k]), t)
+    warm_sq, winding_c = np.float64(current_sq) / (factor * factor), np.float64(arm["temp_c"][k])
+    copper_w = winding_heat(np.float64(law["copper_w_per_a2"][k]), warm_sq, winding_c, t)
+    return copper_w, np.float64(friction_w) + (np.float64(law["idle_w"][k]) if powered else 0.0)
+
+
+@jit_inline
+def advance(law: Array, begin: Array, end: Array) -> None:
+    """Exact step of the thermal network under constant loads: T + (Φ − 1) T + Γ load; see `fleet.heat.thermal.advance`.
+
+    The change is summed, not the temperature, so that rounding to float32 is of the change.
+    """
+    for m in range(WIDE):
+        total = _ZERO
+        for n in range(2 * NODES):
+            total += law["step"][n, m] * begin[n]
+        end[m] = begin[m] + total
+
+
+@jit_inline
+def follow_housings(
+    law: Array, arm: Array, begin: Array, end: Array, friction_w: Array, powered: bool, ambient_c: float, load_w: Array
+) -> None:
+    """Step the arm's own estimate of its housings, from its motor temperatures; see `HousingObserver`.
+
+    The noise of the sensors is left out: over the time constants of housings it averages out to a tenth.
+
+    Args:
+        load_w: Room for the loads of the housings, [lane].
+    """
+    for k in range(JOINTS):
+        warmed_w = _HALF * (begin[k] + end[k]) * law["housing_winding"][k] + law["housing_ambient"][k] * ambient_c
+        load_w[k] = warmed_w + (friction_w[k] + (law["housing_idle_w"][k] if powered else _ZERO))
+        begin[k] = arm["housing_c"][k]
+    for m in range(JOINTS):
+        total = _ZERO
+        for k in range(JOINTS):
+            total += law["housing_keep"][k, m] * begin[k] + law["housing_gain"][k, m] * load_w[k]
+        arm["housing_c"][m] = total
+
+
+@jit
+def trace_arm(
+    t: Tables,
+    trace: Array,
+    law: Array,
+    arm: Array,
+    current_sq: Array,
+    friction_w: Array,
+    powered: bool,
+    home_s: float,
+) -> None:
+    """Record how an arm begins a step, and that no fault stops it; see `TRACE`."""
+    trace["mode"], trace["plan"], trace["todo"] = arm["mode"], arm["plan"], arm["todo"]
+    trace["progress_s"], trace["home_s"], trace["cut_s"] = arm["progress_s"], home_s, t.dt_s
+    for n in range(NODES):
+        trace["start_c"][n] = arm["temp_c"][n]
+    for k in range(JOINTS):
+        heat_w = heat_of(t, law, arm, k, current_sq[k], friction_w[k], powered)
+        trace["heat_w"][k], trace["heat_w"][JOINTS + k] = heat_w
+
+
+@jit_inline
+def settle(sim: Simulation, weights: Array, terms: Array, e: int, a: int, spent: Spent, crossed: Crossed) -> None:
+    """Let an arm end its job, come home, fault and recover, where that happens in this step."""
+    t, s, events, recording = sim.tables, sim.state, sim.events, len(sim.events.what) > 0
+    arm, mode, cut_s = s.arms[e, a], s.arms[e, a]["mode"], crossed.cut_s
+    if len(sim.trace) > 0:
+        sim.trace[e, a]["cut_s"] = cut_s
+    if recording and crossed.warned_s < np.inf:
+        record_event(events, WARNING, e, a, arm["job"], crossed.warned_joint, crossed.warned_s, t.warning_c)
+    if mode == WORKING:
+        if spent.done_s <= cut_s:
+            end_job(sim, weights, terms, e, a, spent.done_s)
+        arm["progress_s"] += cut_s
+        if spent.home_s <= cut_s:
+            if recording:
+                record_event(events, HOME, e, a, arm["job"], -1, spent.home_s, 0.0)
+            stand_at_home(s, arm, t.start[s.env[e]["fleet"], a], e, IDLE)
+            arm["job"], arm["kind"] = -1, t.start[s.env[e]["fleet"], a]["kind"]
+    if mode == FAULTED:
+        arm["lost_s"] += t.dt_s
+    if cut_s < t.dt_s:
+        stop(sim, e, a, cut_s, crossed.fault_joint)
+        terms[e, 3] += weights[3]
+    if arm["mode"] == FAULTED:
+        recover(sim, e, a, crossed.cool_s)
+    if arm["mode"] == WORKING:
+        set_phase(t.plans, arm)
+
+
+@jit
+def end_job(sim: Simulation, weights: Array, terms: Array, e: int, a: int, done_s: float) -> None:
+    """Finish the job of an arm, or return it to the queue where the arm gives it back.
+
+    Args:
+        done_s: When, seconds into the step.
+    """
+    t, s, events, recording = sim.tables, sim.state, sim.events, len(sim.events.what) > 0
+    env, arm, j = s.env[e], s.arms[e, a], nonnegative(s.arms[e, a]["job"])
+    job, now_s = s.jobs[e, j], s.env[e]["tick"] * t.dt_s
+    arm["pending"], env["changed"] = False, True
+    if job["cycles"] + arm["todo"] < job["repetitions"]:
+        job["cycles"] += arm["todo"]
+        job["status"], job["queued_s"] = WAITING, now_s + done_s
+        return_to_queue(s, e, j, now_s + t.dt_s)
+        if recording:
+            record_event(events, GIVE_BACK, e, a, j, -1, done_s, float(arm["todo"]))
+        return
+    job["status"], job["cycles"], job["finished_s"] = DONE, job["repetitions"], now_s + done_s
+    env["unfinished"] -= 1
+    gained = t.value[env["fleet"], nonnegative(arm["kind"])]
+    terms[e, 0] += gained * weights[0]
+    terms[e, 1] += gained * (max(now_s + done_s - job["due_s"], 0.0) / 60.0) * weights[1]
+    if recording:
+        record_event(events, FINISH, e, a, j, -1, done_s, 0.0)
+
+
+@jit
+def stand_at_home(s: State, arm: Array, home: Array, e: int, mode: int) -> None:
+    """Put an arm that is at home into a mode."""
+    arm["mode"], arm["plan"], arm["progress_s"], arm["phase_end_s"], arm["todo"] = mode, -1, 0.0, np.inf, 0
+    for k in range(LANES):
+        arm["current_sq"][k] = home["current_sq"][k] if mode == IDLE else _ZERO
+        arm["friction_w"][k] = home["friction_w"][k] if mode == IDLE else _ZERO
+    s.env[e]["changed"] = True
+
+
+@jit
+def stop(sim: Simulation, e: int, a: int, cut_s: float, joint: int) -> None:
+    """Stop an arm whose motor has passed the error limit; its job returns to the queue, or is given up.
+
+    Args:
+        cut_s: When, seconds into the step.
+        joint: The motor.
+    """
+    t, s, events, recording = sim.tables, sim.state, sim.events, len(sim.events.what) > 0
+    env, arm, now_s = s.env[e], s.arms[e, a], s.env[e]["tick"] * t.dt_s
+    if recording:
+        record_event(events, FAULT, e, a, arm["job"], joint, cut_s, t.error_c)
+    if arm["mode"] == WORKING and arm["pending"]:
+        j = nonnegative(arm["job"])
+        job, times_s = s.jobs[e, j], t.plans[nonnegative(arm["plan"])]["times_s"]
+        kept = int((arm["progress_s"] - times_s[0]) // times_s[1])
+        kept = min(max(kept, 0), arm["todo"])
+        job["cycles"] += kept
+        # Once it may move again the arm ends the cycle in which it stopped, which does not count.
+        arm["todo"] = min(kept + 1, arm["todo"]) if arm["progress_s"] > times_s[0] else 0
+        before, again = nonnegative(job["returns"]), False
+        for n in range(before):
+            again = again or s.failed_arm[e, j, n] == a
+        job["returns"] += 1
+        again = again or before + 1 == MOST_FAULTS
+        if again:
+            give_up(s, e, j, GIVEN_UP)
+        else:
+            s.failed_arm[e, j, before] = a
+            job["status"], job["queued_s"] = WAITING, now_s + cut_s
+            return_to_queue(s, e, j, now_s + t.dt_s)
+        arm["pending"] = False
+        if recording:
+            record_event(events, GIVE_UP if again else RETURN, e, a, j, -1, cut_s, float(kept))
+    arm["faults"] += 1
+    arm["lost_s"] += t.dt_s - cut_s
+    arm["mode"], arm["job"], arm["kind"], arm["phase_end_s"] = FAULTED, -1, t.start[env["fleet"], a]["kind"], np.inf
+    for k in range(LANES):
+        arm["current_sq"][k] = arm["friction_w"][k] = 0.0
+    if arm["plan"] >= 0:
+        arm["moved_at_s"] = now_s + cut_s + t.move_home_s
+    env["changed"] = True
+
+
+@jit
+def recover(sim: Simulation, e: int, a: int, cool_s: float) -> None:
+    """Clear the fault of an arm that has cooled down for long enough, and move it home when that is due.
+
+    Args:
+        cool_s: When every motor is below the restart limit, seconds into the step; inf if not in it.
+    """
+    t, s, events, recording = sim.tables, sim.state, sim.events, len(sim.events.what) > 0
+    env, arm, home = s.env[e], s.arms[e, a], t.start[s.env[e]["fleet"], a]
+    now_s, end_s = env["tick"] * t.dt_s, (env["tick"] + 1) * t.dt_s
+    if arm["clear_at_s"] == np.inf and cool_s < np.inf:
+        arm["clear_at_s"] = now_s + cool_s + t.clear_s
+    if arm["clear_at_s"] <= end_s:
+        recovered_s = arm["clear_at_s"] - now_s
+        arm["lost_s"] -= t.dt_s - recovered_s
+        arm["clear_at_s"] = np.inf
+        if arm["plan"] < 0:
+            stand_at_home(s, arm, home, e, IDLE)
+        arm["mode"] = IDLE if arm["plan"] < 0 else WORKING
+        if arm["moved_at_s"] > now_s + recovered_s:
+            arm["moved_at_s"] = np.inf
+        env["changed"] = True
+        if recording:
+            record_event(events, RECOVER, e, a, -1, -1, recovered_s, t.restart_c)
+    if arm["moved_at_s"] <= end_s:
+        if recording:
+            record_event(events, MOVED, e, a, -1, -1, arm["moved_at_s"] - now_s, 0.0)
+        arm["moved_at_s"] = np.inf
+        stand_at_home(s, arm, home, e, IDLE if arm["mode"] == WORKING else FAULTED)
 
 
 BLOCK = 128
 """Envs that go through a whole step together, few enough to stay in the processor's cache."""
-CLAIM, MOVE, OBSERVE = 1, 2, 4
+CLAIM, MOVE, OFFER, OBSERVE, PLAY = 1, 2, 4, 8, 16
 """Parts of a step, to be added up."""
 
 
 @kernel
 def step_rows(
-    sim: Simulation, parts: int, actions: Array, weights: Array, terms: Array, until: Array, rows: Array, out: Array
+    sim: Simulation,
+    parts: int,
+    actions: Array,
+    weights: Array,
+    terms: Array,
+    until: Array,
+    script: Script,
+    rows: Array,
+    out: Array,
 ) -> None:
-    """Take some envs through parts of a step.
+    """Take some envs through parts of one step, or of several.
 
     Args:
-        parts: CLAIM resolves claims, MOVE steps the arms, OBSERVE updates the offers and fills `out`.
+        parts: CLAIM resolves claims, MOVE steps the arms, OFFER updates the offers, OBSERVE fills `out`, and PLAY takes
+            the claims from the script.
         actions: int64 [env, arm].
         weights: Reward per unit of each term, [term].
         terms: Receives the reward terms and their sum, [env, term + 1].
-        until: Tick until which each env goes on while no arm has a choice, int [env]; not at all if empty.
+        until: Tick until which each env goes on while no arm has a choice, or while it plays, int [env]; not at all if
+            empty.
         rows: int [row].
         out: Receives the observation vectors, float32 [env, arm, size].
     """
+    room = np.empty(BLOCK, np.int64)
     for first in range(0, len(rows), BLOCK):
         some = rows[first : first + BLOCK]
-        if parts & CLAIM:
-            resolve_claims(sim, actions, some)
-        if parts & MOVE:
-            step_arms(sim, weights, terms, some)
+        count, now = len(some), parts
+        for n in range(count):
+            room[n] = some[n]
+            for term in range(terms.shape[1]):
+                terms[some[n], term] = 0.0
+        while count > 0:
+            going = room[:count]
+            if now & PLAY:
+                choose_claims(sim, script, going, actions)
+            if now & CLAIM:
+                resolve_claims(sim, actions, going)
+            if now & PLAY:
+                note_awards(sim, script, going, actions)
+            if now & MOVE:
+                step_arms(sim, weights, terms, going)
+            if now & OFFER:
+                update_offers(sim, going)
+            if now & PLAY:
+                collect_rewards(sim, script, going, terms)
+            else:
+                now &= ~CLAIM  # of the first step only
+            count = keep_going(sim, until, now & PLAY != 0, going)
         if parts & OBSERVE:
-            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, sim.events, some)
-            if len(until) > 0:
-                go_on(sim, weights, terms, until, some)
             observe(sim, some, out)
 
 
-@jit
-def go_on(sim: Simulation, weights: Array, terms: Array, until: Array, rows: Array) -> None:
-    """Step some envs until an arm has a choice, all jobs are done, or their last tick; adds to the reward terms."""
-    one, earned = np.empty(1, np.int64), np.empty(terms.shape[1])
+@jit_inline
+def keep_going(sim: Simulation, until: Array, plays: bool, rows: Array) -> int:
+    """Put the envs that make another step first in `rows`; return their number."""
+    count = 0
+    if len(until) > 0:
+        for row in rows:
+            e = nonnegative(row)
+            env = sim.state.env[e]
+            if env["tick"] >= until[e] or (env["unfinished"] == 0 and env["number"] > 0):
+                continue
+            if plays or not (env["alarm"] or sim.offers.mask[e, :, 1:-1].any()):
+                rows[count] = e
+                count += 1
+    return count
+
+
+@jit_inline
+def choose_claims(sim: Simulation, script: Script, rows: Array, actions: Array) -> None:
+    """Let each arm claim, of its jobs that it may claim, the one that comes first in its script."""
+    t, o, arms = sim.tables, sim.offers, nonnegative(actions.shape[1])
+    options, first = t.work.shape[3], np.empty(arms)
     for row in rows:
         e = nonnegative(row)
-        one[0] = e
-        earned[:] = terms[e]
-        while (
-            sim.state.tick[e] < until[e]
-            and (sim.offers.unfinished[e] > 0 or sim.jobs.number[e] == 0)
-            and not sim.offers.alarm[e]
-            and not sim.offers.mask[e, :, 1:-1].any()
-        ):
-            step_arms(sim, weights, terms, one)
-            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, sim.events, one)
-            earned += terms[e]
-        terms[e] = earned
+        for a in range(arms):
+            first[a], actions[e, a] = np.inf, 0
+        for k in range(o.slot_job.shape[1]):
+            j = o.slot_job[e, k]
+            if j < 0 or script.not_before_s[e, j] > sim.state.env[e]["tick"] * t.dt_s:
+                continue
+            a, action = script.arm[e, j], 1 + k * options + script.option[e, j]
+            if script.order[e, j] < first[a] and o.mask[e, a, action] != 0:
+                first[a], actions[e, a] = script.order[e, j], action
+
+
+@jit_inline
+def note_awards(sim: Simulation, script: Script, rows: Array, actions: Array) -> None:
+    """Note which claims were won, and when."""
+    for row in rows:
+        e = nonnegative(row)
+        tick = sim.state.env[e]["tick"]
+        for a in range(nonnegative(actions.shape[1])):
+            arm = sim.state.arms[e, a]
+            if actions[e, a] > 0 and arm["last_award"] == 1:
+                script.start_s[e, nonnegative(arm["job"])] = tick * sim.tables.dt_s
+                n = script.won[e]
+                if n < script.claims.shape[1]:
+                    script.claims[e, n, 0], script.claims[e, n, 1], script.claims[e, n, 2] = tick, a, actions[e, a]
+                    script.won[e] += 1
+
+
+@jit_inline
+def collect_rewards(sim: Simulation, script: Script, rows: Array, terms: Array) -> None:
+    """Add the discounted rewards of a step to those of the script."""
+    for row in rows:
+        e = nonnegative(row)
+        tick = nonnegative(sim.state.env[e]["tick"] - 1)
+        script.reward[e] += script.discount[tick] * terms[e, terms.shape[1] - 1]
+        for term in range(terms.shape[1]):
+            terms[e, term] = 0.0

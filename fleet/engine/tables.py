@@ -1,4 +1,4 @@
-"""The arrays that the engine's kernels read and write, by name, and the events that they record.
+"""The arrays that the engine's kernels read, by name, and the events that they record.
 
 Axis `fleet`: one fleet as it is built; all envs of one fleet have the same arms. Axis `kind`: one kind of job, its work
 and its number of repetitions. Last axes `lane` and `wide` are joints and nodes padded with zeros to what a processor
@@ -8,16 +8,19 @@ numbers, which are turned into `Event`s for reports.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from fleet.difficulty import extend_curve, forecast_arrays
-from fleet.engine.state import State, World
+from fleet.engine.state import ARM, ENV, JOB, LANES, State, World
 from fleet.events import Event, EventKind
+from fleet.heat.thermal import NODES
 from fleet.jit import jit
+from fleet.job import MOST_FAULTS
 from fleet.observation import Layout, Offsets
 from fleet.robot import JOINTS
+from fleet.telemetry import IDLE
 
 Array = np.ndarray
 
@@ -130,14 +133,52 @@ def _releases(world: World, state: State) -> Iterator[Event]:
         yield Event(time_s=at_s, kind="release", env=e, arm="", job=world.jobs.names[e][j])
 
 
-LANES, WIDE = JOINTS + 1, 16
-"""Padded lengths of the joint and the node axis."""
+WIDE = 16
+"""Nodes padded to what a processor takes at once."""
+
+LAW = np.dtype(
+    [
+        ("step", "f4", (2 * NODES, WIDE)),
+        ("to_ambient", "f4", WIDE),
+        ("housing_keep", "f4", (LANES, LANES)),
+        ("housing_gain", "f4", (LANES, LANES)),
+        ("housing_winding", "f4", LANES),
+        ("housing_ambient", "f4", LANES),
+        ("housing_idle_w", "f4", LANES),
+        ("copper_w_per_a2", "f4", LANES),
+        ("idle_w", "f4", LANES),
+        ("sensor_noise_k", "f4", LANES),
+    ],
+    align=True,
+)
+"""How an arm heats up. `step` [from, to] gives the change in an exact step: rows 0..13 Φ − 1 transposed (temperatures),
+14..27 Γ (loads). Then conductances to ambient, W/K; the observer of its housings, see `fleet.heat.thermal`; and its
+motors."""
+
+MODAL = np.dtype(
+    [
+        ("root_capacity", "f8", NODES),
+        ("rates", "f8", NODES),
+        ("modes", "f8", (NODES, NODES)),
+        ("to_ambient", "f8", NODES),
+        ("idle_w", "f8", JOINTS),
+    ],
+    align=True,
+)
+"""The thermal network by its modes [node, mode], for the moments at which a limit is crossed: square roots of the heat
+capacities, inverse time constants, 1/s, conductances to ambient, W/K, and idle heat, W."""
+
+PLAN = np.dtype(
+    [("times_s", "f8", 3), ("current_sq", "f4", (3, LANES)), ("friction_w", "f4", (3, LANES))],
+    align=True,
+)
+"""Durations and mean heat drives of the phases of a plan: approach, one cycle, retreat."""
 
 WORK = np.dtype(
-    [(name, "f8") for name in ("travel_s", "cycle_s", "difficulty", "p_saturation")]
-    + [(name, "i8") for name in ("risk", "peak", "plan", "volume")]
+    [(name, "f4") for name in ("travel_s", "cycle_s", "difficulty", "p_saturation")]
+    + [(name, "i4") for name in ("risk", "peak", "plan", "volume")]
 )
-"""What an arm knows of a plan for a kind of job, one cache line: seconds of approach and retreat, and of one
+"""What an arm knows of a plan for a kind of job, half a cache line: seconds of approach and retreat, and of one
 repetition, both 0 where it has none; difficulty; P(saturation) from models that ignore the start temperature, both NaN
 where not known; rows of the forecasts of P and of the peak temperature, −1 for none; row of the plan tables, −1 where
 it has none; the volume that the plan takes, counted for each fleet."""
@@ -159,54 +200,26 @@ class Tables(NamedTuple):
     reference_c: float
     ambient_c: Array
     """[fleet, tick, arm]."""
-    thermal_step: Array
-    """Exact thermal step, [fleet, arm, from, wide]: rows 0..13 Φ transposed (temperatures), 14..27 Γ (loads)."""
-    to_ambient: Array
-    """Conductance to ambient, W/K, [fleet, arm, node]."""
-    root_capacity: Array
-    """Square root of the heat capacities, [fleet, arm, node]."""
-    rates: Array
-    """Inverse time constants of the thermal modes, 1/s, [fleet, arm, mode]."""
-    modes: Array
-    """[fleet, arm, node, mode]."""
-    sensor_noise_k: Array
-    copper_w_per_a2: Array
-    idle_w: Array
-    rest_current_sq: Array
-    rest_friction_w: Array
-    """[fleet, arm, lane], as are the four before."""
-    start_c: Array
-    """[fleet, arm, node]."""
-    times_s: Array
-    """[plan, phase]."""
-    current_sq: Array
-    friction_w: Array
-    """[plan, phase, lane], as is the one before."""
+    law: Array
+    """`LAW` [fleet, arm]."""
+    modal: Array
+    """`MODAL` [fleet, arm]."""
+    start: Array
+    """An arm at the start of a shift, at home, `ARM` [fleet, arm]."""
+    plans: Array
+    """`PLAN` [plan]."""
     excluded: Array
     """Volumes that no other arm can take meanwhile, one bit each, uint64 [plan, word]."""
     work: Array
-    """What an arm knows of its plans for a kind of job, the fastest first, `WORK` [fleet, arm, kind, plan]."""
-    housing_keep: Array
-    """The arms' observers of their housings, see `fleet.heat.thermal`; [fleet, arm, from, lane]."""
-    housing_gain: Array
-    """[fleet, arm, from, lane]."""
-    housing_winding: Array
-    housing_ambient: Array
-    """W/K, [fleet, arm, lane], as is the one before."""
-    housing_idle_w: Array
-    """[fleet, arm, lane]."""
-    start_housing_c: Array
-    """[fleet, arm, joint]."""
+    """What an arm knows of its plans for a kind of job, the fastest first, `WORK` [fleet, kind, arm, plan]."""
     forecast_first: Array
     """Where the blocks of each forecast begin, int [forecast + 1]; see `fleet.difficulty.forecast_arrays`."""
     forecast_block: Array
-    """Pieces, [block, 2 + known, lane]."""
+    """Pieces, float32 [block, 2 + known, lane]."""
     forecast_curve: Array
-    """[forecast, knot, 2]; no knots where no forecast has a curve."""
+    """float32 [forecast, knot, 2]; no knots where no forecast has a curve."""
     too_heavy: Array
     """Whether the load of a kind of job exceeds an arm's rating, bool [fleet, kind, arm]."""
-    feasible: Array
-    """Whether an arm can do a kind of job at all, bool [fleet, kind, arm]."""
     stations: Array
     """Stations of a kind of job, one bit each, uint64 [fleet, kind + 1, word]; the last row, no job, has none."""
     payload_kg: Array
@@ -214,85 +227,39 @@ class Tables(NamedTuple):
     """[fleet, kind], as is the one before."""
 
 
-class Jobs(NamedTuple):
-    """What was drawn for the shift of each env."""
-
-    fleet: Array
-    """int [env]."""
-    ambient_offset_k: Array
-    """Added to the ambient temperature of the tables, [env]."""
-    noise_key: Array
-    """Of the sensor noise, uint64 [env]."""
-    number: Array
-    """Number of jobs, int [env]; they come first in their row."""
-    kind: Array
-    """int [env, job]."""
-    release_s: Array
-    due_s: Array
-    """[env, job], as is the one before."""
-    repetitions: Array
-    """int [env, job]."""
-    expires: Array
-    """Whether a job expires at its due date if no arm has begun it, bool [env, job]."""
-    after: Array
-    """Jobs that must be done first, int [env, job, n], −1 for none."""
-
-
 class OpenJobs(NamedTuple):
-    """Jobs that can be claimed, and what follows from the state but is slow to look up."""
+    """Jobs that can be claimed, and by whom."""
 
     slot_job: Array
-    """int [env, slot], −1 for an empty slot."""
+    """int32 [env, slot], −1 for an empty slot."""
     mask: Array
     """Legal actions, int8 [env, arm, option + 2]."""
-    alarm: Array
-    """Whether an arm at work has passed the warning limit in the last step, bool [env]."""
     station_free: Array
     """Whether no arm occupies the stations of a slot's job, bool [env, slot]."""
-    unfinished: Array
-    """Jobs neither done nor given up, int [env]."""
-    given_up: Array
-    """Jobs given up, int [env]."""
-    queue: Array
-    """Waiting jobs, released or not, by queueing time, int32 [env, job], at the end of each row."""
-    head: Array
-    """Where in its row the queue begins, int [env]."""
-    current_kind: Array
-    """Kind of an arm's current job, int [env, arm]; the number of kinds if it has none."""
     closed: Array
     """Volumes that arms away from home exclude, one bit each, uint64 [env, word]."""
-    pending: Array
-    """Whether the current job is still to be finished, bool [env, arm]; False on the way home."""
 
 
-class Trace(NamedTuple):
-    """How each arm spent the last step; arrays without rows record nothing."""
+TRACE = np.dtype(
+    [
+        ("mode", "i4"),
+        ("plan", "i4"),
+        ("todo", "i4"),
+        ("progress_s", "f8"),
+        ("home_s", "f8"),
+        ("cut_s", "f8"),
+        ("heat_w", "f8", NODES),
+        ("start_c", "f8", NODES),
+    ],
+    align=True,
+)
+"""How an arm spent the last step: its mode at the beginning, with the awards made; row of the plan tables, −1 at home;
+cycles to do; progress at the beginning; seconds into the step at which it is free again, inf if not in it; seconds it
+moved before a fault stopped it, the whole step if none did; heat until the fault, W, and temperatures at the beginning,
+[node]."""
 
-    mode: Array
-    """At the beginning, with the awards made, int [env, arm]."""
-    plan: Array
-    """Row of the plan tables, int [env, arm]; −1 at home."""
-    progress_s: Array
-    """At the beginning, [env, arm]."""
-    todo: Array
-    """int [env, arm]."""
-    home_s: Array
-    """Seconds into the step at which the arm is free again; inf if not in it, [env, arm]."""
-    cut_s: Array
-    """Seconds the arm moved before a fault stopped it; the whole step if none did, [env, arm]."""
-    heat_w: Array
-    """Until the fault, [env, arm, node]."""
-    start_c: Array
-    """[env, arm, node]."""
-
-
-class MeasuredDrive(NamedTuple):
-    """Heat drive from a plant that computes the motion; without rows the planned drive counts."""
-
-    current_sq: Array
-    """Mean over the step, [env, arm, lane]."""
-    friction_w: Array
-    """Mean over the step, [env, arm, lane]."""
+DRIVE = np.dtype([("current_sq", "f4", LANES), ("friction_w", "f4", LANES)])
+"""Mean heat drive of an arm over a step, from a plant that computes the motion, [lane]."""
 
 
 class Form(NamedTuple):
@@ -315,12 +282,13 @@ class Simulation(NamedTuple):
     """Everything that a kernel works on."""
 
     tables: Tables
-    jobs: Jobs
     state: State
     offers: OpenJobs
     events: EventBuffer
-    trace: Trace
-    drive: MeasuredDrive
+    trace: Array
+    """`TRACE` [env, arm]; without rows nothing is recorded."""
+    drive: Array
+    """`DRIVE` [env, arm]; without rows the planned drive counts."""
     form: Form
 
 
@@ -337,17 +305,57 @@ def form_of(layout: Layout) -> Form:
     return Form(offsets, low, high, np.array(first), layout.who, np.array(changes, dtype=int).reshape(-1, 2))
 
 
-def tables_of(world: World) -> tuple[Tables, Jobs]:
-    """A world as tables: each env is a fleet of its own, and each job a kind."""
+def tables_of(world: World) -> tuple[Tables, State]:
+    """A world as tables, in which each env is a fleet and each job a kind, and its shifts before the start."""
     envs, jobs = world.envs, world.jobs
     count = jobs.exists.sum(axis=1)
     if not np.array_equal(jobs.exists, np.arange(jobs.exists.shape[1]) < count[:, None]):
         raise ValueError("The jobs of an env must be the first of its row.")
 
-    def per_fleet(values: Array) -> Array:
-        return np.repeat(values[None], envs, axis=0)
+    def records(kind: np.dtype, shape: tuple[int, ...], **fields: Array) -> Array:
+        made = np.zeros(shape, kind)
+        for name, values in fields.items():
+            place = made[name]
+            place[tuple(slice(0, n) for n in (*shape, *values.shape[values.ndim - place.ndim + len(shape) :]))] = values
+        return made
 
     limits, motors, offers, rest = world.limits, world.motors, world.offers, world.rest
+    observer, thermal, arms = world.observer, world.thermal, len(world.arms)
+    law = records(
+        LAW,
+        (arms,),
+        step=np.concatenate([world.phi - np.eye(NODES), world.gamma], axis=-1).swapaxes(-1, -2),
+        to_ambient=thermal.to_ambient,
+        housing_keep=observer.keep.swapaxes(-1, -2),
+        housing_gain=observer.gain.swapaxes(-1, -2),
+        housing_winding=observer.from_winding,
+        housing_ambient=observer.from_ambient,
+        housing_idle_w=observer.idle_w,
+        copper_w_per_a2=motors.copper_w_per_a2,
+        idle_w=motors.idle_w,
+        sensor_noise_k=motors.sensor_noise_k,
+    )
+    modal = records(
+        MODAL,
+        (arms,),
+        root_capacity=np.sqrt(thermal.capacity),
+        rates=thermal.rates,
+        modes=thermal.modes,
+        to_ambient=thermal.to_ambient,
+        idle_w=motors.idle_w,
+    )
+    start = records(
+        ARM,
+        (arms,),
+        temp_c=world.start_c,
+        housing_c=world.start_housing_c,
+        current_sq=rest.current_sq,
+        friction_w=rest.friction_w,
+    )
+    start["mode"], start["plan"], start["job"], start["kind"] = IDLE, -1, -1, jobs.exists.shape[1]
+    start["peak_c"] = start["temp_c"][:, :JOINTS].max(axis=-1)
+    for name in ("phase_end_s", "clear_at_s", "moved_at_s"):
+        start[name] = np.inf
     can = offers.plan >= 0
     times_s = np.where(can[..., None], world.plans.times_s[offers.plan], 0.0)
     work = np.zeros(can.shape, WORK)
@@ -355,8 +363,18 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
     work["difficulty"], work["p_saturation"] = offers.difficulty, offers.p_saturation
     work["risk"], work["peak"], work["plan"] = offers.risk, offers.peak, offers.plan
     work["volume"] = np.where(can, world.plans.volume[offers.plan], 0)
-    forecasts, observer = forecast_arrays(offers.forecasts, LANES), world.observer
-    thermal_step = np.concatenate([world.phi, world.gamma], axis=-1).swapaxes(-1, -2)
+    plans = records(
+        PLAN,
+        (len(world.plans.times_s),),
+        times_s=world.plans.times_s,
+        current_sq=world.plans.current_sq,
+        friction_w=world.plans.friction_w,
+    )
+
+    def per_fleet(values: Array) -> Array:
+        return np.repeat(values[None], envs, axis=0)
+
+    first, block, curve = forecast_arrays(offers.forecasts, LANES).values()
     tables = Tables(
         dt_s=float(world.dt_s),
         ticks=int(world.ticks),
@@ -370,48 +388,53 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         alpha_kt_per_k=float(motors.alpha_kt_per_k),
         reference_c=float(motors.reference_c),
         ambient_c=per_fleet(world.ambient_c),
-        thermal_step=per_fleet(pad(thermal_step, -1, WIDE)),
-        to_ambient=per_fleet(world.thermal.to_ambient),
-        root_capacity=per_fleet(np.sqrt(world.thermal.capacity)),
-        rates=per_fleet(world.thermal.rates),
-        modes=per_fleet(world.thermal.modes),
-        sensor_noise_k=per_fleet(pad(motors.sensor_noise_k)),
-        copper_w_per_a2=per_fleet(pad(motors.copper_w_per_a2)),
-        idle_w=per_fleet(pad(motors.idle_w)),
-        rest_current_sq=per_fleet(pad(rest.current_sq)),
-        rest_friction_w=per_fleet(pad(rest.friction_w)),
-        start_c=per_fleet(world.start_c),
-        times_s=world.plans.times_s,
-        current_sq=pad(world.plans.current_sq),
-        friction_w=pad(world.plans.friction_w),
+        law=per_fleet(law),
+        modal=per_fleet(modal),
+        start=per_fleet(start),
+        plans=plans,
         excluded=bits(world.conflicts[world.plans.volume]),
-        work=work,
-        housing_keep=per_fleet(pad(observer.keep.swapaxes(-1, -2))),
-        housing_gain=per_fleet(pad(observer.gain.swapaxes(-1, -2))),
-        housing_winding=per_fleet(pad(observer.from_winding)),
-        housing_ambient=per_fleet(pad(observer.from_ambient)),
-        housing_idle_w=per_fleet(pad(observer.idle_w)),
-        start_housing_c=per_fleet(world.start_housing_c),
+        work=work.swapaxes(1, 2),
+        forecast_first=first,
+        forecast_block=block.astype(np.float32),
+        forecast_curve=curve.astype(np.float32),
         too_heavy=offers.too_heavy.swapaxes(-1, -2),
-        **forecasts,
-        feasible=np.any(can, axis=-1).swapaxes(-1, -2),
         stations=bits(_one_hot(jobs.stations, len(world.stations))),
         payload_kg=jobs.payload_kg,
         value=jobs.value,
     )
-    drawn = Jobs(
-        fleet=np.arange(envs),
-        ambient_offset_k=np.zeros(envs),
-        noise_key=np.zeros(envs, np.uint64),
-        number=count,
-        kind=np.repeat(np.arange(jobs.exists.shape[1])[None], envs, axis=0),
-        release_s=jobs.release_s,
-        due_s=jobs.due_s,
-        repetitions=jobs.repetitions,
-        expires=jobs.expires,
-        after=jobs.after,
+    state = empty_state(envs, arms, jobs.exists.shape[1], jobs.after.shape[2])
+    state.env["fleet"], state.env["number"] = np.arange(envs), count
+    state.jobs["kind"] = np.arange(jobs.exists.shape[1])
+    for name in ("release_s", "due_s", "repetitions", "expires"):
+        state.jobs[name] = getattr(jobs, name)
+    state.after[:] = jobs.after
+    return owned(tables), state
+
+
+def empty_state(envs: int, arms: int, jobs: int, waits: int) -> State:
+    """Room for a number of jobs, each of which waits for up to `waits` others; there are none yet."""
+    state = State(
+        env=_aligned((envs,), ENV),
+        arms=_aligned((envs, arms), ARM),
+        jobs=_aligned((envs, jobs), JOB),
+        failed_arm=np.full((envs, jobs, MOST_FAULTS - 1), -1, np.int32),
+        after=np.full((envs, jobs, waits), -1, np.int32),
+        queue=np.zeros((envs, jobs), np.int32),
     )
-    return owned(tables), owned(drawn)
+    state.jobs["release_s"] = state.jobs["due_s"] = np.inf
+    state.jobs["repetitions"] = 1
+    return state
+
+
+_CACHE_LINE = 64
+
+
+def _aligned(shape: tuple[int, ...], kind: np.dtype) -> Array:
+    """Zeros whose records do not straddle more cache lines than they must."""
+    size = math.prod(shape) * kind.itemsize
+    room = np.zeros(size + _CACHE_LINE, np.uint8)
+    first = -room.ctypes.data % _CACHE_LINE
+    return room[first : first + size].view(kind).reshape(shape)
 
 
 def pad(values: Array, axis: int = -1, size: int = LANES, fill: float = 0.0) -> Array:
@@ -439,10 +462,9 @@ def _one_hot(stations: Array, count: int) -> Array:
 
 
 _FORECAST = tuple(forecast_arrays(None, LANES))
-Arrays = TypeVar("Arrays", Tables, Jobs)
 
 
-def owned(arrays: Arrays) -> Arrays:
+def owned(arrays: Tables) -> Tables:
     """The same with every array contiguous, writeable and owned."""
     return arrays._replace(
         **{name: np.array(v, order="C") for name, v in arrays._asdict().items() if isinstance(v, np.ndarray)}
@@ -469,7 +491,7 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
         for name in ("ambient_c", "work"):
             if getattr(other, name).shape != getattr(first, name).shape:
                 raise ValueError(f"Fleets of one batch must have as many arms and kinds of jobs as the first ({name}).")
-    plans = np.cumsum([0, *(len(each.times_s) for each in fleets)])
+    plans = np.cumsum([0, *(len(each.plans) for each in fleets)])
     forecasts = np.cumsum([0, *(len(each.forecast_curve) for each in fleets)])
     blocks = np.cumsum([0, *(len(each.forecast_block) for each in fleets)])
     knots = max(each.forecast_curve.shape[1] for each in fleets)

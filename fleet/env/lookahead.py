@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.engine.batch import Engine, RewardWeights, Shift
-from fleet.engine.play import Executed, Plans
-from fleet.engine.state import DONE, GIVEN_UP, PER_JOB, RUNNING, State
+from fleet.engine.batch import Engine, RewardWeights, shifts_of
+from fleet.engine.state import DONE, GIVEN_UP, RUNNING, State
+from fleet.engine.step import Plans, Script
 from fleet.engine.tables import Tables
 from fleet.heat.thermal import HOUSING, WINDING
 from fleet.observation import Layout, Observation
@@ -21,8 +21,6 @@ Array = np.ndarray
 
 SIDE_BY_SIDE = 32
 """Number of schedules simulated at once."""
-_DERIVED = ("queue", "head", "unfinished", "given_up", "current_kind", "pending")
-"""Fields of the offers that a simulation changes, and `run` restores."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +55,6 @@ class CellSimulator:
             tables._replace(ambient_c=tables.ambient_c.copy()), SIDE_BY_SIDE, layout, weights, compiled=compiled
         )
         self._state: State | None = None
-        self._derived: list[Array] = []
         none = np.zeros((0, 0))
         self._engine.play((none.astype(int), none.astype(int), none, none), np.zeros(0))  # compiles
 
@@ -88,32 +85,27 @@ class CellSimulator:
         Args:
             seen: Observations of its arms.
         """
-        jobs, state, slot_job = engine.jobs, engine.state, engine.offers.slot_job[env]
-        row, count, open_ = slice(env, env + 1), int(jobs.number[env]), slot_job[slot_job >= 0]
-        hidden = (state.status[env] != DONE) & (state.status[env] != RUNNING)
+        state, slot_job = engine.state, engine.offers.slot_job[env]
+        count, open_ = int(state.number[env]), slot_job[slot_job >= 0]
+        known = state.copy(slice(env, env + 1), slice(0, count))
+        hidden = (known.status[0] != DONE) & (known.status[0] != RUNNING)
         hidden[open_] = False
-        known = state.copy(row)
         known.status[0, hidden] = GIVEN_UP
         known.temp_c[0, :, WINDING] = [each.temp_c for each in seen.values()]
         known.temp_c[0, :, HOUSING] = [each.housing_c for each in seen.values()]
         mine, tick = self._engine, int(state.tick[env])
         mine.tables.work["difficulty"] = engine.tables.work["difficulty"]  # it decides between claims
         mine.tables.ambient_c[:] = self._ambient_c[:, [min(tick, mine.tables.ticks - 1)]]
-        named = ("kind", "release_s", "due_s", "repetitions", "expires", "after")
-        drawn = {name: getattr(jobs, name)[env, :count] for name in named}
-        fleet, offset_k = int(jobs.fleet[env]), float(jobs.ambient_offset_k[env])
-        shift = Shift(fleet=fleet, ambient_offset_k=offset_k, noise_key=0, **drawn)
-        mine.reset(np.arange(SIDE_BY_SIDE), [shift] * SIDE_BY_SIDE)
-        mine.load(known._replace(**{name: getattr(known, name)[:, :count] for name in PER_JOB}))
+        mine.reset(np.arange(SIDE_BY_SIDE), shifts_of(known, [0]) * SIDE_BY_SIDE)
+        mine.load(known)
         self._state = mine.state.copy(slice(0, 1))
-        self._derived = [getattr(mine.offers, name)[0].copy() for name in _DERIVED]
-        kind = jobs.kind[env, :count]
-        can, stations = mine.tables.work["plan"][fleet][:, kind] >= 0, mine.tables.stations[fleet, kind]
+        fleet, kind = int(state.fleet[env]), known.kind[0]
+        can, stations = mine.tables.work["plan"][fleet, kind].swapaxes(0, 1) >= 0, mine.tables.stations[fleet, kind]
         unknown = ~np.isin(np.arange(count), open_)
         can[:, unknown], stations[unknown] = False, 0
         return Present(tick * self.dt_s, open_, can, stations)
 
-    def run(self, schedules: Plans, discount: Array) -> Executed:
+    def run(self, schedules: Plans, discount: Array) -> Script:
         """Results of at most `rows` schedules from the time of the last `look`.
 
         Args:
@@ -128,16 +120,14 @@ class CellSimulator:
         if self._state is None:
             raise RuntimeError("There is no present to begin at: call look() before run().")
         mine = self._engine
-        _check(schedules, discount, self.rows, mine.tables.work.shape, int(mine.jobs.number[0]), mine.tables.ticks)
+        _check(schedules, discount, self.rows, mine.tables.work.shape, int(mine.state.number[0]), mine.tables.ticks)
         for own, saved in zip(mine.state, self._state, strict=True):
             own[:] = saved
-        for name, saved in zip(_DERIVED, self._derived, strict=True):
-            getattr(mine.offers, name)[:] = saved
         return mine.play(schedules, discount)
 
 
 def _check(schedules: Plans, discount: Array, rows: int, work: tuple[int, ...], jobs: int, ticks: int) -> None:
-    """Check the indices that the compiled loop reads; `work` has the shape [fleet, arm, kind, option]."""
+    """Check the indices that the compiled loop reads; `work` has the shape [fleet, kind, arm, option]."""
     arm, option = schedules[:2]
     shapes = [np.shape(each) for each in schedules]
     if len(shapes[0]) != 2 or shapes[0][1] != jobs or shapes[0][0] > rows or len(set(shapes)) != 1:
@@ -145,7 +135,7 @@ def _check(schedules: Plans, discount: Array, rows: int, work: tuple[int, ...], 
             f"Schedules must be arrays [schedule, job] of at most {rows} schedules and {jobs} jobs, all of "
             f"the same shape (got {', '.join(map(str, shapes))})."
         )
-    for name, values, most in (("arm", arm, work[1]), ("option", option, work[3])):
+    for name, values, most in (("arm", arm, work[2]), ("option", option, work[3])):
         if not np.issubdtype(values.dtype, np.integer) or (values < 0).any() or (values >= most).any():
             raise ValueError(
                 f"The {name} of a schedule must be an integer from 0 to {most - 1}, also of a job that is "

@@ -292,7 +292,7 @@ class BatchEnv:
         """Replace the peers' fields of the observations by the delivered messages."""
         if self._exchanges is None or self._delivered is None:
             return
-        names = [str(j) for j in range(self._engine.jobs.kind.shape[1])]
+        names = [str(j) for j in range(self._engine.state.jobs.shape[1])]
         for e in rows.tolist():
             deliver(self._exchanges[e], self._engine, vectors[e], names, ("",) * len(self.agents), e)
         self._delivered[rows] = vectors[rows]
@@ -311,11 +311,11 @@ class BatchEnv:
                 "action_mask": np.zeros((0, arms, self.layout.actions), np.int8),
             }
         return {
-            "faults": state.faults.copy(),
-            "illegal": state.illegal.copy(),
-            "peak_c": state.peak_c.copy(),
+            "faults": state.faults.astype(int),
+            "illegal": state.illegal.astype(int),
+            "peak_c": state.peak_c.astype(float),
             "above_warning_s": state.above_warning_s.copy(),
-            "jobs_done": self._engine.done,
+            "jobs_done": self._engine.state.done,
             "elapsed_s": self._elapsed_s,
             **{f"reward_{name}": terms[:, n] for n, name in enumerate(TERMS)},
             "final_envs": ended,

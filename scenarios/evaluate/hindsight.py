@@ -81,7 +81,7 @@ class ShiftSimulator:
 
     def changes(self, rng: np.random.Generator) -> Changes:
         tables, jobs = self._engine.tables, self.jobs
-        can = tables.work["plan"][0, :, :jobs] >= 0
+        can = tables.work["plan"][0, :jobs].swapaxes(0, 1) >= 0
         return Changes(
             can, tables.stations[0, :jobs], self.world.jobs.release_s[0, :jobs], self.world.horizon_s,
             self.world.dt_s, rng,

@@ -18,8 +18,7 @@ from fleet.arm.plant import MujocoPlant
 from fleet.arm.trajectory import CollisionChecker, limit_violation
 from fleet.difficulty import Blind
 from fleet.engine.profile_plant import sample
-from fleet.engine.shift import step
-from fleet.engine.state import initial
+from fleet.engine.shift import initial, step
 from fleet.engine.world import Arm, build_world
 from fleet.errors import FleetError
 from fleet.heat.motor import Motors, gen3_motors

@@ -22,7 +22,7 @@ from fleet.engine.world import Arm, build_world, warm_start
 from fleet.env.lookahead import CellSimulator
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError
 from fleet.files import cache_folder
-from fleet.jit import cache_of_this_code
+from fleet.jit import is_compiled
 from fleet.job import Job, Work
 from fleet.motion import Plan
 from fleet.robot import Robot
@@ -214,7 +214,10 @@ def _blind_arm(planned: PlannedArm, works: Sequence[Work], folder: Path) -> Arm:
 
 def _compile_meanwhile(scenario: Scenario, arms: Sequence[Arm], folder: Path) -> None:
     """Compile the engine, unless it was compiled, in a thread, while other processes train."""
-    if cache_of_this_code().exists():
+    from fleet.engine.batch import reset_rows
+    from fleet.engine.step import step_rows
+
+    if is_compiled(step_rows, reset_rows):
         return
     env = env_of(_fleet(scenario, arms, (), folder), bus="memory")
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from fleet.engine.shift import Stepped, step
-from fleet.engine.state import initial
+from fleet.engine.shift import Stepped, initial, step
 from fleet.events import Event
 
 DT_S = 10.0

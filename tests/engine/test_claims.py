@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.engine.shift import open_jobs, step
-from fleet.engine.state import World, initial
+from fleet.engine.shift import initial, open_jobs, step
+from fleet.engine.state import World
 from fleet.telemetry import IDLE, WORKING
 from tests.profiles import examples
 
@@ -111,7 +111,7 @@ def test_awards_equal_the_reference(small, data) -> None:
         won, lost, illegal = referee(slot_job[0], mask[0], stations, actions, difficulty, busy, touches, away)
         before = state.copy()
         after = step(world, state, actions[None], plant, compiled=False).state
-        for name, values in before._asdict().items():
+        for name, values in before.named().items():
             np.testing.assert_array_equal(getattr(state, name), values, err_msg=f"{name} of the state before")
         assert (after.illegal - state.illegal)[0].tolist() == illegal
         assert (after.last_award[0] == -1).tolist() == lost

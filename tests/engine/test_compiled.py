@@ -39,7 +39,7 @@ def check_equal(episode: Episode, seed: int, **options) -> ShiftRunner:
         (terms, reward, done), (fast_terms, fast_reward, fast_done) = slow.step(actions), fast.step(actions)
         np.testing.assert_array_equal(fast_terms, terms)
         assert (fast_reward, fast_done) == (reward, done)
-        for name, values in slow.state._asdict().items():
+        for name, values in slow.state.named().items():
             np.testing.assert_array_equal(getattr(fast.state, name), values, err_msg=name)
     assert list(map(repr, fast.events)) == list(map(repr, slow.events))  # NaN equals itself in text
     assert (fast.messages, fast.jobs_done) == (slow.messages, slow.jobs_done)

@@ -11,8 +11,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from fleet.engine.crossings import crossing_s, hottest_at, to_modes
-from fleet.engine.shift import Stepped, open_jobs, step
-from fleet.engine.state import DONE, WAITING, World, initial
+from fleet.engine.shift import Stepped, initial, open_jobs, step
+from fleet.engine.state import DONE, WAITING, World
 from fleet.engine.tables import tables_of
 from fleet.events import Event
 from fleet.heat.thermal import NODES, WINDING
@@ -75,20 +75,20 @@ def winding_after(world: World, start_c, heat_w, seconds: float) -> float:
 def test_crossing_times_equal_brentq(small, start_c) -> None:
     """Also if the search hits the limit exactly; the time is never before the crossing."""
     world, _ = small.shop([[small.job("a")]])
-    tables = tables_of(world)[0]
+    net = tables_of(world)[0].modal[0, 0]
     heat_w, temp_c, modal = np.zeros(NODES), np.full(NODES, start_c), np.empty((2, NODES))
     heat_w[1] = 90.0 if start_c < 50.0 else 0.0
     temp_c[1] += 1.0
-    to_modes(tables, 0, 0, temp_c, heat_w + tables.to_ambient[0, 0] * AMBIENT_C, modal)
+    to_modes(net, temp_c, heat_w + net["to_ambient"] * AMBIENT_C, modal)
     first_c, last_c = (winding_after(world, temp_c, heat_w, time_s) for time_s in (0.0, DT_S))
     assert (last_c > first_c) == (start_c < 50.0)
     exact = 0
     limits = np.random.default_rng(3).uniform(min(first_c, last_c), max(first_c, last_c), size=400)
     for limit_c in limits.tolist():
-        root_s = crossing_s(tables, 0, 0, modal, DT_S, limit_c, first_c, last_c)
+        root_s = crossing_s(net, modal, DT_S, limit_c, first_c, last_c)
         expected_s = brentq(lambda s, c=limit_c: winding_after(world, temp_c, heat_w, s) - c, 0.0, DT_S, xtol=1e-12)
         assert root_s == pytest.approx(expected_s, rel=0, abs=1e-9)
-        there_c = hottest_at(tables, 0, 0, modal, root_s)
+        there_c = hottest_at(net, modal, root_s)
         exact += there_c == limit_c
         assert there_c == limit_c or (there_c > limit_c) == (last_c > first_c)
     assert exact > 3

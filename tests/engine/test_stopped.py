@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.engine.shift import open_jobs, step
-from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, WAITING, initial
+from fleet.engine.shift import initial, open_jobs, step
+from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, WAITING
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 

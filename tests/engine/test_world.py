@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleet.difficulty import KNOWN, Blind, Difficulty, Forecast
-from fleet.engine.state import initial
+from fleet.engine.shift import initial
 from fleet.engine.world import warm_start
 from fleet.heat.motor import gen3_motors
 from fleet.motion import Plan

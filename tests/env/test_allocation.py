@@ -8,7 +8,6 @@ import pytest
 from fleet.bus.exchange.memory import Exchange
 from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.engine.batch import TERMS, RewardWeights
-from fleet.engine.state import State
 from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import ThermalLimits
@@ -204,7 +203,7 @@ def test_an_episode_ends_the_same_in_fewer_steps(small, seed) -> None:
     shifts = small.Shifts(ticks=80)
     every, all_rewards, intervals = played(parallel_env(shifts), seed)
     some, rewards, seconds = played(parallel_env(shifts, decisions="events"), seed)
-    for name in State._fields:
+    for name in some.named():
         if name != "last_award":  # of the last step
             np.testing.assert_array_equal(getattr(some, name), getattr(every, name), err_msg=name)
     assert sum(rewards) == pytest.approx(sum(all_rewards), rel=1e-12)

@@ -254,7 +254,7 @@ def test_returned_arrays_of_a_batch_belong_to_the_caller(batch, play) -> None:
             for values in vars(env.knowledge()).values():
                 values[...] = 1
             play.same(vars(env.knowledge()), vars(untouched.knowledge()))
-        play.same(env.state._asdict(), untouched.state._asdict())
+        play.same(env.state.named(), untouched.state.named())
         if step % 7 == 3:
             some = {"rows": [1, 4]}
             handed, kept = env.reset(**some), untouched.reset(**some)

@@ -13,7 +13,7 @@ import pytest
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
-from fleet.engine.state import DONE, State, World
+from fleet.engine.state import DONE, JOB, State, World
 from fleet.engine.tables import Tables
 from fleet.env.allocation_v1 import Episode, parallel_env
 from fleet.env.vector import BatchEnv
@@ -256,9 +256,13 @@ def actions_of(result: RunLog, offered: list[str], arms: list[str], now_s: float
 
 def check_equal(actual: State, expected: State, jobs: int) -> None:
     """Assert that the states of one env are equal, apart from unused job entries and the rows of plans."""
-    for name, values in expected._replace(plan=expected.plan >= 0)._asdict().items():
-        own = actual.plan >= 0 if name == "plan" else getattr(actual, name)
-        if name in ("status", "queued_s", "cycles", "returns", "failed_arm", "finished_s"):
+    for name, values in expected.named().items():
+        own = getattr(actual, name)
+        if name in ("kind", "fleet"):
+            continue
+        if name == "plan":
+            own, values = own >= 0, values >= 0
+        if name in JOB.names:
             own, values = own[:, :jobs], values[:, :jobs]
         np.testing.assert_array_equal(own, values, err_msg=name)
 
@@ -266,8 +270,10 @@ def check_equal(actual: State, expected: State, jobs: int) -> None:
 def check_plans(tables: Tables, actual: np.ndarray, world: World, expected: np.ndarray) -> None:
     """Assert that arms away from home follow equal plans, int [arm]; each table has rows of its own."""
     one, other = actual[actual >= 0], expected[expected >= 0]
-    np.testing.assert_array_equal(tables.times_s[one], world.plans.times_s[other])
-    np.testing.assert_array_equal(tables.current_sq[one, :, :JOINTS], world.plans.current_sq[other])
+    np.testing.assert_array_equal(tables.plans["times_s"][one], world.plans.times_s[other])
+    np.testing.assert_array_equal(
+        tables.plans["current_sq"][one, :, :JOINTS], world.plans.current_sq[other].astype(np.float32)
+    )
 
 
 def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None:

@@ -45,7 +45,7 @@ def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batc
                 here["illegal"] = idle["illegal"]
                 play.same(here, idle)
                 assert all(
-                    np.array_equal(v[e], v[-1], equal_nan=True) for n, v in now._asdict().items() if n != "illegal"
+                    np.array_equal(v[e], v[-1], equal_nan=True) for n, v in now.named().items() if n != "illegal"
                 )
                 counts["illegal"] += not legal
                 continue

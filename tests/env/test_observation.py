@@ -13,8 +13,8 @@ from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import UNHEARD, Exchange, PeerView
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.profile_plant import sensor_noise
-from fleet.engine.shift import Episode, ShiftRunner, broadcast, write_peers
-from fleet.engine.state import State, World, initial
+from fleet.engine.shift import Episode, ShiftRunner, broadcast, initial, write_peers
+from fleet.engine.state import State, World
 from fleet.engine.tables import tables_of
 from fleet.env.allocation_v1 import parallel_env
 from fleet.errors import ScenarioError

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fleet.engine.shift import step
-from fleet.engine.state import initial
+from fleet.engine.shift import initial, step
 from fleet.env.render.heat import heat_colour
 from fleet.env.render.picture import (
     FLOOR,

@@ -216,7 +216,7 @@ def test_autoreset_returns_the_first_observation_of_a_reset(batch, play) -> None
         else:
             play.same(one[0], other[0])
         play.same(vars(by_itself.knowledge()), vars(by_hand.knowledge()))
-        play.same(by_itself.state._asdict(), by_hand.state._asdict())
+        play.same(by_itself.state.named(), by_hand.state.named())
     assert ends > 10
 
 
@@ -437,12 +437,12 @@ def test_a_warmer_cell_warms_every_motor(cell, plans) -> None:
     nobody = np.zeros((5, 3), int)
     for batch in (cool, warm):
         batch.reset()
-    np.testing.assert_allclose(warm.state.temp_c - cool.state.temp_c, 3.0)
+    np.testing.assert_allclose(warm.state.temp_c - cool.state.temp_c, 3.0, atol=1e-5)  # float32
     for batch in (cool, warm):
         for _ in range(15):
             batch.step(nobody)
     warmer = warm.state.temp_c - cool.state.temp_c
-    assert warmer.min() > 3.0 - 1e-9
+    assert warmer.min() > 3.0 - 1e-5
     assert 3.0 + 1e-6 < warmer.max() < 3.1  # a warmer motor has slightly higher losses
 
 

@@ -13,8 +13,7 @@ from agents.policy import WAIT
 from agents.registry import RULES
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.difficulty import KNOWN
-from fleet.engine.shift import step
-from fleet.engine.state import initial
+from fleet.engine.shift import initial, step
 from fleet.engine.world import warm_start
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, WINDING, drive_heat, gen3_network, node_heat, steady_state, thermal_model

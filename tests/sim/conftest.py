@@ -12,8 +12,7 @@ from fleet.arm.planner import Planner
 from fleet.arm.plant import MujocoPlant
 from fleet.difficulty import Blind
 from fleet.engine.profile_plant import ProfilePlant, recorded_noise, telemetry_of
-from fleet.engine.shift import step
-from fleet.engine.state import initial
+from fleet.engine.shift import initial, step
 from fleet.engine.world import Arm, build_world
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import gen3_network, thermal_model

@@ -16,8 +16,7 @@ from fleet.arm.planner import Planner
 from fleet.arm.plant import STRIDE, TIMESTEP_S, MujocoPlant, control, load_hands, reference, still
 from fleet.arrivals import Arrivals
 from fleet.engine.profile_plant import sample, sample_row
-from fleet.engine.shift import step
-from fleet.engine.state import initial
+from fleet.engine.shift import initial, step
 from fleet.errors import FleetError
 from fleet.heat.motor import gen3_motors
 from fleet.job import KINDS, Fixture, Place, Work, payload_radius_m
@@ -226,7 +225,7 @@ def test_many_envs_and_parts_of_samples_are_refused_and_ticks_come_in_order(cell
             step(world, initial(world), nobody, plants["mujoco"])
     world, plants = cell.shift(cell.job("sort"))
     done = step(world, initial(world), np.zeros((1, 2), int), plants["mujoco"])
-    later = done.state._replace(tick=done.state.tick + 1)
+    later = done.state.changed(tick=done.state.tick + 1)
     with pytest.raises(ValueError, match=r"1 is next \(got 2\)"):
         step(world, later, np.zeros((1, 2), int), plants["mujoco"])
     step(world, done.state, np.zeros((1, 2), int), plants["mujoco"])

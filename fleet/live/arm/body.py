@@ -20,8 +20,8 @@ import numpy as np
 
 from fleet.difficulty import Blind
 from fleet.engine.profile_plant import ProfilePlant, telemetry_of
-from fleet.engine.shift import StepRecord, step
-from fleet.engine.state import DONE, State, World, initial
+from fleet.engine.shift import StepRecord, initial, step
+from fleet.engine.state import DONE, State, World
 from fleet.engine.step import ROUNDING_S
 from fleet.engine.world import Arm, build_world
 from fleet.events import Event
@@ -383,7 +383,7 @@ class SimulatedBody:
         hottest_c = float(self._state.temp_c[0, 0, WINDING].max())
         if hottest_c >= self._limits.restart_c:
             return f"a motor has {hottest_c:.1f} °C; a fault can be cleared below {self._limits.restart_c:g} °C"
-        self._state = self._state._replace(clear_at_s=np.full((1, 1), float(self._state.tick[0]) * self._dt_s))
+        self._state = self._state.changed(clear_at_s=np.full((1, 1), float(self._state.tick[0]) * self._dt_s))
         return ""
 
     def set_time(self, time_s: float) -> None:
@@ -397,7 +397,7 @@ class SimulatedBody:
         clear_at_s, moved_at_s = self._state.clear_at_s + later_s, self._state.moved_at_s + later_s
         observer = HousingObserver(*(part[None] for part in housing_observer(*self._arm.beliefs, dt_s)))
         self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma, observer=observer)
-        self._state = self._state._replace(clear_at_s=clear_at_s, moved_at_s=moved_at_s)
+        self._state = self._state.changed(clear_at_s=clear_at_s, moved_at_s=moved_at_s)
         self._dt_s = dt_s
         self.set_time(time_s)
 
@@ -440,7 +440,7 @@ class SimulatedBody:
                 approach_s, cycle_s, _ = self._times_s
                 # A job that ends at this very moment has not ended for the engine yet.
                 progress_s = min(self._progress_s, approach_s + todo * cycle_s - 2 * ROUNDING_S)
-                self._state = state._replace(todo=np.array([[todo]]), progress_s=np.array([[progress_s]]))
+                self._state = state.changed(todo=np.array([[todo]]), progress_s=np.array([[progress_s]]))
         return False
 
     def _set_repetitions(self, count: int) -> None:
@@ -497,7 +497,7 @@ class SimulatedBody:
 
     def _carried(self, world: World) -> State:
         """State at home before a stint, with temperatures and counters of the present state."""
-        return initial(world)._replace(**{name: getattr(self._state, name).copy() for name in _CARRIED})
+        return initial(world).changed(**{name: getattr(self._state, name).copy() for name in _CARRIED})
 
     @property
     def _faulted(self) -> bool:
