@@ -138,7 +138,7 @@ def _features(seen: Observation, at: Places, learned: Worth, rate: Array, scale:
         np.log(duration_s / 240.0),
         np.log(np.maximum(value, 1e-6) / mean_value[env]),
         seen.payload_kg[env, arm, slot] / 4.0,
-        seen.difficulty[at],
+        np.maximum(seen.difficulty[at], 0.0),
         np.log(duration_s / fastest_s[env, slot]),
         own - _best_of_others(best, axis=1)[env, arm, slot],
         own - _best_of_others(best, axis=2)[env, arm, slot],
@@ -325,12 +325,11 @@ def _without_empty(seen: Observation) -> Observation:
         return seen
     ends: dict[tuple[str, ...], int] = {("slot",): slots, ("option",): slots * plans}
     short = {f.name: getattr(seen, f.name)[..., : ends[f.axes]] for f in FIELDS if f.axes in ends}
+    short["fleet_difficulty"] = seen.fleet_difficulty[..., :slots]
     return replace(seen, **short, action_mask=seen.action_mask[..., [*range(1 + slots * plans), -1]])
 
 
 def _stacked(seen: Sequence[Observation]) -> Observation:
     """Observations of arms as one with the axes [1, arm]."""
-    names = [*(field.name for field in FIELDS if not field.name.startswith("peer_")), "action_mask"]
-    stacked = {name: np.stack([getattr(each, name) for each in seen])[None] for name in names}
-    peers = {field.name: np.zeros(0) for field in FIELDS if field.name.startswith("peer_")}
-    return Observation(**stacked, **peers)
+    names = [*(field.name for field in FIELDS), "peers", "action_mask"]
+    return Observation(**{name: np.stack([getattr(each, name) for each in seen])[None] for name in names})

@@ -256,7 +256,7 @@ class RollingHorizon(Wsept):
         hottest_c = float(seen.temp_c.max())
         free_c = max(hottest_c, float(seen.job_peak_c)) if seen.working else hottest_c
         legal = seen.action_mask[1:-1] > 0
-        open_now = ((seen.space_free > 0) | (seen.working > 0)) & (per_option(seen, seen.station_free) > 0)
+        open_now = (legal | (seen.working > 0)) & (per_option(seen, seen.station_free) > 0)
         begin_s = np.maximum(free_s, np.where(open_now, 0.0, home_s))
         can = (seen.feasible > 0) & (per_option(seen, seen.offered) > 0) & (seen.faulted == 0)
         peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_of(seen)).astype(float)

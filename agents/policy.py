@@ -184,7 +184,7 @@ def legal_options(observation: Observation) -> list[int]:
 
 def plans_of(observation: Observation) -> int:
     """Number of options of a slot."""
-    return observation.difficulty.shape[-1] // observation.offered.shape[-1]
+    return observation.difficulty.shape[-1] // observation.group.shape[-1]
 
 
 def per_option(observation: Observation, per_slot: np.ndarray) -> np.ndarray:

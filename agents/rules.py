@@ -364,8 +364,7 @@ class Ahead:
             seen,
             action_mask=mask,
             busy_s=np.zeros_like(seen.busy_s),
-            duration_s=seen.duration_s + late_s,
-            slack_s=seen.slack_s - late_s,
+            duration_s=np.where(seen.feasible, seen.duration_s + np.float32(late_s), np.float32(0.0)),
         )
 
 

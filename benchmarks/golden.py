@@ -145,7 +145,7 @@ def _rollouts(scenario: str, difficulty: "DifficultyName") -> dict[str, Any]:
         mask = seen["action_mask"]
         actions = (rng.random(mask.shape) * mask).argmax(axis=-1)
         seen, reward, _, _, info = batch.step(actions)
-        rows["vectors"].append(seen["observation"].copy())
+        rows["vectors"].append(env.layout.join(seen["shared"], seen["own"]))
         rows["masks"].append(seen["action_mask"].copy())
         rows["rewards"].append(reward)
         rows["infos"].append([info["jobs_done"], info["faults"].sum(axis=1), info["peak_c"].max(axis=1)])

@@ -114,7 +114,7 @@ def train_here(algorithm: Any, seed: int, warm_start: str = "") -> Training:
     rng = np.random.default_rng(np.random.SeedSequence([seed, SHIFTS[0]]))
 
     def act(obs: Obs, _: Array) -> Array:
-        return trainer.act(curve.env.layout, obs["observation"], obs["action_mask"], rng)
+        return trainer.act(curve.env.layout, curve.env.joined(obs)["observation"], obs["action_mask"], rng)
 
     curve.add(0, 0.0, act)
     for iteration in trainer.iterate():
@@ -135,7 +135,7 @@ def probe() -> tuple[Array, Array]:
     seen = list[Array]()
     for _ in range(400):
         obs, *_ = env.step(random_legal(obs["action_mask"], rng))
-        seen.append(obs["observation"].reshape(-1, env.layout.size))
+        seen.append(env.joined(obs)["observation"].reshape(-1, env.layout.size))
     vectors = np.concatenate(seen).astype(float)
     spread = vectors.std(axis=0)
     return vectors.mean(axis=0), np.where(spread > 1e-6, spread, 1.0)
@@ -180,6 +180,7 @@ def train_benchmarl(algorithm: str, seed: int) -> Training:
             return dict, ()
 
     def act(obs: Obs, _: Array) -> Array:
+        obs = curve.env.joined(obs)
         lead = obs["observation"].shape[:2]
         inner = TensorDict({"observation": torch.from_numpy(standardise(obs["observation"]))}, lead)
         arms = TensorDict({"observation": inner, "action_mask": torch.from_numpy(obs["action_mask"]).bool()}, lead)

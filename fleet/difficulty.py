@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fleet.jit import jit_inline
+from fleet.jit import Real, jit_inline
 from fleet.motion import Plan
 from fleet.robot import JOINTS
 
@@ -173,7 +173,7 @@ def extend_curve(curve: Array, knots: int) -> Array:
 
 
 @jit_inline
-def probability_of(value: float, curve: Array) -> float:
+def probability_of(value: Real, curve: Array) -> float:
     """Probability for a forecast's value; see `Forecast`.
 
     Args:

@@ -21,6 +21,8 @@ from fleet.files import user_cache_folder
 
 log = logging.getLogger(__name__)
 
+Real = Any
+"""A number of any type of floats, which compiled functions take alike."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _PACKAGE = Path(__file__).parent
@@ -37,6 +39,16 @@ def jit_inline(function: Function) -> Function:
 
 def jit(function: Function) -> Function:
     """Compile a function that compiled functions seldom call."""
+    _called.append(function)
+    return function
+
+
+def jit_lean(function: Function) -> Function:
+    """As `jit`, for the loops of a kernel, without counting references to arrays, which takes longer than most steps.
+
+    Such a function and all that it calls allocate nothing: the caller gives them room.
+    """
+    vars(function)["options"] = {"_nrt": False}
     _called.append(function)
     return function
 
@@ -145,7 +157,8 @@ def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
         inlined = _inlined.pop()
         register_jitable(forceinline=True, **_options_of(inlined))(inlined)
     while _called:
-        register_jitable(**_OPTIONS)(_called.pop())
+        called = _called.pop()
+        register_jitable(**_options_of(called))(called)
     options: Any = config  # numba sets its options by name
     note = _note_of(function)
     note.parent.mkdir(parents=True, exist_ok=True)

@@ -27,7 +27,7 @@ IMPORTED = (
     *("scenarios.cli.main", "scenarios.cli.look", "scenarios.cli.run", "scenarios.cli.live", "scenarios.cli.jobs"),
     *("scenarios.run.shift", "scenarios.run.log", "scenarios.prepare.fleet"),
     *("scenarios.live.arm", "scenarios.live.auctioneer", "scenarios.live.requests", "scenarios.show.watch"),
-    *("fleet.live.arm.node", "fleet.live.auction.node", "fleet.env.allocation_v1", "fleet.arm.planner"),
+    *("fleet.live.arm.node", "fleet.live.auction.node", "fleet.env.allocation_v2", "fleet.arm.planner"),
     *("fleet.bus.router", "pyarrow.parquet", "numba", "scipy.optimize"),
 )
 """Modules that commands import."""

@@ -20,7 +20,7 @@ from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
 from fleet.engine.world import Arm, Space, build_world
-from fleet.env.allocation_v1 import Episode
+from fleet.env.allocation_v2 import Episode
 from fleet.env.lookahead import CellSimulator
 from fleet.env.vector import BatchEnv, Library
 from fleet.heat.motor import Motors, gen3_motors

@@ -135,13 +135,13 @@ WRONG_WAYS = """
 fleet.job twin.vae.twin / fleet.engine.step agents.rules / fleet.motion fleet.difficulty
 fleet.heat.thermal fleet.engine.state / fleet.job fleet.bus.protocol.keys / fleet.engine.step fleet.env.vector
 fleet.engine.step fleet.bus.client / fleet.bus.exchange.memory fleet.engine.state
-fleet.env.allocation_v1 fleet.bus.exchange.zenoh / agents.rules fleet.engine.state
-agents.rules fleet.env.allocation_v1 / agents.rules twin.vae.twin / twin.vae.twin agents.rules
+fleet.env.allocation_v2 fleet.bus.exchange.zenoh / agents.rules fleet.engine.state
+agents.rules fleet.env.allocation_v2 / agents.rules twin.vae.twin / twin.vae.twin agents.rules
 twin.vae.twin scenarios.prepare.arms
 """
 OUT_OF_PLACE = """
 scenarios.prepare.fleet mujoco / fleet.bus.exchange.memory zenoh / agents.rules torch / fleet.env.x mink
-fleet.ros2.node rosbags / fleet.env.allocation_v1 ray / agents.learned.train stable_baselines3
+fleet.ros2.node rosbags / fleet.env.allocation_v2 ray / agents.learned.train stable_baselines3
 fleet.env.vector torch / twin.vae.train torchrl
 """
 

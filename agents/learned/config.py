@@ -9,7 +9,7 @@ from fleet.fields import MAX_SEED, check, option
 
 Algorithm = Literal["mappo", "ippo"]
 Decisions = Literal["interval", "events"]
-"""As in `fleet.env.allocation_v1`, which agents do not import."""
+"""As in `fleet.env.allocation_v2`, which agents do not import."""
 LONGEST_S = 1e7
 """Longest horizon of a discount, 116 days."""
 
@@ -99,7 +99,7 @@ class PpoConfig:
         choices=get_args(Decisions),
         noun="kind of step",
     )
-    """See `fleet.env.allocation_v1`."""
+    """See `fleet.env.allocation_v2`."""
     discount_s: float = 7200.0
     """Horizon of the discount: gamma of a step is exp(-elapsed_s / discount_s)."""
     trace_s: float = 900.0

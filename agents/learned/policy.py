@@ -23,8 +23,8 @@ from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Layout, Observation
 
-OWN, OPTION, PEER, PAIR = 28, 15, 6, 4
-"""Number of features of the arm itself, of an option, of a peer, and of a peer's score of an option."""
+OWN, OPTION, PEER, PAIR = 27, 15, 5, 3
+"""Number of features of the arm itself, of an option, of an arm of the fleet, and of its score of an option."""
 
 
 class Sets(NamedTuple):
@@ -44,10 +44,11 @@ def sets_of(layout: Layout, vectors: Tensor) -> Sets:
     """Features of vectors float32 [..., size]; the same for any number and order of arms and slots."""
     as_array: Any = vectors  # tensors are sliced and reshaped like arrays
     o: Any = layout.read(as_array, as_array[..., :0])  # an Observation of tensors
+    feasible, offered = o.duration_s > 0, o.group > 0
+    known = feasible & (o.difficulty >= 0)
     own = [
-        o.clock,
         _minutes(o.left_s),
-        o.idle,
+        1 - o.working - o.faulted,
         o.working,
         o.faulted,
         _minutes(o.busy_s),
@@ -60,34 +61,35 @@ def sets_of(layout: Layout, vectors: Tensor) -> Sets:
         o.job_p,
         (o.ambient_c - 25.0) / 10.0,
     ]
-    offered, age_s, payload_kg, value, returns, expires, station_free, peer_known, peer_difficulty, peer_blocks = (
+    offered, age_s, due_in_s, payload_kg, value, returns, expires, station_free, blocked, shared_d = (
         each.repeat_interleave(layout.plans, dim=-1)
         for each in (
-            o.offered, o.age_s, o.payload_kg, o.value, o.returns, o.expires, o.station_free,
-            o.peer_known, o.peer_difficulty, o.peer_blocks,
+            offered.float(), o.age_s, o.due_in_s, o.payload_kg, o.value, o.returns, o.expires, o.station_free,
+            o.blocked, o.fleet_difficulty,
         )
     )  # fmt: skip
+    difficulty, shared = o.difficulty.clamp(min=0.0), (shared_d >= 0).float() * offered[..., None, :]
     option = [
         offered,
-        o.feasible,
-        o.known,
-        o.difficulty,
+        feasible.float(),
+        known.float(),
+        difficulty,
         _degrees(o.peak_c),
         o.p_saturation,
         _minutes(o.duration_s),
-        _minutes(o.slack_s),
+        _minutes(torch.where(feasible, due_in_s - o.duration_s, 0.0)),
         _minutes(age_s),
         payload_kg / 4.0,
         value / 4.0,
         returns,
         expires,
         value / (o.duration_s / 60.0).clamp(min=0.5),
-        station_free * o.space_free,
+        station_free * (1 - blocked),
     ]
-    fresh = torch.exp(-o.peer_age_s / 60.0)
-    peer = [o.peer_heard, fresh, o.peer_working, o.peer_faulted, o.peer_headroom_k / 20.0, _minutes(o.peer_busy_s)]
-    harder = peer_known * o.known[..., None, :] * (peer_difficulty - o.difficulty[..., None, :])
-    pair = [peer_known, peer_difficulty, harder, peer_blocks]
+    fresh = torch.exp(-o.fleet_age_s / 60.0)
+    peer = [fresh, o.fleet_working, o.fleet_faulted, o.fleet_headroom_k / 20.0, _minutes(o.fleet_busy_s)]
+    harder = shared * known.float()[..., None, :] * (shared_d - difficulty[..., None, :])
+    pair = [shared, shared_d.clamp(min=0.0), harder]
     own, option, peer, pair = (torch.stack(features, dim=-1) for features in (own, option, peer, pair))
     return Sets(torch.cat([own, _degrees(o.temp_c), _degrees(o.housing_c)], dim=-1), option, peer, pair)
 
@@ -195,7 +197,7 @@ def _mlp(widths: Sequence[int], *, last: bool = True) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-FORMAT = 5
+FORMAT = 6
 """Increase it when the network or its inputs change."""
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
@@ -231,7 +233,7 @@ class LearnedPolicy:
         if not choosing:
             return actions
         first = observations[choosing[0]]
-        layout = Layout(len(first.peer_heard) + 1, len(first.offered), plans=plans_of(first))
+        layout = Layout(len(first.fleet_age_s), len(first.group), plans=plans_of(first))
         vectors = torch.from_numpy(np.stack([layout.pack(observations[arm]) for arm in choosing]))
         mask = torch.from_numpy(np.stack([observations[arm].action_mask for arm in choosing]))
         with torch.inference_mode():

@@ -99,11 +99,11 @@ def _shift(env: Any, policy: Any, seed: int) -> tuple[float, float]:  # modules 
     obs, _ = env.reset(seed=[seed])
     over, engine_s, matching_s, lazy = False, 0.0, 0.0, only_choices(policy)
     while not over:
-        vectors, mask = obs["observation"][0], obs["action_mask"][0]
+        shared, own, mask = (obs[key][0] for key in ("shared", "own", "action_mask"))
         began = process_time()
         actions = np.zeros((1, len(env.agents)), int)
         if mask[:, 1:-1].any() or not lazy:
-            actions[0] = actions_of(env.agents, policy.act(env.layout.read_each(env.agents, vectors, mask)))
+            actions[0] = actions_of(env.agents, policy.act(env.layout.read_each(env.agents, shared, own, mask)))
         decided = process_time()
         obs, _, finished, cut, _ = env.step(actions)
         engine_s, matching_s = engine_s + process_time() - decided, matching_s + decided - began

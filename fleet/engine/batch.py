@@ -31,11 +31,13 @@ from fleet.engine.tables import (
     PER_ARM,
     TRACE,
     OpenJobs,
+    Room,
     Simulation,
     Tables,
     empty_state,
     event_buffer,
     form_of,
+    room_for,
 )
 from fleet.heat.thermal import NODES
 from fleet.jit import kernel, nonnegative
@@ -179,6 +181,16 @@ class Shift:
     """Of the sensor noise, 64 bits; see `fleet.seeding`."""
 
 
+Parts = tuple[Array, Array]
+"""Both parts of observations (`fleet.observation`): float32 [env, shared] and [env, arm, own]."""
+
+
+def empty_parts(layout: Layout, envs: int) -> Parts:
+    """Room for the observations of some envs."""
+    own = (envs, layout.arms, layout.size - layout.shared)
+    return np.empty((envs, layout.shared), np.float32), np.empty(own, np.float32)
+
+
 class Engine:
     """Steps shifts in place; `reset` puts a new shift into a row.
 
@@ -215,6 +227,7 @@ class Engine:
         offers = OpenJobs(
             slot_job=np.full((envs, slots), -1, np.int32),
             mask=np.zeros((envs, arms, layout.actions), np.int8),
+            group=np.zeros((envs, slots), np.int32),
             station_free=np.zeros((envs, slots), bool),
             closed=np.zeros((envs, tables.excluded.shape[1]), np.uint64),
         )
@@ -227,20 +240,24 @@ class Engine:
             np.zeros((envs if trace else 0, arms), TRACE),
             np.zeros((0, arms), DRIVE),
             form_of(layout),
+            room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK)),
         )
         self._prepare()
 
     def _prepare(self) -> None:
         _, _, compiled, threads = self._options
         self._step, self._reset = step_rows.chosen(compiled), reset_rows.chosen(compiled)
-        self._bundle: Any = self._simulation  # numba's where the loops are compiled
-        if self._step is not step_rows.interpreted:
-            from fleet.engine.bundle import bundle_of
-
-            self._bundle = bundle_of(self._simulation)
         self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
         size = -(-len(self._all) // (threads * BLOCK)) * BLOCK if threads > 1 else len(self._all)
         self._shares = [self._all[first : first + size] for first in range(0, len(self._all), size)]
+        mine, room = self._simulation, self._simulation.room
+        rooms = [room, *(Room(*(each.copy() for each in room)) for _ in self._shares[1:])]
+        self._bundles: list[Any] = [mine._replace(room=each) for each in rooms]  # numba's where the loops are compiled
+        """One for each thread."""
+        if self._step is not step_rows.interpreted:
+            from fleet.engine.bundle import bundle_of
+
+            self._bundles = [bundle_of(each) for each in self._bundles]
 
     @property
     def envs(self) -> int:
@@ -292,23 +309,23 @@ class Engine:
             return np.concatenate([getattr(shift, name) for shift in shifts])
 
         self._reset(
-            self._bundle, envs,
+            self._bundles[0], envs,
             np.array([shift.fleet for shift in shifts]), np.array([shift.ambient_offset_k for shift in shifts]),
             np.array([shift.noise_key for shift in shifts], np.uint64), first,
             of_all("kind"), of_all("release_s"), of_all("due_s"), of_all("repetitions"), of_all("expires"), after,
         )  # fmt: skip
 
-    def observe(self, envs: Array, out: Array) -> None:
-        """Put what the arms of some envs know now into `out`, float32 [env, arm, size]."""
+    def observe(self, envs: Array, out: Parts) -> None:
+        """Put what the arms of some envs know now into `out`."""
         self._run(OFFER + OBSERVE, _NO_ACTIONS, _no_terms(self.envs), envs, out)
 
-    def step(self, actions: Array | None, out: Array, until: Array | None = None) -> tuple[Array, Array, Array]:
+    def step(self, actions: Array | None, out: Parts, until: Array | None = None) -> tuple[Array, Array, Array]:
         """One decision interval of every env, or more.
 
         Args:
             actions: int64 [env, arm]; anything outside the mask is a wait, and counted. None: no claims, and the
                 outcome of the last claims remains.
-            out: Receives what the arms know afterwards, float32 [env, arm, size].
+            out: Receives what the arms know afterwards.
             until: Go on while no arm has a `choice`, to this tick at most, int64 [env]. The events and the trace are
                 then those of the last interval alone.
 
@@ -326,7 +343,7 @@ class Engine:
         if actions is not None:
             self._run(CLAIM, actions, _no_terms(self.envs), self._all, _NO_VECTORS)
 
-    def move(self, drive: Drive, out: Array) -> tuple[Array, Array, Array]:
+    def move(self, drive: Drive, out: Parts) -> tuple[Array, Array, Array]:
         """The rest of `step`, for arms that were seen to move.
 
         Args:
@@ -357,14 +374,17 @@ class Engine:
         return script
 
     def _stepped(
-        self, parts: int, actions: Array, out: Array, until: Array | None = None
+        self, parts: int, actions: Array, out: Parts, until: Array | None = None
     ) -> tuple[Array, Array, Array]:
         terms = np.empty((self.envs, len(TERMS) + 1))
         if self._pool is None:
             self._run(parts, actions, terms, self._all, out, until)
         else:
             own, *others = self._shares
-            done = [self._pool.submit(self._run, parts, actions, terms, share, out, until) for share in others]
+            done = [
+                self._pool.submit(self._run, parts, actions, terms, share, out, until, thread=thread)
+                for thread, share in enumerate(others, 1)
+            ]
             self._run(parts, actions, terms, own, out, until)
             for each in done:
                 each.result()
@@ -379,12 +399,13 @@ class Engine:
         actions: Array,
         terms: Array,
         rows: Array,
-        out: Array,
+        out: Parts,
         until: Array | None = None,
         script: Script = NO_SCRIPT,
+        thread: int = 0,
     ) -> None:
         until = _ONE_INTERVAL if until is None else until
-        self._step(self._bundle, parts, actions, self._weights, terms, until, script, rows, out)
+        self._step(self._bundles[thread], parts, actions, self._weights, terms, until, script, rows, *out)
 
     def load(self, state: State) -> None:
         """Take over a state with at most as many jobs, and what follows from it."""
@@ -437,7 +458,7 @@ class Engine:
         self._prepare()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in vars(self).items() if k not in ("_step", "_reset", "_bundle", "_pool", "_shares")}
+        return {k: v for k, v in vars(self).items() if k not in ("_step", "_reset", "_bundles", "_pool", "_shares")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -445,7 +466,7 @@ class Engine:
 
 
 _NO_ACTIONS = np.zeros((0, 0), np.int64)
-_NO_VECTORS, _ONE_INTERVAL = np.zeros((0, 0, 0), np.float32), np.zeros(0, np.int64)
+_NO_VECTORS, _ONE_INTERVAL = (np.zeros((0, 0), np.float32), np.zeros((0, 0, 0), np.float32)), np.zeros(0, np.int64)
 
 
 def _no_terms(envs: int) -> Array:

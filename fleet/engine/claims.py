@@ -7,6 +7,8 @@ job or station, or by two arms whose plans would touch, the lower shared difficu
 An arm takes the space of its whole plan from the award until it is home again, all at once: so nothing can deadlock.
 """
 
+from typing import Any
+
 import numpy as np
 
 from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State
@@ -22,7 +24,7 @@ LARGEST = float(np.finfo(np.float32).max)
 """Claims without a difficulty are ordered behind all others."""
 
 
-@jit
+@jit_inline
 def update_offers(sim: Simulation, rows: Array) -> None:
     """Fill the slots of some envs, oldest job in the queue first, and their action masks; late jobs expire.
 
@@ -31,12 +33,13 @@ def update_offers(sim: Simulation, rows: Array) -> None:
     """
     t, s, mask = sim.tables, sim.state, sim.offers.mask
     arms, last = nonnegative(s.arms.shape[1]), nonnegative(mask.shape[2] - 1)
-    busy, slot_kind = np.empty(t.stations.shape[2], np.uint64), np.empty(sim.offers.slot_job.shape[1], np.int64)
+    busy, slot_kind = sim.room.busy, sim.room.slot_kind
     for row in rows:
         e = nonnegative(row)
         env = s.env[e]
         if env["changed"] or env["next_s"] <= env["tick"] * t.dt_s:
             filled = fill_slots(t, s, sim.offers.slot_job, sim.events, e, slot_kind)
+            group_slots(t.stations[nonnegative(env["fleet"])], slot_kind, filled, sim.offers.group[e])
             fill_masks(sim, e, filled, slot_kind, busy)
             env["changed"] = False
         for a in range(arms):
@@ -89,6 +92,21 @@ def fill_slots(t: Tables, s: State, slot_job: Array, events: EventBuffer, e: int
 
 
 @jit_inline
+def group_slots(stations: Array, slot_kind: Array, filled: int, group: Array) -> None:
+    """Number the jobs in the slots, those that share a station with the first of them alike; 0 for an empty slot.
+
+    Args:
+        stations: Of each kind of job, uint64 [kind, word].
+    """
+    for k in range(len(group)):
+        group[k] = k + 1 if k < filled else 0
+        for before in range(k if k < filled else 0):
+            if not are_free(stations[slot_kind[k]], stations[slot_kind[before]]):
+                group[k] = group[before]
+                break
+
+
+@jit_inline
 def fill_masks(sim: Simulation, e: int, filled: int, slot_kind: Array, busy: Array) -> None:
     """Find out which stations of an env are free, and which options its idle arms may claim.
 
@@ -105,7 +123,8 @@ def fill_masks(sim: Simulation, e: int, filled: int, slot_kind: Array, busy: Arr
         o.station_free[e, k] = k < filled and are_free(t.stations[fleet, slot_kind[k]], busy)
     for a in range(arms):
         mask = o.mask[e, a]
-        mask[1:-1] = 0
+        for action in range(1, len(mask) - 1):
+            mask[action] = 0
         if s.arms[e, a]["mode"] != IDLE:
             continue
         action = 1
@@ -120,7 +139,8 @@ def fill_masks(sim: Simulation, e: int, filled: int, slot_kind: Array, busy: Arr
 @jit_inline
 def mark_busy_stations(t: Tables, arms: Array, fleet: int, busy: Array) -> None:
     """Put the stations with an arm of an env at work into `busy`, one bit each, uint64 [word]."""
-    busy[:] = 0
+    for w in range(len(busy)):
+        busy[w] = 0
     for a in range(len(arms)):
         for w in range(len(busy)):
             busy[w] |= t.stations[fleet, nonnegative(arms[a]["kind"]), w]
@@ -129,7 +149,8 @@ def mark_busy_stations(t: Tables, arms: Array, fleet: int, busy: Array) -> None:
 @jit_inline
 def mark_closed_space(t: Tables, arms: Array, closed: Array) -> None:
     """Put the volumes that the arms of an env exclude into `closed`; none excludes a volume of the same arm."""
-    closed[:] = 0
+    for w in range(len(closed)):
+        closed[w] = 0
     for a in range(len(arms)):
         plan = arms[a]["plan"]
         if plan >= 0:
@@ -147,7 +168,7 @@ def are_free(stations: Array, busy: Array) -> bool:
 
 
 @jit_inline
-def cycles_begun(plans: Array, arm: Array) -> int:
+def cycles_begun(plans: Array, arm: Array) -> Any:  # an integer
     """Cycles of its plan that an arm at work has begun."""
     plan = plans[nonnegative(arm["plan"])]
     into_s = arm["progress_s"] - plan["times_s"][0]
@@ -161,7 +182,7 @@ def is_closed(bits: Array, volume: int) -> bool:
     return (bits[place >> 6] >> np.uint64(place & 63)) & np.uint64(1) != 0
 
 
-@jit
+@jit_inline
 def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     """Award every claimed job to one arm, and note who gives a job back; an illegal action is counted and waits.
 
@@ -172,7 +193,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     t, s, mask, events = sim.tables, sim.state, sim.offers.mask, sim.events
     arms, options = nonnegative(s.arms.shape[1]), nonnegative(t.work.shape[3])
     give_back, recording = mask.shape[2] - 1, len(events.what) > 0
-    busy, key, order = np.empty(t.stations.shape[2], np.uint64), np.empty(arms), np.empty(arms, np.int64)
+    busy, key, order = sim.room.busy, sim.room.key, sim.room.order
     for row in rows:
         e = nonnegative(row)
         fleet, claims = nonnegative(s.env[e]["fleet"]), 0
@@ -207,7 +228,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
 
 
 @jit_inline
-def award(sim: Simulation, e: int, a: int, action: int, busy: Array) -> None:
+def award(sim: Simulation, e: int, a: int, action: Any, busy: Array) -> None:
     """Award a claimed job to an arm, unless the job, a station or the space was awarded before.
 
     Args:

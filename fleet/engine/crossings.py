@@ -11,7 +11,7 @@ import numpy as np
 
 from fleet.engine.tables import Tables
 from fleet.heat.thermal import NODES
-from fleet.jit import jit, jit_inline
+from fleet.jit import Real, jit, jit_inline
 from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED
 
@@ -19,6 +19,8 @@ Array = np.ndarray
 
 TOLERANCE_S = 1e-10
 """Accuracy of a crossing's moment."""
+Y, Z, NOW, LAST, STOPPED, BRAKES = range(6)
+"""Rows of `modal` [6, node]: y and z of an interval, and room for temperatures and loads."""
 MOST_STEPS = 100
 """Iterations of the root search; about ten are enough."""
 
@@ -54,29 +56,31 @@ def hottest(temp_c: Array) -> float:
 
 @jit
 def to_modes(net: Array, temp_c: Array, load_w: Array, modal: Array) -> None:
-    """Put y and z of an interval that begins at these temperatures into `modal` [2, mode].
+    """Put y and z of an interval that begins at these temperatures into the first rows of `modal`.
 
     Args:
         net: A `MODAL` record.
         load_w: Heat plus conductance to ambient times ambient temperature, W, [node].
     """
-    modal[:] = 0.0
+    for m in range(NODES):
+        modal[Y, m] = modal[Z, m] = 0.0
     for n in range(NODES):
         root = net["root_capacity"][n]
         warm = root * temp_c[n]
         load = load_w[n] / root
         for m in range(NODES):
-            modal[0, m] += net["modes"][n, m] * warm
-            modal[1, m] += net["modes"][n, m] * load
+            modal[Y, m] += net["modes"][n, m] * warm
+            modal[Z, m] += net["modes"][n, m] * load
 
 
 @jit
 def temperatures_at(net: Array, modal: Array, time_s: float, out: Array) -> None:
     """Put the temperatures at a moment of an interval into `out` [node]."""
-    out[:] = 0.0
+    for n in range(NODES):
+        out[n] = 0.0
     for m in range(NODES):
         rate = net["rates"][m]
-        now = modal[0, m] + math.expm1(-rate * time_s) * (modal[0, m] - modal[1, m] / rate)
+        now = modal[Y, m] + math.expm1(-rate * time_s) * (modal[Y, m] - modal[Z, m] / rate)
         for n in range(NODES):
             out[n] += net["modes"][n, m] * now
     for n in range(NODES):
@@ -86,17 +90,17 @@ def temperatures_at(net: Array, modal: Array, time_s: float, out: Array) -> None
 @jit
 def hottest_at(net: Array, modal: Array, time_s: float) -> float:
     """Return the temperature of the hottest motor at a moment of an interval."""
-    now = np.empty(NODES)
-    temperatures_at(net, modal, time_s, now)
-    return hottest(now)
+    temperatures_at(net, modal, time_s, modal[NOW])
+    return hottest(modal[NOW])
 
 
-@jit
-def hottest_joint_at(net: Array, modal: Array, time_s: float) -> int:
-    """Return the index of the hottest motor at a moment of an interval."""
-    now = np.empty(NODES)
-    temperatures_at(net, modal, time_s, now)
-    return int(np.argmax(now[:JOINTS]))
+@jit_inline
+def hottest_joint(temp_c: Array) -> int:
+    """Return the index of the hottest motor, from [node]."""
+    joint = 0
+    for k in range(1, JOINTS):
+        joint = k if temp_c[k] > temp_c[joint] else joint
+    return joint
 
 
 @jit
@@ -135,7 +139,7 @@ def crossing_s(net: Array, modal: Array, length_s: float, limit_c: float, first_
 
 
 @jit
-def braked_load(net: Array, power_off: bool, ambient_c: float, out: Array) -> float:
+def braked_load(net: Array, power_off: bool, ambient_c: Real, out: Array) -> float:
     """Put the load of an arm on its brakes into `out`, W, [node]; return the heat in it."""
     heat_w = 0.0
     for n in range(NODES):
@@ -149,7 +153,7 @@ def braked_load(net: Array, power_off: bool, ambient_c: float, out: Array) -> fl
 
 @jit
 def step_with_crossing(
-    t: Tables, net: Array, mode: int, begin: Array, heat_w: float, ambient_c: float, end: Array
+    t: Tables, net: Array, mode: int, begin: Array, heat_w: float, ambient_c: Real, end: Array, modal: Array
 ) -> Crossed:
     """Step an arm that crosses a limit or is faulted; `end` becomes its true temperatures at the end.
 
@@ -157,8 +161,9 @@ def step_with_crossing(
         net: A `MODAL` record.
         begin: Temperatures, then loads (heat, and conductance times ambient temperature), [from].
         heat_w: Total heat until a fault.
+        modal: Room, [6, node].
     """
-    dt_s, modal, faulted, last = t.dt_s, np.empty((2, NODES)), mode == FAULTED, np.empty(NODES)
+    dt_s, faulted, last, stopped = t.dt_s, mode == FAULTED, modal[LAST], modal[STOPPED]
     to_modes(net, begin, begin[NODES:], modal)
     temperatures_at(net, modal, dt_s, last)
     first_c, last_c = np.float64(hottest(begin)), hottest(last)
@@ -169,17 +174,17 @@ def step_with_crossing(
             if first_c >= t.restart_c:
                 cool_s = crossing_s(net, modal, dt_s, t.restart_c, first_c, last_c)
         above, warned_s, joint = warning_in(t.warning_c, net, modal, dt_s, first_c, last_c)
-        end[:NODES] = last
+        for n in range(NODES):
+            end[n] = last[n]
         return Crossed(dt_s, above, heat_w * dt_s, last_c, cool_s, warned_s, joint, -1)
     cut_s = 0.0
     if first_c < t.error_c:
         cut_s = crossing_s(net, modal, dt_s, t.error_c, first_c, last_c)
-    stopped, brakes = np.empty(NODES), np.empty(NODES)
     temperatures_at(net, modal, cut_s, stopped)
-    stopped_c, fault_joint = hottest(stopped), int(np.argmax(stopped[:JOINTS]))
+    stopped_c, fault_joint = hottest(stopped), hottest_joint(stopped)
     above, warned_s, joint = warning_in(t.warning_c, net, modal, cut_s, first_c, stopped_c)
-    brakes_w = braked_load(net, t.power_off, ambient_c, brakes)
-    to_modes(net, stopped, brakes, modal)
+    brakes_w = braked_load(net, t.power_off, ambient_c, modal[BRAKES])
+    to_modes(net, stopped, modal[BRAKES], modal)
     left_s = dt_s - cut_s
     temperatures_at(net, modal, left_s, last)
     last_c = hottest(last)
@@ -192,7 +197,8 @@ def step_with_crossing(
         if peak >= t.restart_c:
             cool_s = cut_s + crossing_s(net, modal, left_s, t.restart_c, stopped_c, last_c)
     energy_j = heat_w * cut_s + brakes_w * left_s
-    end[:NODES] = last
+    for n in range(NODES):
+        end[n] = last[n]
     return Crossed(cut_s, above + above_braked, energy_j, peak, cool_s, warned_s, joint, fault_joint)
 
 
@@ -207,4 +213,5 @@ def warning_in(
     passed_s = crossing_s(net, modal, length_s, warning_c, first_c, last_c)
     if begins:
         return passed_s, np.inf, -1
-    return length_s - passed_s, passed_s, hottest_joint_at(net, modal, passed_s)
+    temperatures_at(net, modal, passed_s, modal[NOW])
+    return length_s - passed_s, passed_s, hottest_joint(modal[NOW])

@@ -1,7 +1,7 @@
-"""What every arm knows at a moment: one observation vector per arm of many envs.
+"""What every arm knows at a moment: what all arms of an env know alike, and what each knows of itself.
 
-`fleet.observation` says what the fields mean. Peers are those of this moment; where messages take time or get lost,
-`fleet.engine.shift` replaces the peers' fields by what was delivered.
+`fleet.observation` says what the fields mean. What arms share is that of this moment; where messages take time or get
+lost, `fleet.engine.shift` replaces it by what was delivered.
 """
 
 import numpy as np
@@ -9,184 +9,234 @@ import numpy as np
 from fleet.difficulty import KNOWN, probability_of
 from fleet.engine.claims import is_closed
 from fleet.engine.crossings import hottest
-from fleet.engine.tables import LANES, Simulation
-from fleet.jit import jit_inline, nonnegative
-from fleet.observation import LONG_S
+from fleet.engine.state import LANES
+from fleet.engine.tables import Form, Simulation, Tables
+from fleet.jit import Real, jit_inline, nonnegative
+from fleet.observation import FIELDS, LONG_S
 from fleet.robot import JOINTS
 from fleet.seeding import random_normal
-from fleet.telemetry import FAULTED, IDLE, WORKING
+from fleet.telemetry import FAULTED, WORKING
 
 Array = np.ndarray
 
-PEAK_LOW_C, PEAK_HIGH_C = -60.0, 300.0
-"""Bounds of predicted temperatures in the vector."""
-
-assert (IDLE, WORKING, FAULTED) == (0, 1, 2), "the mode fields of the observation are in this order"
+_LOW, _HIGH = ({f.name: np.float32(each) for f, each in zip(FIELDS, bounds, strict=True)} for bounds in (
+    [f.low for f in FIELDS], [f.high for f in FIELDS],
+))  # fmt: skip
+LOW_C, HIGH_C, LOW_K, HIGH_K = _LOW["temp_c"], _HIGH["temp_c"], _LOW["headroom_k"], _HIGH["headroom_k"]
+PEAK_LOW_C, PEAK_HIGH_C = _LOW["peak_c"], _HIGH["peak_c"]
+MOST_KG, MOST_VALUE, MOST_RETURNS = _HIGH["payload_kg"], _HIGH["value"], _HIGH["returns"]
+_LONG_S, _ZERO, _ONE, _HALF = np.float32(LONG_S), np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 
 @jit_inline
-def observe(sim: Simulation, rows: Array, out: Array) -> None:
-    """Put the vectors of the arms of some envs into `out`.
+def observe(sim: Simulation, rows: Array, shared: Array, own: Array) -> None:
+    """Put what the arms of some envs know into arrays.
 
     Args:
         rows: Envs, int [row].
-        out: float32 [env, arm, size].
+        shared: What all arms know alike, float32 [env, shared].
+        own: What each arm knows of itself, float32 [env, arm, own].
     """
-    t, s, o, form = sim.tables, sim.state, sim.offers, sim.form
-    slot_job, station_free, work = o.slot_job, o.station_free, t.work
-    arms, slots, options = nonnegative(s.arms.shape[1]), nonnegative(slot_job.shape[1]), nonnegative(work.shape[3])
-    at, low, high, first, change = form.offsets, form.low, form.high, form.first_change, form.change
-    size, who = nonnegative(out.shape[2]), form.who
-    peers = nonnegative((size - at.peer_heard) // (6 + 3 * slots))
-    low_c, high_c, low_k, high_k = low[at.temp_c], high[at.temp_c], low[at.headroom_k], high[at.headroom_k]
-    most_kg, most_value, most_returns = high[at.payload_kg], high[at.value], high[at.returns]
-    true_c, measured_c, hottest_c = np.empty(LANES, np.float32), np.empty((arms, LANES), np.float32), np.empty(arms)
-    headroom_k = np.empty(arms, np.float32)
-    left, slack_s, slot_kind = np.empty(slots), np.empty(slots), np.empty(slots, np.int64)
-    fast_volume, fast_can = np.empty(slots, np.int64), np.empty(slots, np.bool_)
-    known, shared = np.zeros((arms, slots), np.float32), np.zeros((arms, slots), np.float32)
-    first_block, block, curve = t.forecast_first, t.forecast_block, t.forecast_curve
-    warning_c, error_c, forecasts = t.warning_c, t.error_c, len(curve) > 0
-    known_c, values_c, left_s = np.zeros(KNOWN, np.float32), np.empty(LANES, np.float32), np.zeros(arms)
-    # The vector of an arm but for its own fields: filled slots and peers.
-    frame = np.zeros(size, np.float32)
-    for k in range(slots * options):
-        frame[at.p_saturation + k] = 0.5
-    for peer in range(peers):
-        frame[at.peer_heard + peer] = 1.0
-    filled_before = 0
+    t, s, form = sim.tables, sim.state, sim.form
+    arms, room = nonnegative(s.arms.shape[1]), sim.room
+    measured_c, hottest_c, busy_s, known_c = room.measured_c, room.hottest_c, room.busy_s, room.known_c
+    slot_kind, left, values_c = room.slot_kind, room.left, room.lanes[0]
+    alike, forecasts = form.alike[0] != 0, len(t.forecast_curve) > 0
     for row in rows:
         e = nonnegative(row)
-        env, closed = s.env[e], o.closed[e]
-        fleet, tick, key = nonnegative(env["fleet"]), nonnegative(env["tick"]), env["noise_key"]
-        now_s, count = tick * t.dt_s, np.uint64(tick * arms * JOINTS)
-        frame[at.clock] = now_s / (t.ticks * t.dt_s)
-        frame[at.left_s] = min((t.ticks - tick) * t.dt_s, LONG_S)
-        filled = 0
-        while filled < slots and slot_job[e, filled] >= 0:
-            j = nonnegative(slot_job[e, filled])
-            job = s.jobs[e, j]
-            kind = nonnegative(job["kind"])
-            slot_kind[filled] = kind
-            left[filled], slack_s[filled] = job["repetitions"] - job["cycles"], job["due_s"] - now_s
-            frame[at.offered + filled], frame[at.station_free + filled] = 1.0, station_free[e, filled]
-            frame[at.age_s + filled] = min(max(now_s - job["queued_s"], 0.0), LONG_S)
-            frame[at.payload_kg + filled] = min(t.payload_kg[fleet, kind], most_kg)
-            frame[at.value + filled] = min(max(t.value[fleet, kind], 0.0), most_value)
-            frame[at.returns + filled] = min(job["returns"], most_returns)
-            frame[at.expires + filled] = job["expires"]
-            filled += 1
-        for k in range(filled, filled_before):
-            frame[at.offered + k] = frame[at.age_s + k] = frame[at.payload_kg + k] = 0.0
-            frame[at.value + k] = frame[at.returns + k] = frame[at.station_free + k] = frame[at.expires + k] = 0.0
-            for peer in range(peers):
-                frame[at.peer_known + peer * slots + k] = frame[at.peer_difficulty + peer * slots + k] = 0.0
-        filled_before = filled
+        fleet, filled = nonnegative(s.env[e]["fleet"]), show_jobs(sim, e, shared[e], slot_kind, left)
+        measure(sim, e, measured_c, hottest_c, busy_s)
+        if alike:
+            show_members(sim, e, 0, shared[e], slot_kind, filled, hottest_c, busy_s)
         for a in range(arms):
-            arm, noise_k = s.arms[e, a], t.law[fleet, a]["sensor_noise_k"]
+            mine, arm = own[e, a], s.arms[e, a]
+            for i in range(len(mine)):
+                mine[i] = _ZERO
+            if not alike:
+                show_members(sim, e, a, mine, slot_kind, filled, hottest_c, busy_s)
+            show_arm(sim, e, a, mine, measured_c[a], hottest_c[a], busy_s[a])
+            shown = busy_s[a] <= form.ahead_s[0]
             for k in range(JOINTS):
-                true_c[k] = arm["temp_c"][k] + noise_k[k] * random_normal(key, count + np.uint64(k + 1))
-                measured_c[a, k] = true_c[k]
-            count += np.uint64(JOINTS)
-            hottest_c[a] = hottest(true_c)
-            headroom_k[a] = min(max(warning_c - hottest_c[a], low_k), high_k)
-            left_s[a] = 0.0
-            if arm["mode"] == WORKING:
-                times_s = t.plans[nonnegative(arm["plan"])]["times_s"]
-                busy_s = times_s[0] + times_s[2] + arm["todo"] * times_s[1] - arm["progress_s"]
-                left_s[a] = min(max(busy_s, 0.0), LONG_S)
-            for k in range(filled):
-                known[a, k] = shared[a, k] = 0.0
-                for n in range(options):
-                    score = work[fleet, slot_kind[k], a, n]["difficulty"]
-                    if not np.isnan(score) and (known[a, k] == 0.0 or score < shared[a, k]):
-                        known[a, k], shared[a, k] = 1.0, score
-        for a in range(arms):
-            for n in range(first[a], first[a + 1]):
-                peer, b = nonnegative(change[n, 0]), nonnegative(change[n, 1])
-                frame[at.peer_working + peer] = s.arms[e, b]["mode"] == WORKING
-                frame[at.peer_faulted + peer] = s.arms[e, b]["mode"] == FAULTED
-                frame[at.peer_headroom_k + peer], frame[at.peer_busy_s + peer] = headroom_k[b], left_s[b]
-                for k in range(filled):
-                    frame[at.peer_known + peer * slots + k] = known[b, k]
-                    frame[at.peer_difficulty + peer * slots + k] = shared[b, k]
-            for i in range(size):
-                out[e, a, i] = frame[i]
-            arm = s.arms[e, a]
-            mode = nonnegative(arm["mode"])
-            out[e, a, at.idle + mode] = 1.0
-            out[e, a, at.busy_s], out[e, a, at.last_award] = left_s[a], arm["last_award"]
-            air_c = t.ambient_c[fleet, min(tick, t.ticks - 1), a] + env["ambient_offset_k"]
-            for k in range(JOINTS):
-                out[e, a, at.temp_c + k] = min(max(measured_c[a, k], low_c), high_c)
-                out[e, a, at.housing_c + k] = min(max(arm["housing_c"][k], low_c), high_c)
                 known_c[k], known_c[JOINTS + k] = measured_c[a, k], arm["housing_c"][k]
-            known_c[2 * JOINTS] = air_c
-            out[e, a, at.headroom_k], out[e, a, at.ambient_c] = headroom_k[a], min(max(air_c, low_c), high_c)
-            out[e, a, at.error_headroom_k] = min(max(error_c - hottest_c[a], low_k), high_k)
-            if mode == WORKING and arm["pending"]:
-                job, plan = s.jobs[e, nonnegative(arm["job"])], nonnegative(arm["plan"])
-                kind, times_s = nonnegative(job["kind"]), t.plans[plan]["times_s"]
-                out[e, a, at.job_value] = min(max(t.value[fleet, kind], 0.0), most_value)
-                over_s = max(arm["progress_s"] - times_s[0], 0.0)
-                cycles_over = min(int(over_s / max(times_s[1], 1e-9) + 1e-9), arm["todo"])
-                out[e, a, at.job_cycles] = min(job["repetitions"] - job["cycles"] - cycles_over, LONG_S)
-                for n in range(options):
-                    own = work[fleet, kind, a, n]
-                    if own["plan"] == plan:
-                        p, risk, peak, peak_c = own["p_saturation"], own["risk"], own["peak"], 0.0
-                        if risk >= 0 or peak >= 0:
-                            p, peak_c = predict(p, risk, peak, first_block, block, curve, known_c, left_s[a], values_c)
-                            if peak >= 0:
-                                peak_c = max(peak_c, warning_c - headroom_k[a])
-                        out[e, a, at.job_p] = 0.5 if np.isnan(p) else p
-                        out[e, a, at.job_peak_c] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
-            for k in range(filled):
-                kind = nonnegative(slot_kind[k])
-                out[e, a, at.too_heavy + k] = t.too_heavy[fleet, kind, a]
-                for n in range(options):  # without branches: few of these conditions can be guessed
-                    own, option = work[fleet, kind, a, n], k * options + n
-                    can, open_space = own["plan"] >= 0, not is_closed(closed, own["volume"])
-                    duration_s, score, p = (
-                        own["travel_s"] + left[k] * own["cycle_s"],
-                        own["difficulty"],
-                        own["p_saturation"],
-                    )
-                    late_s, is_known = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S), can & (score == score)
-                    out[e, a, at.feasible + option], out[e, a, at.space_free + option] = can, can & open_space
-                    out[e, a, at.duration_s + option] = min(duration_s, LONG_S)
-                    out[e, a, at.slack_s + option] = late_s if can else 0.0
-                    out[e, a, at.known + option], out[e, a, at.difficulty + option] = (
-                        is_known,
-                        score if is_known else 0.0,
-                    )
-                    out[e, a, at.p_saturation + option] = p if p == p else 0.5
-            for k in range(filled):
-                own = work[fleet, slot_kind[k], a, 0]
-                fast_volume[k], fast_can[k] = nonnegative(own["volume"]), own["plan"] >= 0
-            for peer in range(peers):
-                other = s.arms[e, who[a, peer]]["plan"]
-                if other >= 0:
-                    for k in range(filled):
-                        blocked = is_closed(t.excluded[other], fast_volume[k]) & fast_can[k]
-                        out[e, a, at.peer_blocks + peer * slots + k] = blocked
-            if forecasts:
-                for k in range(filled):
-                    for n in range(options):
-                        own, option = work[fleet, slot_kind[k], a, n], k * options + n
-                        p, risk, peak = own["p_saturation"], own["risk"], own["peak"]
-                        if risk >= 0 or peak >= 0:
-                            # All cycles, also of a job that came back: moments in between are not predicted.
-                            p, peak_c = predict(p, risk, peak, first_block, block, curve, known_c, np.inf, values_c)
-                            out[e, a, at.peak_c + option] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
-                            if not np.isnan(p):
-                                out[e, a, at.p_saturation + option] = p
+            known_c[2 * JOINTS] = air_at(t, s.env[e], a)
+            if arm["mode"] == WORKING and arm["pending"]:
+                show_job(sim, e, a, mine, hottest_c[a], busy_s[a], known_c, values_c)
+            if shown:
+                show_options(sim, e, a, mine, slot_kind, left, filled)
+                if forecasts:
+                    show_forecasts(t, form, fleet, a, mine, slot_kind, filled, known_c, values_c)
+
+
+@jit_inline
+def air_at(t: Tables, env: Array, a: int) -> Real:
+    """Ambient temperature at an arm, °C."""
+    moment = nonnegative(min(env["tick"], t.ticks - 1))
+    return np.float32(t.ambient_c[nonnegative(env["fleet"]), moment, a] + env["ambient_offset_k"])
+
+
+@jit_inline
+def show_jobs(sim: Simulation, e: int, to: Array, slot_kind: Array, left: Array) -> int:
+    """Put the jobs in the slots of an env into its shared part; return their number.
+
+    Args:
+        slot_kind: Receives their kinds, int [slot].
+        left: Receives the repetitions that are left, [slot].
+    """
+    t, s, o, at, unit = sim.tables, sim.state, sim.offers, sim.form.offsets, sim.form.inverse
+    env, jobs, slots = s.env[e], s.jobs[e], nonnegative(o.slot_job.shape[1])
+    fleet, now_s = nonnegative(env["fleet"]), np.float32(env["tick"] * t.dt_s)
+    for i in range(len(to)):
+        to[i] = _ZERO
+    to[at.left_s] = min(np.float32((t.ticks - env["tick"]) * t.dt_s), _LONG_S) * unit.left_s
+    filled = 0
+    while filled < slots and o.slot_job[e, filled] >= 0:
+        k, job = filled, jobs[nonnegative(o.slot_job[e, filled])]
+        kind = nonnegative(job["kind"])
+        slot_kind[k], left[k] = kind, np.float32(job["repetitions"] - job["cycles"])
+        to[at.group + k] = np.float32(o.group[e, k]) * unit.group
+        to[at.station_free + k] = _ONE if o.station_free[e, k] else _ZERO
+        to[at.age_s + k] = min(max(now_s - job["queued_s"], _ZERO), _LONG_S) * unit.age_s
+        to[at.due_in_s + k] = min(max(job["due_s"] - now_s, -_LONG_S), _LONG_S) * unit.due_in_s
+        to[at.payload_kg + k] = min(np.float32(t.payload_kg[fleet, kind]), MOST_KG) * unit.payload_kg
+        to[at.value + k] = min(max(np.float32(t.value[fleet, kind]), _ZERO), MOST_VALUE) * unit.value
+        to[at.returns + k] = min(np.float32(job["returns"]), MOST_RETURNS)
+        to[at.expires + k] = _ONE if job["expires"] else _ZERO
+        filled += 1
+    return filled
+
+
+@jit_inline
+def measure(sim: Simulation, e: int, measured_c: Array, hottest_c: Array, busy_s: Array) -> None:
+    """Read the sensors of all arms of an env.
+
+    Args:
+        measured_c: Receives their motor temperatures, [arm, lane].
+        hottest_c: Receives the hottest of them, [arm].
+        busy_s: Receives the time until each is home, [arm].
+    """
+    t, s = sim.tables, sim.state
+    env, arms = s.env[e], nonnegative(s.arms.shape[1])
+    fleet, key, count = nonnegative(env["fleet"]), env["noise_key"], np.uint64(env["tick"] * arms * JOINTS)
+    for a in range(arms):
+        arm, noise_k = s.arms[e, a], t.law[fleet, a]["sensor_noise_k"]
+        for k in range(JOINTS):
+            measured_c[a, k] = arm["temp_c"][k] + noise_k[k] * random_normal(key, count + np.uint64(k + 1))
+        count += np.uint64(JOINTS)
+        hottest_c[a] = hottest(measured_c[a])
+        busy_s[a] = _ZERO
+        if arm["mode"] == WORKING:
+            times_s = t.plans[nonnegative(arm["plan"])]["times_s"]
+            home_s = times_s[0] + times_s[2] + arm["todo"] * times_s[1] - arm["progress_s"]
+            busy_s[a] = min(max(np.float32(home_s), _ZERO), _LONG_S)
+
+
+@jit_inline
+def show_members(
+    sim: Simulation, e: int, a: int, to: Array, slot_kind: Array, filled: int, hottest_c: Array, busy_s: Array
+) -> None:
+    """Put what the members of an arm share into a part of the observation."""
+    t, s, at, unit, members = sim.tables, sim.state, sim.form.offsets, sim.form.inverse, sim.form.members
+    fleet, slots = nonnegative(s.env[e]["fleet"]), nonnegative(sim.offers.slot_job.shape[1])
+    for m in range(members.shape[1]):
+        b = nonnegative(members[a, m])
+        mode = s.arms[e, b]["mode"]
+        to[at.fleet_working + m] = _ONE if mode == WORKING else _ZERO
+        to[at.fleet_faulted + m] = _ONE if mode == FAULTED else _ZERO
+        to[at.fleet_busy_s + m] = busy_s[b] * unit.fleet_busy_s
+        headroom_k = min(max(np.float32(t.warning_c) - hottest_c[b], LOW_K), HIGH_K)
+        to[at.fleet_headroom_k + m] = headroom_k * unit.fleet_headroom_k
+        for k in range(filled):
+            to[at.fleet_difficulty + m * slots + k] = t.least[fleet, slot_kind[k], b]
+
+
+@jit_inline
+def show_arm(sim: Simulation, e: int, a: int, mine: Array, measured_c: Array, hottest_c: Real, busy_s: Real) -> None:
+    """Put what an arm knows of itself into its part."""
+    t, arm, at, unit = sim.tables, sim.state.arms[e, a], sim.form.offsets, sim.form.inverse
+    mine[at.working] = _ONE if arm["mode"] == WORKING else _ZERO
+    mine[at.faulted] = _ONE if arm["mode"] == FAULTED else _ZERO
+    mine[at.busy_s], mine[at.last_award] = busy_s * unit.busy_s, np.float32(arm["last_award"])
+    for k in range(JOINTS):
+        mine[at.temp_c + k] = min(max(measured_c[k], LOW_C), HIGH_C) * unit.temp_c
+        mine[at.housing_c + k] = min(max(arm["housing_c"][k], LOW_C), HIGH_C) * unit.housing_c
+    mine[at.ambient_c] = min(max(air_at(t, sim.state.env[e], a), LOW_C), HIGH_C) * unit.ambient_c
+    mine[at.headroom_k] = min(max(np.float32(t.warning_c) - hottest_c, LOW_K), HIGH_K) * unit.headroom_k
+    error_k = min(max(np.float32(t.error_c) - hottest_c, LOW_K), HIGH_K)
+    mine[at.error_headroom_k] = error_k * unit.error_headroom_k
+
+
+@jit_inline
+def show_job(
+    sim: Simulation, e: int, a: int, mine: Array, hottest_c: Real, busy_s: Real, known_c: Array, room: Array
+) -> None:
+    """Put an arm's current job into its part."""
+    t, s, at, unit = sim.tables, sim.state, sim.form.offsets, sim.form.inverse
+    arm, fleet = s.arms[e, a], nonnegative(s.env[e]["fleet"])
+    job, plan = s.jobs[e, nonnegative(arm["job"])], nonnegative(arm["plan"])
+    kind, times_s = nonnegative(job["kind"]), t.plans[plan]["times_s"]
+    mine[at.job_value] = min(max(np.float32(t.value[fleet, kind]), _ZERO), MOST_VALUE) * unit.job_value
+    over_s = max(arm["progress_s"] - times_s[0], 0.0)
+    cycles_over = min(int(over_s / max(times_s[1], 1e-9) + 1e-9), arm["todo"])
+    cycles = np.float32(job["repetitions"] - job["cycles"] - cycles_over)
+    mine[at.job_cycles] = min(cycles, _LONG_S) * unit.job_cycles
+    for n in range(t.work.shape[3]):
+        work = t.work[fleet, kind, a, n]
+        if work["plan"] == plan:
+            p, peak_c = work["p_saturation"], _ZERO
+            if work["risk"] >= 0 or work["peak"] >= 0:
+                p, peak_c = predict(
+                    p, work["risk"], work["peak"], t.forecast_first, t.forecast_block, t.forecast_curve, known_c,
+                    busy_s, room,
+                )  # fmt: skip
+                if work["peak"] >= 0:
+                    peak_c = max(peak_c, min(max(hottest_c, LOW_C), HIGH_C))
+            mine[at.job_p] = p if p == p else _HALF
+            mine[at.job_peak_c] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C) * unit.job_peak_c
+
+
+@jit_inline
+def show_options(sim: Simulation, e: int, a: int, mine: Array, slot_kind: Array, left: Array, filled: int) -> None:
+    """Put an arm's plans for the jobs in the slots into its part."""
+    t, closed, at, unit = sim.tables, sim.offers.closed[e], sim.form.offsets, sim.form.inverse
+    fleet, options = nonnegative(sim.state.env[e]["fleet"]), nonnegative(t.work.shape[3])
+    for k in range(filled):
+        works = t.work[fleet, nonnegative(slot_kind[k]), a]
+        mine[at.blocked + k] = _ONE if (works[0]["plan"] >= 0) & is_closed(closed, works[0]["volume"]) else _ZERO
+        for n in range(options):
+            work, option = works[n], k * options + n
+            can, score, p = work["plan"] >= 0, work["difficulty"], work["p_saturation"]
+            duration_s = work["travel_s"] + left[k] * work["cycle_s"]
+            mine[at.duration_s + option] = min(duration_s, _LONG_S) * unit.duration_s
+            mine[at.difficulty + option] = (score if score == score else -_ONE) if can else _ZERO
+            mine[at.p_saturation + option] = (p if p == p else _HALF) if can else _ZERO
+
+
+@jit_inline
+def show_forecasts(
+    t: Tables, form: Form, fleet: int, a: int, mine: Array, slot_kind: Array, filled: int, known_c: Array, room: Array
+) -> None:
+    """Put the predictions of an arm's plans from its present temperatures into its part."""
+    at, options = form.offsets, nonnegative(t.work.shape[3])
+    first, block, curve = t.forecast_first, t.forecast_block, t.forecast_curve
+    for k in range(filled):
+        works = t.work[fleet, nonnegative(slot_kind[k]), a]
+        for n in range(options):
+            work, option = works[n], k * options + n
+            if work["risk"] >= 0 or work["peak"] >= 0:
+                # All cycles, also of a job that came back: moments in between are not predicted.
+                p, peak_c = predict(
+                    work["p_saturation"], work["risk"], work["peak"], first, block, curve, known_c, np.float32(np.inf),
+                    room,
+                )  # fmt: skip
+                mine[at.peak_c + option] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C) * form.inverse.peak_c
+                if p == p:
+                    mine[at.p_saturation + option] = p
 
 
 @jit_inline
 def predict(
-    p: float, risk: int, peak: int, first: Array, block: Array, curve: Array, known_c: Array, left_s: float, room: Array
-) -> tuple[float, float]:
+    p: Real, risk: int, peak: int, first: Array, block: Array, curve: Array, known_c: Array, left_s: Real, room: Array
+) -> tuple[Real, Real]:
     """P(saturation), NaN if unknown, and predicted peak temperature, °C, 0 if unknown, of a plan.
 
     Arrays of forecasts are arguments of their own: to pass a tuple of them takes longer than to use it.
@@ -200,20 +250,20 @@ def predict(
         left_s: Pieces of later moments do not count.
         room: For the values of some pieces, [lane].
     """
-    peak_c = 0.0
+    chance, peak_c = np.float32(p), _ZERO
     if peak >= 0:
-        peak_c = largest_piece(first, block, peak, known_c, left_s, room)
+        peak_c = np.float32(largest_piece(first, block, peak, known_c, left_s, room))
         if curve.shape[1] > 0 and risk < 0 and np.isnan(p) and not np.isnan(curve[peak, 0, 0]):
-            p = probability_of(peak_c, curve[peak])
+            chance = np.float32(probability_of(peak_c, curve[peak]))
     if risk >= 0:
-        p = probability_of(largest_piece(first, block, risk, known_c, left_s, room), curve[risk])
-    return p, peak_c
+        chance = np.float32(probability_of(largest_piece(first, block, risk, known_c, left_s, room), curve[risk]))
+    return chance, peak_c
 
 
 @jit_inline
-def largest_piece(first: Array, block: Array, row: int, known_c: Array, left_s: float, room: Array) -> float:
+def largest_piece(first: Array, block: Array, row: int, known_c: Array, left_s: Real, room: Array) -> Real:
     """Value of a forecast without the pieces of moments later than `left_s`, −inf if none is left."""
-    most = -np.inf
+    most = np.float32(-np.inf)
     for b in range(nonnegative(first[row]), nonnegative(first[row + 1])):
         for lane in range(LANES):
             total = block[b, 0, lane]

@@ -4,14 +4,14 @@ One shift, step by step: the engine with one row, a plant, an exchange, an event
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
 
 from fleet.bus.exchange.memory import Broadcast, Exchange, PeerView
-from fleet.engine.batch import Engine, RewardWeights, shifts_of
+from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts, shifts_of
 from fleet.engine.state import State, World
 from fleet.engine.tables import TRACE, events_of, tables_of
 from fleet.events import Event
@@ -24,22 +24,23 @@ Array = np.ndarray
 
 
 def deliver(
-    exchange: Exchange, engine: Engine, vectors: Array, names: Sequence[str], twins: tuple[str, ...], env: int = 0
+    exchange: Exchange, engine: Engine, parts: Parts, names: Sequence[str], twins: tuple[str, ...], env: int = 0
 ) -> None:
-    """Broadcast what the arms of an env know now, and replace their peers' fields by what was delivered.
+    """Broadcast what the arms of an env know now, and replace what they know of each other by what was delivered.
 
     Args:
-        vectors: Of the env, float32 [arm, size].
-        names: Of its jobs, [job].
+        parts: Observations of all envs, in a layout with `delivered`.
+        names: Of the env's jobs, [job].
         twins: Version of each arm's difficulty model.
     """
-    view = exchange.share(broadcast(engine, vectors, names, twins, env))
-    write_peers(engine.layout, view, vectors)
+    view = exchange.share(broadcast(engine, parts, names, twins, env))
+    write_members(engine.layout, view, parts[1][env])
 
 
-def broadcast(engine: Engine, vectors: Array, names: Sequence[str], twins: tuple[str, ...], env: int = 0) -> Broadcast:
+def broadcast(engine: Engine, parts: Parts, names: Sequence[str], twins: tuple[str, ...], env: int = 0) -> Broadcast:
     """What the arms of an env broadcast at this moment; arguments as in `deliver`."""
-    known, slots = engine.layout.read(vectors, engine.mask[env]), engine.offers.slot_job[env]
+    layout, slots = engine.layout, engine.offers.slot_job[env]
+    known = layout.read_parts(parts[0][env], parts[1][env], engine.mask[env])
     tables, fleet = engine.tables, engine.state.fleet[env]
     kinds = np.where(slots >= 0, engine.state.kind[env, slots], 0)
     filled = slots[:, None] >= 0
@@ -48,7 +49,7 @@ def broadcast(engine: Engine, vectors: Array, names: Sequence[str], twins: tuple
     p_saturation = known.p_saturation.reshape(unknown.shape)
     return Broadcast(
         time_s=float(engine.state.tick[env] * tables.dt_s),
-        mode=engine.state.mode[env].copy(),
+        mode=engine.state.mode[env].astype(int),
         busy_s=known.busy_s.astype(float),
         temp_c=known.temp_c.astype(float),
         headroom_k=known.headroom_k.astype(float),
@@ -59,28 +60,24 @@ def broadcast(engine: Engine, vectors: Array, names: Sequence[str], twins: tuple
     )
 
 
-def write_peers(layout: Layout, view: PeerView, vectors: Array) -> None:
-    """Put what each arm received of its peers into the vectors [arm, size]."""
-    rows = np.arange(layout.arms)[:, None]
+def write_members(layout: Layout, view: PeerView, own: Array) -> None:
+    """Put what each arm received of its members into their parts of the observation, [arm, own]."""
+    rows, members = np.arange(layout.arms)[:, None], layout.members
 
     def received(values: Array) -> Array:
-        return values[rows, layout.who]  # [arm, peer, ...]
+        return values[rows, members]  # [arm, member, ...]
 
     age_s, mode = received(view.age_s), received(view.mode)
-    headroom_k, busy_s, difficulty = received(view.headroom_k), received(view.busy_s), received(view.difficulty)
-    never, unknown = np.isinf(age_s), np.isnan(difficulty)
-    difficulty[unknown] = 0.0
+    never = np.isinf(age_s)
     fields = {
-        "peer_heard": ~never,
-        "peer_age_s": np.where(never, LONG_S, age_s),
-        "peer_working": ~never & (mode == WORKING),
-        "peer_faulted": ~never & (mode == FAULTED),
-        "peer_busy_s": np.where(np.isnan(busy_s), 0.0, busy_s),
-        "peer_headroom_k": np.where(np.isnan(headroom_k), 0.0, headroom_k),
-        "peer_known": ~unknown,
-        "peer_difficulty": difficulty,
+        "fleet_age_s": np.where(never, LONG_S, age_s),
+        "fleet_working": ~never & (mode == WORKING),
+        "fleet_faulted": ~never & (mode == FAULTED),
+        "fleet_busy_s": np.nan_to_num(received(view.busy_s)),
+        "fleet_headroom_k": np.nan_to_num(received(view.headroom_k)),
+        "fleet_difficulty": np.nan_to_num(received(view.difficulty), nan=-1.0),
     }
-    layout.write(vectors, fields)
+    layout.write(own, fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,9 +181,10 @@ class ShiftRunner:
     ) -> None:
         world = episode.world
         self._episode, self._watch = episode, watch
-        self._layout = layout or Layout(len(world.arms), world.slots, plans=world.plans_per_job)
-        self._reports_contacts = keep_events and not episode.plant.follows_plans
         at_once = exchange is None or exchange.perfect
+        layout = layout or Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+        self._layout = replace(layout, delivered=not at_once)
+        self._reports_contacts = keep_events and not episode.plant.follows_plans
         self._exchange = None if at_once else exchange
         self._delivered_before = 0
         if self._exchange is not None:
@@ -200,8 +198,8 @@ class ShiftRunner:
             tables, 1, self._layout, weights, jobs=room, events=keep_events, trace=trace, compiled=compiled
         )
         self._engine.reset(_FIRST, shifts_of(drawn, [episode.noise_key]))
-        self._vectors = np.empty((1, self._layout.arms, self._layout.size), np.float32)
-        self._engine.observe(_FIRST, self._vectors)
+        self._parts = empty_parts(self._layout, 1)
+        self._engine.observe(_FIRST, self._parts)
         self._deliver()
 
     @cached_property
@@ -213,9 +211,14 @@ class ShiftRunner:
         return {name: value for name, value in vars(self).items() if name != "state"}  # a copy has views of its own
 
     @property
-    def vectors(self) -> Array:
-        """What each arm knows, float32 [arm, size]; the next step overwrites it."""
-        return self._vectors[0]
+    def layout(self) -> Layout:
+        """Of the observation."""
+        return self._layout
+
+    @property
+    def parts(self) -> Parts:
+        """What the arms know, float32 [shared] and [arm, own]; the next step overwrites it."""
+        return self._parts[0][0], self._parts[1][0]
 
     @property
     def mask(self) -> Array:
@@ -262,7 +265,7 @@ class ShiftRunner:
         """
         engine, world, plant = self._engine, self._episode.world, self._episode.plant
         chosen = None if actions is None else actions[None]
-        terms, reward, finished = _stepped(engine, world, plant, chosen, self._vectors)
+        terms, reward, finished = _stepped(engine, world, plant, chosen, self._parts)
         if len(engine.events.what):
             self.events += events_of(world, engine.state, engine.events)
         if self._reports_contacts:
@@ -276,14 +279,14 @@ class ShiftRunner:
         """Replace what the arms observe of their peers by what the exchange delivered."""
         if self._exchange is not None:
             names, twins = self._episode.world.jobs.names[0], self._episode.twins
-            deliver(self._exchange, self._engine, self._vectors[0], names, twins)
+            deliver(self._exchange, self._engine, self._parts, names, twins)
 
 
 _FIRST = np.zeros(1, dtype=int)
 
 
 def _stepped(
-    engine: Engine, world: World, plant: Plant, actions: Array | None, out: Array
+    engine: Engine, world: World, plant: Plant, actions: Array | None, out: Parts
 ) -> tuple[Array, Array, Array]:
     if plant.follows_plans:
         return engine.step(actions, out)
@@ -364,11 +367,11 @@ def open_jobs(world: World, state: State, *, compiled: bool | None = None) -> tu
 
 
 @lru_cache(maxsize=4)
-def _engine_of(world: World, compiled: bool | None) -> tuple[Engine, Array]:
+def _engine_of(world: World, compiled: bool | None) -> tuple[Engine, Parts]:
     """An engine for a world, and room for its observations."""
     tables, drawn = tables_of(world)
     layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
     room = world.jobs.exists.shape[1]
     engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=room, events=True, trace=True, compiled=compiled)
     engine.reset(np.arange(world.envs), shifts_of(drawn, [0] * world.envs))
-    return engine, np.empty((world.envs, layout.arms, layout.size), np.float32)
+    return engine, empty_parts(layout, world.envs)

@@ -74,8 +74,6 @@ class Offers:
     """Row of `forecasts` for the peak temperature, int [env, arm, job, plan]; −1 where the model has none."""
     forecasts: Forecast | None
     """[forecast, ...]; None where no model of the fleet has any."""
-    too_heavy: Array
-    """Whether the load exceeds the arm's rating, bool [env, arm, job]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,23 +136,23 @@ LANES = JOINTS + 1
 ARM = np.dtype(
     [
         ("temp_c", "f4", NODES),
-        ("housing_c", "f4", LANES),
+        ("peak_c", "f4"),
+        ("faults", "i4"),
         ("current_sq", "f4", LANES),
         ("friction_w", "f4", LANES),
-        ("peak_c", "f4"),
-        ("plan", "i4"),
-        ("progress_s", "f8"),
-        ("phase_end_s", "f8"),
-        ("clear_at_s", "f8"),
-        ("moved_at_s", "f8"),
+        ("housing_c", "f4", LANES),
         ("above_warning_s", "f8"),
         ("busy_s", "f8"),
         ("lost_s", "f8"),
         ("energy_j", "f8"),
+        ("progress_s", "f8"),
+        ("phase_end_s", "f8"),
+        ("clear_at_s", "f8"),
+        ("moved_at_s", "f8"),
+        ("plan", "i4"),
         ("job", "i4"),
         ("kind", "i4"),
         ("todo", "i4"),
-        ("faults", "i4"),
         ("illegal", "i4"),
         ("mode", "i1"),
         ("last_award", "i1"),
@@ -163,9 +161,10 @@ ARM = np.dtype(
     ],
     align=True,
 )
-"""All that changes of an arm, four cache lines; see the properties of `State`. `current_sq` and `friction_w` are the
-heat drive of the present phase of its plan, which ends when `progress_s` is `phase_end_s`; `kind` is that of its job,
-and `pending` whether the job is still to be finished (False on the way home)."""
+"""All that changes of an arm, four cache lines, the last of which is all that claims need; see the properties of
+`State`. `current_sq` and `friction_w` are the heat drive of the present phase of its plan, which ends when `progress_s`
+is `phase_end_s`; `kind` is that of its job, and `pending` whether the job is still to be finished (False on the way
+home)."""
 
 JOB = np.dtype(
     [

@@ -32,7 +32,7 @@ from fleet.engine.tables import (
 )
 from fleet.heat.motor import magnet_factor, winding_heat
 from fleet.heat.thermal import NODES
-from fleet.jit import jit, jit_inline, kernel, nonnegative
+from fleet.jit import Real, jit, jit_inline, jit_lean, kernel, nonnegative
 from fleet.job import MOST_FAULTS
 from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED, IDLE, WORKING
@@ -82,7 +82,7 @@ NO_SCRIPT = script_of((np.zeros((0, 0), int), np.zeros((0, 0), int), np.zeros((0
 class Spent(NamedTuple):
     """What an arm does in a step, unless a fault stops it."""
 
-    away_s: float
+    away_s: Real
     """Seconds away from home."""
     done_s: float
     """When its job is done; inf if not in this step."""
@@ -90,7 +90,7 @@ class Spent(NamedTuple):
     """When it is home; inf if not in this step."""
 
 
-@jit
+@jit_inline
 def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> None:
     """Take every arm of some envs through one step.
 
@@ -101,9 +101,8 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
     """
     t, s, dt_s = sim.tables, sim.state, sim.tables.dt_s
     tracing, measured = len(sim.trace) > 0, len(sim.drive) > 0
-    current_sq, friction_w = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    load_w, end = np.empty(LANES, np.float32), np.empty(WIDE, np.float32)
-    begin = np.zeros(2 * NODES + LANES, np.float32)  # temperatures, loads, padding
+    current_sq, friction_w, load_w = sim.room.lanes[0], sim.room.lanes[1], sim.room.lanes[2]
+    begin, end, modal = sim.room.begin, sim.room.end, sim.room.modal
     for row in rows:
         e = nonnegative(row)
         env = s.env[e]
@@ -132,7 +131,7 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
                 trace_arm(t, sim.trace[e, a], law, arm, current_sq, friction_w, powered, spent.home_s)
             at_limit = mode == FAULTED or last_c >= t.error_c or hot != (last_c >= t.warning_c)
             if at_limit:
-                crossed = step_with_crossing(t, t.modal[fleet, a], mode, begin, heat_w, ambient_c, end)
+                crossed = step_with_crossing(t, t.modal[fleet, a], mode, begin, heat_w, ambient_c, end, modal)
                 env["alarm"] = env["alarm"] or (mode == WORKING and not hot and hottest(end) >= t.warning_c)
             for n in range(NODES):
                 arm["temp_c"][n] = end[n]
@@ -191,7 +190,7 @@ def load_nodes(
     current_sq: Array,
     friction_w: Array,
     powered: bool,
-    ambient_c: float,
+    ambient_c: Real,
     begin: Array,
 ) -> float:
     """Put an arm's temperatures and the loads of its nodes into `begin`; return its heat, W.
@@ -234,7 +233,7 @@ def advance(law: Array, begin: Array, end: Array) -> None:
 
 @jit_inline
 def follow_housings(
-    law: Array, arm: Array, begin: Array, end: Array, friction_w: Array, powered: bool, ambient_c: float, load_w: Array
+    law: Array, arm: Array, begin: Array, end: Array, friction_w: Array, powered: bool, ambient_c: Real, load_w: Array
 ) -> None:
     """Step the arm's own estimate of its housings, from its motor temperatures; see `HousingObserver`.
 
@@ -422,8 +421,8 @@ CLAIM, MOVE, OFFER, OBSERVE, PLAY = 1, 2, 4, 8, 16
 """Parts of a step, to be added up."""
 
 
-@kernel
-def step_rows(
+@jit_lean
+def take_steps(
     sim: Simulation,
     parts: int,
     actions: Array,
@@ -432,24 +431,13 @@ def step_rows(
     until: Array,
     script: Script,
     rows: Array,
-    out: Array,
+    shared: Array,
+    own: Array,
 ) -> None:
-    """Take some envs through parts of one step, or of several.
-
-    Args:
-        parts: CLAIM resolves claims, MOVE steps the arms, OFFER updates the offers, OBSERVE fills `out`, and PLAY takes
-            the claims from the script.
-        actions: int64 [env, arm].
-        weights: Reward per unit of each term, [term].
-        terms: Receives the reward terms and their sum, [env, term + 1].
-        until: Tick until which each env goes on while no arm has a choice, or while it plays, int [env]; not at all if
-            empty.
-        rows: int [row].
-        out: Receives the observation vectors, float32 [env, arm, size].
-    """
-    room = np.empty(BLOCK, np.int64)
-    for first in range(0, len(rows), BLOCK):
-        some = rows[first : first + BLOCK]
+    """Take some envs through parts of one step, or of several; see `step_rows`."""
+    room, block = sim.room.rows, len(sim.room.rows)
+    for first in range(0, len(rows), block):
+        some = rows[first : first + block]
         count, now = len(some), parts
         for n in range(count):
             room[n] = some[n]
@@ -473,7 +461,39 @@ def step_rows(
                 now &= ~CLAIM  # of the first step only
             count = keep_going(sim, until, now & PLAY != 0, going)
         if parts & OBSERVE:
-            observe(sim, some, out)
+            observe(sim, some, shared, own)
+
+
+@kernel
+def step_rows(
+    sim: Simulation,
+    parts: int,
+    actions: Array,
+    weights: Array,
+    terms: Array,
+    until: Array,
+    script: Script,
+    rows: Array,
+    shared: Array,
+    own: Array,
+) -> None:
+    """Take some envs through parts of one step, or of several.
+
+    Args:
+        parts: CLAIM resolves claims, MOVE steps the arms, OFFER updates the offers, OBSERVE fills `out`, and PLAY takes
+            the claims from the script.
+        actions: int64 [env, arm].
+        weights: Reward per unit of each term, [term].
+        terms: Receives the reward terms and their sum, [env, term + 1].
+        until: Tick until which each env goes on while no arm has a choice, or while it plays, int [env]; not at all if
+            empty.
+        rows: int [row].
+        shared: Receives what all arms of an env know alike, float32 [env, shared].
+        own: Receives what each arm knows of itself, float32 [env, arm, own].
+    """
+    s = sim
+    whole = Simulation(s.tables, s.state, s.offers, s.events, s.trace, s.drive, s.form, s.room)
+    take_steps(whole, parts, actions, weights, terms, until, script, rows, shared, own)
 
 
 @jit_inline
@@ -496,7 +516,7 @@ def keep_going(sim: Simulation, until: Array, plays: bool, rows: Array) -> int:
 def choose_claims(sim: Simulation, script: Script, rows: Array, actions: Array) -> None:
     """Let each arm claim, of its jobs that it may claim, the one that comes first in its script."""
     t, o, arms = sim.tables, sim.offers, nonnegative(actions.shape[1])
-    options, first = t.work.shape[3], np.empty(arms)
+    options, first = t.work.shape[3], sim.room.key
     for row in rows:
         e = nonnegative(row)
         for a in range(arms):

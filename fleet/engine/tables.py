@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.difficulty import extend_curve, forecast_arrays
+from fleet.difficulty import KNOWN, extend_curve, forecast_arrays
 from fleet.engine.state import ARM, ENV, JOB, LANES, State, World
 from fleet.events import Event, EventKind
 from fleet.heat.thermal import NODES
 from fleet.jit import jit
 from fleet.job import MOST_FAULTS
-from fleet.observation import Layout, Offsets
+from fleet.observation import FIELDS, Layout, Offsets
 from fleet.robot import JOINTS
 from fleet.telemetry import IDLE
 
@@ -218,8 +218,8 @@ class Tables(NamedTuple):
     """Pieces, float32 [block, 2 + known, lane]."""
     forecast_curve: Array
     """float32 [forecast, knot, 2]; no knots where no forecast has a curve."""
-    too_heavy: Array
-    """Whether the load of a kind of job exceeds an arm's rating, bool [fleet, kind, arm]."""
+    least: Array
+    """Least difficulty of an arm's plans for a kind of job, float32 [fleet, kind, arm]; −1 where there is none."""
     stations: Array
     """Stations of a kind of job, one bit each, uint64 [fleet, kind + 1, word]; the last row, no job, has none."""
     payload_kg: Array
@@ -234,6 +234,8 @@ class OpenJobs(NamedTuple):
     """int32 [env, slot], −1 for an empty slot."""
     mask: Array
     """Legal actions, int8 [env, arm, option + 2]."""
+    group: Array
+    """Jobs that share a station have the same number, int32 [env, slot], from 1; 0 for an empty slot."""
     station_free: Array
     """Whether no arm occupies the stations of a slot's job, bool [env, slot]."""
     closed: Array
@@ -266,16 +268,68 @@ class Form(NamedTuple):
     """A `Layout` as the kernels want it."""
 
     offsets: Offsets
-    """Where each field begins in the vector; unsigned, so that the compiler omits checks for negative indices."""
-    low: Array
-    """Bounds of the vector, float32 [size]."""
-    high: Array
-    first_change: Array
-    """Where the rows of an arm begin in `change`, int [arm + 1]."""
-    who: Array
-    """The peers of each arm, int [arm, peer]."""
-    change: Array
-    """Place among the peers and peer, where an arm's peers differ from those of the arm before, int [change, 2]."""
+    """Where each field begins in its part; unsigned, so that the compiler omits checks for negative indices."""
+    inverse: Offsets
+    """What the values of each field are multiplied with, float32."""
+    members: Array
+    """The members of each arm, int [arm, member]."""
+    alike: Array
+    """1 where what the arms share is the same for all of them, else 0, int [1]."""
+    ahead_s: Array
+    """Arms that are home later than this have no options, float32 [1]."""
+
+
+class Room(NamedTuple):
+    """Arrays in which the loops of one thread keep what they need for a moment."""
+
+    rows: Array
+    """int [block]."""
+    busy: Array
+    """Stations that are taken, uint64 [word]."""
+    slot_kind: Array
+    """Kinds of the jobs in the slots, int [slot]."""
+    left: Array
+    """Their repetitions that are left, float32 [slot]."""
+    key: Array
+    """By which claims are ordered, [arm]."""
+    order: Array
+    """Arms in this order, int [arm]."""
+    measured_c: Array
+    """Motor temperatures of arms, float32 [arm, lane]."""
+    hottest_c: Array
+    """float32 [arm]."""
+    busy_s: Array
+    """Time until each arm is home, float32 [arm]."""
+    known_c: Array
+    """What predictions begin at, float32 [KNOWN]."""
+    lanes: Array
+    """Heat drive of an arm, loads of its housings and values of pieces, float32 [4, lane]."""
+    begin: Array
+    """Temperatures, loads, padding, float32 [from]."""
+    end: Array
+    """float32 [wide]."""
+    modal: Array
+    """See `fleet.engine.crossings`, [6, node]."""
+
+
+def room_for(arms: int, slots: int, words: int, rows: int) -> Room:
+    """Room for some arms, slots, words of stations, and rows at a time."""
+    return Room(
+        rows=np.zeros(rows, int),
+        busy=np.zeros(words, np.uint64),
+        slot_kind=np.zeros(slots, int),
+        left=np.zeros(slots, np.float32),
+        key=np.zeros(arms),
+        order=np.zeros(arms, int),
+        measured_c=np.zeros((arms, LANES), np.float32),
+        hottest_c=np.zeros(arms, np.float32),
+        busy_s=np.zeros(arms, np.float32),
+        known_c=np.zeros(KNOWN, np.float32),
+        lanes=np.zeros((4, LANES), np.float32),
+        begin=np.zeros(2 * NODES + LANES, np.float32),
+        end=np.zeros(WIDE, np.float32),
+        modal=np.zeros((6, NODES)),
+    )
 
 
 class Simulation(NamedTuple):
@@ -290,19 +344,15 @@ class Simulation(NamedTuple):
     drive: Array
     """`DRIVE` [env, arm]; without rows the planned drive counts."""
     form: Form
+    room: Room
 
 
 def form_of(layout: Layout) -> Form:
-    """Every peer of the first arm is a change; in a fleet where each arm observes all others, later arms have one."""
-    changes: list[tuple[int, int]] = []
-    first, shown = [0], [-1] * layout.peers
-    for peers in layout.who.tolist():
-        changes += [(place, arm) for place, arm in enumerate(peers) if shown[place] != arm]
-        first.append(len(changes))
-        shown = peers
-    low, high = layout.bounds
+    """A layout as the kernels want it."""
+    scales = Offsets(*(np.float32(1.0 / field.scale if layout.scaled else 1.0) for field in FIELDS))
     offsets = Offsets(*map(np.uint32, layout.offsets))
-    return Form(offsets, low, high, np.array(first), layout.who, np.array(changes, dtype=int).reshape(-1, 2))
+    alike, ahead_s = np.array([layout.is_shared], int), np.array([layout.ahead_s], np.float32)
+    return Form(offsets, scales, layout.members, alike, ahead_s)
 
 
 def tables_of(world: World) -> tuple[Tables, State]:
@@ -397,7 +447,7 @@ def tables_of(world: World) -> tuple[Tables, State]:
         forecast_first=first,
         forecast_block=block.astype(np.float32),
         forecast_curve=curve.astype(np.float32),
-        too_heavy=offers.too_heavy.swapaxes(-1, -2),
+        least=np.nan_to_num(np.fmin.reduce(work["difficulty"], axis=-1), nan=-1.0).swapaxes(-1, -2),
         stations=bits(_one_hot(jobs.stations, len(world.stations))),
         payload_kg=jobs.payload_kg,
         value=jobs.value,

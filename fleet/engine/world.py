@@ -198,7 +198,6 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> 
     shape = (len(shifts), len(arms), max(1, *map(len, shifts)), most)
     plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
     risk, peak = np.full(shape, -1), np.full(shape, -1)
-    too_heavy = np.zeros(shape[:3], bool)
     rows: dict[int, int] = {}
     plans: list[Plan] = []
     forecasts: dict[int, tuple[int, Forecast]] = {}
@@ -206,13 +205,12 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> 
     def row_of(forecast: Forecast | None) -> int:
         return -1 if forecast is None else forecasts.setdefault(id(forecast), (len(forecasts), forecast))[0]
 
-    able, heavy = _arms_of_works(tuple(arms))
+    able = _arms_of_works(tuple(arms))
     offered: dict[int, list[tuple[int, ScoredPlans]]] = {}  # by id: hashing a work takes longer than the rest
     for e, jobs in enumerate(shifts):
         for j, job in enumerate(jobs):
             if id(job.work) not in offered:
                 offered[id(job.work)] = [(a, arms[a].offers(job.work)) for a in able.get(job.work, ())]
-            too_heavy[e, heavy.get(job.work, []), j] = True
             for a, offers in offered[id(job.work)]:
                 for n, (offer, score) in enumerate(offers[job.repetitions][:most]):
                     if id(offer) not in rows:
@@ -225,19 +223,17 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> 
                         risk[e, a, j, n], peak[e, a, j, n] = row_of(score.risk), row_of(score.peak)
     stack = stack_forecasts([forecast for _, forecast in forecasts.values()]) if forecasts else None
     scores = {"difficulty": total, "p_saturation": p_saturation, "risk": risk, "peak": peak, "forecasts": stack}
-    return tuple(plans), Offers(plan=plan, too_heavy=too_heavy, **scores)
+    return tuple(plans), Offers(plan=plan, **scores)
 
 
 @lru_cache(maxsize=8)
-def _arms_of_works(arms: tuple[Arm, ...]) -> tuple[dict[Work, list[int]], dict[Work, list[int]]]:
-    """The arms that have plans for each work, and those for which its load is too heavy: few of a large cell."""
+def _arms_of_works(arms: tuple[Arm, ...]) -> dict[Work, list[int]]:
+    """The arms that have plans for each work: few of a large cell."""
     able: dict[Work, list[int]] = {}
-    heavy: dict[Work, list[int]] = {}
     for a, arm in enumerate(arms):
-        for works, of in ((arm.plans, able), (arm.too_heavy, heavy)):
-            for work in works:
-                of.setdefault(work, []).append(a)
-    return able, heavy
+        for work in arm.plans:
+            able.setdefault(work, []).append(a)
+    return able
 
 
 def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm], volume: Array) -> PlanTable:

@@ -1,6 +1,6 @@
 """Many shifts at once: the batched environment for trainers.
 
-It has the engine of `fleet.env.allocation_v1` with a leading env axis: a row equals that env bit for bit, for any
+It has the engine of `fleet.env.allocation_v2` with a leading env axis: a row equals that env bit for bit, for any
 number of rows.
 
 Large arrays are reused when nobody holds them any more: clearing the pages of a new array costs more than filling it.
@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from fleet.bus.exchange.memory import Exchange
-from fleet.engine.batch import TERMS, Engine, RewardWeights, Shift
+from fleet.engine.batch import TERMS, Engine, Parts, RewardWeights, Shift, empty_parts
 from fleet.engine.shift import deliver
 from fleet.engine.state import State
 from fleet.engine.tables import Tables
-from fleet.env.allocation_v1 import arm_spaces
+from fleet.env.allocation_v2 import AHEAD_S, arm_spaces
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.random_actions import random_legal as random_legal
 from fleet.env.validation import Decisions, at_least_one, decisions_of, seeds_of, switch
@@ -87,7 +87,8 @@ def keep_pages() -> bool:
 
 
 Obs = dict[str, Array]
-"""{"observation": float32 [env, arm, size], "action_mask": int8 [env, arm, option + 2]}."""
+"""What arms know, in both parts of `fleet.observation.Layout`, and their legal actions: {"shared": float32 [env,
+shared], "own": float32 [env, arm, own], "action_mask": int8 [env, arm, option + 2]}; `Layout.join` makes vectors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +122,7 @@ class BatchEnv:
         exchanges: What carries the messages of the arms of each env; perfect and immediate if not given.
         decisions: Length of a step: one decision "interval", or until an arm may claim a job ("events"), which takes no
             exchanges.
+        scaled, ahead_s: As in `fleet.env.allocation_v2.AllocationEnv`.
     """
 
     def __init__(
@@ -136,11 +138,21 @@ class BatchEnv:
         threads: int = 1,
         exchanges: Sequence[Exchange] | None = None,
         decisions: Decisions = "interval",
+        scaled: bool = True,
+        ahead_s: float = AHEAD_S,
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
         self.agents = library.arms
         """Names of the arms, in the order of the arm axis."""
-        self.layout = Layout(len(library.arms), library.slots, library.near, library.tables.work.shape[3])
+        self.layout = Layout(
+            len(library.arms),
+            library.slots,
+            library.near,
+            library.tables.work.shape[3],
+            scaled=scaled,
+            delivered=exchanges is not None,
+            ahead_s=ahead_s,
+        )
         _check_memory(num_envs, self.layout)
         autoreset, stagger = switch("autoreset", autoreset), switch("stagger", stagger)
         ticks = library.tables.ticks
@@ -150,9 +162,9 @@ class BatchEnv:
         self._last_tick = np.ceil(self._whole * share).astype(int)
         """Number of decision intervals of the current shift of each env."""
         self.single_observation_space, self.single_action_space = arm_spaces(self.layout)
-        """Of one arm."""
+        """Of one arm, with both parts as one vector."""
         self.autoreset = autoreset
-        self._shelf = Shelf((num_envs, len(library.arms), self.layout.size), np.float32)
+        self._shelves = [Shelf(each.shape, np.float32) for each in empty_parts(self.layout, num_envs)]
         self._library = library
         self._engine = Engine(
             library.tables, num_envs, self.layout, weights or RewardWeights(), threads=at_least_one("threads", threads)
@@ -170,7 +182,7 @@ class BatchEnv:
         self._elapsed_s = np.zeros(num_envs)
         """Length of the last step of each env."""
         self._exchanges = exchanges
-        self._delivered = None if exchanges is None else self._no_vectors()
+        self._delivered = None if exchanges is None else self._no_parts()
         """Knowledge of the arms with their received messages; only with exchanges."""
 
     @property
@@ -207,10 +219,10 @@ class BatchEnv:
         chosen = self._rows_of(rows)
         if not self._begun and len(chosen) < self.num_envs:
             raise RuntimeError("No episode has started: call reset() for all envs before reset(rows=…).")
-        self._vectors = self._no_vectors()
+        self._parts = self._no_parts()
         self._begin(chosen)
         if len(chosen) < self.num_envs:
-            self._observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._vectors)
+            self._observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._parts)
         self._begun = True
         raw, self._elapsed_s = np.zeros((self.num_envs, len(TERMS))), np.zeros(self.num_envs)
         return self._obs(), self._info(raw, np.zeros(0, dtype=int), None)
@@ -239,14 +251,14 @@ class BatchEnv:
                 f"The shift of {len(which)} env(s) is over (first: env {which[0]}): call reset(rows=…) before step()."
             )
         chosen = self._checked(actions)
-        vectors = self._no_vectors()
+        parts = self._no_parts()
         before = self._engine.state.tick.copy()
         until = self._last_tick.astype(np.int64) if self._events else None
-        terms, reward, finished = self._engine.step(chosen, vectors, until)
+        terms, reward, finished = self._engine.step(chosen, parts, until)
         self._elapsed_s = (self._engine.state.tick - before) * self._engine.tables.dt_s
-        self._deliver(np.arange(self.num_envs), vectors)
+        self._deliver(np.arange(self.num_envs), parts)
         truncated = ~finished & (self._engine.state.tick >= self._last_tick)
-        self._vectors, self._over = vectors, finished | truncated
+        self._parts, self._over = parts, finished | truncated
         ended = np.flatnonzero(self._over)
         self._last_tick[ended] = self._whole
         last = self._obs(ended) if len(ended) and self.autoreset else None
@@ -255,12 +267,16 @@ class BatchEnv:
             self._begin(ended)
         return self._obs(), reward.copy(), finished, truncated, info
 
+    def joined(self, obs: Obs) -> Obs:
+        """Both parts of observations as one vector for each arm: {"observation": [env, arm, size], "action_mask"}."""
+        return {"observation": self.layout.join(obs["shared"], obs["own"]), "action_mask": obs["action_mask"]}
+
     def knowledge(self) -> Observation:
         """Current observations by field, leading axes [env, arm], as policies read them."""
         self._check_begun("knowledge()")
-        vectors = self._no_vectors()  # the caller may have written into the last ones
-        self._observe(np.arange(self.num_envs), vectors)
-        return self.layout.read(vectors, self._engine.mask.copy())
+        parts = self._no_parts()  # the caller may have written into the last ones
+        self._observe(np.arange(self.num_envs), parts)
+        return self.layout.read_parts(*parts, self._engine.mask.copy())
 
     def lookahead(self, simulator: CellSimulator, env: int) -> Lookahead:
         """A simulator of the cell for the shifts of an env, for policies that plan."""
@@ -275,41 +291,42 @@ class BatchEnv:
         seeds = [self._seeds[e] if self._fresh[e] else self._seeds[e].spawn(1)[0] for e in rows.tolist()]
         self._engine.reset(rows, [self._library.draw(seed) for seed in seeds])
         self._fresh[rows], self._over[rows] = False, False
-        self._engine.observe(rows, self._vectors)
+        self._engine.observe(rows, self._parts)
         for e, seed in zip(rows.tolist(), seeds, strict=True):
             if self._exchanges is not None:
                 self._exchanges[e].begin(np.random.default_rng(exchange_seed(shift_seeds(seed)[1])))
-        self._deliver(rows, self._vectors)
+        self._deliver(rows, self._parts)
 
-    def _observe(self, rows: Array, vectors: Array) -> None:
-        """Write the current observations of some envs into `vectors` again."""
+    def _observe(self, rows: Array, parts: Parts) -> None:
+        """Write the current observations of some envs into `parts` again."""
         if self._delivered is None:
-            self._engine.observe(rows, vectors)
+            self._engine.observe(rows, parts)
         else:
-            vectors[rows] = self._delivered[rows]
+            for part, delivered in zip(parts, self._delivered, strict=True):
+                part[rows] = delivered[rows]
 
-    def _deliver(self, rows: Array, vectors: Array) -> None:
-        """Replace the peers' fields of the observations by the delivered messages."""
+    def _deliver(self, rows: Array, parts: Parts) -> None:
+        """Replace what the arms observe of each other by the delivered messages."""
         if self._exchanges is None or self._delivered is None:
             return
         names = [str(j) for j in range(self._engine.state.jobs.shape[1])]
         for e in rows.tolist():
-            deliver(self._exchanges[e], self._engine, vectors[e], names, ("",) * len(self.agents), e)
-        self._delivered[rows] = vectors[rows]
+            deliver(self._exchanges[e], self._engine, parts, names, ("",) * len(self.agents), e)
+        for part, delivered in zip(parts, self._delivered, strict=True):
+            delivered[rows] = part[rows]
 
     def _obs(self, rows: Array | None = None) -> Obs:
+        shared, own = self._parts
         if rows is None:
-            return {"observation": self._vectors, "action_mask": self._engine.mask.copy()}
-        return {"observation": self._vectors[rows], "action_mask": self._engine.mask[rows]}
+            return {"shared": shared, "own": own, "action_mask": self._engine.mask.copy()}
+        return {"shared": shared[rows], "own": own[rows], "action_mask": self._engine.mask[rows]}
 
     def _info(self, terms: Array, ended: Array, last: Obs | None) -> dict[str, Any]:
         state = self._engine.state
         if last is None:
-            arms = self.layout.arms
-            last = {
-                "observation": np.zeros((0, arms, self.layout.size), np.float32),
-                "action_mask": np.zeros((0, arms, self.layout.actions), np.int8),
-            }
+            shared, own = empty_parts(self.layout, 0)
+            mask = np.zeros((0, self.layout.arms, self.layout.actions), np.int8)
+            last = {"shared": shared, "own": own, "action_mask": mask}
         return {
             "faults": state.faults.astype(int),
             "illegal": state.illegal.astype(int),
@@ -322,9 +339,10 @@ class BatchEnv:
             "final_obs": last,
         }
 
-    def _no_vectors(self) -> Array:
-        """An array for vectors: an unused one of an earlier step, if there is one."""
-        return self._shelf.take()
+    def _no_parts(self) -> Parts:
+        """Arrays for observations: unused ones of an earlier step, if there are any."""
+        shared, own = (shelf.take() for shelf in self._shelves)
+        return shared, own
 
     def _checked(self, actions: object) -> Array:
         shape = (self.num_envs, self.layout.arms)

@@ -10,7 +10,7 @@ import numpy as np
 
 from agents.policy import WAIT, PlanningPolicy, Policy, only_choices
 from agents.schedules import LEAST_GAIN, Changes, Schedules, stack
-from fleet.engine.batch import Engine, RewardWeights, shifts_of
+from fleet.engine.batch import Engine, RewardWeights, empty_parts, shifts_of
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
 from fleet.env.lookahead import CellSimulator, Lookahead
@@ -77,7 +77,7 @@ class ShiftSimulator:
         self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
         self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
         self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled)
-        self._vectors = np.zeros((rows, self._layout.arms, self._layout.size), np.float32)
+        self._parts = empty_parts(self._layout, rows)
 
     def changes(self, rng: np.random.Generator) -> Changes:
         tables, jobs = self._engine.tables, self.jobs
@@ -107,7 +107,7 @@ class ShiftSimulator:
         engine, world, given = self._engine, self.world, len(policies)
         skips = all(only_choices(policy) for policy in policies)
         engine.reset(np.arange(self.rows), self._shifts)
-        engine.observe(np.arange(self.rows), self._vectors)
+        engine.observe(np.arange(self.rows), self._parts)
         for e, policy in enumerate(policies):
             if isinstance(policy, PlanningPolicy) and self._simulator:
                 policy.plan_in(Lookahead(self._simulator(), engine, e))
@@ -123,7 +123,7 @@ class ShiftSimulator:
             actions = self._actions(policies, asked, limit)
             tick, slot_job = engine.state.tick.copy(), engine.offers.slot_job.copy()
             legal = np.take_along_axis(engine.mask, np.clip(actions, 0, give_back)[..., None], axis=2)[..., 0] > 0
-            _, earned, finished = engine.step(actions, self._vectors, until)
+            _, earned, finished = engine.step(actions, self._parts, until)
             reward += np.where(running, earned, 0.0)
             for e, a in np.argwhere((actions > 0) & legal & running[:, None]).tolist():
                 action = int(actions[e, a])
@@ -142,7 +142,7 @@ class ShiftSimulator:
         names, mask = self.world.arms, self._engine.mask
         actions = np.full((self.rows, len(names)), WAIT, np.int64)
         for e in np.flatnonzero(asked).tolist():
-            known = self._layout.read_each(names, self._vectors[e], mask[e])
+            known = self._layout.read_each(names, self._parts[0][e], self._parts[1][e], mask[e])
             with limit.decision():
                 actions[e] = actions_of(names, policies[e].act(known))
         return actions

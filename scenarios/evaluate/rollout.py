@@ -121,6 +121,8 @@ def play(
         weights=weights_of(fleet.scenario),
         autoreset=False,
         exchanges=exchanges,
+        scaled=False,
+        ahead_s=np.inf,
     )
     obs, _ = env.reset()
     heat = HeatUse(env.temp_c, fleet.scenario.people.burn_c)
@@ -228,7 +230,7 @@ def acts_of(
 
 def known_in(env: BatchEnv, e: int, obs: Obs) -> dict[str, Observation]:
     """What each arm of one env knows."""
-    return env.layout.read_each(env.agents, obs["observation"][e], obs["action_mask"][e])
+    return env.layout.read_each(env.agents, obs["shared"][e], obs["own"][e], obs["action_mask"][e])
 
 
 _library = lru_cache(maxsize=1)(library_of)

@@ -1,6 +1,6 @@
 """Registers the environment in PettingZoo when it is imported.
 
-`pettingzoo.make("parallel", "thermofleet/allocation_v1", scenario="quickstart")` then works, and so does "aec".
+`pettingzoo.make("parallel", "thermofleet/allocation_v2", scenario="quickstart")` then works, and so does "aec".
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ import pettingzoo
 from pettingzoo import AECEnv
 from pettingzoo.utils import wrappers
 
-from fleet.env.allocation_v1 import VERSION, AllocationEnv, InTurns
+from fleet.env.allocation_v2 import VERSION, AllocationEnv, InTurns
 from scenarios.prepare.fleet import make_env
 from scenarios.spec.schema import Scenario
 

@@ -40,7 +40,7 @@ from scenarios.spec.schema import Scenario
 
 if TYPE_CHECKING:
     from fleet.engine.shift import Episode, Plant
-    from fleet.env.allocation_v1 import AllocationEnv, MaskPlace
+    from fleet.env.allocation_v2 import AllocationEnv, MaskPlace
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,7 +385,7 @@ def make_env(
         bus: Transport of the messages between arms.
         channel: Topology, delay, loss and partitions of the messages; if it is perfect, those of the scenario.
         cache: Folder of plans and twins.
-        max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v1.AllocationEnv`.
+        max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v2.AllocationEnv`.
         peers: Number of peers in an arm's observation, the nearest ones; default: all.
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`; Any, as fields differ.
 
@@ -412,7 +412,7 @@ def env_of(
     **options: Any,  # passed on
 ) -> "AllocationEnv":
     """The `ParallelEnv` of a prepared fleet; arguments as in `open_exchange`, options (Any) as in `AllocationEnv`."""
-    from fleet.env.allocation_v1 import parallel_env
+    from fleet.env.allocation_v2 import parallel_env
 
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)

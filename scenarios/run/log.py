@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from fleet.bus.exchange.channel import PERFECT
 from fleet.difficulty import DifficultyModel
-from fleet.env.allocation_v1 import VERSION
+from fleet.env.allocation_v2 import VERSION
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import JOINTS

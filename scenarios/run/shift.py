@@ -10,7 +10,7 @@ import numpy as np
 from agents.policy import only_choices
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
-from fleet.env.allocation_v1 import AllocationEnv
+from fleet.env.allocation_v2 import AllocationEnv
 from fleet.env.validation import actions_of
 from fleet.errors import FleetError, nearest
 from fleet.events import Event
@@ -86,6 +86,8 @@ def run(
         channel=spec.channel,
         keep_events=True,
         watch=recorder,
+        scaled=False,
+        ahead_s=np.inf,
     )
     finished, reward = False, 0.0
     offers: list[Offer] = []

@@ -100,7 +100,7 @@ class NetworkLearner:
         self.trainer = trainer_of(library, weights, config)
         # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in
         # training.
-        self._env = BatchEnv(library, count, weights=weights)
+        self._env = BatchEnv(library, count, weights=weights, ahead_s=np.inf)
         self._seeds = [VALIDATION_SEED + i for i in range(count)]
 
     @property
@@ -111,7 +111,7 @@ class NetworkLearner:
         """Mean reward of a validation shift."""
         rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, self.done]))
         act = partial(self.trainer.act, self._env.layout, rng=rng)
-        return self._reward(lambda obs, _: act(obs["observation"], obs["action_mask"]))
+        return self._reward(lambda obs, _: act(self._env.layout.join(obs["shared"], obs["own"]), obs["action_mask"]))
 
     def validate_teacher(self) -> float | None:
         """That of the imitated rule."""
@@ -137,12 +137,17 @@ class NetworkLearner:
 
 def trainer_of(library: Library, weights: RewardWeights, config: PpoConfig) -> Trainer:
     """A trainer on the batched environments of a fleet, with envs spread over the hours of a shift."""
-    options: Any = {"autoreset": False, "decisions": config.decisions, "stagger": True}  # two kinds of values
+    options: Any = {
+        "autoreset": False,
+        "decisions": config.decisions,
+        "stagger": True,
+        "ahead_s": np.inf,
+    }  # two kinds of values
 
     def envs(count: int, seed: int) -> TorchRLEnv:
         return TorchRLEnv(BatchEnv(library, count, seed=seed, weights=weights, **options))
 
-    return Trainer([(envs, BatchEnv(library, 1).layout)], config)
+    return Trainer([(envs, BatchEnv(library, 1, ahead_s=np.inf).layout)], config)
 
 
 DEMONSTRATIONS = 60
@@ -155,7 +160,7 @@ def imitate_rule(trainer: Trainer, library: Library, weights: RewardWeights, pro
     """Warm start: let the actor imitate the rule of the configuration."""
     rng = np.random.default_rng(np.random.SeedSequence([trainer.config.seed, 4]))
     seed = int(rng.integers(2**31))
-    teacher = BatchEnv(library, TEACHERS, seed=seed, weights=weights, stagger=True, decisions="events")
+    teacher = BatchEnv(library, TEACHERS, seed=seed, weights=weights, stagger=True, decisions="events", ahead_s=np.inf)
     imitate(trainer.actor, teacher.layout, _demonstrations(teacher, trainer.config.warm_start, progress), rng)
 
 
@@ -170,7 +175,7 @@ def _demonstrations(env: BatchEnv, rule: str, progress: Progress) -> Iterator[tu
         rows: list[tuple[Array, Array, Array]] = []
         for _ in range(STEPS):
             actions = np.array([actions_of(env.agents, p.act(known_in(env, e, obs))) for e, p in enumerate(policies)])
-            rows.append((obs["observation"], obs["action_mask"], actions))
+            rows.append((env.layout.join(obs["shared"], obs["own"]), obs["action_mask"], actions))
             obs, *_ = env.step(actions)
         vectors, masks, actions = (np.concatenate(part) for part in zip(*rows, strict=True))
         yield vectors.reshape(-1, vectors.shape[-1]), masks.reshape(-1, masks.shape[-1]), actions.reshape(-1)

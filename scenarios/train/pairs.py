@@ -94,13 +94,15 @@ def rewards(instance: TrainingInstance, parameters: Array, seeds: Sequence[int])
     Args:
         parameters: [row, parameter] of `agents.pairs`.
     """
-    env = BatchEnv(instance.library, len(seeds), weights=instance.weights, decisions="events")
+    env = BatchEnv(
+        instance.library, len(seeds), weights=instance.weights, decisions="events", scaled=False, ahead_s=np.inf
+    )
 
     def act(obs: Obs, running: Array) -> Array:
         actions = np.full((len(seeds), instance.arms), WAIT)
         asked = np.flatnonzero(running & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
         if len(asked):
-            seen = env.layout.read(obs["observation"][asked], obs["action_mask"][asked])
+            seen = env.layout.read_parts(obs["shared"][asked], obs["own"][asked], obs["action_mask"][asked])
             score = scores(seen, parameters[asked])
             for k in np.flatnonzero(np.isfinite(score).any(axis=(1, 2))).tolist():
                 for arm, option in matched_options(-score[k], env.layout.plans):

@@ -14,7 +14,7 @@ import pytest
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from fleet.env.allocation_v1 import parallel_env
+from fleet.env.allocation_v2 import parallel_env
 from fleet.env.validation import Decisions
 from fleet.env.vector import BatchEnv
 from fleet.files import user_cache_folder

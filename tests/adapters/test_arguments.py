@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleet.env.adapters.arguments import check_batch, check_choice, check_env
-from fleet.env.allocation_v1 import parallel_env
+from fleet.env.allocation_v2 import parallel_env
 
 
 def test_an_environment_with_the_masks_in_the_observations_is_taken(small) -> None:

@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import FlattenObservation
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from fleet.env import allocation_v1
+from fleet.env import allocation_v2
 from fleet.env.adapters.gymnasium_view import DispatcherEnv, DispatcherVectorEnv
 from fleet.observation import Layout
 
@@ -109,8 +109,8 @@ def test_what_it_cannot_take_is_refused(small, small_batch, small_workshop) -> N
         with pytest.raises(ValueError, match=r"DispatcherVectorEnv takes a batch made by scenarios\.make_batch\(\)"):
             DispatcherVectorEnv(wrong)
     with pytest.raises(ValueError, match="make the environment with mask_in='obs'"):
-        DispatcherEnv(allocation_v1.parallel_env(small.Shifts(), mask_in="info"))
-    DispatcherEnv(allocation_v1.parallel_env(small.Shifts(), mask_in="both")).reset(seed=0)
+        DispatcherEnv(allocation_v2.parallel_env(small.Shifts(), mask_in="info"))
+    DispatcherEnv(allocation_v2.parallel_env(small.Shifts(), mask_in="both")).reset(seed=0)
 
 
 def test_nothing_is_legal_before_a_reset(many) -> None:

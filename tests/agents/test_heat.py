@@ -12,7 +12,7 @@ from agents.pairs import Worth, worth_per_second
 from agents.policy import WAIT, for_all_arms
 from agents.registry import WRAPPERS, make_policy
 from fleet.arm.model import ArmModel
-from fleet.env.allocation_v1 import parallel_env
+from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import FleetError
 from fleet.observation import Observation
 from fleet.robot import POSTURES, RATING, Mount, Robot

@@ -14,7 +14,7 @@ from scipy import stats
 from agents.policy import WAIT, EveryArm, for_all_arms, only_choices
 from agents.registry import RULES, make_policy
 from agents.rules import RandomLegal, Wspt, WsptCool
-from fleet.env.allocation_v1 import parallel_env
+from fleet.env.allocation_v2 import parallel_env
 from fleet.observation import LONG_S, Observation
 from tests.agents.observations import observation
 from tests.profiles import examples

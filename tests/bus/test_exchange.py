@@ -25,7 +25,7 @@ from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, decode, encoding
 from fleet.bus.router import Router, open_client
-from fleet.env.allocation_v1 import parallel_env
+from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import BusError
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S

@@ -76,7 +76,7 @@ def test_crossing_times_equal_brentq(small, start_c) -> None:
     """Also if the search hits the limit exactly; the time is never before the crossing."""
     world, _ = small.shop([[small.job("a")]])
     net = tables_of(world)[0].modal[0, 0]
-    heat_w, temp_c, modal = np.zeros(NODES), np.full(NODES, start_c), np.empty((2, NODES))
+    heat_w, temp_c, modal = np.zeros(NODES), np.full(NODES, start_c), np.empty((6, NODES))
     heat_w[1] = 90.0 if start_c < 50.0 else 0.0
     temp_c[1] += 1.0
     to_modes(net, temp_c, heat_w + net["to_ambient"] * AMBIENT_C, modal)

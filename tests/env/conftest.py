@@ -11,7 +11,7 @@ import pytest
 
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.state import DONE, WAITING, State, World
-from fleet.env.allocation_v1 import AllocationEnv, parallel_env
+from fleet.env.allocation_v2 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import JOINTS
 from scenarios.spec.parse import parse_scenario

@@ -8,7 +8,7 @@ import pytest
 from fleet.bus.exchange.memory import Exchange
 from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.engine.batch import TERMS, RewardWeights
-from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
+from fleet.env.allocation_v2 import AllocationEnv, Episode, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import ThermalLimits
 from fleet.telemetry import WORKING

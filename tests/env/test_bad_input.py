@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet.env import allocation_v1
+from fleet.env import allocation_v2
 from fleet.errors import ScenarioError
 from scenarios.prepare.batch import make_batch
 from scenarios.prepare.fleet import Randomisation, make_env
@@ -99,7 +99,7 @@ def test_invalid_options_are_refused(make, options, message) -> None:
 
 
 def test_the_aec_env_refuses_wrong_actions(small) -> None:
-    env = allocation_v1.env(small.Shifts())
+    env = allocation_v2.env(small.Shifts())
     with pytest.raises(AssertionError, match=r"reset\(\) needs to be called before step"):
         env.step(1)
     env.reset(seed=0)

@@ -28,8 +28,8 @@ from scipy.stats import chisquare
 
 import scenarios
 from fleet.engine.batch import TERMS
-from fleet.env import allocation_v1
-from fleet.env.allocation_v1 import AllocationEnv
+from fleet.env import allocation_v2
+from fleet.env.allocation_v2 import AllocationEnv
 from fleet.env.random_actions import random_legal
 from fleet.env.vector import BatchEnv
 from fleet.offered_plans import PLANS
@@ -54,9 +54,9 @@ def module(small) -> SimpleNamespace:
     """Return an environment of small shifts with the entry points of a PettingZoo module."""
     shifts = small.Shifts()
     return SimpleNamespace(
-        env=lambda **options: allocation_v1.env(shifts, **options),
-        raw_env=lambda **options: allocation_v1.raw_env(shifts, **options),
-        parallel_env=lambda **options: allocation_v1.parallel_env(shifts, **options),
+        env=lambda **options: allocation_v2.env(shifts, **options),
+        raw_env=lambda **options: allocation_v2.raw_env(shifts, **options),
+        parallel_env=lambda **options: allocation_v2.parallel_env(shifts, **options),
     )
 
 
@@ -72,7 +72,7 @@ def test_pettingzoo_parallel_test_passes(make, arms) -> None:
 def test_pettingzoo_aec_test_passes(module, quiet, door) -> None:
     env = getattr(module, door)()
     api_test(env, num_cycles=120)
-    assert env.metadata["name"] == "allocation_v1"
+    assert env.metadata["name"] == "allocation_v2"
 
 
 @pytest.mark.parametrize("keep_events", [False, True])
@@ -264,7 +264,7 @@ def test_returned_arrays_of_a_batch_belong_to_the_caller(batch, play) -> None:
     assert not np.shares_memory(env.state.temp_c, env.state.temp_c)
 
 
-NAME = "thermofleet/allocation_v1"
+NAME = "thermofleet/allocation_v2"
 
 
 def test_pettingzoo_makes_the_env_by_name(cell, plans, play) -> None:

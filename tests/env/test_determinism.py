@@ -15,7 +15,7 @@ from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.engine.state import DONE, JOB, State, World
 from fleet.engine.tables import Tables
-from fleet.env.allocation_v1 import Episode, parallel_env
+from fleet.env.allocation_v2 import Episode, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import WINDING
@@ -39,7 +39,7 @@ for name, path in zip(("small_worlds", "playing"), sys.argv[1:]):
     spec.loader.exec_module(module)
     loaded.append(module)
 worlds, playing = loaded
-from fleet.env.allocation_v1 import env as aec_env, parallel_env
+from fleet.env.allocation_v2 import env as aec_env, parallel_env
 from fleet.env.vector import BatchEnv
 
 def results():

@@ -16,7 +16,7 @@ from fleet.engine.profile_plant import sensor_noise
 from fleet.engine.shift import Episode, ShiftRunner, broadcast, initial, write_peers
 from fleet.engine.state import State, World
 from fleet.engine.tables import tables_of
-from fleet.env.allocation_v1 import parallel_env
+from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import ScenarioError
 from fleet.heat.motor import gen3_motors
 from fleet.observation import FIELDS, LONG_S, Layout, Observation

@@ -411,7 +411,7 @@ def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
 
 def test_matplotlib_is_loaded_for_frames_alone() -> None:
     code = (
-        "import sys; import fleet.env.allocation_v1, fleet.env.render.renderer; "
+        "import sys; import fleet.env.allocation_v2, fleet.env.render.renderer; "
         "print([m for m in ('matplotlib', 'PIL', 'torch', 'mujoco', 'zenoh', 'tkinter') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import event, given
 
 from fleet.engine.state import DONE, EXPIRED, RUNNING, WAITING, State
-from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
+from fleet.env.allocation_v2 import AllocationEnv, Episode, parallel_env
 from fleet.job import MOST_FAULTS
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from fleet.env.allocation_v1 import Episode, parallel_env
+from fleet.env.allocation_v2 import Episode, parallel_env
 from fleet.heat.thermal import WINDING
 from fleet.live.arm.body import MAX_STEPS, SimulatedBody
 from fleet.robot import ThermalLimits

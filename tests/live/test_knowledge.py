@@ -16,7 +16,7 @@ from fleet.bus.protocol.auction import Award, QuoteRequest, Submission
 from fleet.bus.protocol.consensus import Bid, JobOutcome
 from fleet.bus.protocol.messages import State
 from fleet.difficulty import KNOWN, Difficulty, Forecast
-from fleet.env.allocation_v1 import Episode, parallel_env
+from fleet.env.allocation_v2 import Episode, parallel_env
 from fleet.errors import InfeasibleJob
 from fleet.heat.motor import gen3_motors
 from fleet.live.arm.awards import ArmHistory, AwardExecutor, ExecutorConfig

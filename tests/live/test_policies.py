@@ -14,7 +14,7 @@ from agents.registry import RULES, make_policy
 from fleet.bus.protocol.auction import JobEstimate as Estimate
 from fleet.bus.protocol.auction import JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
-from fleet.env.allocation_v1 import parallel_env
+from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import BusError
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.rounds import Assignment, Bidding, Choice, offers_of, resolve_claims

@@ -17,13 +17,16 @@ _LENGTHS: dict[Axis, tuple[int, int]] = {
     "joint": (JOINTS, JOINTS),
     "slot": (0, MOST_SLOTS),
     "option": (0, MOST_OPTIONS),
-    "peer": (0, MOST_ARMS - 1),
+    "member": (0, MOST_ARMS),
 }
 Action = Annotated[int, msgspec.Meta(ge=0, le=MOST_OPTIONS + 1)]
 _Mask = Annotated[
     list[Annotated[int, msgspec.Meta(ge=0, le=1)]],
     msgspec.Meta(min_length=2, max_length=MOST_OPTIONS + 2, description="1 for each legal action, [option + 2]"),
 ]
+
+
+_Peers = Annotated[list[Annotated[int, msgspec.Meta(ge=0, lt=MOST_ARMS)]], msgspec.Meta(max_length=MOST_ARMS)]
 
 
 def _type_of(field: Field) -> Any:
@@ -42,14 +45,19 @@ if TYPE_CHECKING:
 else:
     ArmObservation = msgspec.defstruct(
         "ArmObservation",
-        [("arm", Name), *((field.name, _type_of(field)) for field in FIELDS), ("action_mask", _Mask)],
+        [
+            ("arm", Name),
+            *((field.name, _type_of(field)) for field in FIELDS),
+            ("peers", _Peers),
+            ("action_mask", _Mask),
+        ],
         module=__name__,
         frozen=True,
         namespace={
             "__doc__": """The observation of one arm: the fields of `fleet.observation.Observation` by name.
 
-            option = slot · plans + plan, with len(difficulty) / len(offered) plans; peers are the other arms, in the
-            order of the request, or the nearest of them."""
+            option = slot · plans + plan, with len(difficulty) / len(group) plans; members are all arms, in the order of
+            the request, or only the nearest peers. `peers` are the numbers of those that are not this arm."""
         },
     )
 

@@ -110,7 +110,7 @@ class DispatcherVectorEnv(VectorEnv[Observation, Array, Array]):
         super().reset(seed=seed if isinstance(seed, int) else None)
         obs, info = self.batch.reset(seed, rows=(options or {}).get("reset_mask"))
         self._mask = obs["action_mask"]
-        return dict(obs), self._numbers(info)
+        return self.batch.joined(obs), self._numbers(info)
 
     def step(self, actions: Array) -> tuple[Observation, Array, Array, Array, Infos]:
         """One decision of every arm of every env, int [env, arm]."""
@@ -121,7 +121,7 @@ class DispatcherVectorEnv(VectorEnv[Observation, Array, Array]):
             ended = terminated | truncated
             numbers |= {"final_obs": self._last(info), "_final_obs": ended}
             numbers |= {"final_info": self._numbers(info, masks=False), "_final_info": ended}
-        return dict(obs), reward, terminated, truncated, numbers
+        return self.batch.joined(obs), reward, terminated, truncated, numbers
 
     def legal_sample(self, rng: np.random.Generator | None = None) -> Array:
         """Random legal actions, all equally likely, int64 [env, arm]."""
@@ -143,7 +143,7 @@ class DispatcherVectorEnv(VectorEnv[Observation, Array, Array]):
     def _last(self, info: Infos) -> Observation:
         """Last observation of each episode that ended, zeros for the others, [env, arm, …]."""
         last = {}
-        for key, values in info["final_obs"].items():
+        for key, values in self.batch.joined(info["final_obs"]).items():
             last[key] = np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
             last[key][info["final_envs"]] = values
         return last

@@ -30,7 +30,7 @@ from ray.tune.registry import register_env
 
 from fleet.env.adapters.arguments import Env, arm_space, check_env
 
-NAME = "thermofleet/allocation_v1"
+NAME = "thermofleet/allocation_v2"
 SHARED_POLICY = "arm"
 
 ByArm = dict[int, Any]

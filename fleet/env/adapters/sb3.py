@@ -80,9 +80,10 @@ class ArmsVecEnv(VecEnv):
         self._returns += reward
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        final = self.batch.joined(info["final_obs"])
         for n, env in enumerate(info["final_envs"].tolist()):
             for arm in range(self.arms):
-                last = {key: values[n, arm] for key, values in info["final_obs"].items()}
+                last = {key: values[n, arm] for key, values in final.items()}
                 infos[env * self.arms + arm] = {
                     "terminal_observation": last if self.kind == "dict" else last["observation"],
                     "TimeLimit.truncated": bool(truncated[env]),
@@ -131,6 +132,6 @@ class ArmsVecEnv(VecEnv):
         return [wrapper_class is Monitor for _ in rows]
 
     def _rows(self, obs: Obs) -> Array | dict[str, Array]:
-        flat = {key: values.reshape(self.num_envs, -1) for key, values in obs.items()}
+        flat = {key: values.reshape(self.num_envs, -1) for key, values in self.batch.joined(obs).items()}
         self._mask = flat["action_mask"] == 1
         return flat if self.kind == "dict" else flat["observation"]

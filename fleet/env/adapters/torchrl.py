@@ -4,7 +4,7 @@ Example, installation and tested versions: docs/trainers.md.
 
 | key | value |
 |---|---|
-| ("arms", "observation") | float32 [env, arm, size], raw units: scale by `layout.bounds` or in the network |
+| ("arms", "observation") | float32 [env, arm, size] |
 | ("arms", "action_mask") | bool [env, arm, action] |
 | ("arms", "action") | int64 [env, arm] |
 | ("arms", "reward") | float32 [env, arm, 1], the team's reward of the whole step for every arm |
@@ -151,7 +151,7 @@ class TorchRLEnv(EnvBase):
     def _tensors(self, obs: Obs, info: Infos, **ends: torch.Tensor) -> TensorDict:
         """Result of the batch as tensors that share the arrays' memory."""
         envs, arms = self.batch.num_envs, len(self.batch.agents)
-        vectors = torch.from_numpy(obs["observation"])
+        vectors = torch.from_numpy(self.layout.join(obs["shared"], obs["own"]))
         mask = torch.from_numpy(obs["action_mask"]).view(torch.bool)
         self._action.update_mask(mask)
         self._mask = mask

@@ -9,7 +9,7 @@ import numpy as np
 from fleet.bus.protocol.auction import JobEstimate, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
 from fleet.live.auction.rounds import Bidding, Choice
-from fleet.observation import LONG_S, Layout, Observation, all_peers
+from fleet.observation import LONG_S, Layout, Observation
 from fleet.offered_plans import PLANS
 from fleet.robot import JOINTS, ThermalLimits
 
@@ -51,7 +51,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     """
     by_arm, limits = {**bidding.full, **bidding.quotes}, fleet.limits
     arms, time_s = fleet.order(by_arm), bidding.time_s
-    layout, peers = Layout(len(arms), len(bidding.jobs), plans=PLANS), all_peers(len(arms))
+    layout = Layout(len(arms), len(bidding.jobs), plans=PLANS)
     quotes, states = [by_arm.get(arm) for arm in arms], [bidding.states.get(arm) for arm in arms]
     estimates = [{} if quote is None else {offer.job: offer for offer in quote.estimates} for quote in quotes]
     offers = [_plans_of(by_job, bidding) for by_job in estimates]
@@ -59,7 +59,6 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         [bidding.in_the_way(arm, plan.space) if plan else () for plan in row]
         for arm, row in zip(arms, offers, strict=True)
     ]
-    names = [job.name for job in bidding.jobs]
 
     def table(value: Callable[[PlanQuote], float | None]) -> Array:
         rows = [[None if plan is None else value(plan) for plan in row] for row in offers]
@@ -68,11 +67,11 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     def stated(value: Callable[[State], float | None]) -> Array:
         return np.array([(0.0 if state is None else value(state)) or 0.0 for state in states])
 
-    def per_option(per_slot: Array) -> Array:
-        return np.repeat(per_slot, PLANS, axis=-1)
-
     def per_job(values: Sequence[float]) -> Array:
         return np.broadcast_to(np.array(values, dtype=float), (len(arms), layout.slots))
+
+    def of_all(values: Array | Sequence[float]) -> Array:
+        return np.repeat(np.asarray(values, float)[None], len(arms), axis=0)
 
     heard = [quote or state for quote, state in zip(quotes, states, strict=True)]
     modes = np.array([each.mode if each else "" for each in heard])
@@ -81,15 +80,11 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     working = np.isin(modes, ["idle", "working"]) & ~room
     feasible = table(lambda offer: 1.0) > 0
     free = np.array([[not in_way for in_way in row] for row in in_the_way]).reshape(feasible.shape)
-    blocks = [
-        [[peer in in_way for in_way in row[::PLANS]] for peer in arms if peer != arm]
-        for arm, row in zip(arms, in_the_way, strict=True)
-    ]
-    too_heavy = [[name in row and row[name].too_heavy for name in names] for row in estimates]
     stations = [bidding.has_free_stations(job) for job in bidding.jobs]
     difficulty, p_saturation = table(lambda offer: offer.difficulty), table(lambda offer: offer.p_saturation)
     known = ~np.isnan(difficulty)
     least = np.where(known, difficulty, np.inf).reshape(len(arms), -1, PLANS).min(axis=-1)  # [arm, slot]
+    least = np.where(np.isfinite(least), least, -1.0)
     scored = known | ~np.isnan(p_saturation)
     quoted_s = table(lambda offer: offer.duration_s)
     longest_s = np.nan_to_num(quoted_s).max(initial=0.0)
@@ -100,9 +95,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     ambient_c = np.array([each.ambient_c if each else None for each in states], float)  # None becomes NaN
     temp_c = _per_joint(states, "temp_c", np.repeat(limits.warning_c - headroom_k[:, None], JOINTS, axis=1))
     fields = Observation(
-        clock=np.full(len(arms), time_s / fleet.horizon_s),
         left_s=np.full(len(arms), fleet.horizon_s - time_s),
-        idle=room,
         working=working,
         faulted=modes == "faulted",
         busy_s=busy_s,
@@ -116,37 +109,42 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         job_cycles=stated(lambda state: state.job_cycles_left),
         job_peak_c=stated(lambda state: state.job_peak_c),
         job_p=stated(_risk_of_job),
-        offered=per_job([1.0] * layout.slots),
+        group=per_job(_groups(bidding)),
         station_free=per_job(stations),
-        too_heavy=np.array(too_heavy).reshape(len(arms), layout.slots),
-        feasible=feasible,
-        space_free=feasible & free,
-        known=known,
-        difficulty=np.where(known, difficulty, 0.0),
+        blocked=(feasible & ~free).reshape(len(arms), layout.slots, PLANS)[..., 0],
+        difficulty=np.where(known, difficulty, np.where(feasible, -1.0, 0.0)),
         peak_c=np.where(scored, np.nan_to_num(table(lambda offer: offer.peak_c)), 0.0),
-        p_saturation=np.where(np.isnan(p_saturation), 0.5, p_saturation),
+        p_saturation=np.where(np.isnan(p_saturation), np.where(feasible, 0.5, 0.0), p_saturation),
         duration_s=duration_s,
-        slack_s=np.where(feasible, per_option(due_s) - time_s - duration_s, 0.0),
+        due_in_s=due_s - time_s,
         age_s=time_s - per_job(queued_s),
         payload_kg=per_job([job.payload_kg for job in bidding.jobs]),
         value=per_job([job.value for job in bidding.jobs]),
         returns=per_job([bidding.returned.get(job.name, (0, 0.0))[0] for job in bidding.jobs]),
         expires=per_job([float(job.expires) for job in bidding.jobs]),
-        peer_heard=np.array([each is not None for each in heard])[peers],
-        peer_age_s=np.array([_age_s(arm, bidding) for arm in arms])[peers],
-        peer_working=working[peers],
-        peer_faulted=(modes == "faulted")[peers],
-        peer_headroom_k=headroom_k[peers],
-        peer_busy_s=busy_s[peers],
-        peer_known=np.isfinite(least)[peers],
-        peer_difficulty=np.where(np.isfinite(least), least, 0.0)[peers],
-        peer_blocks=np.array(blocks).reshape(*peers.shape, layout.slots),
+        fleet_age_s=of_all([_age_s(arm, bidding) for arm in arms]),
+        fleet_working=of_all(working),
+        fleet_faulted=of_all(modes == "faulted"),
+        fleet_busy_s=of_all(busy_s),
+        fleet_headroom_k=of_all(headroom_k),
+        fleet_difficulty=of_all(least),
+        peers=layout.peers,
         action_mask=np.zeros(0),
     )
     # Waiting is always legal; a live fleet has no action to give a job back.
-    legal = feasible & free & per_option(per_job(stations) > 0) & room[:, None]
+    legal = feasible & free & np.repeat(per_job(stations) > 0, PLANS, axis=-1) & room[:, None]
     mask = np.pad(legal.astype(np.int8), ((0, 0), (1, 1)), constant_values=((0, 0), (1, 0)))
-    return layout.read_each(arms, layout.pack(fields), mask)
+    vectors = layout.pack(fields)
+    return layout.read_each(arms, vectors[0, : layout.shared], vectors[:, layout.shared :], mask)
+
+
+def _groups(bidding: Bidding) -> list[float]:
+    """Return a number for each job of the round: jobs that share a station have the same."""
+    groups: list[float] = []
+    for k, job in enumerate(bidding.jobs):
+        alike = [groups[i] for i, other in enumerate(bidding.jobs[:k]) if set(job.places) & set(other.places)]
+        groups.append(alike[0] if alike else k + 1.0)
+    return groups
 
 
 def claimed_jobs(

@@ -1,4 +1,4 @@
-"""Thermal job allocation, version 1: a PettingZoo `ParallelEnv` on the engine `fleet.engine.step`.
+"""Thermal job allocation, version 2: a PettingZoo `ParallelEnv` on the engine `fleet.engine.step`.
 
 Agents are the arms, fixed for the whole episode. Actions are Discrete(slots · plans + 2): 0 waits or continues and is
 always legal, 1 + slot · plans + plan claims the job in a slot by one of the arm's plans for it, and the last action
@@ -53,7 +53,9 @@ def spaces_like(first: tuple[spaces.Dict, spaces.Discrete]) -> tuple[spaces.Dict
 
 Array = np.ndarray
 
-VERSION = "allocation_v1"
+VERSION = "allocation_v2"
+AHEAD_S = 180.0
+"""Options are given to arms that are home within this time."""
 MaskPlace = Literal["obs", "info", "both"]
 RENDER_MODES = ("ansi", "rgb_array", "human")
 FRAMES_PER_S = 10
@@ -78,6 +80,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         near: The peers each arm has in its vector; see `fleet.observation.Layout`.
         decisions: Length of a step: one decision "interval", or until an arm may claim a job or one at work passes its
             warning limit ("events").
+        scaled: Vectors hold values of order 1 (`Field.scale`); otherwise they have the units of the fields.
+        ahead_s: Options of arms that are home later than this are 0: they cannot claim soon. inf for those of all.
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo's
@@ -101,6 +105,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         mask_in: MaskPlace = "obs",
         near: tuple[tuple[int, ...], ...] | None = None,
         decisions: Decisions = "interval",
+        scaled: bool = True,
+        ahead_s: float = AHEAD_S,
     ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             allowed = ", ".join(map(repr, RENDER_MODES))
@@ -123,7 +129,15 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.possible_agents = list(world.arms)
         self.agents: list[str] = []
         self._exchange = exchange or Exchange(world.arms)
-        self.layout = Layout(len(world.arms), world.slots, near, world.plans_per_job)
+        self.layout = Layout(
+            len(world.arms),
+            world.slots,
+            near,
+            world.plans_per_job,
+            scaled=scaled,
+            delivered=not self._exchange.perfect,
+            ahead_s=ahead_s,
+        )
         first = arm_spaces(self.layout)
         per_arm = [spaces_like(first) for _ in world.arms]
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
@@ -241,7 +255,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     def state(self) -> Array:
         """Vectors of all arms, concatenated, float32."""
-        return self._begun("state()").vectors.reshape(-1).copy()
+        return self.layout.join(*self._begun("state()").parts).reshape(-1)
 
     @property
     def may_claim(self) -> bool:
@@ -251,7 +265,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     def knowledge(self) -> dict[str, Observation]:
         """Current observation of every arm by name, as policies read it."""
         shift = self._begun("knowledge()")
-        return self.layout.read_each(self.possible_agents, shift.vectors.copy(), shift.mask.copy())
+        shared, own = shift.parts
+        return self.layout.read_each(self.possible_agents, shared.copy(), own.copy(), shift.mask.copy())
 
     def lookahead(self, simulator: CellSimulator) -> Lookahead:
         """A simulator of the cell in the current episode, for policies that plan."""
@@ -287,7 +302,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     def _observations(self) -> tuple[dict[str, Any], Array]:
         """Observations by agent, and the masks [arm, option + 2]; all in arrays of their own."""
         shift = self._begun("observing")
-        vectors, masks = shift.vectors.copy(), shift.mask.copy()
+        vectors, masks = self.layout.join(*shift.parts), shift.mask.copy()
         arms = self.possible_agents
         if self._mask_in == "info":
             return {arm: vectors[a] for a, arm in enumerate(arms)}, masks
