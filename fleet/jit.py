@@ -169,17 +169,20 @@ def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
         options.CACHE_DIR = before
     if note.exists():
         return compiled
-    once = Lock()
+    once, ready = Lock(), False
 
     @wraps(function)
     def compile_first(*arguments: Any) -> Any:  # as the function
+        nonlocal ready
+        if ready:
+            return compiled(*arguments)
         with once:
             if not note.exists():
                 _announce(note.parent)
-                result = compiled(*arguments)
-                note.touch()
-                return result
-        return compiled(*arguments)
+            result = compiled(*arguments)
+            note.touch()
+            ready = True
+            return result
 
     return compile_first
 

@@ -4,8 +4,9 @@ from itertools import product
 
 import numpy as np
 
-from fleet.engine.batch import Engine, RewardWeights, shifts_of
+from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts, shifts_of
 from fleet.engine.state import DONE, State, World
+from fleet.engine.step import FINISHED, TOTAL
 from fleet.engine.tables import tables_of
 from fleet.observation import Layout
 from scenarios.evaluate.upper_bound import check_signs
@@ -38,7 +39,7 @@ def optimum(world: World, weights: RewardWeights, at_least: float = -np.inf) -> 
     tables, drawn = tables_of(world)
     layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
     engine = Engine(tables, ROWS, layout, weights, jobs=world.jobs.exists.shape[1])
-    rows, vectors = np.arange(ROWS), np.zeros((ROWS, layout.arms, layout.size), np.float32)
+    rows, parts = np.arange(ROWS), empty_parts(layout, ROWS)
     engine.reset(rows, shifts_of(drawn, [0])[:1] * ROWS)
     value = weights.finished_value * np.where(world.jobs.exists[0], world.jobs.value[0], 0.0)
     states, rewards, best = [_state_of(engine.state, 0)], [0.0], at_least
@@ -46,17 +47,18 @@ def optimum(world: World, weights: RewardWeights, at_least: float = -np.inf) -> 
         children: list[tuple[int, tuple[int, ...]]] = []
         for first in range(0, len(states), ROWS):
             some = states[first : first + ROWS]
-            _load(engine, some, vectors)
+            _load(engine, some, parts)
             for n in range(len(some)):
                 legal = [np.flatnonzero(engine.mask[n, a]) for a in range(layout.arms)]
                 children += [(first + n, tuple(map(int, actions))) for actions in product(*legal)]
         found: dict[bytes, tuple[State, float]] = {}
         for first in range(0, len(children), ROWS):
             some = children[first : first + ROWS]
-            _load(engine, [states[parent] for parent, _ in some], vectors)
+            _load(engine, [states[parent] for parent, _ in some], parts)
             actions = np.zeros((ROWS, layout.arms), np.int64)
             actions[: len(some)] = [each for _, each in some]
-            _, earned, finished = engine.step(actions, vectors)
+            outcome = engine.step(actions, parts)
+            earned, finished = outcome[:, TOTAL], outcome[:, FINISHED] > 0
             left = (np.where(engine.state.status < DONE, 1.0, 0.0) * value).sum(axis=1)
             for n, (parent, _) in enumerate(some):
                 reward = rewards[parent] + float(earned[n])
@@ -80,9 +82,9 @@ def _state_of(state: State, row: int) -> State:
     return State(*(values[row].copy() for values in state))
 
 
-def _load(engine: Engine, states: list[State], vectors: Array) -> None:
+def _load(engine: Engine, states: list[State], parts: Parts) -> None:
     """Put states into the first rows, and find their legal actions."""
     for name, values in engine.state._asdict().items():
         values[: len(states)] = np.stack([getattr(state, name) for state in states])
     engine.refresh()
-    engine.observe(np.arange(engine.envs), vectors)
+    engine.observe(np.arange(engine.envs), parts)

@@ -19,6 +19,7 @@ from fleet.engine.step import (
     NO_SCRIPT,
     OBSERVE,
     OFFER,
+    OUTCOME,
     PLAY,
     ROUNDING_S,
     Plans,
@@ -28,6 +29,7 @@ from fleet.engine.step import (
 )
 from fleet.engine.tables import (
     DRIVE,
+    INFO,
     PER_ARM,
     TRACE,
     OpenJobs,
@@ -239,6 +241,7 @@ class Engine:
             event_buffer(envs * (arms * PER_ARM + jobs) if events else 0),
             np.zeros((envs if trace else 0, arms), TRACE),
             np.zeros((0, arms), DRIVE),
+            np.zeros((envs, arms), INFO),
             form_of(layout),
             room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK)),
         )
@@ -294,6 +297,11 @@ class Engine:
         """How each arm spent the last step, `TRACE` [env, arm]."""
         return self._simulation.trace
 
+    @property
+    def infos(self) -> Array:
+        """What had become of each arm after the last step, `INFO` [env, arm]; the next step overwrites it."""
+        return self._simulation.infos
+
     def reset(self, envs: Array, shifts: Sequence[Shift]) -> None:
         """Put a new shift into each of some rows; `observe` then gives what their arms know."""
         first = np.cumsum([0, *(len(shift.kind) for shift in shifts)])
@@ -319,7 +327,7 @@ class Engine:
         """Put what the arms of some envs know now into `out`."""
         self._run(OFFER + OBSERVE, _NO_ACTIONS, _no_terms(self.envs), envs, out)
 
-    def step(self, actions: Array | None, out: Parts, until: Array | None = None) -> tuple[Array, Array, Array]:
+    def step(self, actions: Array | None, out: Parts, until: Array | None = None) -> Array:
         """One decision interval of every env, or more.
 
         Args:
@@ -330,7 +338,7 @@ class Engine:
                 then those of the last interval alone.
 
         Returns:
-            Weighted reward terms [env, term], their sum [env], and which envs have done all their jobs, bool [env].
+            Outcomes, [env, OUTCOME]: weighted reward terms, and the columns of `fleet.engine.step.OUTCOME`.
         """
         self._clear_events()
         if actions is None:
@@ -343,7 +351,7 @@ class Engine:
         if actions is not None:
             self._run(CLAIM, actions, _no_terms(self.envs), self._all, _NO_VECTORS)
 
-    def move(self, drive: Drive, out: Parts) -> tuple[Array, Array, Array]:
+    def move(self, drive: Drive, out: Parts) -> Array:
         """The rest of `step`, for arms that were seen to move.
 
         Args:
@@ -365,7 +373,7 @@ class Engine:
             discount: Factor on the reward of each step of a shift, [tick].
         """
         script = script_of(schedules, discount)
-        terms, actions = np.empty((self.envs, len(TERMS) + 1)), np.zeros((self.envs, self.layout.arms), np.int64)
+        terms, actions = np.empty((self.envs, OUTCOME)), np.zeros((self.envs, self.layout.arms), np.int64)
         until = np.full(self.envs, self.tables.ticks)
         over = (self.state.tick >= until) | ((self.state.unfinished == 0) & (self.state.number > 0))
         rows = np.flatnonzero(~over[: len(script.reward)])
@@ -373,10 +381,8 @@ class Engine:
         self._run(PLAY + CLAIM + MOVE + OFFER, actions, terms, rows, _NO_VECTORS, until, script)
         return script
 
-    def _stepped(
-        self, parts: int, actions: Array, out: Parts, until: Array | None = None
-    ) -> tuple[Array, Array, Array]:
-        terms = np.empty((self.envs, len(TERMS) + 1))
+    def _stepped(self, parts: int, actions: Array, out: Parts, until: Array | None = None) -> Array:
+        terms = np.empty((self.envs, OUTCOME))
         if self._pool is None:
             self._run(parts, actions, terms, self._all, out, until)
         else:
@@ -388,7 +394,7 @@ class Engine:
             self._run(parts, actions, terms, own, out, until)
             for each in done:
                 each.result()
-        return terms[:, :-1], terms[:, -1], (self.state.unfinished == 0) & (self.state.number > 0)
+        return terms
 
     def _clear_events(self) -> None:
         self._simulation.events.used[0] = 0

@@ -26,6 +26,9 @@ LOW_C, HIGH_C, LOW_K, HIGH_K = _LOW["temp_c"], _HIGH["temp_c"], _LOW["headroom_k
 PEAK_LOW_C, PEAK_HIGH_C = _LOW["peak_c"], _HIGH["peak_c"]
 MOST_KG, MOST_VALUE, MOST_RETURNS = _HIGH["payload_kg"], _HIGH["value"], _HIGH["returns"]
 _LONG_S, _ZERO, _ONE, _HALF = np.float32(LONG_S), np.float32(0.0), np.float32(1.0), np.float32(0.5)
+NEVER = np.float32(-np.inf)
+
+assert LANES == 8, "the largest of the lanes is found by halves"
 
 
 @jit_inline
@@ -263,14 +266,15 @@ def predict(
 @jit_inline
 def largest_piece(first: Array, block: Array, row: int, known_c: Array, left_s: Real, room: Array) -> Real:
     """Value of a forecast without the pieces of moments later than `left_s`, −inf if none is left."""
-    most = np.float32(-np.inf)
+    most = NEVER
     for b in range(nonnegative(first[row]), nonnegative(first[row + 1])):
         for lane in range(LANES):
             total = block[b, 0, lane]
             for i in range(KNOWN):
                 total += block[b, 2 + i, lane] * known_c[i]
-            room[lane] = total
-        for lane in range(LANES):
-            if block[b, 1, lane] <= left_s:
-                most = max(most, room[lane])
+            room[lane] = total if block[b, 1, lane] <= left_s else NEVER
+        for half in (4, 2, 1):
+            for lane in range(half):
+                room[lane] = max(room[lane], room[lane + half])
+        most = max(most, room[0])
     return most

@@ -243,9 +243,9 @@ class ShiftRunner:
         return self._layout.arms * (self._layout.arms - 1) * (self.tick + 1)
 
     @property
-    def jobs_done(self) -> int:
-        """Finished so far."""
-        return int(self._engine.state.done[0])
+    def infos(self) -> list[tuple[float, float, float, float]]:
+        """Faults, illegal actions, hottest motor, °C, and s above the warning limit of each arm so far."""
+        return self._engine.infos[0].tolist()
 
     @property
     def tick(self) -> int:
@@ -257,15 +257,15 @@ class ShiftRunner:
         """The engine, with one row."""
         return self._engine
 
-    def step(self, actions: Array | None) -> tuple[Array, float, bool]:
-        """One decision interval: weighted reward terms [term], their sum, and whether all jobs are done.
+    def step(self, actions: Array | None) -> Array:
+        """One decision interval; returns its outcome, [OUTCOME], as `Engine.step` does.
 
         Args:
             actions: int64 [arm]. None: no claims, and the outcome of the last ones remains.
         """
         engine, world, plant = self._engine, self._episode.world, self._episode.plant
         chosen = None if actions is None else actions[None]
-        terms, reward, finished = _stepped(engine, world, plant, chosen, self._parts)
+        outcome = _stepped(engine, world, plant, chosen, self._parts)[0]
         if len(engine.events.what):
             self.events += events_of(world, engine.state, engine.events)
         if self._reports_contacts:
@@ -273,7 +273,7 @@ class ShiftRunner:
         if self._watch is not None:
             self._watch(record_of(engine))
         self._deliver()
-        return terms[0], float(reward[0]), bool(finished[0])
+        return outcome
 
     def _deliver(self) -> None:
         """Replace what the arms observe of their peers by what the exchange delivered."""
@@ -285,9 +285,7 @@ class ShiftRunner:
 _FIRST = np.zeros(1, dtype=int)
 
 
-def _stepped(
-    engine: Engine, world: World, plant: Plant, actions: Array | None, out: Parts
-) -> tuple[Array, Array, Array]:
+def _stepped(engine: Engine, world: World, plant: Plant, actions: Array | None, out: Parts) -> Array:
     if plant.follows_plans:
         return engine.step(actions, out)
     engine.claim(actions)

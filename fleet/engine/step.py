@@ -39,6 +39,9 @@ from fleet.telemetry import FAULTED, IDLE, WORKING
 
 Array = np.ndarray
 
+TOTAL, FINISHED, JOBS_DONE, TICK, OUTCOME = range(5, 10)
+"""Columns of an outcome after the five reward terms: their sum, whether all jobs are done, how many, and decision
+intervals that are over; and the number of all columns."""
 ROUNDING_S = 1e-9
 """Sums of phases may be off by this much; a whole step must not be lost to it."""
 _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
@@ -96,7 +99,7 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
 
     Args:
         weights: Reward per unit of each term, [term], in the order of `fleet.engine.batch.TERMS`.
-        terms: Reward terms and their sum, [env, term + 1], to which those of the step are added.
+        terms: Outcomes, [env, OUTCOME], to whose reward terms those of the step are added.
         rows: Envs, int [row].
     """
     t, s, dt_s = sim.tables, sim.state, sim.tables.dt_s
@@ -149,7 +152,7 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
                 arm["progress_s"] += dt_s
         terms[e, 2] += above_s * weights[2]
         terms[e, 4] += energy_j * weights[4]
-        terms[e, 5] = terms[e, 0] + terms[e, 1] + terms[e, 2] + terms[e, 3] + terms[e, 4]
+        terms[e, TOTAL] = terms[e, 0] + terms[e, 1] + terms[e, 2] + terms[e, 3] + terms[e, 4]
         env["tick"] += 1
 
 
@@ -460,6 +463,8 @@ def take_steps(
             else:
                 now &= ~CLAIM  # of the first step only
             count = keep_going(sim, until, now & PLAY != 0, going)
+        if terms.shape[1] > 0:
+            sum_up(sim, some, terms)
         if parts & OBSERVE:
             observe(sim, some, shared, own)
 
@@ -484,7 +489,7 @@ def step_rows(
             the claims from the script.
         actions: int64 [env, arm].
         weights: Reward per unit of each term, [term].
-        terms: Receives the reward terms and their sum, [env, term + 1].
+        terms: Receives the outcomes, [env, OUTCOME]; without columns, nothing.
         until: Tick until which each env goes on while no arm has a choice, or while it plays, int [env]; not at all if
             empty.
         rows: int [row].
@@ -492,8 +497,24 @@ def step_rows(
         own: Receives what each arm knows of itself, float32 [env, arm, own].
     """
     s = sim
-    whole = Simulation(s.tables, s.state, s.offers, s.events, s.trace, s.drive, s.form, s.room)
+    whole = Simulation(s.tables, s.state, s.offers, s.events, s.trace, s.drive, s.infos, s.form, s.room)
     take_steps(whole, parts, actions, weights, terms, until, script, rows, shared, own)
+
+
+@jit_inline
+def sum_up(sim: Simulation, rows: Array, terms: Array) -> None:
+    """Put what has become of some envs so far into the outcomes and `infos`."""
+    s, infos = sim.state, sim.infos
+    for row in rows:
+        e = nonnegative(row)
+        env = s.env[e]
+        terms[e, FINISHED] = 1.0 if env["unfinished"] == 0 and env["number"] > 0 else 0.0
+        terms[e, JOBS_DONE] = env["number"] - env["unfinished"] - env["given_up"]
+        terms[e, TICK] = env["tick"]
+        for a in range(nonnegative(s.arms.shape[1])):
+            arm, info = s.arms[e, a], infos[e, a]
+            info["faults"], info["illegal"] = arm["faults"], arm["illegal"]
+            info["peak_c"], info["above_warning_s"] = arm["peak_c"], arm["above_warning_s"]
 
 
 @jit_inline
@@ -552,6 +573,6 @@ def collect_rewards(sim: Simulation, script: Script, rows: Array, terms: Array) 
     for row in rows:
         e = nonnegative(row)
         tick = nonnegative(sim.state.env[e]["tick"] - 1)
-        script.reward[e] += script.discount[tick] * terms[e, terms.shape[1] - 1]
+        script.reward[e] += script.discount[tick] * terms[e, TOTAL]
         for term in range(terms.shape[1]):
             terms[e, term] = 0.0

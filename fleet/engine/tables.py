@@ -264,6 +264,10 @@ DRIVE = np.dtype([("current_sq", "f4", LANES), ("friction_w", "f4", LANES)])
 """Mean heat drive of an arm over a step, from a plant that computes the motion, [lane]."""
 
 
+INFO = np.dtype([("faults", "f8"), ("illegal", "f8"), ("peak_c", "f8"), ("above_warning_s", "f8")])
+"""What has become of an arm so far; see `State`."""
+
+
 class Form(NamedTuple):
     """A `Layout` as the kernels want it."""
 
@@ -343,6 +347,8 @@ class Simulation(NamedTuple):
     """`TRACE` [env, arm]; without rows nothing is recorded."""
     drive: Array
     """`DRIVE` [env, arm]; without rows the planned drive counts."""
+    infos: Array
+    """`INFO` [env, arm]."""
     form: Form
     room: Room
 

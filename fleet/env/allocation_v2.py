@@ -23,6 +23,7 @@ from fleet.engine.shift import Episode as Episode
 from fleet.engine.shift import EpisodeFactory as EpisodeFactory
 from fleet.engine.shift import ShiftRunner, Watch
 from fleet.engine.state import State, World
+from fleet.engine.step import FINISHED, OUTCOME, TICK, TOTAL
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import CellMap
@@ -54,8 +55,8 @@ def spaces_like(first: tuple[spaces.Dict, spaces.Discrete]) -> tuple[spaces.Dict
 Array = np.ndarray
 
 VERSION = "allocation_v2"
-AHEAD_S = 180.0
-"""Options are given to arms that are home within this time."""
+AHEAD_S = 0.0
+"""Options are given to free arms; see `Layout.ahead_s`."""
 MaskPlace = Literal["obs", "info", "both"]
 RENDER_MODES = ("ansi", "rgb_array", "human")
 FRAMES_PER_S = 10
@@ -150,6 +151,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         low, high = self.layout.bounds
         self.state_space = spaces.Box(np.tile(low, len(world.arms)), np.tile(high, len(world.arms)), dtype=np.float32)
         self._shift: ShiftRunner | None = None
+        self._tick = 0
 
     @property
     def world(self) -> World:
@@ -169,7 +171,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     @property
     def tick(self) -> int:
         """Elapsed decision intervals of this episode."""
-        return self._begun("counting steps").tick
+        self._begun("counting steps")
+        return self._tick
 
     @property
     def messages(self) -> int:
@@ -207,9 +210,9 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             watch=self._watch,
             layout=self.layout,
         )
-        self.events = self._shift.events
+        self.events, self._tick = self._shift.events, 0
         observations, masks = self._observations()
-        return observations, self._infos(np.zeros(len(TERMS)), masks, 0.0)
+        return observations, self._infos(np.zeros(OUTCOME), masks, 0.0)
 
     def step(
         self, actions: dict[str, Any]
@@ -220,11 +223,11 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             RuntimeError: before reset, or after the end.
             ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
         """
-        before = self._begun("step()").tick
-        parts, reward, finished, over = self.advance(actions)
+        before = self._tick
+        outcome, finished, over = self.advance(actions)
         observations, masks = self._observations()
-        infos = self._infos(parts, masks, (self.tick - before) * self.world.dt_s)
-        arms = self.possible_agents
+        infos = self._infos(outcome, masks, (self._tick - before) * self.world.dt_s)
+        reward, arms = float(outcome[TOTAL]), self.possible_agents
         return (
             observations,
             dict.fromkeys(arms, reward),
@@ -233,25 +236,28 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             infos,
         )
 
-    def advance(self, actions: dict[str, Any]) -> tuple[Array, float, bool, bool]:
+    def advance(self, actions: dict[str, Any]) -> tuple[Array, bool, bool]:
         """As `step`, without observations, for callers that read `knowledge` when they need it.
 
-        Returns the weighted terms of the reward, float [term], their sum, and whether all jobs are done and whether
-        the time is over.
+        Returns the outcome, as `fleet.engine.batch.Engine.step`, and whether all jobs are done and whether the time is
+        over.
         """
         shift = self._begun("step()")
         if not self.agents:
             raise RuntimeError("The episode is over: call reset() before step().")
         chosen = actions_of(self.possible_agents, actions)
         last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
-        parts, reward, finished = shift.step(chosen)
-        while self._until_choice and not finished and shift.tick < last_tick and not shift.choice:
-            more, earned, finished = shift.step(None)
-            parts, reward = parts + more, reward + earned
-        over = not finished and shift.tick >= last_tick
+        outcome = shift.step(chosen)
+        while self._until_choice and not outcome[FINISHED] and outcome[TICK] < last_tick and not shift.choice:
+            more = shift.step(None)
+            more[: TOTAL + 1] += outcome[: TOTAL + 1]
+            outcome = more
+        self._tick = int(outcome[TICK])
+        finished = bool(outcome[FINISHED])
+        over = not finished and self._tick >= last_tick
         if finished or over:
             self.agents = []
-        return parts, reward, finished, over
+        return outcome, finished, over
 
     def state(self) -> Array:
         """Vectors of all arms, concatenated, float32."""
@@ -308,29 +314,13 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             return {arm: vectors[a] for a, arm in enumerate(arms)}, masks
         return {arm: {"observation": vectors[a], "action_mask": masks[a]} for a, arm in enumerate(arms)}, masks
 
-    def _infos(self, parts: Array, masks: Array, elapsed_s: float) -> dict[str, dict[str, Any]]:
-        shift = self._begun("infos")
-        state = shift.state
-        named = {
-            "jobs_done": float(shift.jobs_done),
-            "elapsed_s": elapsed_s,
-            **dict(zip(_REWARDS, parts.tolist(), strict=True)),
-        }
-        infos = {
-            arm: {
-                "faults": float(faults),
-                "illegal": float(illegal),
-                "peak_c": peak_c,
-                "above_warning_s": above_s,
-                **named,
-            }
-            for arm, faults, illegal, peak_c, above_s in zip(
-                self.possible_agents,
-                state.faults[0].tolist(),
-                state.illegal[0].tolist(),
-                state.peak_c[0].tolist(),
-                state.above_warning_s[0].tolist(),
-                strict=True,
+    def _infos(self, outcome: Array, masks: Array, elapsed_s: float) -> dict[str, dict[str, Any]]:
+        *rewards, _, _, jobs_done, _ = outcome.tolist()
+        of_all = {"jobs_done": jobs_done, "elapsed_s": elapsed_s, **dict(zip(_REWARDS, rewards, strict=True))}
+        infos: dict[str, dict[str, Any]] = {
+            arm: {"faults": faults, "illegal": illegal, "peak_c": peak_c, "above_warning_s": above_s, **of_all}
+            for arm, (faults, illegal, peak_c, above_s) in zip(
+                self.possible_agents, self._begun("infos").infos, strict=True
             )
         }
         if self._mask_in != "obs":

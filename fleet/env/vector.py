@@ -19,7 +19,8 @@ from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import TERMS, Engine, Parts, RewardWeights, Shift, empty_parts
 from fleet.engine.shift import deliver
 from fleet.engine.state import State
-from fleet.engine.tables import Tables
+from fleet.engine.step import FINISHED, JOBS_DONE, OUTCOME, TICK, TOTAL
+from fleet.engine.tables import INFO, Tables
 from fleet.env.allocation_v2 import AHEAD_S, arm_spaces
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.random_actions import random_legal as random_legal
@@ -172,7 +173,7 @@ class BatchEnv:
         self._seeds = seeds_of(seed, num_envs)
         self._fresh = np.ones(num_envs, dtype=bool)
         """Rows whose next shift is that of their seed itself."""
-        self._over = np.ones(num_envs, dtype=bool)
+        self._over, self._tick = np.ones(num_envs, dtype=bool), np.zeros(num_envs)
         self._begun = False
         if exchanges is not None and len(exchanges) != num_envs:
             raise ValueError(f"exchanges must be one per env ({num_envs}, got {len(exchanges)}).")
@@ -224,8 +225,9 @@ class BatchEnv:
         if len(chosen) < self.num_envs:
             self._observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._parts)
         self._begun = True
-        raw, self._elapsed_s = np.zeros((self.num_envs, len(TERMS))), np.zeros(self.num_envs)
-        return self._obs(), self._info(raw, np.zeros(0, dtype=int), None)
+        nothing, self._elapsed_s = np.zeros((self.num_envs, OUTCOME)), np.zeros(self.num_envs)
+        nothing[:, JOBS_DONE] = self._engine.state.done
+        return self._obs(), self._info(nothing, np.zeros(0, dtype=int), None)
 
     def step(self, actions: object) -> tuple[Obs, Array, Array, Array, dict[str, Any]]:
         """One step of every env.
@@ -252,20 +254,21 @@ class BatchEnv:
             )
         chosen = self._checked(actions)
         parts = self._no_parts()
-        before = self._engine.state.tick.copy()
-        until = self._last_tick.astype(np.int64) if self._events else None
-        terms, reward, finished = self._engine.step(chosen, parts, until)
-        self._elapsed_s = (self._engine.state.tick - before) * self._engine.tables.dt_s
+        until = self._last_tick if self._events else None
+        outcome = self._engine.step(chosen, parts, until)
+        tick, finished = outcome[:, TICK], outcome[:, FINISHED] > 0
+        self._elapsed_s = (tick - self._tick) * self._engine.tables.dt_s
+        self._tick = tick
         self._deliver(np.arange(self.num_envs), parts)
-        truncated = ~finished & (self._engine.state.tick >= self._last_tick)
+        truncated = ~finished & (tick >= self._last_tick)
         self._parts, self._over = parts, finished | truncated
         ended = np.flatnonzero(self._over)
         self._last_tick[ended] = self._whole
         last = self._obs(ended) if len(ended) and self.autoreset else None
-        info = self._info(terms, ended, last)
+        info = self._info(outcome, ended, last)
         if last is not None:
             self._begin(ended)
-        return self._obs(), reward.copy(), finished, truncated, info
+        return self._obs(), outcome[:, TOTAL].copy(), finished, truncated, info
 
     def joined(self, obs: Obs) -> Obs:
         """Both parts of observations as one vector for each arm: {"observation": [env, arm, size], "action_mask"}."""
@@ -290,7 +293,7 @@ class BatchEnv:
             return
         seeds = [self._seeds[e] if self._fresh[e] else self._seeds[e].spawn(1)[0] for e in rows.tolist()]
         self._engine.reset(rows, [self._library.draw(seed) for seed in seeds])
-        self._fresh[rows], self._over[rows] = False, False
+        self._fresh[rows], self._over[rows], self._tick[rows] = False, False, 0
         self._engine.observe(rows, self._parts)
         for e, seed in zip(rows.tolist(), seeds, strict=True):
             if self._exchanges is not None:
@@ -321,20 +324,17 @@ class BatchEnv:
             return {"shared": shared, "own": own, "action_mask": self._engine.mask.copy()}
         return {"shared": shared[rows], "own": own[rows], "action_mask": self._engine.mask[rows]}
 
-    def _info(self, terms: Array, ended: Array, last: Obs | None) -> dict[str, Any]:
-        state = self._engine.state
+    def _info(self, outcome: Array, ended: Array, last: Obs | None) -> dict[str, Any]:
+        infos = self._engine.infos.copy()
         if last is None:
             shared, own = empty_parts(self.layout, 0)
             mask = np.zeros((0, self.layout.arms, self.layout.actions), np.int8)
             last = {"shared": shared, "own": own, "action_mask": mask}
         return {
-            "faults": state.faults.astype(int),
-            "illegal": state.illegal.astype(int),
-            "peak_c": state.peak_c.astype(float),
-            "above_warning_s": state.above_warning_s.copy(),
-            "jobs_done": self._engine.state.done,
+            **{name: infos[name] for name in INFO.names or ()},
+            "jobs_done": outcome[:, JOBS_DONE],
             "elapsed_s": self._elapsed_s,
-            **{f"reward_{name}": terms[:, n] for n, name in enumerate(TERMS)},
+            **{f"reward_{name}": outcome[:, n] for n, name in enumerate(TERMS)},
             "final_envs": ended,
             "final_obs": last,
         }

@@ -12,6 +12,7 @@ from agents.policy import WAIT, PlanningPolicy, Policy, only_choices
 from agents.schedules import LEAST_GAIN, Changes, Schedules, stack
 from fleet.engine.batch import Engine, RewardWeights, empty_parts, shifts_of
 from fleet.engine.state import World
+from fleet.engine.step import FINISHED, TOTAL
 from fleet.engine.tables import tables_of
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.validation import actions_of
@@ -123,8 +124,8 @@ class ShiftSimulator:
             actions = self._actions(policies, asked, limit)
             tick, slot_job = engine.state.tick.copy(), engine.offers.slot_job.copy()
             legal = np.take_along_axis(engine.mask, np.clip(actions, 0, give_back)[..., None], axis=2)[..., 0] > 0
-            _, earned, finished = engine.step(actions, self._parts, until)
-            reward += np.where(running, earned, 0.0)
+            outcome = engine.step(actions, self._parts, until)
+            reward += np.where(running, outcome[:, TOTAL], 0.0)
             for e, a in np.argwhere((actions > 0) & legal & running[:, None]).tolist():
                 action = int(actions[e, a])
                 if action < give_back and engine.state.last_award[e, a] != 1:
@@ -134,7 +135,7 @@ class ShiftSimulator:
                     slot, option = divmod(action - 1, options)
                     job = slot_job[e, slot]
                     start_s[e, job], arm_of[e, job], option_of[e, job] = tick[e] * world.dt_s, a, option
-            running &= ~finished & (engine.state.tick < world.ticks)
+            running &= (outcome[:, FINISHED] == 0) & (engine.state.tick < world.ticks)
         self.evaluations += given
         return Simulated(reward[:given], start_s[:given], arm_of[:given], option_of[:given], claims[:given])
 

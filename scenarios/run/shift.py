@@ -10,6 +10,7 @@ import numpy as np
 from agents.policy import only_choices
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
+from fleet.engine.step import TOTAL
 from fleet.env.allocation_v2 import AllocationEnv
 from fleet.env.validation import actions_of
 from fleet.errors import FleetError, nearest
@@ -103,12 +104,12 @@ def run(
             with blaming(spec.policy, f"{shift}, at {env.tick * env.world.dt_s:g} s of the shift"):
                 actions = policy.act(seen) if asked else {}
                 actions_of(env.agents, actions)
-            _, earned, _, _ = env.advance(actions)
+            outcome, _, _ = env.advance(actions)
             awards = [event for event in env.events[count:] if event.kind == "award"]
             for award in awards if record else ():
                 offers += offers_of(award, seen, actions, env.world.plans_per_job)
             env.events[count:] = [_with_prediction(event, seen, actions) for event in env.events[count:]]
-            reward += earned
+            reward += float(outcome[TOTAL])
             progress("working", env.tick / env.world.ticks)
         finished = not env.agents
     finally:
