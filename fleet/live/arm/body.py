@@ -440,7 +440,7 @@ class SimulatedBody:
                 approach_s, cycle_s, _ = self._times_s
                 # A job that ends at this very moment has not ended for the engine yet.
                 progress_s = min(self._progress_s, approach_s + todo * cycle_s - 2 * ROUNDING_S)
-                self._state = state.changed(todo=np.array([[todo]]), progress_s=np.array([[progress_s]]))
+                self._state = state.changed(todo=todo, progress_s=progress_s, repetitions=todo)
         return False
 
     def _set_repetitions(self, count: int) -> None:
