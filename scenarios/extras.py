@@ -6,7 +6,7 @@ from fleet.errors import FleetError, install
 
 EXTRAS = {
     "cli": ("rich", "typer"),
-    "twin": ("joblib", "safetensors", "sklearn", "torch"),
+    "twin": ("joblib", "sklearn", "torch"),
     "bus": ("zenoh",),
     "tls": ("cryptography",),
     "report": ("jinja2", "matplotlib", "pandas", "PIL", "plotly", "pyarrow", "trimesh"),

@@ -1,11 +1,9 @@
 """What a study runs: every policy on every instance, fleet, training and seed, with every source of predictions."""
 
 import hashlib
-import platform
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -18,7 +16,7 @@ from scenarios.evaluate.rollout import FIGURES, DecisionLimit, Outcome, TooSlow
 from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, plan_content
 from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
-from scenarios.run.log import code_hash
+from scenarios.run.log import code_hash, versions_of
 from scenarios.spec.load import INSTANCE, SPLITS, library, load
 from scenarios.spec.options import StudySpec
 from scenarios.spec.parse import scenario_hash
@@ -238,7 +236,7 @@ class Study(StudySpec):
         """What makes two results comparable: hashes of code, scenarios and policies, versions, settings."""
         return {
             "code_hash": code_hash(),
-            "versions": {"python": platform.python_version()} | {name: _version(name) for name in _LIBRARIES},
+            "versions": versions_of(_LIBRARIES),
             "risk": self.risk,
             "randomise": asdict(self.randomise or Randomisation()),
             "channel": self.channel.described(),
@@ -247,13 +245,6 @@ class Study(StudySpec):
             "instances": {case.name: scenario_hash(case.scenario) for case in self.cases},
             "policies": self.policy_hashes,
         }
-
-
-def _version(library: str) -> str | None:
-    try:
-        return version(library)
-    except PackageNotFoundError:
-        return None
 
 
 def split_source(name: str) -> tuple[str, str | None]:

@@ -24,6 +24,7 @@ from fleet.heat.thermal import WINDING, ThermalModel, ThermalSpread, gen3_networ
 from fleet.job import Work
 from fleet.motion import Plan
 from fleet.robot import JOINTS, Robot
+from scenarios.prepare.shipped import unpack_shipped
 from scenarios.progress import Count, Progress
 from scenarios.spec.jobs import works_of
 from scenarios.spec.schema import Scenario
@@ -133,6 +134,7 @@ def plan_arms(
     scenario: Scenario, indices: Sequence[int], works: Sequence[Work], folder: Path, progress: Progress
 ) -> list[PlannedArm]:
     """The arms with these indices in the scenario, each with its plans for the works (cached in `folder`)."""
+    unpack_shipped(scenario.name, folder)
     planned, loaded = [], LoadedPlans()
     for done, index in enumerate(indices):
         hardware = hardware_of(scenario, index)

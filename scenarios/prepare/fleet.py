@@ -31,6 +31,7 @@ from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms, problems_of
 from scenarios.prepare.randomisation import Randomisation, ShiftConditions, randomisation_of
+from scenarios.prepare.shipped import is_shipped
 from scenarios.progress import Count, Progress, check_progress, quiet
 from scenarios.spec.jobs import JobSampler, all_works, rehearsal_works, weights_of
 from scenarios.spec.load import scenario_with
@@ -92,7 +93,7 @@ def prepare(
     Raises:
         ScenarioError: no such scenario, no arm can do some work, arms at home are too close to each other, or a
             variant is no fleet of the same arms and jobs.
-        MissingExtra: twins are wanted, and their libraries are not installed.
+        MissingExtra: twins must be trained, and the libraries for it are not installed.
     """
     randomise = randomisation_of(randomise)
     check_progress(progress)
@@ -170,7 +171,7 @@ def _arms(
         every_work: Raise if none of the arms can do some work.
     """
     check_progress(progress)
-    if choose("difficulty", difficulty, DifficultyName) == "twin":
+    if choose("difficulty", difficulty, DifficultyName) == "twin" and not is_shipped(scenario.name):
         require_extra("twin")
     choose("risk", risk, RiskName)
     folder = _folder(cache)

@@ -17,7 +17,6 @@ from typing import Any, Generic, TypeVar
 from urllib.parse import quote
 
 import numpy as np
-from joblib import cpu_count, delayed
 
 from fleet.arm.random_motions import RANDOM_MOTIONS_VERSION, light_jobs, random_jobs
 from fleet.errors import CheckpointError, FleetError, nearest
@@ -25,9 +24,9 @@ from fleet.files import cache_folder
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import NODES, ThermalModel
 from fleet.motion import RATE_HZ, Plan
+from scenarios.extras import require_extra
 from scenarios.prepare.arms import ArmHardware, PlannedArm, plan_arms
 from scenarios.prepare.oracle import peaks
-from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.spec.jobs import rehearsal_works
@@ -109,11 +108,17 @@ def load_or_make(models: Sequence[CachedModel[Model]], stage: str, progress: Pro
         progress(stage, Count(len(models) - len(missing) + made, len(models)))
 
     report(0)
+    if missing:
+        require_extra("twin")
     reasons: list[str | None] = []
     if len(missing) == 1:  # in this process, which can report progress within one model
         reasons = [missing[0].make(missing[0].folder, report)]
         report(1)
     elif missing:
+        from joblib import cpu_count, delayed
+
+        from scenarios.processes import worker_processes
+
         with worker_processes(min(len(missing), cpu_count())) as pool:
             for reason in pool(delayed(model.make)(model.folder, _ignore) for model in missing):
                 reasons.append(reason)

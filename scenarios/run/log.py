@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache, cached_property
 from importlib import resources
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any  # values of run.json
 
@@ -140,7 +140,7 @@ def card_of(
         **asdict(replace(spec, channel=PERFECT)),
         "channel": scenario.channel(spec.channel).described(),
         "twins": twins,
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
+        "versions": versions_of(_LIBRARIES),
         "code_hash": code_hash(),
         "reward": reward,
         "metrics": asdict(metrics),
@@ -288,6 +288,17 @@ def provenance(model: DifficultyModel) -> dict[str, Any]:
     if not hasattr(twin, "data_hash"):
         return {"version": model.version}
     return {"version": model.version, "twin": {name: getattr(twin, name) for name in ("version", "data_hash", "seed")}}
+
+
+def versions_of(libraries: Sequence[str]) -> dict[str, str | None]:
+    """Versions of Python and of libraries; None for one that is not installed."""
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for library in libraries:
+        try:
+            versions[library] = version(library)
+        except PackageNotFoundError:
+            versions[library] = None
+    return versions
 
 
 PACKAGES = ("fleet", "twin", "agents", "scenarios")
