@@ -106,10 +106,15 @@ bench-env: .venv-adapters/bench/.installed
 install: $(STAMP)
 
 # A broken environment is removed, so that the next call builds a new one. setuptools is installed first, so that its
-# pinned version builds the package. torch comes by pip, which also looks on this disk, as it may be set up to: uv would
-# fetch the build for NVIDIA's GPUs, of gigabytes. uv installs the rest if it is there and can.
+# pinned version builds the package. torch, which the demo does not need, comes by pip, which also looks on this disk, as
+# it may be set up to: uv would fetch the build for NVIDIA's GPUs, of gigabytes. uv installs the rest if it is there and
+# can.
 $(STAMP): WANTED := dev
+$(STAMP): FIRST := setuptools torch
+$(STAMP): LASTS := a few minutes
 $(DEMO_STAMP): WANTED := demo
+$(DEMO_STAMP): FIRST := setuptools
+$(DEMO_STAMP): LASTS := about a minute
 $(STAMP) $(DEMO_STAMP): pyproject.toml constraints.txt
 	@command -v "$(PYTHON)" >/dev/null 2>&1 || { \
 	  echo "thermofleet needs Python 3.11 or newer, and there is no '$(PYTHON)' here. Install it, or name one: make $(GOAL) PYTHON=/path/to/python3.11"; exit 1; }
@@ -118,8 +123,8 @@ $(STAMP) $(DEMO_STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) >/dev/null 2>&1 || { \
 	  rm -rf $(VENV); \
 	  echo "'$(PYTHON) -m venv $(VENV)' could not make an environment. On Debian and Ubuntu the package python3-venv is missing then: apt install python3-venv"; exit 1; }
-	@echo "Installing thermofleet into $(VENV) (once, a few minutes; log in $(VENV)/install.log) …"
-	@{ $(PIP) setuptools torch && \
+	@echo "Installing thermofleet into $(VENV) (once, $(LASTS); log in $(VENV)/install.log) …"
+	@{ $(PIP) $(FIRST) && \
 	  { $(if $(UV),VIRTUAL_ENV=$(abspath $(VENV)) $(UV) pip install --quiet -c constraints.txt --no-build-isolation -e '.[$(WANTED)]' ||) \
 	    $(PIP) --no-build-isolation -e '.[$(WANTED)]'; }; } >$(VENV)/install.log 2>&1 || { \
 	  echo "The packages could not be installed. The usual reason is no network: they are fetched once, later runs need none."; \

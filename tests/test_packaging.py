@@ -9,6 +9,7 @@ import sys
 import sysconfig
 import tomllib
 import venv
+from collections.abc import Iterable
 from importlib import import_module
 from importlib.metadata import packages_distributions, version
 from importlib.util import find_spec
@@ -84,12 +85,17 @@ def test_every_extra_that_is_no_trainer_is_told_of():
     assert set(extras.EXTRAS) == {name for name in EXTRAS if name not in (*ALONE, "all", "demo", "dev", "docs")}
 
 
-WITHOUT_EXTRAS = f"""
-import sys
-for library in {sorted(library for libraries in extras.EXTRAS.values() for library in libraries)}:
-    sys.modules[library] = None
-"""
-"""Makes every import of an optional library fail, as if it were not installed."""
+def test_the_demo_asks_for_the_versions_that_the_extras_ask_for():
+    assert set(EXTRAS["demo"]) <= {each for extra in ("cli", "report") for each in EXTRAS[extra]}
+
+
+def without(libraries: Iterable[str]) -> str:
+    """Python that makes every import of these libraries fail, as if they were not installed."""
+    return f"import sys\nsys.modules.update(dict.fromkeys({sorted(libraries)}))\n"
+
+
+OPTIONAL = {library for libraries in extras.EXTRAS.values() for library in libraries}
+WITHOUT_EXTRAS = without(OPTIONAL)
 
 
 def test_nothing_is_pinned_that_is_not_asked_for():
@@ -201,6 +207,8 @@ def test_the_wheel_brings_its_data(elsewhere):
 from importlib.resources import files
 for package, path in (("fleet", "arm/assets/gen3.xml"), ("fleet", "data/gen3_thermal.json")):
     assert files(package).joinpath(path).is_file(), path
+from scenarios.prepare.shipped import is_shipped
+assert is_shipped("quickstart")
 print(*sorted(f.name for f in files("scenarios").joinpath("library").iterdir() if f.name.endswith(".toml")))
 """
     library = sorted(path.name for path in (ROOT / "scenarios" / "library").glob("*.toml"))
@@ -220,7 +228,7 @@ def test_the_command_works_there(elsewhere):
 def test_an_episode_runs_there_without_any_extra(elsewhere):
     program = f"""{WITHOUT_EXTRAS}
 from scenarios import make_env
-env = make_env("quickstart", difficulty="blind", horizon_s=120)
+env = make_env("quickstart", horizon_s=120)  # its twins are in the package
 env.reset(seed=0)
 steps = 0
 while env.agents:
@@ -234,7 +242,7 @@ print(steps)
 @pytest.mark.parametrize(
     ("call", "extra"),
     [
-        ("from scenarios import make_env; make_env('quickstart')", "twin"),
+        ("from scenarios import make_env; make_env('rush_hour')", "twin"),
         ("from scenarios.prepare.fleet import open_exchange; open_exchange('zenoh', ('a', 'b'), 'fleet')", "bus"),
         ("sys.argv = ['thermofleet', 'show']; from scenarios.__main__ import main; main()", "cli"),
     ],
@@ -246,3 +254,19 @@ def test_a_missing_extra_is_one_sentence(call, extra):
     command = r"pip install -e '\.\[(\w+)\]' -c constraints\.txt, in a copy of the repository"
     sentence = rf"This needs the library '\w+', which is not installed: {command}\."
     assert re.findall(sentence, said.stderr.splitlines()[-1]) == [extra]
+
+
+@pytest.mark.ci_slow
+def test_the_demo_needs_no_more_than_its_extra(tmp_path):
+    """Nothing is trained or planned, and no library is imported that `make demo` does not install."""
+    own = {name_of(requirement) for requirement in EXTRAS["demo"]}
+    program = f"""{without(OPTIONAL - own - {"pandas"})}  # pyarrow asks whether it is there
+sys.argv = ["thermofleet", "demo", "--out", {str(tmp_path / "demo")!r}]
+from scenarios.__main__ import main
+main()
+"""
+    env = os.environ | {"THERMOFLEET_CACHE": str(tmp_path / "cache")}
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=600, env=env)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.splitlines()[1].split() == ["round_robin", "wsept", "difference"]
+    assert "Training" not in ran.stderr
