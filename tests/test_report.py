@@ -21,7 +21,7 @@ from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.run.records import ShiftLog
-from scenarios.show.run_page import ROWS, other_choices, pair_page, report_html
+from scenarios.show.run_page import ROWS, other_choices, pair_page, pair_table, report_html
 from scenarios.show.timeline import decimate, figure, stream_of
 
 ARMS = ("arm_0", "arm_1")
@@ -325,21 +325,65 @@ SPARED = side(
 
 
 def test_each_side_says_what_happened_and_what_became_of_the_job_on_the_other():
-    page = pair_page("two", "a shift", reports(BURNED, SPARED))
-    burned, spared = re.findall(r"<section>(.*?)</section>", page, re.S)
-    assert "<h2>round_robin</h2>" in burned
-    assert "status bad" in burned
+    page = pair_page("two", ["a shift"], reports(BURNED, SPARED))
+    burned, spared = re.findall(r"<details>(.*?)</details>", page, re.S)
+    assert re.findall(r'class="status (\w+)"[^>]*>([^<]*)<', page) == [
+        ("bad", "round_robin: 1 fault"),
+        ("good", "wsept: No fault"),
+    ]
     assert "arm_a stopped during crate, out for 13 min: the motor of joint 2 passed 75 °C" in burned
     assert "Under wsept, arm_b finished crate at 0:05:00 without a fault." in burned
-    assert 'href="round_robin/report.html"' in burned
-    assert "status good" in spared
+    assert 'href="round_robin/report.html"' in page
     assert "Under" not in spared
     assert other_choices(BURNED, BURNED) == ["Under round_robin, crate was not finished."]
 
 
+def metrics(**changed):
+    peaks = {"arm_a": 50.0, "arm_b": 75.0}
+    return {
+        "finished": 71,
+        "value": 150.0,
+        "on_time": 69,
+        "faults": 1,
+        "above_warning_min": 78.55,
+        "peak_c": peaks,
+    } | changed
+
+
+def test_two_shifts_are_compared_by_six_figures_and_their_differences():
+    better = metrics(finished=79, value=150.5, faults=0, above_warning_min=56.4, peak_c={"arm_a": 69.3, "arm_b": 60.0})
+    rows = pair_table({"one": side("one", metrics=metrics()), "other": side("other", metrics=better)}).rows
+    assert [row[1:] for row in rows] == [
+        ("71", "79", "+8"),
+        ("150", "150.5", "+0.5"),
+        ("69", "69", "0"),
+        ("1", "0", "−1"),
+        ("78.5", "56.4", "−22.1"),
+        ("75.0", "69.3", "−5.7"),
+    ]
+    assert pair_table({"one": side("one"), "other": side("other")}).rows == ()
+
+
+def test_the_chart_of_two_shifts_has_the_hottest_motor_of_each_and_both_limits():
+    readings = [telemetry(samples=60), telemetry(samples=60)]
+    readings[1].temp_c[30, 1, 4] = 99.0
+    shifts = {
+        name: log_of(each, ("a", "b"), (), {"policy": name})
+        for name, each in zip(("one", "other"), readings, strict=True)
+    }
+    page = pair_page("two", [], {f"{name}.html": log for name, log in shifts.items()})
+    figure = json.loads(held(page, "hottest"))
+    for trace, each in zip(figure["data"], readings, strict=True):
+        value = np.frombuffer(base64.b64decode(trace["y"]["bdata"]), "<f4")
+        np.testing.assert_allclose(value, each.temp_c.max(axis=(1, 2)), atol=1e-4)
+    assert figure["data"][1]["customdata"][30] == "b, joint 5"
+    assert {shape["y0"] for shape in figure["layout"]["shapes"]} == {60.0, 75.0}
+    assert figure["layout"]["yaxis"]["range"][1] > 99.0
+
+
 def test_names_stay_text():
     odd = '<img src=x onerror="a()">\x1b[2J'
-    page = pair_page(odd, odd, reports(side(odd, event(1.0, "fault", job=odd, reason=odd)), SPARED))
+    page = pair_page(odd, [odd], reports(side(odd, event(1.0, "fault", job=odd, reason=odd)), SPARED))
     assert "<img" not in page
     assert 'onerror="' not in page
     assert "\x1b" not in page

@@ -87,12 +87,12 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Playback:
-    """A shift to be played in 3-D."""
+    """Shifts of one cell to be played in 3-D, side by side and in step."""
 
     model: Mapping[str, Any]
     """`fleet.arm.cell.cell_model`."""
-    playback: str
-    """Of `packed`."""
+    shifts: tuple[str, ...]
+    """Each of `packed`."""
     unit_s: float
     """Unit of the figure's time axis."""
 
@@ -123,13 +123,11 @@ class Page:
         """What scripts read, by the id of the element that holds it."""
         data: dict[str, str] = {}
         if self.charts:
-            from plotly.offline import get_plotlyjs
-
-            data["plotly"] = compressed([get_plotlyjs().encode()])
+            data["plotly"] = _plotly_js()
             data |= {chart.key: _json(chart.figure) for chart in self.charts}
         if self.replay:
-            data["three"] = compressed([three_js().encode()])
-            data |= {"cell-model": _json(self.replay.model), "playback": self.replay.playback}
+            data |= {"three": _packed_three_js(), "cell-model": _json(self.replay.model)}
+            data |= {f"playback-{number}": shift for number, shift in enumerate(self.replay.shifts)}
         return data
 
     def _code(self) -> str:
@@ -144,12 +142,24 @@ class Page:
         return f"{''.join(code)}\n{start}\n{failed}"
 
 
+@cache
+def _plotly_js() -> str:
+    from plotly.offline import get_plotlyjs
+
+    return compressed([get_plotlyjs().encode()])
+
+
+@cache
+def _packed_three_js() -> str:
+    return compressed([three_js().encode()])
+
+
 def _json(value: object) -> str:
     """JSON with "<" escaped, so that no name can end the element that holds it."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-# The replay of a page: movement and temperatures of a shift, packed, and three.js.
+# The replays of a page: movement and temperatures of shifts, packed, and three.js.
 
 MOST_VALUES = 3_000_000
 """Joint angles in a page; longer shifts of larger fleets keep fewer moments."""
@@ -228,7 +238,6 @@ def _filled(values: Array) -> Array:
     return flat.reshape(values.shape)
 
 
-@cache
 def three_js() -> str:
     """Source of three.js; it defines the global `THREE`.
 

@@ -13,7 +13,7 @@ from fleet.events import Event
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import JobSpan, Schedule
 from scenarios.show.page import Chart, Page, Playback, packed
-from scenarios.show.timeline import figure, time_unit
+from scenarios.show.timeline import figure, hottest_motors, time_unit
 from scenarios.show.words import CANNOT, clock, duration, kind_text, scores_text, value_text
 from scenarios.table import Moment, Table, render
 
@@ -90,7 +90,7 @@ def _jobs(metrics: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _hottest(metrics: Mapping[str, Any]) -> str:
-    peaks_c = {arm: c for arm, c in (metrics.get("peak_c") or {}).items() if c is not None and math.isfinite(c)}
+    peaks_c = _peaks(metrics)
     if not peaks_c:
         return "No motor reached its fault limit."
     arm = max(peaks_c, key=lambda arm: peaks_c[arm])
@@ -234,11 +234,9 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
         ValueError: the events contradict each other.
     """
     log = replace(log, events=tuple(sorted(log.events, key=lambda e: (e.time_s, e.arm, e.kind, e.job))))
-    card, replay, limits = log.card, None, log.limits
+    card, replay = log.card, None
     if model is not None and len(log.readings.time_s):
-        shown = {**model, "heat": heat_scale(limits.warning_c, limits.error_c)}
-        unit_s = time_unit(log.plan.horizon_s)[1]
-        replay = Playback(model=shown, playback=packed(log.readings, log.load_kg), unit_s=unit_s)
+        replay = _playback([log], model)
     scenario = card.get("scenario", {})
     outcome = verdict(log)
     moments = {sentence: _before(fault) for sentence, fault in outcome.faults.items()}
@@ -259,6 +257,16 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
     title = f"{scenario.get('name', 'unnamed scenario')} · {log.policy}{seed}"
     chart = Chart(key="drawn", figure=figure(log), alt="Work and motor temperatures of each arm over the shift")
     return Page(title=title, template="run.html", content=content, charts=(chart,), replay=replay).html()
+
+
+def _playback(logs: Sequence[ShiftLog], model: Mapping[str, Any]) -> Playback:
+    """Shifts with readings in the same cell, to be played in step."""
+    limits = logs[0].limits
+    return Playback(
+        model={**model, "heat": heat_scale(limits.warning_c, limits.error_c)},
+        shifts=tuple(packed(log.readings, log.load_kg) for log in logs),
+        unit_s=time_unit(logs[0].plan.horizon_s)[1],
+    )
 
 
 def run_html(log: ShiftLog) -> str:
@@ -297,11 +305,8 @@ KEY_FIGURES = (
 
 def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
     """The most important metrics; those without a number are left out."""
-    values = {k: float(v) for k, v in metrics.items() if isinstance(v, int | float) and math.isfinite(v)}
-    peaks = {k: v for k, v in (metrics.get("peak_c") or {}).items() if v is not None and math.isfinite(v)}
+    values, peaks = _numbers(metrics), _peaks(metrics)
     hottest = max(peaks, key=lambda arm: peaks[arm], default="")
-    if hottest:
-        values["hottest_c"] = peaks[hottest]
     for name, own in (("most_drift_mm", "tool_drift_mm"), ("most_insulation_ppb", "insulation_ppb")):
         if metrics.get(own):
             values[name] = max(metrics[own].values())
@@ -312,6 +317,16 @@ def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
             bad = name in ("faults", "contacts") and values[name] > 0
             tiles.append(Tile(label, f"{values[name]:{form}}", small.rstrip(), bad))
     return tiles
+
+
+def _peaks(metrics: Mapping[str, Any]) -> dict[str, float]:
+    return {arm: c for arm, c in (metrics.get("peak_c") or {}).items() if c is not None and math.isfinite(c)}
+
+
+def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """The finite numbers among metrics, and the temperature of the hottest motor."""
+    values = {k: float(v) for k, v in metrics.items() if isinstance(v, int | float) and math.isfinite(v)}
+    return values | ({"hottest_c": max(peaks.values())} if (peaks := _peaks(metrics)) else {})
 
 
 def _event_table(events: Sequence[Event]) -> Mapping[str, object] | None:
@@ -409,25 +424,68 @@ def _provenance(run: Mapping[str, Any]) -> Table:
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 
-def pair_page(title: str, description: str, reports: Mapping[str, ShiftLog]) -> str:
-    """Two shifts of the same jobs side by side: verdicts, key figures and links to their reports, as one HTML page.
+MAIN_FIGURES = (
+    ("jobs finished", "finished", ".0f"),
+    ("value of finished jobs", "value", ".4g"),
+    ("jobs on time", "on_time", ".0f"),
+    ("faults", "faults", ".0f"),
+    ("minutes above the warning limit", "above_warning_min", ".1f"),
+    ("hottest motor, °C", "hottest_c", ".1f"),
+)
+"""Label, metric and format of the figures by which two shifts are compared."""
+
+
+def pair_table(logs: Mapping[str, ShiftLog]) -> Table:
+    """The main figures of two shifts by name, and the second minus the first; missing figures are left out."""
+    columns = [_numbers(log.card.get("metrics") or {}) for log in logs.values()]
+    rows = list[tuple[str, ...]]()
+    for label, name, form in MAIN_FIGURES:
+        values = [column[name] for column in columns if name in column]
+        if len(values) == len(columns):
+            change = f"{values[1] - values[0]:+{form}}".replace("-", "−")
+            rows.append((label, *(f"{value:{form}}" for value in values), change if float(change[1:]) else "0"))
+    return Table(head=("", *logs, "difference"), rows=tuple(rows))
+
+
+def pair_page(
+    title: str, sentences: Sequence[str], reports: Mapping[str, ShiftLog], model: Mapping[str, Any] | None = None
+) -> str:
+    """Two shifts of the same jobs in the same cell as one HTML page: the hottest motors in one chart, the movements in
+    step, the main figures, and links to the reports.
 
     The same input gives the same text.
 
     Args:
+        sentences: What the page is about.
         reports: The two shifts, each by the path of its report relative to the page.
+        model: As in `report_html`.
     """
+    logs = {log.policy: log for log in reports.values()}
     columns = [
         {
             "name": log.policy,
             "verdict": verdict(log),
+            "first": next(map(_before, log.faults), None),
             "other_choices": other_choices(log, other),
             "tiles": key_figures(log.card.get("metrics") or {}),
             "report": quote(path),
         }
         for (path, log), other in zip(reports.items(), [*reports.values()][::-1], strict=True)
     ]
-    return Page(title=title, template="pair.html", content={"description": description, "sides": columns}).html()
+    recorded = all(len(log.readings.time_s) for log in reports.values())
+    charts = list[Chart]()
+    if recorded:
+        alt = f"Hottest motor over the shift under {' and '.join(logs)}"
+        charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
+    content = {
+        "sentences": sentences,
+        "sides": columns,
+        "charts": charts,
+        "replays": tuple(logs) if recorded and model else (),
+        "table": pair_table(logs),
+    }
+    replay = _playback([*reports.values()], model) if recorded and model else None
+    return Page(title=title, template="pair.html", content=content, charts=charts, replay=replay).html()
 
 
 def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:

@@ -1,17 +1,17 @@
-"""Plotly figure of a shift: Gantt chart above, motor temperatures below.
+"""Plotly figures of shifts: Gantt chart above and motor temperatures below, or the hottest motors of several shifts.
 
-The figure is a plain dict in Plotly's schema, because Plotly's own objects take longer than the rest of a report.
+The figures are plain dicts in Plotly's schema, because Plotly's own objects take longer than the rest of a report.
 """
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar  # Any: values of Plotly's schema
 
 import numpy as np
 
 from fleet.env.render.heat import HEAT, heat_marks
 from fleet.events import Event
-from fleet.robot import JOINTS
+from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.run.records import ShiftLog
 from scenarios.run.schedule import JobSpan, Outage
@@ -57,6 +57,9 @@ JOINT_LINES = (
 """Colour and dash of each joint. Each colour has a contrast above 3 on light and dark pages; the dashes tell apart what
 looks alike to people who see few colours."""
 
+POLICY_LINES = (("#0072b2", "solid"), ("#d55e00", "dash"))
+"""Colour and dash of each of two shifts."""
+
 MARGIN = {"l": 90, "r": 84, "b": 52}
 NARROW_PX = 860
 """Width of the plotting area on a small laptop; a legend wraps at this width."""
@@ -93,7 +96,6 @@ def figure(log: ShiftLog) -> dict[str, Any]:
         "title": {"text": f"time ({unit})", "standoff": 6},
         "domain": [0, 1],
     }
-    limits = (("error", error_c, FAULT, "bottom", "solid"), ("warning", warning_c, WARNING, "top", "longdash"))
     layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
     layout["xaxis"] = time | {"anchor": "y"}
     layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
@@ -111,12 +113,9 @@ def figure(log: ShiftLog) -> dict[str, Any]:
     for lane in range(len(lanes)):
         axis = f"yaxis{lane + 2}"
         layout[axis] = temperature | layout[axis] | ({"matches": "y2"} if lane else {})
-        for name, limit_c, colour, anchor, dash in limits:
-            at = {"yref": f"y{lane + 2}", "y0": limit_c, "y1": limit_c, "xref": "paper", "x0": 0, "x1": 1}
-            layout["shapes"].append(at | {"type": "line", "line": {"color": colour, "width": 1, "dash": dash}})
-            aside = {"x": 1, "xshift": 4, "y": limit_c, "yref": f"y{lane + 2}", "yanchor": anchor, "font": {"size": 10}}
-            label = {"text": f"{name} {limit_c:g} °C", "yshift": -5 if anchor == "bottom" else 5}
-            layout["annotations"].append(TEXT | aside | label)
+        shapes, labels = _limit_lines(log.limits, f"y{lane + 2}")
+        layout["shapes"] += shapes
+        layout["annotations"] += labels
     layout["shapes"] += _outages(plan.outages, [arms[a] for a in lanes], unit_s)
     data = [*bars, *_temperatures(telemetry, arms, lanes, unit, unit_s)]
     if overview:
@@ -128,6 +127,58 @@ def figure(log: ShiftLog) -> dict[str, Any]:
         heat = _heat_map(log, number, unit, unit_s)
         data.append(heat | {"colorbar": heat["colorbar"] | {"y": layout[f"yaxis{number}"]["domain"][1]}})
     return {"data": data, "layout": layout}
+
+
+def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
+    """The hottest motor of the fleet over time in shifts with equal limits, by name: `data` and `layout`."""
+    first = next(iter(logs.values()))
+    unit, unit_s = time_unit(max(log.plan.horizon_s for log in logs.values()))
+    traces, low_c, high_c = list[Trace](), first.limits.warning_c - 20.0, first.limits.error_c
+    for (name, log), (colour, dash) in zip(logs.items(), POLICY_LINES, strict=False):
+        temp_c = np.nan_to_num(log.readings.temp_c.reshape(len(log.readings.time_s), -1), nan=-np.inf)
+        motor = temp_c.argmax(axis=1)
+        value = temp_c[np.arange(len(motor)), motor]
+        kept = decimate(value, POINTS_PER_TRACE)
+        low_c, high_c = min(low_c, *value.tolist()), max(high_c, *value.tolist())
+        texts = [f"{log.arms[m // JOINTS]}, joint {m % JOINTS + 1}" for m in motor[kept].tolist()]
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": plain(name, STREAM_NAME),
+                "x": _packed(log.readings.time_s[kept] / unit_s),
+                "y": _packed(value[kept]),
+                "line": {"color": colour, "width": 2, "dash": dash},
+                "customdata": [plain(text) for text in texts],
+                "hovertemplate": f"{plain(name)}: %{{y:.1f}} °C at %{{x:.1f}} {unit}<br>%{{customdata}}<extra></extra>",
+            }
+        )
+    shapes, labels = _limit_lines(first.limits, "y")
+    room_k = 0.06 * (high_c - low_c)
+    time = {"range": [0, first.plan.horizon_s / unit_s], "title": {"text": f"time ({unit})"}}
+    temperature = {"range": [low_c - room_k, high_c + room_k], "title": {"text": "hottest motor, °C"}}
+    return {
+        "data": traces,
+        "layout": LAYOUT
+        | {"height": 360, "margin": MARGIN | {"l": 60, "t": 36}, "showlegend": True, "legend": LEGEND | {"y": 1.02}}
+        | {"modebar": {"orientation": "h"}}
+        | {"xaxis": AXIS | time, "yaxis": AXIS | temperature, "shapes": shapes, "annotations": labels},
+    }
+
+
+def _limit_lines(limits: ThermalLimits, axis: str) -> tuple[list[Trace], list[Trace]]:
+    """Lines of the limits over the whole width of a y axis, and their labels."""
+    lines, labels = list[Trace](), list[Trace]()
+    for name, limit_c, colour, anchor, dash in (
+        ("error", limits.error_c, FAULT, "bottom", "solid"),
+        ("warning", limits.warning_c, WARNING, "top", "longdash"),
+    ):
+        at = {"yref": axis, "y0": limit_c, "y1": limit_c, "xref": "paper", "x0": 0, "x1": 1}
+        lines.append(at | {"type": "line", "line": {"color": colour, "width": 1, "dash": dash}})
+        aside = {"x": 1, "xshift": 4, "y": limit_c, "yref": axis, "yanchor": anchor, "font": {"size": 10}}
+        label = {"text": f"{name} {limit_c:g} °C", "yshift": -5 if anchor == "bottom" else 5}
+        labels.append(TEXT | aside | label)
+    return lines, labels
 
 
 def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:

@@ -134,26 +134,30 @@ def test_compare_prints_a_table_or_json_against_round_robin_or_the_first_policy(
 
 
 @pytest.mark.ci_slow
-def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypatch, plans):
-    from scenarios.prepare.fleet import prepare
-
-    def without_twins(scenario, *, difficulty, risk, progress):
-        return prepare(scenario, difficulty="blind", cache=plans, progress=progress)
-
-    monkeypatch.setattr("scenarios.prepare.fleet.prepare", without_twins)
+def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path):
     said = thermofleet("demo", "--out", tmp_path / "demo")
     assert said.code == 0
     head = said.out.splitlines()[1].split()
-    assert head == ["round_robin", "wsept"]
-    for policy in head:
+    assert head == ["round_robin", "wsept", "difference"]
+    for policy in head[:2]:
         told = run_json(tmp_path / "demo" / policy)
         assert (told["policy"], told["status"], told["scenario"]["name"]) == (policy, "finished", "quickstart")
-        assert f"{told['metrics']['energy_wh']:.0f}" in said.out
+        assert f"{told['metrics']['above_warning_min']:.1f}" in said.out
         assert str(tmp_path / "demo" / policy / "report.html") in said.out
     page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
     for link in re.findall(r'href="([^"]+)"', page):
         assert (tmp_path / "demo" / link).is_file()
-    assert page.count("<section>") == page.count("href=") == 2
+    assert page.count('class="cell"') == page.count("<details>") == page.count("href=") == 2
+
+
+@pytest.mark.ci_slow
+def test_a_run_of_the_demo_and_of_the_command_are_one(thermofleet, tmp_path):
+    """The same scenario, policy and seed give the same figures, whichever way the messages take."""
+    thermofleet("demo", "--out", tmp_path / "demo")
+    thermofleet("run", "quickstart", "--policy", "round_robin", "--seed", 20, "--out", tmp_path / "run")
+    demo, run = run_json(tmp_path / "demo" / "round_robin"), run_json(tmp_path / "run")
+    assert (demo["bus"], run["bus"]) == ("memory", "zenoh")
+    assert demo["metrics"] == run["metrics"]
 
 
 def unreachable(text: str) -> str:

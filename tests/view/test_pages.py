@@ -3,6 +3,7 @@
 import io
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from scenarios.run.log import open_run
+from scenarios.run.log import RunLog, open_run
+from scenarios.show.run_page import pair_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
@@ -51,7 +53,7 @@ def page(browser: Browser, run_folder: Path) -> Iterator[Page]:
 def canvas(page: Page) -> np.ndarray:
     """What the cell's canvas shows, uint8 [y, x, 3]."""
     page.wait_for_timeout(200)  # two frames or more
-    picture = Image.open(io.BytesIO(page.locator("#cell canvas").screenshot()))
+    picture = Image.open(io.BytesIO(page.locator(".cell canvas").screenshot()))
     return np.asarray(picture.convert("RGB")).astype(int)
 
 
@@ -100,8 +102,32 @@ def test_the_keyboard_plays_and_turns(page: Page) -> None:
     page.locator("body").press("Space")
     assert float(page.locator("#time").input_value()) > 2
     still = canvas(page)
-    page.locator("#cell canvas").press("ArrowRight")
+    page.locator(".cell canvas").press("ArrowRight")
     assert (np.abs(canvas(page) - still).max(axis=2) > 60).sum() > 200
+
+
+@pytest.mark.parametrize("width", [390, 1200])
+def test_two_shifts_play_in_step(browser: Browser, run: RunLog, tmp_path: Path, width: int) -> None:
+    reports = {f"{name}.html": replace(run, card={**run.card, "policy": name}) for name in ("one", "other")}
+    (tmp_path / "index.html").write_text(pair_page("two", ["a shift"], reports, run.cell_model()), encoding="utf-8")
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    page.goto((tmp_path / "index.html").as_uri())
+    page.wait_for_selector("body[data-ready]", timeout=300_000)
+    page.locator("#time").fill("3600")
+    page.locator("#time").dispatch_event("input")
+    one, other = page.locator(".now").all_inner_texts()
+    assert one == other != ""
+    hottest = max(
+        range(len(run.arms)),
+        key=lambda arm: np.interp(3600, run.readings.time_s, run.readings.temp_c[:, arm].max(axis=1)),
+    )
+    assert one.startswith(run.arms[hottest])
+    boxes = [cell.bounding_box() for cell in page.locator(".cell canvas").all()]
+    assert len(boxes) == 2
+    side_by_side = boxes[0]["y"] == boxes[1]["y"]  # pyright: ignore[reportOptionalSubscript]
+    assert side_by_side == (width > 800)
+    assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
+    page.close()
 
 
 @pytest.mark.ci_slow

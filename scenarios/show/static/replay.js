@@ -1,4 +1,4 @@
-// Plays a recorded shift: the cell, a clock, and a cursor in the figure below, all at one time of the shift.
+// Plays recorded shifts of one cell in step: their cells, a clock, and a cursor in the figure, all at one time of the shift.
 "use strict";
 
 // Difference-coded 16-bit values after a line of JSON, see `packed` of scenarios/show/page.py.
@@ -30,35 +30,39 @@ function stateAt(array, row, timeS) {
   return array.values[row * array.moments + i] * array.scale;
 }
 
-// Plays the shift; a figure that is drawn later gets its cursor by `attach`.
+// Plays the shifts; a figure that is drawn later gets its cursor by `attach`.
 async function startReplay(unitS) {
-  const place = document.getElementById("cell");
   const model = JSON.parse(document.getElementById("cell-model").textContent);
-  const data = await readPlayback("playback");
-  const joints = data.q.rows / model.arms.length, endS = data.q.first_s + (data.q.moments - 1) * data.q.step_s;
+  const shifts = await Promise.all([...document.querySelectorAll(".replay .cell")].map(async (place, i) =>
+    ({ place, now: place.nextElementSibling, data: await readPlayback(`playback-${i}`), cell: null, modes: null })));
+  const first = shifts[0].data, joints = first.q.rows / model.arms.length, beginS = first.q.first_s;
+  const endS = Math.max(...shifts.map(({ data: { q } }) => q.first_s + (q.moments - 1) * q.step_s));
   const play = document.getElementById("play"), slider = document.getElementById("time"), speed = document.getElementById("speed");
-  const clock = document.getElementById("clock"), now = document.getElementById("now"), chooser = document.getElementById("arm");
-  let cell;
-  try {
-    cell = makeCell(place, model);
+  const clock = document.getElementById("clock"), chooser = document.getElementById("arm");
+  for (const shift of shifts) try {
+    shift.cell = makeCell(shift.place, model);
   } catch (error) {
-    place.className = "absent";
-    place.textContent = "This browser cannot draw in 3-D (WebGL is missing). The figures below show the same shift.";
+    shift.place.className = "cell absent";
+    shift.place.textContent = "This browser cannot draw in 3-D (WebGL is missing). The figures below show the same shift.";
   }
-  let timeS = data.q.first_s, playing = false, last = 0, shown = null, figure = null, moveCursor = null;
-  slider.min = data.q.first_s;
+  let timeS = beginS, playing = false, last = 0, figure = null, moveCursor = null;
+  slider.min = beginS;
   slider.max = endS;
   slider.step = "any";
   const radius = (kg) => Math.min(model.load.most_m, Math.cbrt((3 * kg) / (4 * Math.PI * model.load.kg_per_m3)));
   const words = ["idle", "working", "faulted"];
 
   function show(t) {
-    timeS = Math.min(endS, Math.max(data.q.first_s, t));
+    timeS = Math.min(endS, Math.max(beginS, t));
     slider.value = timeS;
     const s = Math.round(timeS), text = `${Math.floor(s / 3600)}:${String(Math.floor(s / 60) % 60).padStart(2, "0")}:${String(s % 60).padStart(2, "0")}`;
     clock.textContent = text;
     slider.setAttribute("aria-valuetext", text);
-    const lines = [];
+    shifts.forEach(showShift);
+    if (moveCursor) moveCursor(timeS);
+  }
+  function showShift(shift) {
+    const { data, cell, modes } = shift, lines = [];
     for (let arm = 0; arm < model.arms.length; arm++) {
       const q = [], temp = [];
       for (let j = 0; j < joints; j++) {
@@ -67,17 +71,16 @@ async function startReplay(unitS) {
       }
       const mode = stateAt(data.mode, arm, timeS), hottest = temp.indexOf(Math.max(...temp));
       if (cell) {
-        if (!shown || shown[arm] !== mode) cell.setMode(arm, mode);
+        if (!modes || modes[arm] !== mode) cell.setMode(arm, mode);
         cell.setHeat(arm, temp);
         cell.setPose(arm, q, radius(stateAt(data.payload_kg, arm, timeS)));
       }
       lines.push({ arm, mode, hottest: hottest + 1, tempC: temp[hottest] });
     }
-    shown = lines.map((line) => line.mode);
-    now.textContent = lines.sort((a, b) => b.tempC - a.tempC).slice(0, 8).map(({ arm, mode, hottest, tempC }) =>
+    shift.modes = lines.map((line) => line.mode);
+    shift.now.textContent = lines.sort((a, b) => b.tempC - a.tempC).slice(0, 8).map(({ arm, mode, hottest, tempC }) =>
       words[mode] === undefined ? `${model.arms[arm].name}: absent` : `${model.arms[arm].name}: ${words[mode]}, joint ${hottest} at ${tempC.toFixed(1)} °C`
       + (tempC >= model.heat.error_c ? " (above the limit)" : tempC >= model.heat.warning_c ? " (warm)" : "")).join("\n");
-    if (moveCursor) moveCursor(timeS);
   }
   function frame(ms) {
     if (playing) {
@@ -85,12 +88,12 @@ async function startReplay(unitS) {
       if (timeS >= endS) toggle();
     }
     last = ms;
-    if (cell) cell.draw();
+    for (const { cell } of shifts) if (cell) cell.draw();
     requestAnimationFrame(frame);
   }
   function toggle() {
     playing = !playing;
-    if (playing && timeS >= endS) show(data.q.first_s);
+    if (playing && timeS >= endS) show(beginS);
     play.textContent = playing ? "❚❚" : "▶";
     play.setAttribute("aria-label", playing ? "pause" : "play");
   }
@@ -114,11 +117,11 @@ async function startReplay(unitS) {
   // Looks at one arm, and shows its temperatures in the last lane of a large fleet; -1: the whole cell.
   function choose(arm) {
     chooser.value = arm;
-    if (cell) cell.focus(arm);
+    for (const { cell } of shifts) if (cell) cell.focus(arm);
     const lane = figure && figure.layout.meta;
     if (!lane || arm < 0) return;
-    const { moments, first_s, step_s } = data.temp_c, xs = Array.from({ length: moments }, (_, i) => (first_s + i * step_s) / unitS);
-    const ys = Array.from({ length: joints }, (_, j) => xs.map((_, i) => data.temp_c.values[(arm * joints + j) * moments + i] * data.temp_c.scale));
+    const { moments, first_s, step_s, values, scale } = first.temp_c, xs = Array.from({ length: moments }, (_, i) => (first_s + i * step_s) / unitS);
+    const ys = Array.from({ length: joints }, (_, j) => xs.map((_, i) => values[(arm * joints + j) * moments + i] * scale));
     Plotly.restyle(figure, { x: ys.map(() => xs), y: ys }, lane.lane_traces);
     const name = document.createElement("b");
     name.textContent = model.arms[arm].name;
@@ -135,7 +138,7 @@ async function startReplay(unitS) {
     const arm = model.arms.findIndex((one) => one.name === row.dataset.arm);
     show(Number(row.dataset.time));
     if (arm >= 0) choose(arm);
-    place.scrollIntoView({ block: "center", behavior: "smooth" });
+    shifts[0].place.scrollIntoView({ block: "center", behavior: "smooth" });
   }
   for (const one of document.querySelectorAll("[data-time]")) one.tabIndex = 0;
   document.addEventListener("click", goTo);
