@@ -79,6 +79,7 @@ def run(
     with blaming(spec.policy, shift):
         policy = policy_at(spec.policy, spec.seed, OnBus(fleet=fleet.scenario.name))
     recorder = _Recorder(fleet.scenario, record)
+    progress("working", 0.0)  # the first shift of a machine waits for the compiler
     env = env_of(
         fleet,
         plant=spec.plant,

@@ -37,7 +37,7 @@ print(digest.hexdigest())
 def play(python: str, cache: Path) -> str:
     """Digest of the observations and rewards of the episode."""
     env = os.environ | {"PYTHONPATH": str(ROOT), "THERMOFLEET_CACHE": str(cache)}
-    ran = subprocess.run([python, "-c", EPISODE], capture_output=True, text=True, timeout=900, env=env, check=False)
+    ran = subprocess.run([python, "-c", EPISODE], capture_output=True, text=True, timeout=1800, env=env, check=False)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout
 
