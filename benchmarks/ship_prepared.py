@@ -9,10 +9,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from scenarios.prepare.fleet import prepare
-from scenarios.prepare.shipped import FOLDER, archive_of
+from scenarios.prepare.shipped import FOLDER, SCENARIOS, archive_of
 from scenarios.terminal import progress_bar
-
-SCENARIOS = ("quickstart",)
 
 
 def pack(folder: Path, archive: Path) -> None:
@@ -27,10 +25,9 @@ def pack(folder: Path, archive: Path) -> None:
 
 def main() -> None:
     """Compute the plans and models of each scenario in an empty cache, and replace its archive."""
-    FOLDER.mkdir(exist_ok=True)
+    for old in FOLDER.iterdir():
+        old.unlink()
     for scenario in SCENARIOS:
-        for old in FOLDER.glob(f"{scenario}-*.tar.xz"):
-            old.unlink()
         with TemporaryDirectory() as folder, progress_bar(kept="") as progress:
             prepare(scenario, cache=folder, progress=progress)
             pack(Path(folder), archive_of(scenario))

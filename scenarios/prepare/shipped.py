@@ -15,6 +15,8 @@ from fleet.files import atomic_path
 
 _ROOT = Path(str(files("scenarios"))).parent
 FOLDER = _ROOT / "scenarios" / "prepare" / "archives"
+SCENARIOS = ("quickstart",)
+"""Scenarios of the library that have an archive."""
 _SOURCES = {
     "fleet": ("difficulty", "job", "motion", "offered_plans", "robot"),
     "fleet/arm": (
@@ -44,7 +46,7 @@ def archive_of(scenario: str) -> Path:
 
 def is_shipped(scenario: str) -> bool:
     """Whether the package has plans and models of a scenario of this name, computed by the present code."""
-    return any(FOLDER.glob(f"{scenario}-*.tar.xz")) and archive_of(scenario).is_file()
+    return scenario in SCENARIOS and archive_of(scenario).is_file()
 
 
 def unpack_shipped(scenario: str, folder: Path) -> None:

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.ship_prepared import SCENARIOS
 from fleet.difficulty import KNOWN, Difficulty
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.prepare.shipped import FOLDER, archive_of, unpack_shipped
+from scenarios.prepare.shipped import FOLDER, SCENARIOS, archive_of, unpack_shipped
 
 AGAIN = "the code that makes plans and models has changed; run: python -m benchmarks.ship_prepared"
 
