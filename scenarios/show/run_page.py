@@ -472,19 +472,18 @@ def pair_page(
         }
         for (path, log), other in zip(reports.items(), [*reports.values()][::-1], strict=True)
     ]
-    recorded = all(len(log.readings.time_s) for log in reports.values())
-    charts = list[Chart]()
-    if recorded:
+    charts, replay = list[Chart](), None
+    if all(len(log.readings.time_s) for log in reports.values()):
         alt = f"Hottest motor over the shift under {' and '.join(logs)}"
         charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
+        replay = _playback([*reports.values()], model) if model else None
     content = {
         "sentences": sentences,
         "sides": columns,
         "charts": charts,
-        "replays": tuple(logs) if recorded and model else (),
+        "replays": tuple(logs) if replay else (),
         "table": pair_table(logs),
     }
-    replay = _playback([*reports.values()], model) if recorded and model else None
     return Page(title=title, template="pair.html", content=content, charts=charts, replay=replay).html()
 
 

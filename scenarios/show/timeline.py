@@ -132,14 +132,14 @@ def figure(log: ShiftLog) -> dict[str, Any]:
 def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
     """The hottest motor of the fleet over time in shifts with equal limits, by name: `data` and `layout`."""
     first = next(iter(logs.values()))
-    unit, unit_s = time_unit(max(log.plan.horizon_s for log in logs.values()))
-    traces, low_c, high_c = list[Trace](), first.limits.warning_c - 20.0, first.limits.error_c
+    unit, unit_s = time_unit(first.plan.horizon_s)
+    traces, ends_c = list[Trace](), [first.limits.warning_c - 20.0, first.limits.error_c]
     for (name, log), (colour, dash) in zip(logs.items(), POLICY_LINES, strict=False):
-        temp_c = np.nan_to_num(log.readings.temp_c.reshape(len(log.readings.time_s), -1), nan=-np.inf)
-        motor = temp_c.argmax(axis=1)
+        temp_c = log.readings.temp_c.reshape(len(log.readings.time_s), -1)  # NaN of an absent arm
+        motor = np.nan_to_num(temp_c, nan=-np.inf).argmax(axis=1)
         value = temp_c[np.arange(len(motor)), motor]
         kept = decimate(value, POINTS_PER_TRACE)
-        low_c, high_c = min(low_c, *value.tolist()), max(high_c, *value.tolist())
+        ends_c += value[np.isfinite(value)].tolist()
         texts = [f"{log.arms[m // JOINTS]}, joint {m % JOINTS + 1}" for m in motor[kept].tolist()]
         traces.append(
             {
@@ -154,6 +154,7 @@ def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
             }
         )
     shapes, labels = _limit_lines(first.limits, "y")
+    low_c, high_c = min(ends_c), max(ends_c)
     room_k = 0.06 * (high_c - low_c)
     time = {"range": [0, first.plan.horizon_s / unit_s], "title": {"text": f"time ({unit})"}}
     temperature = {"range": [low_c - room_k, high_c + room_k], "title": {"text": "hottest motor, °C"}}

@@ -22,7 +22,7 @@ from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder
 from scenarios.live.trace import NOT_RECORDED, rows_of, thread_of, thread_table
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.run.log import FILES, code_hash, event_table, telemetry_table
+from scenarios.run.log import FILES, code_hash, event_table, telemetry_table, versions_of
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.shift import RunLog, run
 from scenarios.show.run_page import verdict
@@ -422,3 +422,9 @@ def test_without_offers_only_the_work_is_told_and_without_a_fault_the_hottest_mo
     assert told({"metrics": {"peak_c": {"hot": 68.2, "cool": float("nan")}}}) == (
         "No motor reached its fault limit; the hottest, in hot, reached 68 °C.",
     )
+
+
+def test_a_library_that_is_not_installed_has_no_version():
+    versions = versions_of(("numpy", "no-such-library"))
+    assert versions["numpy"] == np.__version__
+    assert versions["no-such-library"] is None
