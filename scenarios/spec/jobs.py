@@ -97,8 +97,13 @@ def sample_jobs(
                 drawn[total + n, 2 + c] = int(share * choices[i, c])
         total += count
         first[i + 1] = total
-    order = np.argsort(times[:total], kind="mergesort")
-    place = np.empty(total, np.int64)
+    order, place = np.empty(total, np.int64), np.empty(total, np.int64)
+    for row in range(total):  # NumPy's stable sort takes seconds to compile
+        n = row
+        while n > 0 and times[order[n - 1]] > times[row]:
+            order[n] = order[n - 1]
+            n -= 1
+        order[n] = row
     for n in range(total):
         place[order[n]] = n
     for n in range(total):
