@@ -100,8 +100,22 @@ EXTRA := [cli]
 .venv-adapters/bench/.installed: EXTRA := [cli,learn]
 .venv-adapters/ray/.installed: EXTRA := [cli,ray]
 .venv-adapters/ros2/.installed: EXTRA := [bus,ros2]
-bench-env: .venv-adapters/bench/.installed
-	@.venv-adapters/bench/bin/python -m benchmarks.env
+BENCH := $(abspath .venv-adapters/bench)
+bench-env: $(BENCH)/ocean_rware/binding.so
+	@PYTHONPATH=$(BENCH) $(BENCH)/bin/python -m benchmarks.env $(if $(JSON),--out $(JSON))
+
+# PufferLib's warehouse in C, one file of its source package. Building the whole package needs libraries from elsewhere
+# and a GPU compiler, so pip only unpacks the source, and --no-clean keeps it when pip gives up on the rest.
+$(BENCH)/ocean_rware/binding.so: .venv-adapters/bench/.installed
+	@rm -rf $(@D) && mkdir -p $(@D)/source
+	@{ NO_OCEAN=1 NO_TRAIN=1 TMPDIR=$(@D)/source $(BENCH)/bin/python -m pip --disable-pip-version-check download \
+	    --no-clean --no-deps --no-build-isolation --no-binary pufferlib --dest $(@D) pufferlib==3.0.0; \
+	  cd $(@D)/source/pip-download-*/pufferlib_*/ && \
+	  cc -O2 -shared -fPIC -w -DPLATFORM_DESKTOP -Iraylib-5.5_linux_amd64/include \
+	    -I$$($(BENCH)/bin/python -c 'import numpy; print(numpy.get_include())') \
+	    -I$$($(BENCH)/bin/python -c 'import sysconfig; print(sysconfig.get_path("include"))') \
+	    pufferlib/ocean/rware/binding.c raylib-5.5_linux_amd64/lib/libraylib.a -lm -lpthread -ldl -o $@; \
+	} >$(@D)/build.log 2>&1 || echo "PufferLib's warehouse was not built and has no row; see $(@D)/build.log."
 
 install: $(STAMP)
 

@@ -1,12 +1,13 @@
-"""Env steps per CPU-second on one core and one thread, beside other environments.
+"""Speed of the environments on one core and one thread beside other environments, and beside copies of observations.
 
-    make bench-env                          # installs the other environments and runs this
-    .venv/bin/python -m benchmarks.env      # skips environments that are not installed
+    make bench-env                                                  # installs the other environments and runs this
+    .venv/bin/python -m benchmarks.env [--out docs/results/env.json] # skips environments that are not installed
 
 Every row is a separate process, pinned to one core, and the median of three windows. A window is a whole shift (720
 steps), so resets are included. Actions are random legal ones, and choosing them is included:
 `fleet.env.random_actions.random_legal` for the batch, the same by hand for the single environment. For more than four
-arms, the arms of quickstart are repeated, and its arrival rates multiplied; there are always 16 slots.
+arms, the arms of quickstart are repeated, and its arrival rates multiplied; there are always 16 slots. The bytes of a
+step are those of all arrays of its observations, and `np.copyto` copies arrays of that size in the same process.
 """
 
 import os
@@ -14,15 +15,21 @@ import sys
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import json
+import platform
 import statistics
 import subprocess
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple  # values of JSON
 
 import numpy as np
 
-from benchmarks.harness import median_rate, rss_mb
+from benchmarks.harness import machine, options, rss_mb, step_figures, write_text
+from benchmarks.result_tables import env_ratios_table, env_table
 from fleet.engine.tables import Tables
 from fleet.env.random_actions import random_legal
 from fleet.env.vector import BatchEnv, Library, keep_pages
@@ -34,12 +41,12 @@ from scenarios.spec.options import DifficultyName
 WINDOWS, SHIFT = 3, 720
 
 
-def single(difficulty: DifficultyName) -> float:
+def single(difficulty: DifficultyName) -> dict[str, float]:
     """Measure the `ParallelEnv`."""
     env = env_of(prepare(load("quickstart"), difficulty=difficulty))
     rng, seen = np.random.default_rng(0), {}
 
-    def window() -> int:
+    def window() -> tuple[int, Any]:
         nonlocal seen
         steps = 2 * SHIFT
         for _ in range(steps):
@@ -50,12 +57,12 @@ def single(difficulty: DifficultyName) -> float:
                 legal = seen[arm]["action_mask"].nonzero()[0]
                 actions[arm] = int(legal[int(share * len(legal))])
             seen, *_ = env.step(actions)
-        return steps
+        return steps, seen
 
     seen, _ = env.reset(seed=0)
     for _ in range(10):  # fills the caches: a twin scores every possible job once
         env.reset()
-    return median_rate(window)
+    return step_figures(window, 1, len(env.possible_agents))
 
 
 def library(difficulty: DifficultyName, arms: int = 4, peers: int | None = None) -> Library:
@@ -79,18 +86,18 @@ def library(difficulty: DifficultyName, arms: int = 4, peers: int | None = None)
     return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, one.tables._replace(**repeated), one.draw, near)
 
 
-def batch(difficulty: DifficultyName, envs: int, arms: int = 4, peers: int | None = None) -> float:
+def batch(difficulty: DifficultyName, envs: int, arms: int = 4, peers: int | None = None) -> dict[str, float]:
     """Measure a batch."""
     env, rng = BatchEnv(library(difficulty, arms, peers), envs, seed=0), np.random.default_rng(0)
     seen, _ = env.reset()
 
-    def window() -> int:
+    def window() -> tuple[int, Any]:
         nonlocal seen
         for _ in range(SHIFT):
             seen, *_ = env.step(random_legal(seen["action_mask"], rng))
-        return envs * SHIFT
+        return SHIFT, seen
 
-    return median_rate(window)
+    return step_figures(window, envs, arms)
 
 
 def two_threads(envs: int) -> float:
@@ -111,7 +118,7 @@ def two_threads(envs: int) -> float:
     return statistics.median(ratios[1:])
 
 
-def torchrl(envs: int, *, kept: bool = False) -> float:
+def torchrl(envs: int, *, kept: bool = False) -> dict[str, float]:
     """Measure rollouts of TorchRL with its random policy."""
     if kept and not keep_pages():
         raise SystemExit("keep_pages() needs glibc.")
@@ -123,14 +130,14 @@ def torchrl(envs: int, *, kept: bool = False) -> float:
     env = TorchRLEnv(BatchEnv(library("blind"), envs, seed=0, autoreset=False), seed=0)
     begin, length = env.reset(), 90
 
-    def window() -> int:
+    def window() -> tuple[int, Any]:
         nonlocal begin
         for _ in range(SHIFT // length):
             frames = env.rollout(length, break_when_any_done=False, auto_reset=False, tensordict=begin)
             begin = env.step_mdp(frames[:, -1])
-        return envs * SHIFT
+        return SHIFT, [begin[key] for key in env.observation_keys]
 
-    return median_rate(window)
+    return step_figures(window, envs, len(env.batch.agents))
 
 
 def memory(envs: int, arms: int) -> float:
@@ -152,17 +159,59 @@ def memory(envs: int, arms: int) -> float:
     return after - before
 
 
-ROWS = {
+class Row(NamedTuple):
+    """A row of the table."""
+
+    what: str
+    command: tuple[str, ...]
+    """Module of `benchmarks`, and its arguments."""
+    needs: str = "numpy"
+    """The Python module that must be installed."""
+
+
+def rows() -> Iterator[Row]:
+    """All rows of the table."""
+    for difficulty in ("blind", "twin"):
+        yield Row(f"single ParallelEnv, {difficulty}", ("env", "single", difficulty))
+        for envs in ("32", "1024"):
+            yield Row(f"batch of {envs}, {difficulty}", ("env", "batch", difficulty, envs))
+    yield Row("TorchRL rollout of 1024, blind", ("env", "torchrl", "1024"), "torchrl")
+    yield Row("the same after keep_pages()", ("env", "torchrl", "1024", "kept"), "torchrl")
+    yield Row("MPE simple_spread", ("peers", "mpe", "1"), "mpe2")
+    yield Row("RWARE tiny", ("peers", "rware", "1"), "rware")
+    for envs in ("1", "32", "1024"):
+        yield Row(f"VMAS simple_spread, {envs}", ("peers", "vmas", envs), "vmas")
+    for envs in ("32", "1024"):
+        yield Row(f"PufferLib Ocean RWARE tiny (C), {envs}", ("peers", "ocean", envs), "ocean_rware")
+    yield Row("Craftax-Classic (JAX), 1024", ("peers", "craftax", "1024"), "craftax")
+    for peers, what in (((), "all peers"), (("3",), "3 peers")):
+        for arms in ("4", "8", "16", "64"):
+            yield Row(f"64 envs of {arms} arms that observe {what}", ("env", "batch", "blind", "64", arms, *peers))
+
+
+RATIOS = (
+    ("1024 envs against VMAS 1024, blind", ("batch of 1024, blind", "VMAS simple_spread, 1024"), "≥ 2"),
+    ("32 envs against VMAS 32, blind", ("batch of 32, blind", "VMAS simple_spread, 32"), "≥ 28"),
+    ("single env against MPE", ("single ParallelEnv, blind", "MPE simple_spread"), "≥ 15"),
+    ("single env against RWARE", ("single ParallelEnv, blind", "RWARE tiny"), "≥ 13"),
+    ("1024 envs with twins against blind", ("batch of 1024, twin", "batch of 1024, blind"), "≥ 0.8"),
+    ("TorchRL rollout against the bare batch", ("TorchRL rollout of 1024, blind", "batch of 1024, blind"), "≥ 0.7"),
+)
+"""What the ratio of the steps per second of two rows means, the rows, and the goal."""
+SMALL, LARGE = (f"64 envs of {arms} arms that observe all peers" for arms in (4, 64))
+
+MEASURED = {
     "single": lambda difficulty: single(difficulty),
     "batch": lambda difficulty, envs, arms="4", *peers: batch(difficulty, int(envs), int(arms), *map(int, peers)),
-    "threads": lambda envs: two_threads(int(envs)),
     "torchrl": lambda envs, pages="": torchrl(int(envs), kept=pages == "kept"),
-    "memory": lambda envs, arms: memory(int(envs), int(arms)),
+    "threads": lambda envs: {"speed_up": two_threads(int(envs))},
+    "memory": lambda envs, arms: {"mb": memory(int(envs), int(arms))},
 }
 
 
-def measured(*command: str) -> float | None:
-    """Run a measurement in a separate process; if it fails, print the reason and return None."""
+def measured(*command: str) -> dict[str, Any]:
+    """Run a measurement in a separate process; if it fails, return the reason as `missing`."""
+    print(" ".join(command), "…", file=sys.stderr, flush=True)
     done = subprocess.run(
         [sys.executable, "-m", f"benchmarks.{command[0]}", *command[1:]],
         capture_output=True,
@@ -171,48 +220,51 @@ def measured(*command: str) -> float | None:
         check=False,
     )
     if done.returncode:
-        print(f"  {' '.join(command[1:])} failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
-        return None
-    return float(done.stdout.split()[-1])
+        return {"missing": f"failed: {(done.stderr.strip().splitlines() or [f'exit code {done.returncode}'])[-1]}"}
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-def line(what: str, value: float | None, target: float | None = None, unit: str = "") -> None:
-    """Print one row of the table."""
-    aim = "" if target is None else f"{target:>12,.0f}"
-    print(f"{what:<52}{'-' if value is None else f'{value:,.0f}':>12}{aim:>12} {unit}", flush=True)
+def ratios(found: dict[str, dict[str, Any]], speed_up: float | None) -> Iterator[dict[str, Any]]:
+    """Every ratio with its goal; None if one of its rows is missing."""
+
+    def ratio(above: float | None, below: float | None) -> float | None:
+        return None if above is None or below is None else above / below
+
+    for what, names, goal in RATIOS:
+        yield {"what": what, "ratio": ratio(*(found[name].get("steps_per_s") for name in names)), "goal": goal}
+    one = found["batch of 1024, blind"]
+    share = ratio(one.get("observed_gb_per_s"), one.get("copied_gb_per_s"))
+    yield {"what": "observations of 1024 envs against np.copyto", "ratio": share, "goal": "≥ 0.25"}
+    growth = ratio(*(found[name].get("ns_per_agent_step") for name in (LARGE, SMALL)))
+    yield {"what": "time per arm step, 64 arms against 4, all peers", "ratio": growth, "goal": "≤ 1.3"}
+    yield {"what": "two threads against one, 1024 envs, wall clock", "ratio": speed_up, "goal": "≥ 1.7"}
 
 
 def main() -> None:
-    """Print the table."""
-    print(f"{'env steps per CPU-second, one core':<52}{'measured':>12}{'target':>12}")
-    for difficulty in ("blind", "twin"):
-        line(f"single ParallelEnv, {difficulty}", measured("env", "single", difficulty), 40_000)
-        line(f"batch of 32, {difficulty}", measured("env", "batch", difficulty, "32"), 600_000)
-        line(f"batch of 1024, {difficulty}", measured("env", "batch", difficulty, "1024"), 1_000_000)
-    print(f"two threads against one, 1024 envs, wall clock: {measured('env', 'threads', '1024')} times (target 1.8)")
-    if find_spec("torchrl") is None:
-        print("TorchRL is not installed; install it with: pip install -e '.[learn]' -c constraints.txt")
-    else:
-        line("TorchRL rollout of 1024, blind", measured("env", "torchrl", "1024"), 300_000)
-        line("the same after keep_pages()", measured("env", "torchrl", "1024", "kept"), 300_000)
-    for name, module, envs in (("mpe", "mpe2", (1,)), ("rware", "rware", (1,)), ("vmas", "vmas", (1, 32, 1024))):
-        if find_spec(module) is None:
-            print(f"{name} is not installed; make bench-env installs it")
-            continue
-        for count in envs:
-            line(f"{name}, {count}", measured("peers", name, str(count)))
-    for peers, what in (((), "all peers"), (("3",), "3 peers")):
-        for arms in (4, 8, 16, 64):
-            rate = measured("env", "batch", "blind", "64", str(arms), *peers)
-            cost_ns = None if rate is None else 1e9 / (rate * arms)
-            line(f"64 envs of {arms} arms that observe {what}: one arm step", cost_ns, unit="ns")
-    line("memory of 1024 envs with 8 arms", measured("env", "memory", "1024", "8"), 200, "MB")
+    """Measure all rows, and print them and their ratios."""
+    given = options(__doc__, out=(Path, "file of the result, as JSON"))
+    busy = machine()
+    found: dict[str, dict[str, Any]] = {}
+    for what, command, needs in rows():
+        installed = find_spec(needs) is not None
+        found[what] = measured(*command) if installed else {"missing": "not installed; make bench-env installs it"}
+    threads = measured("env", "threads", "1024")
+    result = {
+        **busy,
+        "python": platform.python_version(),
+        "rows": [{"what": what, **figures} for what, figures in found.items()],
+        "ratios": list(ratios(found, threads.get("speed_up"))),
+        "memory_mb": measured("env", "memory", "1024", "8").get("mb"),
+    }
+    print(env_table(result), env_ratios_table(result), sep="\n\n")
+    if given.out is not None:
+        write_text(given.out, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
+    if sys.argv[1:] and sys.argv[1] in MEASURED:
         if sys.argv[1] != "threads":
             os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-        print(ROWS[sys.argv[1]](*sys.argv[2:]))
+        print(json.dumps(MEASURED[sys.argv[1]](*sys.argv[2:])))
     else:
         main()

@@ -5,8 +5,10 @@ depend least on what else the machine does; absolute times need its load beside 
 """
 
 import json
+import math
 import multiprocessing
 import os
+import platform
 import statistics
 import time
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
@@ -15,6 +17,8 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any  # defaults of options, and values of JSON
+
+import numpy as np
 
 from fleet.files import atomic_path
 
@@ -69,7 +73,14 @@ def write_text(path: Path, text: str) -> None:
 
 def machine() -> dict[str, object]:
     """The machine, and how busy it is."""
-    return {"cores": os.cpu_count(), "load_average": [round(load, 2) for load in os.getloadavg()]}
+    cpus = Path("/proc/cpuinfo")
+    names = [line.partition(":")[2].strip() for line in cpus.open() if "model name" in line] if cpus.exists() else []
+    processor = names[0] if names else platform.machine()
+    return {
+        "processor": processor,
+        "cores": os.cpu_count(),
+        "load_average": [round(load, 2) for load in os.getloadavg()],
+    }
 
 
 def seconds(call: Callable[[], object], clock: Callable[[], float] = time.process_time) -> float:
@@ -94,18 +105,57 @@ def in_turns(
     return {name: column[warm_up:] for name, column in took.items()}
 
 
-def median_rate(window: Callable[[], int], windows: int = 3) -> float:
-    """Steps per CPU-second: the median of some windows, after one that does not count.
+COPIES = 4
+"""Pairs of arrays that copies rotate over, as `BatchEnv` rotates its observations."""
+
+
+def observed_bytes(observation: Any) -> int:
+    """Bytes of all arrays and tensors in an observation of nested dicts and sequences; a repeated axis counts once."""
+    if isinstance(observation, Mapping):
+        observation = tuple(observation.values())
+    if isinstance(observation, tuple | list):
+        return sum(map(observed_bytes, observation))
+    if isinstance(observation, np.ndarray):
+        sizes = zip(observation.shape, observation.strides, strict=True)
+        return observation.itemsize * math.prod(size for size, stride in sizes if stride)
+    return observation.nbytes
+
+
+def step_figures(window: Callable[[], tuple[int, Any]], envs: int, agents: int, windows: int = 3) -> dict[str, float]:
+    """Speed of an env beside `np.copyto` of its observations: medians of windows, after one that does not count.
 
     Args:
-        window: Does some steps, and returns their number.
+        window: Does some steps; returns their number and the last observation of all envs.
+        envs: Number of envs that take a step together.
+        agents: Number of agents in an env.
     """
     rates: list[float] = []
+    copied: list[float] = []
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    size = 0
     for _ in range(windows + 1):
         begin_s = time.process_time()
-        steps = window()
-        rates.append(steps / (time.process_time() - begin_s))
-    return statistics.median(rates[1:])
+        steps, observation = window()
+        rates.append(envs * steps / (time.process_time() - begin_s))
+        size = observed_bytes(observation)
+        pairs = pairs or [(np.ones(size, np.uint8), np.ones(size, np.uint8)) for _ in range(COPIES)]
+        begin_s, copies = time.process_time(), 0
+        while (took_s := time.process_time() - begin_s) < 0.2:
+            for _ in range(20):
+                for target, source in pairs:
+                    np.copyto(target, source)
+            copies += 20 * COPIES
+        copied.append(size * copies / took_s)
+    rate, observed = statistics.median(rates[1:]), size / envs
+    return {
+        "envs": envs,
+        "agents": agents,
+        "steps_per_s": rate,
+        "ns_per_agent_step": 1e9 / (rate * agents),
+        "observed_bytes": observed,
+        "observed_gb_per_s": rate * observed / 1e9,
+        "copied_gb_per_s": statistics.median(copied[1:]) / 1e9,
+    }
 
 
 def quantiles(values: list[float], *shares: float) -> list[float]:

@@ -119,6 +119,35 @@ def _range(values: Iterable[float], digits: int = 0, unit: str = "") -> str:
     return (shown[0] if shown[0] == shown[-1] else f"{shown[0]}–{shown[-1]}") + unit
 
 
+def env_table(measured: Mapping[str, Any]) -> str:
+    """Speed of every environment, and its observations beside a copy of them.
+
+    Args:
+        measured: A result of `benchmarks/env.py`.
+    """
+    rows: list[tuple[str, ...]] = []
+    for row in measured["rows"]:
+        if "missing" in row:
+            rows.append((row["what"], row["missing"], "", "", "", ""))
+            continue
+        speed, copied = row["observed_gb_per_s"], row["copied_gb_per_s"]
+        cells = (f"{row[name]:,.0f}" for name in ("steps_per_s", "ns_per_agent_step", "observed_bytes"))
+        rows.append((row["what"], *cells, f"{speed:.3g}", f"{100 * speed / copied:.2g} %"))
+    heads = ("env", "env steps per CPU-second", "ns per agent step", "bytes observed per env step", "GB/s",
+             "share of `np.copyto`")  # fmt: skip
+    return table(heads, rows)
+
+
+def env_ratios_table(measured: Mapping[str, Any]) -> str:
+    """Ratios of rows of `env_table` with their goals, and the machine."""
+    rows = [(each["what"], "–" if each["ratio"] is None else f"{each['ratio']:.3g}", each["goal"])
+            for each in measured["ratios"]]  # fmt: skip
+    load = measured["load_average"][0]
+    machine = f"{measured['processor']}, {measured['cores']} cores, load {load:.1f}, Python {measured['python']}"
+    memory = f"1024 envs with 8 arms take {measured['memory_mb']:.0f} MB. " if measured["memory_mb"] else ""
+    return f"{table(('ratio', 'measured', 'goal'), rows)}\n\n{memory}Machine: {machine}."
+
+
 def halls_table(path: Path) -> str:
     """The costs of halls of every size, from the rows of `benchmarks/scaling/arms.py`."""
     rows: list[tuple[str, ...]] = []

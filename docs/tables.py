@@ -34,6 +34,8 @@ from benchmarks.result_tables import (
     channel_table,
     difference,
     efficiency_table,
+    env_ratios_table,
+    env_table,
     halls_table,
     live_table,
     processor_sentence,
@@ -431,6 +433,8 @@ def tables_of(results: Path) -> Tables:
         "decisions": of_file(decisions, "ladder/decisions.json"),
         "live_policies": of_file(live_table, "live_policies.json"),
         "steps": of_file(steps_table, "steps.json"),
+        "env_rows": of_file(env_table, "env.json"),
+        "env_ratios": of_file(env_ratios_table, "env.json"),
         "processors": of_file(processor_sentence, "processors.json"),
         **{
             f"channels_{path.stem}": of_file(channel_table, f"channels/{path.name}")
