@@ -1,20 +1,16 @@
-"""Studies of real and simulated logs: forecasts, identification, and folds by file."""
+"""Studies of real and simulated logs: identification, and folds by file."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.metrics import roc_auc_score
 
 from benchmarks.paper.real_logs import (
     AHEAD_S,
-    FORECAST,
     MOTION,
-    NETWORK,
     QUESTIONS,
     Windows,
     answers,
-    forecasts,
     judged_windows,
     peak_within,
 )
@@ -24,7 +20,7 @@ from fleet.heat.thermal import WINDING
 from fleet.robot import JOINTS
 from scenarios.prepare.calibrate import AIR_SD_K, own_logs
 from tests.logs import COOL, TINY, WARM
-from twin.logs.recording import Recording, heat_logs
+from twin.logs.recording import Recording, cool_stretches, heat_logs
 from twin.thermal.identify import HeatModel, Noise, ParameterVector, Problem, identify, nominal_heat_model
 from twin.thermal.thermal_twin import RcTwin
 
@@ -32,8 +28,7 @@ ONE_EPOCH = replace(TINY, epochs=1)
 
 
 def made_up(file: list[str], d: list[float], rms: list[float], temp_c: list[float]) -> Windows:
-    names = (*MOTION, *NETWORK)
-    scores = {name: np.array(rms if name == "rms_torque" else d) for name in names}
+    scores = {name: np.array(rms if name == "rms_torque" else d) for name in MOTION}
     temps = np.array(temp_c)
     return Windows(
         file=np.array(file), fold=np.zeros(len(file), int), scores=scores, temp_c=temps, end_c=temps, peak_next_c=temps
@@ -58,27 +53,14 @@ def test_a_lead_over_rms_torque_has_an_interval_over_files() -> None:
     assert answers(made_up(file, alone, alone, alone)) == {}
 
 
-@pytest.mark.ci_slow
-def test_the_forecast_is_judged_where_the_network_predicts() -> None:
-    file = [name for name in "abcd" for _ in range(4)]
-    before, after = np.full(16, 35.0), np.array([45.0, 35.0] * 8)
-    windows = replace(made_up(file, list(after), [1.0] * 16, list(before)), peak_next_c=after)
-    partly = {**windows.scores, "load planned": np.where(np.arange(16) < 12, after, np.nan)}
-    found = answers(replace(windows, scores=partly))
-    assert (found[FORECAST]["windows"], found["forecast"]["windows"]) == (16, 12)
-    assert list(found[FORECAST]["auroc"]) == list(MOTION)
-    assert list(found["forecast"]["auroc"]) == [*MOTION, *NETWORK]
-    assert found["forecast"]["auroc"]["load planned"].mean == 1.0
-
-
-def test_every_file_is_judged_once_by_models_that_do_not_know_it(tmp_path, monkeypatch) -> None:
+def test_every_file_is_judged_once_by_a_twin_that_does_not_know_it(tmp_path, monkeypatch) -> None:
     recordings, known = [*COOL, WARM, replace(WARM, name="warm_2")], list[set[str]]()
 
-    def names_of(training, *, arm):
+    def names_of(training, *arguments, **options):
         known.append({r.name for r in training})
+        return cool_stretches(training, *arguments, **options)
 
-    monkeypatch.setattr("benchmarks.paper.real_logs.identify", names_of)
-    monkeypatch.setattr("benchmarks.paper.real_logs.RcTwin.of", lambda _: RcTwin.nominal())
+    monkeypatch.setattr("benchmarks.paper.real_logs.cool_stretches", names_of)
     windows = judged_windows(recordings, 0, config=ONE_EPOCH, folder=tmp_path)
     assert set(windows.file) == {r.name for r in recordings}
     for fold, training in enumerate(known):
@@ -102,49 +84,6 @@ def test_the_next_peak_is_unknown_past_the_end():
     assert peak_within(recording, 0.0, AHEAD_S)[1] == 50.0
     assert peak_within(recording, 299.0, AHEAD_S)[1] == 50.0
     assert np.isnan(peak_within(recording, 300.0, AHEAD_S)).all()
-
-
-def heated(name: str, load: float, rng: np.random.Generator) -> Recording:
-    """2 Hz for fifteen minutes by the nominal arm: joint 2 carries `load` A after five of them."""
-    twin, count = RcTwin.nominal(), 1800
-    amps = np.zeros((count + 1, 7))
-    amps[600:, 1] = load
-    temps = np.empty((count + 1, 14))
-    temps[0] = twin.idle_c
-    phi, gamma = twin.thermal.step_matrices(0.5)
-    for k in range(count):
-        heat = np.append(twin.motors.copper_w_per_a2 * amps[k] ** 2, twin.motors.idle_w)
-        temps[k + 1] = phi @ temps[k] + gamma @ (heat + twin.thermal.to_ambient * twin.ambient_c)
-    still = np.zeros_like(amps)
-    tau = amps * twin.motors.torque_per_amp * twin.motors.eta
-    return Recording(
-        name=name,
-        time_s=np.arange(count + 1) / 2.0,
-        q=still,
-        qd=still,
-        tau=tau,
-        current_a=amps,
-        temp_c=temps[:, :7] + 0.01 * rng.standard_normal(amps.shape),
-    )
-
-
-@pytest.mark.ci_slow
-def test_a_known_load_tells_more_than_the_present_temperature():
-    rng = np.random.default_rng(1)
-    recordings = [heated(f"log {i}", load, rng) for i, load in enumerate(np.linspace(2.0, 6.0, 6))]
-    twin = RcTwin.of(identify(recordings, ambient_sd_k=0.0))
-    end_s = np.tile(np.arange(30.0, 590.0, 30.0), len(recordings))
-    file = np.repeat([r.name for r in recordings], len(end_s) // len(recordings))
-    continued, planned = forecasts(recordings, file, end_s, twin, past_s=25.0)
-    by_name = {r.name: r for r in recordings}
-    now = np.array([peak_within(by_name[name], end - 0.5, 0.5)[1] for name, end in zip(file, end_s, strict=True)])
-    ahead = np.array([peak_within(by_name[name], end, AHEAD_S)[1] for name, end in zip(file, end_s, strict=True)])
-    below = now < 40.0
-    passes = ahead[below] >= 40.0
-    auroc = [float(roc_auc_score(passes, score[below])) for score in (planned, continued)]
-    assert auroc[0] > 0.99
-    assert auroc[0] > auroc[1] > 0.5
-    np.testing.assert_allclose(planned, ahead, atol=2.5)  # the simulated arm has no temperature coefficients
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 from sklearn.metrics import brier_score_loss
 
-from benchmarks.paper.real_logs import continued_peaks, estimated_temperatures, held_out_errors, planned_peaks, rms
+from benchmarks.paper.real_logs import held_out_errors
 from benchmarks.paper.reliability import reliability
 from fleet.difficulty import KNOWN, SETTLING_S, known_temperatures
 from fleet.errors import CheckpointError, IdentificationError
@@ -197,32 +197,6 @@ def working(twin: RcTwin, minutes: float, rng: np.random.Generator) -> tuple[Rec
     return Recording(name="work", time_s=np.arange(count + 1.0), **arrays), temps
 
 
-def test_the_observer_converges_to_the_housings(rng_5):
-    twin = RcTwin.nominal()
-    recording, truth = working(twin, 40.0, rng_5)
-    (log,) = heat_logs(recording, twin.motors, "current")
-    error = np.abs(estimated_temperatures(twin, log)[:, HOUSING] - truth[log.time_s.astype(int), HOUSING])
-    assert (error[0] > 3.5).all()
-    assert error[-1].max() < 1.0
-
-
-def test_forecasts_know_the_coming_load_or_take_the_last_one_for_granted(rng_5):
-    twin = RcTwin.nominal()
-    recording, truth = working(twin, 40.0, rng_5)
-    (log,) = heat_logs(recording, twin.motors, "torque")
-    states = truth[log.time_s.astype(int)]
-    planned = planned_peaks(twin, log, states, 300.0)
-    continued = continued_peaks(twin, log, states, 300.0, past_s=30.0)
-    assert np.isnan(planned[-1]).all()
-    assert np.isnan(continued[0]).all()
-    for k in (30, 100, 125, 180):
-        coming = truth[int(log.time_s[k]) + 1 : int(log.time_s[k]) + 301, WINDING].max(axis=0)
-        np.testing.assert_allclose(planned[k], coming, atol=0.15)
-    # Just before the hold ends, a load that goes on is hotter than what comes; in the middle it is the same.
-    assert continued[115, 1] > planned[115, 1] + 0.5
-    np.testing.assert_allclose(continued[60], planned[60], atol=0.15)
-
-
 def own_arm(seed: int) -> tuple[RcTwin, HeatModel]:
     rng, spread = np.random.default_rng(seed), ThermalSpread.gen3()
     body = nominal_heat_model()
@@ -399,10 +373,8 @@ def test_the_course_in_modes_is_that_of_a_fine_euler_step(rng):
 
 def test_the_true_arm_simulates_a_recording_down_to_the_sensor_noise(rng):
     body = prior_draw(rng)
-    recording, temp = logged(body, rng, 15.0)
-    errors, simulated = held_out_errors(body, recording)
-    np.testing.assert_allclose(rms(errors), body.motors.sensor_noise_k, rtol=0.2)
-    np.testing.assert_allclose(simulated[-1][-1, HOUSING], temp[-1, HOUSING], atol=0.5)
+    errors = held_out_errors(body, logged(body, rng, 15.0)[0])
+    np.testing.assert_allclose(np.sqrt(np.mean(errors**2, axis=0)), body.motors.sensor_noise_k, rtol=0.2)
 
 
 @pytest.mark.ci_slow
