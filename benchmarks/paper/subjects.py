@@ -27,7 +27,6 @@ from scenarios.prepare.arms import ArmHardware
 from scenarios.prepare.twins import cold_peaks, records
 from scenarios.spec.schema import Scenario
 from twin.vae.config import TwinConfig
-from twin.vae.measures import fewest, p_value
 from twin.vae.window import windows_of
 
 Array = np.ndarray
@@ -48,6 +47,8 @@ SHORT = TwinConfig(
 """Half the hidden units and half the sample rate of a usual twin: an eighth of its time."""
 EVERYTHING_C = 1e6
 """A limit that no motor reaches: any motion is cool."""
+PHASES = ("approach", "cycle", "retreat")
+"""Fields of a plan."""
 QD, TAU = CHANNELS.index("qd"), CHANNELS.index("tau")
 
 
@@ -213,25 +214,23 @@ class _Simulator:
             yield from ((sample.plans[i], sample.peak_c[i]) for i in np.flatnonzero(cool))
 
 
-def detection(score: Array, peak_c: Array, *, reference: Array, limit_c: float) -> dict[str, float]:
+def detection(score: Array, peak_c: Array, *, limit_c: float) -> dict[str, float]:
     """Quality of scores [job] of held-out jobs with true peaks [job], °C.
 
     Args:
-        reference: Scores of other held-out cool jobs, [job], which set the alarm.
         limit_c: A job is critical if its peak reaches this.
 
     Returns:
         `auroc`: probability that a critical job scores above another one. `auprc`: average precision; by chance, the
-        share of critical jobs. `spearman`: rank correlation with the true peak. `caught`: share of critical jobs with a
-        conformal p-value of at most `ALARM_RATE` (Laxhammar & Falkman 2010).
+        share of critical jobs. `spearman`: rank correlation with the true peak.
 
     Raises:
         ValueError: scores that are not finite, or not one per peak.
-        FleetError: no job is critical or all are, or too few reference jobs for the alarm.
+        FleetError: no job is critical or all are.
     """
     if score.shape != peak_c.shape or score.ndim != 1:
         raise ValueError(f"Scores and peaks must be [job] alike (got {score.shape} and {peak_c.shape}).")
-    if not all(np.isfinite(values).all() for values in (score, peak_c, reference)):
+    if not all(np.isfinite(values).all() for values in (score, peak_c)):
         raise ValueError("Scores and peaks must be finite.")
     critical = peak_c >= limit_c
     if critical.all() or not critical.any():
@@ -239,17 +238,10 @@ def detection(score: Array, peak_c: Array, *, reference: Array, limit_c: float) 
             f"{critical.sum()} of {len(critical)} test jobs reach {limit_c:g} °C: without some of both kinds no "
             "quality can be measured. Change the payloads, the ambient temperature or the limit."
         )
-    if len(reference) < fewest(ALARM_RATE):
-        raise FleetError(
-            f"A false-alarm rate of {ALARM_RATE:g} needs {fewest(ALARM_RATE)} or more cool reference jobs (got "
-            f"{len(reference)}). Increase their number."
-        )
-    rate = ALARM_RATE + 1e-9 / (len(reference) + 1)
     return {
         "auroc": float(roc_auc_score(critical, score)),
         "auprc": float(average_precision_score(critical, score)),
         "spearman": float(np.asarray(spearmanr(score, peak_c))[0]),
-        "caught": float((p_value(np.sort(reference), score[critical]) <= rate).mean()),
     }
 
 
@@ -258,7 +250,6 @@ class Sizes:
     """Number of jobs."""
 
     train: int = 200
-    reference: int = 100
     test: int = 600
 
 
@@ -270,9 +261,6 @@ class Subject:
     index: int
     seed: int
     sizes: Sizes
-    carrier_only: bool = False
-    """Whether twins have networks of the joints up to the carrying one only: much faster, but with d of that one
-    alone."""
 
     @property
     def name(self) -> str:
@@ -287,18 +275,14 @@ class Subject:
 
     def study(self, **changes: float) -> Study:
         """The arm in its scenario's usual ambient temperature with random jobs; `changes` as in `make_study`."""
-        spec, sizes = self.scenario.twin, {**vars(self.sizes), "novel": 0}
+        spec, sizes = self.scenario.twin, {**vars(self.sizes), "reference": 0, "novel": 0}
         settings = {"cool_c": spec.cool_c, "horizon_s": spec.horizon_s, "ambient_c": spec.ambient_c} | sizes | changes
         robot = self.scenario.arms[self.index].robot()
         return make_study(self.entropy, robot=robot, **settings)  # pyright: ignore[reportArgumentType]
 
-    def seen(self, plans: Sequence[Plan], carrier: int) -> tuple[Plan, ...]:
-        """The plans as the twin sees them, with all joints or those up to the carrying one."""
-        return tuple(first_joints(plan, carrier + 1) for plan in plans) if self.carrier_only else tuple(plans)
-
     def any_motion(self) -> Study:
         """The same arm with training jobs of any heat, and no other jobs."""
-        return self.study(cool_c=EVERYTHING_C, reference=0, test=0)
+        return self.study(cool_c=EVERYTHING_C, test=0)
 
 
 def arm_of(subject: str) -> str:
@@ -311,15 +295,18 @@ def carrier_of(study: Study) -> int:
     return int((study.test.peak_c >= study.warning_c).sum(axis=0).argmax())
 
 
-def first_joints(plan: Plan, joints: int) -> Plan:
-    """The same plan, of the first joints of the arm."""
-    cut = [replace(phase, profile=phase.profile[:, :, :joints]) for phase in plan.phases]
-    return replace(plan, approach=cut[0], cycle=cut[1], retreat=cut[2])
+def up_to_joint(plans: Iterable[Plan], last: int) -> tuple[Plan, ...]:
+    """The same plans, of the joints up to one, 0 … 6. Joints have networks of their own, so fewer train faster."""
+    return tuple(
+        replace(plan, **{name: _first_joints(getattr(plan, name), last + 1) for name in PHASES}) for plan in plans
+    )
 
 
-def subjects_of(
-    scenarios: Iterable[str], *, arms: Sequence[int], seeds: Sequence[int], sizes: Sizes, carrier_only: bool = False
-) -> list[Subject]:
+def _first_joints(phase: Phase, joints: int) -> Phase:
+    return replace(phase, profile=phase.profile[:, :, :joints])
+
+
+def subjects_of(scenarios: Iterable[str], *, arms: Sequence[int], seeds: Sequence[int], sizes: Sizes) -> list[Subject]:
     """The arms with these indices of every scenario, under every seed.
 
     Raises:
@@ -330,7 +317,7 @@ def subjects_of(
     if max(arms) > last:
         raise FleetError(f"--arms must be 0 to {last}, as the scenarios have arms (got {max(arms)}).")
     return [
-        Subject(scenario, index, seed, sizes, carrier_only)
+        Subject(scenario, index, seed, sizes)
         for scenario in chosen
         for index in arms
         if index < len(scenario.arms)
@@ -350,10 +337,7 @@ def sensed(plans: Iterable[Plan], motors: Motors) -> tuple[Plan, ...]:
     Args:
         motors: The true motors of the arm, whose friction the drives overcome.
     """
-    return tuple(
-        replace(plan, **{name: _sensed(getattr(plan, name), motors) for name in ("approach", "cycle", "retreat")})
-        for plan in plans
-    )
+    return tuple(replace(plan, **{name: _sensed(getattr(plan, name), motors) for name in PHASES}) for plan in plans)
 
 
 def _sensed(phase: Phase, motors: Motors) -> Phase:

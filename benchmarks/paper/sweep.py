@@ -36,7 +36,6 @@ from benchmarks.paper.subjects import (
     RANKING,
     SCENARIOS,
     TAU,
-    Sample,
     Sizes,
     Study,
     Subject,
@@ -44,6 +43,7 @@ from benchmarks.paper.subjects import (
     carrier_of,
     detection,
     subjects_of,
+    up_to_joint,
 )  # fmt: skip
 from fleet.errors import FleetError, nearest
 from fleet.motion import RATE_HZ, Plan
@@ -121,20 +121,16 @@ CONFIGURATIONS: Mapping[str, Configuration] = {
     "beta_2_latent_4": Configuration("together", "β 2, latent 4, 60 epochs", {"beta": 2.0, "latent": 4, "epochs": 60}),
     "latent_4_long": Configuration("together", "latent 4, 60 epochs", {"latent": 4, "epochs": 60}),
     "large": Configuration("together", "32 units, latent 4, 60 epochs", {"hidden": 32, "latent": 4, "epochs": 60}),
-    "whole_arm": Configuration("scope", "one network", {"scope": "arm", "hidden": 64, "latent": 8}),
     "ae": Configuration("scope", "autoencoder", {"kind": "ae"}),
 }
 """By the key of their rows, the most informative first."""
-HOT = {"hot_60": "60 °C", "hot_40": "40 °C", "no_band": "60 °C, without jobs of 40 to 60 °C"}
-"""Which peak makes a job hot, by the names in a row; the others are cool, but `no_band` drops those in between."""
-SCORES = ("carrier", "weighted", "sum", "sum_of_means")
-"""d of the carrying joint, for its own peak; for the hottest joint Σ w_k d_k, Σ d_k, and Σ d_k with |error| averaged
-over the channels instead of summed."""
+HOT = ("hot_60", "hot_40", "no_band")
+"""Names in a row for the peak from which a job is hot, 60 or 40 °C; `no_band` leaves out jobs of 40 to 60 °C."""
 
 
 def key_of(name: str, config: TwinConfig, subject: Subject) -> str:
     """Key of a row of the sweep."""
-    basis = content_key(RECIPE, msgspec.to_builtins(config), asdict(subject.sizes), subject.carrier_only)
+    basis = content_key(RECIPE, msgspec.to_builtins(config), asdict(subject.sizes))
     return f"{name}/{subject.name}/{basis}"
 
 
@@ -153,88 +149,66 @@ def sweep_rows(
         if key not in keys:
             continue
         source = study if configuration.data == "cool" else subject.any_motion()
-        plans = subject.seen(source.train.plans, carrier_of(study))
+        plans = up_to_joint(source.train.plans, carrier_of(study))
         start_s = time.process_time()
         twin = train(records(plans), configuration.config, subject.entropy, arm=subject.name)
         cpu_s = round(time.process_time() - start_s, 2)
-        card = {"configuration": name, "subject": subject.name, **measures(twin, subject, study)}
+        card = {"configuration": name, "subject": subject.name, **measures(twin, study)}
         yield key, card | {"epochs": configuration.config.epochs, "cpu_s": cpu_s}
 
 
-def measures(twin: Twin, subject: Subject, study: Study) -> Row:
-    """How the twin's scores rank the test jobs: [label][score][measure]; and how the training went, carrier first."""
-    carrier = carrier_of(study)
-    test, reference = study.test, study.reference
-    of_test, of_reference = (_scores(twin, subject, jobs, carrier) for jobs in (test, reference))
-    own, hottest = test.peak_c[:, carrier], test.peak_c.max(axis=1)
+def measures(twin: Twin, study: Study) -> Row:
+    """How d of the carrying joint ranks the test jobs, [label][measure], and how the training of its network went."""
+    carrier, test = carrier_of(study), study.test
+    peak_c = test.peak_c[:, carrier]
+    d = twin.features(up_to_joint(test.plans, carrier), test.repetitions).difficulty[:, carrier]
     row: Row = {"carrier": carrier + 1}
     for label in HOT:
-        row[label] = {}
-        for score in of_test:
-            peak_c = own if score == "carrier" else hottest
-            limit_c = study.cool_c if label == "hot_40" else study.warning_c
-            kept = (peak_c < study.cool_c) | (peak_c >= study.warning_c) if label == "no_band" else peak_c == peak_c
-            found = detection(of_test[score][kept], peak_c[kept], reference=of_reference[score], limit_c=limit_c)
-            row[label][score] = {measure: round(found[measure], 4) for measure in (*RANKING, "caught")}
-    fits = [twin.fits[min(carrier, len(twin.fits) - 1)], *twin.fits]
-    row["kl"], row["active_units"], row["mse"] = (
-        [round(getattr(fit, name), 3) for fit in fits] for name in ("kl", "active_units", "mean_squared_error")
-    )
-    return row
+        limit_c = study.cool_c if label == "hot_40" else study.warning_c
+        kept = (peak_c < study.cool_c) | (peak_c >= study.warning_c) if label == "no_band" else peak_c == peak_c
+        found = detection(d[kept], peak_c[kept], limit_c=limit_c)
+        row[label] = {measure: round(value, 4) for measure, value in found.items()}
+    fit = twin.fits[carrier]
+    return row | {"kl": round(fit.kl, 3), "active_units": fit.active_units}
 
 
-def _scores(twin: Twin, subject: Subject, jobs: Sample, carrier: int) -> dict[str, Array]:
-    """By the names of `SCORES`."""
-    features = twin.features(subject.seen(jobs.plans, carrier), jobs.repetitions)
-    if subject.carrier_only:
-        return {"carrier": features.difficulty[:, carrier]}
-    means = 1.0 - np.exp(-features.errors.mean(axis=-1))
-    d = features.difficulty
-    values = d[:, carrier], d @ twin.joint_weight, d.sum(axis=1), means.sum(axis=1)
-    return dict(zip(SCORES, values, strict=True))
-
-
-COLUMNS: Mapping[str, tuple[str, ...]] = {
-    "AUROC": ("hot_60", "carrier", "auroc"),
-    "AUPRC": ("hot_60", "carrier", "auprc"),
-    "Spearman": ("hot_60", "carrier", "spearman"),
-    "AUROC, hot from 40 °C": ("hot_40", "carrier", "auroc"),
-    "AUROC, 40–60 °C left out": ("no_band", "carrier", "auroc"),
-    "any joint, Σ w d": ("hot_60", "weighted", "auroc"),
-    "any joint, Σ d": ("hot_60", "sum", "auroc"),
-    "Σ d of means": ("hot_60", "sum_of_means", "auroc"),
+COLUMNS: Mapping[str, tuple[str, str]] = {
+    "AUROC": ("hot_60", "auroc"),
+    "AUPRC": ("hot_60", "auprc"),
+    "Spearman": ("hot_60", "spearman"),
+    "AUROC, hot from 40 °C": ("hot_40", "auroc"),
+    "AUROC, 40–60 °C left out": ("no_band", "auroc"),
 }
-"""Path in a row of each measure that is compared with ours; the first five are of d of the carrying joint."""
+"""Path in a row of each measure that is compared with ours."""
 
 
 def sweep_tables(rows: Sequence[Row]) -> dict[str, Table]:
-    """A line for each configuration: means over the arms, and paired differences to ours; columns without rows go."""
+    """A line for each configuration: means over the arms, and paired differences to ours."""
     by_name: dict[str, dict[str, Row]] = {}
     for row in rows:
         by_name.setdefault(row["configuration"], {})[row["subject"]] = row
     ours = by_name.get(OURS, {})
-    columns = [name for name, path in COLUMNS.items() if all(path[1] in row[path[0]] for row in rows)]
     lines = [
         (
             configuration.group,
             configuration.label,
-            *(sweep_cell(by_name[name], {} if name == OURS else ours, COLUMNS[column]) for column in columns),
+            *(sweep_cell(by_name[name], {} if name == OURS else ours, path) for path in COLUMNS.values()),
             *plain_cells(list(by_name[name].values())),
         )
         for name, configuration in CONFIGURATIONS.items()
         if name in by_name
     ]
     caption = "in brackets: paired difference to ours, ± the 95 % margin over the arms; * if that excludes zero"
-    heads = ("group", "configuration", *columns, "active units", "KL, nat", "epochs", "CPU s", "arms")
+    heads = ("group", "configuration", *COLUMNS, "active units", "KL, nat", "epochs", "CPU s", "arms")
     return {"sweep": table_of(heads, lines, caption)}
 
 
-def sweep_cell(rows: Mapping[str, Row], ours: Mapping[str, Row], path: Sequence[str]) -> str:
+def sweep_cell(rows: Mapping[str, Row], ours: Mapping[str, Row], path: tuple[str, str]) -> str:
     """A measure of one configuration, by subject, and its paired difference to ours on the same subjects."""
 
     def at(row: Row) -> float:
-        first, second, third = path
-        return float(row[first][second][third])
+        label, measure = path
+        return float(row[label][measure])
 
     own = mean_by_group((arm_of(subject), at(row)) for subject, row in rows.items())
     leads = [(arm_of(subject), at(row) - at(ours[subject])) for subject, row in rows.items() if subject in ours]
@@ -248,7 +222,7 @@ def sweep_cell(rows: Mapping[str, Row], ours: Mapping[str, Row], path: Sequence[
 
 def plain_cells(rows: Sequence[Row]) -> tuple[str, ...]:
     """Active units, KL, epochs and CPU time on average, and the number of subjects."""
-    numbers = [(row["active_units"][0], row["kl"][0], row["epochs"], row["cpu_s"]) for row in rows]
+    numbers = [(row["active_units"], row["kl"], row["epochs"], row["cpu_s"]) for row in rows]
     units, nats, epochs, cpu_s = np.mean(numbers, axis=0)
     return f"{units:.1f}", f"{nats:.2f}", f"{epochs:.0f}", f"{cpu_s:.0f}", str(len(rows))
 
@@ -269,41 +243,34 @@ def subject_options(parser: ArgumentParser) -> None:
     size_options(parser, Sizes)
 
 
-def subjects_given(given: Namespace, *, carrier_only: bool) -> list[Subject]:
+def subjects_given(given: Namespace) -> list[Subject]:
     """The subjects of the options."""
     sizes, seeds = size_given(given, Sizes), range(1, given.seeds + 1)
-    return subjects_of(given.scenarios, arms=given.arms, seeds=seeds, sizes=sizes, carrier_only=carrier_only)
+    return subjects_of(given.scenarios, arms=given.arms, seeds=seeds, sizes=sizes)
 
 
 def sweep_options(parser: ArgumentParser) -> None:
     """Options of `sweep`."""
     subject_options(parser)
     parser.add_argument("--only", type=names, help="configurations, separated by commas [all]")
-    parser.add_argument(
-        "--carrier-only", action="store_true", help="networks up to the carrying joint only: faster, d of it alone"
-    )
 
 
 def sweep_units(given: Namespace) -> list[Unit]:
     """A unit for each subject.
 
     Raises:
-        FleetError: a configuration is unknown, or has one network of all joints with --carrier-only.
+        FleetError: a configuration is unknown.
     """
-    whole_arm = {name for name, each in CONFIGURATIONS.items() if given.carrier_only and each.config.scope == "arm"}
-    every = [name for name in CONFIGURATIONS if name not in whole_arm]
     for name in given.only or ():
         if name not in CONFIGURATIONS:
             raise FleetError(f"No configuration '{name}'{nearest(name, CONFIGURATIONS)}")
-        if name in whole_arm:
-            raise FleetError(f"'{name}' is one network of all joints; leave out --carrier-only.")
-    chosen = {name: CONFIGURATIONS[name] for name in given.only or every}
+    chosen = {name: CONFIGURATIONS[name] for name in given.only or CONFIGURATIONS}
     return [
         Unit(
             tuple(key_of(name, each.config, subject) for name, each in chosen.items()),
             partial(sweep_rows, subject, chosen),
         )
-        for subject in subjects_given(given, carrier_only=given.carrier_only)
+        for subject in subjects_given(given)
     ]
 
 
@@ -350,23 +317,19 @@ def parsimony_measures(model: str, jobs: int, subject: Subject, study: Study, ho
     carrier = carrier_of(study)
     sample = (hot if model == LSTM_ANY else study).train
     plans, known = sample.plans[:jobs], records(sample.plans[:jobs])
-    test, reference = study.test, study.reference
+    test = study.test
     if model == TWIN:
         windows = min(BASE.max_windows, len(windows_of(known, BASE)))
         config = replace(BASE, epochs=max(1, round(STEPS / -(-windows // BASE.batch))))
-        twin = train(records(subject.seen(plans, carrier)), config, subject.entropy, arm=subject.name)
-        scores = [
-            twin.features(subject.seen(each.plans, carrier), each.repetitions).difficulty[:, carrier]
-            for each in (test, reference)
-        ]
+        twin = train(records(up_to_joint(plans, carrier)), config, subject.entropy, arm=subject.name)
+        score = twin.features(up_to_joint(test.plans, carrier), test.repetitions).difficulty[:, carrier]
     else:
         times = sample.repetitions[:jobs]
         seed = int(subject.entropy.generate_state(1)[0])
         rise_k = sample.peak_c[:jobs] - study.ambient_c
         regressor = train_regressor(plans, times, rise_k, BASE, seed, steps=STEPS)
-        scores = [regressor.predict(each.plans, each.repetitions)[:, carrier] for each in (test, reference)]
-    peak_c = test.peak_c[:, carrier]
-    found = detection(scores[0], peak_c, reference=scores[1], limit_c=study.warning_c)
+        score = regressor.predict(test.plans, test.repetitions)[:, carrier]
+    found = detection(score, test.peak_c[:, carrier], limit_c=study.warning_c)
     minutes = sum(map(len, known)) / RATE_HZ / 60
     return {"minutes": round(minutes, 2), **{measure: round(found[measure], 4) for measure in RANKING}}
 
@@ -404,7 +367,7 @@ def parsimony_units(given: Namespace) -> list[Unit]:
             tuple(parsimony_key(model, jobs, subject) for jobs in JOBS for model in MODELS),
             partial(parsimony_rows, subject),
         )
-        for subject in subjects_given(given, carrier_only=True)
+        for subject in subjects_given(given)
     ]
 
 

@@ -20,8 +20,8 @@ RESULTS = "docs/results/"
 TINY = {
     "readings": "--scenarios quickstart --train 20 --exploration 6 --reference 125 --test 60 --novel 70",
     "sides": "--count 2 --train 20 --exploration 6 --reference 20 --test 60 --novel 2",
-    "sweep": "--scenarios heat_wave --arms 0 --only ours --train 10 --reference 25 --test 60",
-    "parsimony": "--scenarios heat_wave --train 6 --reference 25 --test 60",
+    "sweep": "--scenarios heat_wave --arms 0 --only ours --train 10 --test 60",
+    "parsimony": "--scenarios heat_wave --train 6 --test 60",
     "reliability": "--policies wspt --seeds 1 --fleets 1",
     "questions": "--seeds 1 --epochs 1",
     "identification": "",
