@@ -38,7 +38,7 @@ from scenarios.prepare.fleet import Randomisation, env_of, prepare
 from scenarios.spec.load import load
 from scenarios.spec.options import DifficultyName
 
-WINDOWS, SHIFT = 3, 720
+WINDOWS, SHIFT, LONGEST_S = 3, 720, 1200
 
 
 def single(difficulty: DifficultyName) -> dict[str, float]:
@@ -212,13 +212,11 @@ MEASURED = {
 def measured(*command: str) -> dict[str, Any]:
     """Run a measurement in a separate process; if it fails, return the reason as `missing`."""
     print(" ".join(command), "…", file=sys.stderr, flush=True)
-    done = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{command[0]}", *command[1:]],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+    program = [sys.executable, "-m", f"benchmarks.{command[0]}", *command[1:]]
+    try:
+        done = subprocess.run(program, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+    except subprocess.TimeoutExpired:
+        return {"missing": f"not done after {LONGEST_S} s"}
     if done.returncode:
         return {"missing": f"failed: {(done.stderr.strip().splitlines() or [f'exit code {done.returncode}'])[-1]}"}
     return json.loads(done.stdout.splitlines()[-1])

@@ -223,24 +223,20 @@ def joint_row(cooling: Cooling) -> Row:
     """Joint 2 of a nominal Gen3 with one way of cooling, and a cold start with 3 kg outstretched at 25 °C.
 
     Returns:
-        Conductances W/K: `shell_w_per_k` from housing to ambient, `neighbour_w_per_k` to the next housing,
-        `whole_w_per_k` from winding to ambient without neighbours. `shell_j_per_k`: capacity of the housing.
-        `warning_min`, `error_min`: time until 60 and 75 °C, None for never. `steady_c`: None for a thermal runaway.
+        `whole_w_per_k`: conductance from winding to ambient without neighbours, W/K. `warning_min`, `error_min`: time
+        until 60 and 75 °C, None for never. `steady_c`: None for a thermal runaway.
     """
     network, (coil, shell) = gen3_network(cooling=cooling), (winding(JOINT), housing(JOINT))
 
     def conductance(one: str, other: str) -> float:
         return float(network.edges[one, other]["conductance_w_per_k"]) if network.has_edge(one, other) else 0.0
 
-    outer = conductance(shell, "ambient")
     course = hold(PAYLOAD_KG, "outstretched", AMBIENT_C, cooling=cooling).cold
     return {
         "cooling": cooling,
         "passive": cooling in PASSIVE,
-        "shell_w_per_k": outer,
-        "shell_j_per_k": float(network.nodes[shell]["capacity_j_per_k"]),
-        "neighbour_w_per_k": conductance(shell, housing(JOINT + 1)),
-        "whole_w_per_k": in_series(conductance(coil, shell), outer) + conductance(coil, "ambient"),
+        "whole_w_per_k": in_series(conductance(coil, shell), conductance(shell, "ambient"))
+        + conductance(coil, "ambient"),
         "warning_min": course.t60_min[JOINT],
         "error_min": course.t75_min[JOINT],
         "steady_c": course.steady_c[JOINT],

@@ -17,13 +17,11 @@ from typing import Any, NamedTuple  # values of JSON
 
 import msgspec
 import numpy as np
-from joblib import delayed
 from rich.console import Console
 
 from fleet.errors import FleetError
 from scenarios.evaluate.statistics import Interval, interval
 from scenarios.json_rows import Row, Rows
-from scenarios.processes import worker_processes
 from scenarios.progress import brief
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
@@ -39,7 +37,7 @@ class Unit(NamedTuple):
 
     keys: tuple[str, ...]
     compute: Callable[[Collection[str]], KeyedRows]
-    """Rows of some of the keys, each with its key, one by one; it must be picklable."""
+    """Rows of some of the keys, each with its key, one by one."""
 
 
 def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> Table:
@@ -86,39 +84,23 @@ def content_key(*basis: Any) -> str:
 
 def one_row(key: str, compute: Callable[[], Mapping[str, Any]]) -> Unit:
     """A unit of a single row."""
-    return Unit((key,), lambda _: [(key, compute())])  # a worker gets it by cloudpickle
+    return Unit((key,), lambda _: [(key, compute())])
 
 
-def compute(units: Sequence[Unit], rows: Rows, *, workers: int = 1) -> None:
+def compute(units: Sequence[Unit], rows: Rows) -> None:
     """Append the missing rows of the units.
-
-    Args:
-        workers: Processes; 1 computes in this one. The rows do not depend on it, except their CPU times.
 
     Raises:
         FleetError: the file cannot be written, or an error of the study.
     """
     rows.check_writable()
     missing = [(unit, [key for key in unit.keys if key not in rows]) for unit in units]
-    missing = [(unit, keys) for unit, keys in missing if keys]
-    began_s, total = monotonic(), sum(len(keys) for _, keys in missing)
-    for done, (key, row) in enumerate(_computed(missing, workers), start=1):
-        rows.append(key, plain(row))
-        print(f"{done} of {total} rows, {brief(monotonic() - began_s)}: {key}", file=sys.stderr, flush=True)
-
-
-def _computed(missing: Sequence[tuple[Unit, list[str]]], workers: int) -> KeyedRows:
-    if workers == 1:
-        for unit, keys in missing:
-            yield from unit.compute(keys)
-        return
-    with worker_processes(workers) as pool:
-        for some in pool(delayed(_listed)(unit, keys) for unit, keys in missing):
-            yield from some or ()
-
-
-def _listed(unit: Unit, keys: list[str]) -> list[tuple[str, Mapping[str, Any]]]:
-    return list(unit.compute(keys))
+    began_s, done, total = monotonic(), 0, sum(len(keys) for _, keys in missing)
+    for unit, keys in missing:
+        for key, row in unit.compute(keys) if keys else ():
+            rows.append(key, plain(row))
+            done += 1
+            print(f"{done} of {total} rows, {brief(monotonic() - began_s)}: {key}", file=sys.stderr, flush=True)
 
 
 def plain(row: Mapping[str, Any]) -> Row:
@@ -177,11 +159,10 @@ def run(name: str, study: Experiment, argv: Sequence[str]) -> None:
     out = Path(f"runs/paper/{name}.jsonl")
     parser.add_argument("--out", type=Path, default=out, help=f"file of the rows, which is continued [{out}]")
     parser.add_argument("--show", action="store_true", help="compute nothing: print the rows of the file")
-    parser.add_argument("--workers", type=whole(1), default=1, help="processes [1]")
     given = parser.parse_args(argv)
     units, rows = study.units(given), Rows(given.out)
     if not given.show:
-        compute(units, rows, workers=given.workers)
+        compute(units, rows)
     wanted = rows.some(key for unit in units for key in unit.keys)
     if not wanted:
         raise FleetError(

@@ -19,7 +19,7 @@ from typing import Any  # values of the JSON
 
 import msgspec
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import binomtest, spearmanr
 from sklearn.covariance import LedoitWolf
 from sklearn.metrics import average_precision_score, roc_auc_score
 
@@ -36,7 +36,6 @@ from benchmarks.paper.harness import (
     table_of,
     whole,
 )
-from benchmarks.paper.reliability import wilson
 from benchmarks.paper.subjects import ALARM_RATE, SCENARIOS, Sample, Study, arm_of, make_study
 from fleet.arm.model import ArmModel
 from fleet.errors import FleetError
@@ -56,7 +55,7 @@ from twin.vae.twin import Twin
 Array = np.ndarray
 
 LIGHT = 64
-"""Light motions that calibrate; the others test."""
+"""Light motions that calibrate."""
 WORK = 100
 """Cool work that calibrates; the rest, and the cool test jobs, test."""
 CALIBRATION_BEFORE = 64
@@ -127,7 +126,7 @@ JOINTS: Mapping[str, Reading] = {
     "squared torque": lambda e: e.features.torque_sq,
 }
 """Score of a joint for: does the joint that carries the load (largest w_k) overheat?"""
-MEASURES = ("auroc", "auprc", "spearman", "hits", "false_work", "false_light", "false_known", "false_before")
+MEASURES = ("auroc", "auprc", "spearman", "hits", "false_work", "false_before")
 
 
 def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
@@ -135,7 +134,7 @@ def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
 
     Returns:
         `any`: [reading][measure], `carrier`: the joint of the largest w_k, counted from one, `joint`:
-        [reading][measure] for it, and shares of jobs that overheat. A measure without jobs of both kinds is None.
+        [reading][measure] for it. A measure without jobs of both kinds is None.
     """
     parts = {name: _features(twin, getattr(study, name)) for name in ("train", "reference", "test", "novel")}
     work, light = parts["reference"], parts["novel"]
@@ -144,12 +143,7 @@ def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
     before = [_rows(light, slice(count)), _rows(parts["train"], slice(count))]
     peak_c = study.test.peak_c
     cool = peak_c.max(axis=1) < study.cool_c
-    judged_on = {
-        "test": parts["test"],
-        "work": _stack([_rows(work, slice(WORK, None)), _rows(parts["test"], cool)]),
-        "light": _rows(light, slice(LIGHT, None)),
-        "known": _rows(parts["train"], slice(ArmSize.train - ArmSize.exploration)),
-    }
+    new_work = _stack([_rows(work, slice(WORK, None)), _rows(parts["test"], cool)])
     carrier = int(np.argmax(twin.joint_weight))
 
     def judged(reading: Reading, joint: int | None) -> dict[str, float | None]:
@@ -164,25 +158,19 @@ def judge_arm(study: Study, twin: Twin) -> dict[str, Any]:
             return largest_p_value(known, 0 * group if pooled else group, scores(features, kinds))
 
         peak = peak_c.max(axis=1) if joint is None else peak_c[:, joint]
-        hot, score = peak >= study.warning_c, scores(judged_on["test"], split)
+        hot, score = peak >= study.warning_c, scores(parts["test"], split)
         both = hot.any() and not hot.all()
         return {
             "auroc": float(roc_auc_score(hot, score)) if both else None,
             "auprc": float(average_precision_score(hot, score)) if both else None,
             "spearman": float(np.asarray(spearmanr(score, peak))[0]),
-            "hits": float((p(judged_on["test"], split)[hot] <= ALARM_RATE).mean()) if both else None,
-            **{
-                f"false_{kind}": float((p(judged_on[kind], split) <= ALARM_RATE).mean())
-                for kind in ("work", "light", "known")
-            },
-            "false_before": float((p(judged_on["work"], before, pooled=True) <= ALARM_RATE).mean()),
+            "hits": float((p(parts["test"], split)[hot] <= ALARM_RATE).mean()) if both else None,
+            "false_work": float((p(new_work, split) <= ALARM_RATE).mean()),
+            "false_before": float((p(new_work, before, pooled=True) <= ALARM_RATE).mean()),
         }
 
     return {
         "carrier": carrier + 1,
-        "overheats": [float(share) for share in (peak_c >= study.warning_c).mean(axis=0)],
-        "weight": [float(w) for w in twin.joint_weight],
-        "twin": twin.version,
         "any": {name: judged(reading, None) for name, reading in TOTALS.items()},
         "joint": {name: judged(reading, carrier) for name, reading in JOINTS.items()},
     }
@@ -227,8 +215,7 @@ def reading_tables(rows: Sequence[Row]) -> dict[str, Table]:
     for question, title in TITLES.items():
         lines: list[tuple[str, ...]] = []
         for reading, measured in reading_cells(rows, question).items():
-            shown = [measured[name] for name in ("auroc", "auprc", "spearman", "hits", "false_work", "false_before")]
-            texts = (each.text(3) if i in (0, 4) else f"{each.mean:.3f}" for i, each in enumerate(shown))
+            texts = (each.text(3) if i in (0, 4) else f"{each.mean:.3f}" for i, each in enumerate(measured.values()))
             lines.append((reading, *texts))
         caption = f"{len(rows)} arms and seeds; jobs found and false alarms of a verdict at {ALARM_RATE:.0%}"
         tables[f"readings_{question}"] = table_of((title, *HEADS), lines, caption)
@@ -367,8 +354,9 @@ def _realised(model: ArmModel, made: Variation, source: Plan, payload_kg: float 
 
 
 def share_of(event: Array) -> tuple[float, float, float]:
-    """Share of true values with its 95 % Wilson interval."""
-    return float(event.mean()), *wilson(event)
+    """Share of true values with its 95 % interval (Wilson, JASA 22, 1927)."""
+    ends = binomtest(int(event.sum()), len(event)).proportion_ci(method="wilson")
+    return float(event.mean()), float(ends.low), float(ends.high)
 
 
 PAYLOADS = {"own": "as the source", "common": "2 kg for all"}

@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
-from scipy.stats import binomtest
 from sklearn.metrics import brier_score_loss, roc_auc_score
 
 from agents.policy import WAIT
@@ -38,33 +37,17 @@ from scenarios.table import Table
 Array = np.ndarray
 
 BINS = 10
-"""Default number of bins of equal mass."""
+"""Default number of bins."""
 
 
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """Stated probabilities against outcomes, by bins of equal mass without those that ties leave empty."""
+def calibration_error(p: Array, event: Array, *, bins: int = BINS) -> float:
+    """Expected calibration error: mean over jobs of |share with the event − stated probability| of their bin.
 
-    mean_p: Array
-    """Mean stated probability, [bin], ascending."""
-    share: Array
-    """Share of jobs with the event, [bin]."""
-    count: Array
-    """Jobs, int [bin]."""
-    low: Array
-    """Lower end of the Wilson interval of the share, [bin]."""
-    high: Array
-    """Upper end, [bin]."""
+    Source: Naeini et al., AAAI 2015, with bins of equal mass, without those that ties leave empty.
 
-    @property
-    def error(self) -> float:
-        """Expected calibration error: mean over jobs of |share − stated probability| of their bin (Naeini et al.,
-        AAAI 2015, with bins of equal mass)."""
-        return float(np.average(np.abs(self.share - self.mean_p), weights=self.count))
-
-
-def reliability(p: Array, event: Array, *, bins: int = BINS) -> Reliability:
-    """The reliability table of stated probabilities [job] against outcomes, bool [job].
+    Args:
+        p: Stated probability, [job].
+        event: Whether it happened, bool [job].
 
     Raises:
         ValueError: no jobs, unequal lengths, or probabilities outside [0, 1].
@@ -74,21 +57,11 @@ def reliability(p: Array, event: Array, *, bins: int = BINS) -> Reliability:
         raise ValueError(f"Probabilities and events must be [job], at least one (got {p.shape}, {event.shape}).")
     if not ((p >= 0) & (p <= 1)).all():
         raise ValueError("Probabilities must lie in [0, 1].")
-    edges = np.percentile(p, np.linspace(0.0, 1.0, bins + 1) * 100)  # rounds as scikit-learn does
+    edges = np.percentile(p, np.linspace(0.0, 100.0, bins + 1))
     of_job = np.searchsorted(edges[1:-1], p)
     groups = [of_job == each for each in np.unique(of_job)]
-    mean_p, share, count = (
-        np.array([of(group) for group in groups])
-        for of in (lambda group: p[group].mean(), lambda group: event[group].mean(), np.count_nonzero)
-    )
-    low, high = np.transpose([wilson(event[group]) for group in groups])
-    return Reliability(mean_p, share, count, low, high)
-
-
-def wilson(event: Array) -> tuple[float, float]:
-    """95 % interval of the probability of an event, bool [draw] (Wilson, JASA 22, 1927), both ends."""
-    ends = binomtest(int(event.sum()), len(event)).proportion_ci(method="wilson")
-    return float(ends.low), float(ends.high)
+    apart = [abs(event[group].mean() - p[group].mean()) for group in groups]
+    return float(np.average(apart, weights=[group.sum() for group in groups]))
 
 
 POLICIES = "wspt,wspt_cool,least_difficulty"
@@ -142,18 +115,17 @@ def verdict(awards: Awards) -> Row | None:
     """
     if not len(awards):
         return None
-    table, error_k = reliability(awards.p, awards.passed), awards.predicted_c - awards.peak_c
+    error_k = awards.predicted_c - awards.peak_c
     error_k = error_k[np.isfinite(error_k)]
     both, peaks = 0 < awards.passed.sum() < len(awards), len(error_k) > 0
     return {
         "awards": len(awards),
         "passed": int(awards.passed.sum()),
-        "ece": table.error,
+        "ece": calibration_error(awards.p, awards.passed),
         "brier": float(brier_score_loss(awards.passed, awards.p, pos_label=True)),
         "auroc": float(roc_auc_score(awards.passed, awards.p)) if both else np.nan,
         "peak_rms_k": float(np.sqrt(np.mean(error_k**2))) if peaks else np.nan,
         "peak_bias_k": float(error_k.mean()) if peaks else np.nan,
-        "reliability": {name: values.tolist() for name, values in vars(table).items()},
     }
 
 
@@ -244,8 +216,8 @@ def _true_peak(ends_c: Array, dt_s: float, begin_s: float, end_s: float) -> floa
 
 
 def reliability_tables(rows: Sequence[Row]) -> dict[str, Table]:
-    """Accuracy of P and peaks, a row for each policy and group of arms; and the reliability diagram of all awards."""
-    lines, bins = list[tuple[str, ...]](), list[tuple[str, ...]]()
+    """Accuracy of P and peaks, a row for each policy and group of arms."""
+    lines: list[tuple[str, ...]] = []
     for row in rows:
         who = f"{row['scenario']}, {row['policy']}, {row['risk']}"
         for group, v in row["groups"].items():
@@ -255,16 +227,9 @@ def reliability_tables(rows: Sequence[Row]) -> dict[str, Table]:
             peaks = (f"{number(v['peak_rms_k']):.2f}", f"{number(v['peak_bias_k']):+.2f}")
             unknown = str(row["unknown"]) if group == "all" else ""
             lines.append((who, group, str(v["awards"]), str(v["passed"]), unknown, *shown, *peaks))
-        if row["groups"]["all"] is not None:
-            table = row["groups"]["all"]["reliability"]
-            for p, share, low, high, count in zip(
-                *(table[name] for name in ("mean_p", "share", "low", "high", "count")), strict=True
-            ):
-                bins.append((who, f"{p:.3f}", f"{share:.3f} [{low:.3f}, {high:.3f}]", str(count)))
     heads = ("shift", "arms", "awards", "passed", "unknown", "ECE", "Brier", "AUROC", "peak RMS, K", "peak bias, K")
     caption = f"P(saturation) in the shift; warm: a motor within {WARM_K:g} K of the warning limit, or beyond it"
-    diagram = table_of(("shift", "mean P", "share passed [95 %]", "awards"), bins, "Stated and observed")
-    return {"reliability": table_of(heads, lines, caption), "reliability_diagram": diagram}
+    return {"reliability": table_of(heads, lines, caption)}
 
 
 def reliability_options(parser: ArgumentParser) -> None:

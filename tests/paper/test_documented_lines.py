@@ -52,8 +52,7 @@ def parsed(experiment: Experiment, words: list[str]):
 
     parser = ArgumentParser(exit_on_error=False)
     experiment.options(parser)
-    for option in ("--out", "--workers"):
-        parser.add_argument(option)
+    parser.add_argument("--out")
     parser.add_argument("--show", action="store_true")
     return parser.parse_args(words)
 

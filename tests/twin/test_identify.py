@@ -8,7 +8,7 @@ from scipy.stats import norm
 from sklearn.metrics import brier_score_loss
 
 from benchmarks.paper.real_logs import held_out_errors
-from benchmarks.paper.reliability import reliability
+from benchmarks.paper.reliability import calibration_error
 from fleet.difficulty import KNOWN, SETTLING_S, known_temperatures
 from fleet.errors import CheckpointError, IdentificationError
 from fleet.heat.motor import friction_heat, gen3_motors, reference_current
@@ -256,7 +256,7 @@ def test_probability_from_past_jobs_of_an_arm_unlike_the_nominal_one(holds):
     )
     assert 0.1 < passed.mean() < 0.9
     assert brier_score_loss(passed[taught:], p) <= 0.045
-    assert reliability(p, passed[taught:]).error <= 0.04
+    assert calibration_error(p, passed[taught:]) <= 0.04
 
 
 def test_the_warm_end_is_where_newton_says_it_settles(holds):
