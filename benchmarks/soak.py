@@ -6,7 +6,7 @@ The auctioneer's state machine runs with its real journal and 16 model arms, whi
 once. Real time is simulated: a week, whatever the number of jobs. Every submission of 10 jobs is written through to the
 disk, other records at most every 50 ms. One job in 50 is returned once, one in 200 expires.
 
-Writes soak.json and soak.png. Exit code 1: the p99 of the time to accept a submission is more than 1.5 times as long in
+Writes soak.json. Exit code 1: the p99 of the time to accept a submission is more than 1.5 times as long in
 the last tenth as in the first, memory or journal have grown by more than half since the middle, a job is missing, or a
 restart with 10,000 open jobs takes more than 3 s. The first tenth counts from the moment that settled jobs leave.
 """
@@ -196,30 +196,6 @@ def restart_s(folder: Path) -> float:
     return took_s
 
 
-def plot(samples: list[Sample], path: Path) -> None:
-    """Draw memory, journal and time to accept a submission against the number of jobs."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 7), layout="constrained")
-    thousands = [sample.jobs / 1e3 for sample in samples]
-    axes[0].plot(thousands, [sample.rss_mb for sample in samples])
-    axes[0].set_ylabel("resident memory, MB")
-    axes[1].plot(thousands, [sample.journal_mb for sample in samples])
-    axes[1].set_ylabel("journal, MB")
-    axes[2].plot(thousands, [sample.submit_p99_ms for sample in samples], label="p99")
-    axes[2].plot(thousands, [sample.submit_p50_ms for sample in samples], label="median")
-    axes[2].set_ylabel("time to accept 10 jobs, ms")
-    axes[2].set_xlabel("jobs done, thousands")
-    axes[2].legend()
-    for axis in axes:
-        axis.set_ylim(bottom=0)
-        axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
-
-
 def main() -> None:
     """Run the week, write the figures and check the goals."""
     arguments = options(__doc__, jobs=100_000, arms=16, out=Path("runs/soak"))
@@ -243,7 +219,6 @@ def main() -> None:
     good = not missing and last <= GOAL_RATIO * first and max(grown) <= GOAL_GROWTH and took_s <= GOAL_RESTART_S
     text = json.dumps({**figures, "good": good, "samples": [asdict(sample) for sample in samples]})
     (arguments.out / "soak.json").write_text(text + "\n", encoding="utf-8")
-    plot(samples, arguments.out / "soak.png")
     print(json.dumps({**figures, "good": good}, indent=1))
     sys.exit(not good)
 
