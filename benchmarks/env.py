@@ -183,7 +183,7 @@ def rows() -> Iterator[Row]:
         yield Row(f"VMAS simple_spread, {envs}", ("peers", "vmas", envs), "vmas")
     for envs in ("32", "1024"):
         yield Row(f"PufferLib Ocean RWARE tiny (C), {envs}", ("peers", "ocean", envs), "ocean_rware")
-    yield Row("Craftax-Classic (JAX), 1024", ("peers", "craftax", "1024"), "craftax")
+    yield Row("Craftax-Classic (JAX), 64", ("peers", "craftax", "64"), "craftax")
     for peers, what in (((), "all peers"), (("3",), "3 peers")):
         for arms in ("4", "8", "16", "64"):
             yield Row(f"64 envs of {arms} arms that observe {what}", ("env", "batch", "blind", "64", arms, *peers))

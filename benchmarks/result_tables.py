@@ -132,9 +132,10 @@ def env_table(measured: Mapping[str, Any]) -> str:
             continue
         speed, copied = row["observed_gb_per_s"], row["copied_gb_per_s"]
         cells = (f"{row[name]:,.0f}" for name in ("steps_per_s", "ns_per_agent_step", "observed_bytes"))
-        rows.append((row["what"], *cells, f"{speed:.3g}", f"{100 * speed / copied:.2g} %"))
+        shown = (np.format_float_positional(x, 2, fractional=False, trim="-") for x in (speed, 100 * speed / copied))
+        rows.append((row["what"], *cells, *shown))
     heads = ("env", "env steps per CPU-second", "ns per agent step", "bytes observed per env step", "GB/s",
-             "share of `np.copyto`")  # fmt: skip
+             "% of `np.copyto`")  # fmt: skip
     return table(heads, rows)
 
 

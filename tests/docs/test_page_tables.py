@@ -10,10 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from benchmarks.harness import observed_bytes, step_figures
 from benchmarks.paper.cooling import cooling_tables
-from benchmarks.result_tables import difference, efficiency_table, live_table, steps_table, trainings
+from benchmarks.result_tables import difference, efficiency_table, env_table, live_table, steps_table, trainings
 from docs.tables import tables_of
 from scenarios.json_rows import Rows
 
@@ -90,6 +92,28 @@ def test_a_live_shift_stands_beside_the_simulated_one() -> None:
         "live": {"finished": 66, "faults": 1},
     }
     assert cells(live_table({"rows": [row]})) == [["`wspt`", "central", "65", "0", "66", "1"]]
+
+
+def test_observed_bytes_are_those_of_all_arrays_and_repeated_axes_count_once() -> None:
+    own, shared = np.zeros((5, 4, 3), np.float32), np.broadcast_to(np.zeros((5, 1, 2), np.float32), (5, 4, 2))
+    assert observed_bytes({"own": own, "shared": shared, "mask": [np.zeros(7, np.int8)]}) == 240 + 40 + 7
+
+
+def test_the_speed_of_an_env_stands_beside_a_copy_of_its_observations() -> None:
+    def window() -> tuple[int, np.ndarray]:
+        np.ones(1_000_000).sum()
+        return 10, np.zeros((8, 25), np.float32)
+
+    figures = step_figures(window, envs=8, agents=2)
+    assert figures["observed_bytes"] == 100
+    assert figures["ns_per_agent_step"] == pytest.approx(5e8 / figures["steps_per_s"])
+    assert 0 < figures["observed_gb_per_s"] < figures["copied_gb_per_s"]
+    half = {"observed_gb_per_s": 2.0, "copied_gb_per_s": 4.0, "steps_per_s": 2e7, "ns_per_agent_step": 25.0}
+    rows = [{"what": "ours", **figures, **half}, {"what": "theirs", "missing": "not installed"}]
+    assert cells(env_table({"rows": rows})) == [
+        ["ours", "20,000,000", "25", "100", "2", "50"],
+        ["theirs", "not installed", "", "", "", ""],
+    ]
 
 
 ROOT = Path(__file__).parents[2]
