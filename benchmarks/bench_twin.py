@@ -1,13 +1,11 @@
-"""Cost of a twin: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM`.
+"""Cost of a twin: a training step and scoring, beside plain `nn.LSTM`.
 
-    python -m benchmarks.bench_twin [--full]
-    python -m benchmarks.bench_twin --arms 100
+    python -m benchmarks.bench_twin [--arms 100]
 
 CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
-layers, decoder, loss and backward pass, or the forward pass alone. Training is extrapolated from its steps; --full runs
-it on random smooth motion. A scored job lasts 16 s; a real plan has the median number of windows of quickstart. --arms
-trains that many twins of the quick size in two processes and scores 1 000 jobs with each, beside an extrapolated
-training of `nn.LSTM` network after network.
+layers, decoder, loss and backward pass, or the forward pass alone. A scored job lasts 16 s. --arms trains that many
+twins of the quick size in two processes and scores 1 000 jobs with each, beside an extrapolated training of `nn.LSTM`
+network after network.
 """
 
 import os
@@ -84,8 +82,8 @@ def untrained(config: TwinConfig) -> Twin:
 
 
 def training(config: TwinConfig, name: str) -> None:
-    """Duration of a training step beside plain, and of a whole training."""
-    channels, nets = config.channels(JOINTS), config.networks(JOINTS)
+    """Duration of a training step beside plain."""
+    channels = config.channels(JOINTS)
     x = torch.randn(config.batch, config.window, channels)
     net = build(config, 0, channels=channels)
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, fused=True)
@@ -96,11 +94,8 @@ def training(config: TwinConfig, name: str) -> None:
         calls[str(count)] = _epochs_of(count, config, channels)
     took = medians(calls, RUNS)
     ours = {count: took[str(count)] / count for count in BESIDE}
-    steps = nets * -(-config.max_windows // config.batch)
-    trial = round(config.trial * config.epochs) if config.restarts > 1 else 0
-    whole_s = ours[RESTARTED] * steps * (config.epochs + trial * (config.restarts - 1))
     cells = "".join(f"{1e3 * each:>9.1f}" for each in (*ours.values(), took["plain"]))
-    print(f"{name:<26}{cells}{ours[RESTARTED] / took['plain']:>8.2f}   all joints and restarts: {whole_s:.0f} s")
+    print(f"{name:<26}{cells}{ours[RESTARTED] / took['plain']:>8.2f}")
 
 
 def _epochs_of(count: int, config: TwinConfig, channels: int) -> Callable[[], object]:
@@ -187,28 +182,19 @@ def fleet(arms: int) -> None:
 
 def main() -> None:
     """Print the tables."""
-    full = False, "train seven joints at the default configuration"
-    arguments = options(__doc__, full=full, arms=(0, "number of arms whose twins are trained and scored"))
+    arguments = options(__doc__, arms=(0, "number of arms whose twins are trained and scored"))
     torch.set_num_threads(1)
     if arguments.arms > 1:
         fleet(arguments.arms)
         return
-    default, arm = TwinConfig(), TwinConfig(scope="arm", hidden=64, latent=8)
+    default = TwinConfig()
     beside = "".join(f"{f'{count} nets':>9}" for count in BESIDE)
     print(f"{'ms per step and network':<26}{beside}{'plain':>9}{'ratio':>8}")
     training(default, "one joint of seven")
-    training(arm, "whole arm")
     columns = ("features", "networks", "plain")
     print(f"\n{'scoring, 7 joints, ms':<34}" + "".join(f"{name:>11}" for name in columns) + f"{'ratio':>8}")
-    for config, name in ((default, "1 job of 16 s"), (arm, "whole arm, 1 job of 16 s")):
-        scoring(config, name, windows_in(JOB_S, config), 200)
-        scoring(config, name.replace("1 job", "1 000 jobs"), JOBS * windows_in(JOB_S, config), 3)
-    scoring(default, "1 real plan, 11 windows", 11, 100)
-    if arguments.full:
-        rng = np.random.default_rng(0)
-        records = [smooth(rng, 12.0) for _ in range(250)]
-        took_s = seconds(lambda: train(records, default, np.random.SeedSequence(0), arm="bench"))
-        print(f"\nseven joints, default configuration, {default.restarts} restarts: {took_s:.0f} s on one core")
+    scoring(default, "1 job of 16 s", windows_in(JOB_S, default), 200)
+    scoring(default, "1 000 jobs of 16 s", JOBS * windows_in(JOB_S, default), 3)
 
 
 if __name__ == "__main__":

@@ -67,8 +67,6 @@ def calibration_error(p: Array, event: Array, *, bins: int = BINS) -> float:
 POLICIES = "wspt,wspt_cool,least_difficulty"
 FIRST_SEED = 10_000
 """Seeds from this one on were not used for tuning."""
-WARM_K = 5.0
-"""An arm is warm if its hottest motor is at most this far below the warning limit, or above the limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,22 +81,11 @@ class Awards:
     """True peak, counted as in `fleet.difficulty.SETTLING_S`; NaN if a fault ended the plan."""
     passed: Array
     """Whether a motor passed the warning limit, bool."""
-    warm: Array
-    """Whether the arm was warm at the award, bool; see `WARM_K`."""
     unknown: int = 0
     """Number of awards without a known outcome: the shift ended, or the arm gave the job back."""
 
     def __len__(self) -> int:
         return len(self.p)
-
-    def part(self, rows: Array) -> "Awards":
-        """Some of the awards, by index or mask."""
-        return Awards(*(getattr(self, field.name)[rows] for field in fields(self)[:-1]))
-
-
-def groups(awards: Awards) -> dict[str, Awards]:
-    """All awards, those of warm arms, and those of cool arms."""
-    return {"all": awards, "warm": awards.part(awards.warm), "cool": awards.part(~awards.warm)}
 
 
 def join(parts: Sequence[Awards]) -> Awards:
@@ -108,13 +95,14 @@ def join(parts: Sequence[Awards]) -> Awards:
     return Awards(*arrays, unknown=sum(part.unknown for part in parts))
 
 
-def verdict(awards: Awards) -> Row | None:
-    """Accuracy of the predictions at these awards; None without awards.
+def verdict(awards: Awards) -> Row:
+    """Accuracy of the predictions at these awards.
 
     AUROC is unknown if all awards had the same outcome; the errors of the peak are over plans that no fault ended.
+
+    Raises:
+        ValueError: no awards.
     """
-    if not len(awards):
-        return None
     error_k = awards.predicted_c - awards.peak_c
     error_k = error_k[np.isfinite(error_k)]
     both, peaks = 0 < awards.passed.sum() < len(awards), len(error_k) > 0
@@ -151,17 +139,15 @@ def reliability_rows(
             found[key] += [awards_of_shift(fleet, policy, seed) for seed in seeds]
     for key, parts in found.items():
         awards = join(parts)
-        judged_groups = {name: verdict(part) for name, part in groups(awards).items()}
         card = {"scenario": scenario.name, "policy": missing[key], "risk": risk, "unknown": awards.unknown}
-        yield key, card | {"groups": judged_groups}
+        yield key, card | verdict(awards)
 
 
 def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
     """The awards of one shift, with the predictions at each award and the outcome of its plan."""
     records: list[StepRecord] = []
     env = env_of(fleet, bus="memory", keep_events=True, watch=records.append, decisions="interval")
-    chooser, stated = policy_at(policy, seed), dict[tuple[str, int], tuple[float, float, bool]]()
-    warm_c = fleet.scenario.limits.warning_c - WARM_K
+    chooser, stated = policy_at(policy, seed), dict[tuple[str, int], tuple[float, float]]()
     try:
         env.reset(seed=seed)
         let_plan(chooser, fleet, env, seed)
@@ -171,8 +157,8 @@ def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
             for arm, action in actions.items():
                 own = known[arm]
                 if WAIT < action < env.layout.actions - 1:
-                    option, warm = int(action) - 1, bool(own.temp_c.max() >= warm_c)
-                    stated[arm, tick] = float(own.p_saturation[option]), float(own.peak_c[option]), warm
+                    option = int(action) - 1
+                    stated[arm, tick] = float(own.p_saturation[option]), float(own.peak_c[option])
             env.step(actions)
     finally:
         env.close()
@@ -186,8 +172,8 @@ def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
         own_c = ends_c[:, env.possible_agents.index(arm)]
         peak_c = np.nan if faulted else _true_peak(own_c, env.world.dt_s, begin_s, end_s)
         rows.append((*stated[arm, tick], peak_c, faulted or peak_c >= fleet.scenario.limits.warning_c))
-    p, predicted_c, warm, peak_c, passed = np.array(rows, dtype=float).reshape(-1, 5).T
-    return Awards(p, predicted_c, peak_c, passed.astype(bool), warm.astype(bool), unknown)
+    p, predicted_c, peak_c, passed = np.array(rows, dtype=float).reshape(-1, 4).T
+    return Awards(p, predicted_c, peak_c, passed.astype(bool), unknown)
 
 
 def _plans(events: Sequence[Event]) -> Iterator[tuple[str, float, float | None, bool]]:
@@ -216,19 +202,15 @@ def _true_peak(ends_c: Array, dt_s: float, begin_s: float, end_s: float) -> floa
 
 
 def reliability_tables(rows: Sequence[Row]) -> dict[str, Table]:
-    """Accuracy of P and peaks, a row for each policy and group of arms."""
+    """Accuracy of P and peaks, a row for each policy."""
     lines: list[tuple[str, ...]] = []
     for row in rows:
         who = f"{row['scenario']}, {row['policy']}, {row['risk']}"
-        for group, v in row["groups"].items():
-            if v is None:
-                continue
-            shown = (f"{number(v[name]):.3f}" for name in ("ece", "brier", "auroc"))
-            peaks = (f"{number(v['peak_rms_k']):.2f}", f"{number(v['peak_bias_k']):+.2f}")
-            unknown = str(row["unknown"]) if group == "all" else ""
-            lines.append((who, group, str(v["awards"]), str(v["passed"]), unknown, *shown, *peaks))
-    heads = ("shift", "arms", "awards", "passed", "unknown", "ECE", "Brier", "AUROC", "peak RMS, K", "peak bias, K")
-    caption = f"P(saturation) in the shift; warm: a motor within {WARM_K:g} K of the warning limit, or beyond it"
+        counts = (str(row[name]) for name in ("awards", "passed", "unknown"))
+        shown = (f"{number(row[name]):.3f}" for name in ("ece", "brier", "auroc"))
+        lines.append((who, *counts, *shown, f"{number(row['peak_rms_k']):.2f}", f"{number(row['peak_bias_k']):+.2f}"))
+    heads = ("shift", "awards", "passed", "unknown", "ECE", "Brier", "AUROC", "peak RMS, K", "peak bias, K")
+    caption = "P(saturation) and predicted peak at each award, and the outcome"
     return {"reliability": table_of(heads, lines, caption)}
 
 

@@ -151,35 +151,32 @@ def compare_starts(
         auroc: Of d of joint 2 by a twin.
 
     Returns:
-        `minutes`: recorded motion by number of jobs. `unchanged_error`: of the first twin as it is, z-scores included.
-        `trained`: of each start and number of jobs the steps and CPU time of its training, the `error_of` held-out
-        motion, and AUROC.
+        `unchanged_error`: of the first twin as it is, z-scores included. `trained`: of each start and number of jobs
+        the CPU time of its training, the `error_of` held-out motion, and AUROC.
     """
     config = source.config
     common = Scaler.fit(windows_of(parts[max(parts)], config))
     rows: list[Row] = []
     for n, some in parts.items():
 
-        def judged(start: str, steps: int, make: Callable[[], Twin], n: int = n) -> Row:
+        def judged(start: str, make: Callable[[], Twin], n: int = n) -> Row:
             began_s = time.process_time()
             twin = make()
-            cost = {"start": start, "jobs": n, "steps": steps, "cpu_s": time.process_time() - began_s}
+            cost = {"start": start, "jobs": n, "cpu_s": time.process_time() - began_s}
             return cost | {"error": error_of(twin, held_out, common), "auroc": auroc(twin)}
 
         whole_training = with_steps(config, some, size.steps)
         further = replace(with_steps(config, some, size.further_steps), learning_rate=size.further_rate)
         rescaled = partial(replace, source, scaler=Scaler.fit(windows_of(some, config)))
         rows += [
-            judged(NOTHING, size.steps, partial(train, some, whole_training, child(random, n), arm=source.arm)),
-            judged(RESCALED, 0, rescaled),
+            judged(NOTHING, partial(train, some, whole_training, child(random, n), arm=source.arm)),
+            judged(RESCALED, rescaled),
             judged(
                 FURTHER,
-                size.further_steps,
                 partial(continue_training, source, some, further, child(random, n), arm=source.arm),
             ),
         ]
-    minutes = [sum(map(len, some)) / config.record_hz / 60.0 for some in parts.values()]
-    return {"minutes": minutes, "unchanged_error": error_of(source, held_out, common), "trained": rows}
+    return {"unchanged_error": error_of(source, held_out, common), "trained": rows}
 
 
 def error_of(twin: Twin, windows: Array, common: Scaler) -> float:

@@ -195,11 +195,11 @@ def test_synthetic_motion_is_predicted_to_stay_cool(twin, study):
 def transferred(seed: int, further: tuple[float, float]) -> dict:
     errors = {NOTHING: (0.6, 0.5), RESCALED: (0.55, 0.52), FURTHER: further}
     rows = [
-        {"start": start, "jobs": jobs, "steps": 10, "cpu_s": 1.0, "error": error, "auroc": None}
+        {"start": start, "jobs": jobs, "cpu_s": 1.0, "error": error, "auroc": None}
         for start, pair in errors.items()
         for jobs, error in zip((5, 40), pair, strict=True)
     ]
-    return {"target": "tool", "seed": seed, "minutes": [1.0, 8.0], "unchanged_error": 0.7, "trained": rows}
+    return {"target": "tool", "seed": seed, "unchanged_error": 0.7, "trained": rows}
 
 
 def test_the_share_of_data_is_that_of_equal_error():

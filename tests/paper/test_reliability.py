@@ -60,15 +60,12 @@ def test_p_and_peaks_agree_with_the_outcomes_of_a_shift(monkeypatch) -> None:
     )
     ((key, row),) = reliability_rows(load("heat_wave"), (10_000, 10_001), 1, "rc", {"key": "wspt"}, ["key"])
     assert (key, row["policy"]) == ("key", "wspt")
-    every = row["groups"]["all"]
-    assert every["awards"] > 100
-    assert 20 < every["passed"] < every["awards"] - 20
-    assert every["ece"] <= 0.05
-    assert every["brier"] <= 0.05
-    assert every["auroc"] >= 0.95
-    assert every["peak_rms_k"] < 2.0
-    assert row["groups"]["warm"]["brier"] <= 0.05
-    assert row["groups"]["warm"]["awards"] + row["groups"]["cool"]["awards"] == every["awards"]
+    assert row["awards"] > 100
+    assert 20 < row["passed"] < row["awards"] - 20
+    assert row["ece"] <= 0.05
+    assert row["brier"] <= 0.05
+    assert row["auroc"] >= 0.95
+    assert row["peak_rms_k"] < 2.0
 
 
 def test_a_plan_ends_at_home_or_by_a_fault_and_else_its_outcome_is_unknown() -> None:
