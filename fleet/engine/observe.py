@@ -268,7 +268,7 @@ def largest_piece(first: Array, block: Array, row: int, known_c: Array, left_s: 
     """Value of a forecast without the pieces of moments later than `left_s`, −inf if none is left."""
     most = NEVER
     for b in range(nonnegative(first[row]), nonnegative(first[row + 1])):
-        for lane in range(LANES):
+        for lane in range(len(room)):  # a number that the compiler does not know, so that it does not unroll
             total = block[b, 0, lane]
             for i in range(KNOWN):
                 total += block[b, 2 + i, lane] * known_c[i]

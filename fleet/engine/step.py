@@ -243,17 +243,20 @@ def follow_housings(
     The noise of the sensors is left out: over the time constants of housings it averages out to a tenth.
 
     Args:
+        begin, end: Temperatures of the network, which are overwritten.
         load_w: Room for the loads of the housings, [lane].
     """
     for k in range(JOINTS):
         warmed_w = _HALF * (begin[k] + end[k]) * law["housing_winding"][k] + law["housing_ambient"][k] * ambient_c
         load_w[k] = warmed_w + (friction_w[k] + (law["housing_idle_w"][k] if powered else _ZERO))
         begin[k] = arm["housing_c"][k]
-    for m in range(JOINTS):
+    for m in range(len(load_w)):  # a number that the compiler does not know, so that it does not unroll
         total = _ZERO
         for k in range(JOINTS):
             total += law["housing_keep"][k, m] * begin[k] + law["housing_gain"][k, m] * load_w[k]
-        arm["housing_c"][m] = total
+        end[m] = total
+    for m in range(JOINTS):
+        arm["housing_c"][m] = end[m]
 
 
 @jit
