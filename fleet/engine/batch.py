@@ -16,30 +16,30 @@ from fleet.engine.step import (
     BLOCK,
     CLAIM,
     MOVE,
-    NO_SCRIPT,
     OBSERVE,
     OFFER,
     OUTCOME,
     PLAY,
     ROUNDING_S,
-    Plans,
-    Script,
-    script_of,
     step_rows,
 )
 from fleet.engine.tables import (
     DRIVE,
     INFO,
+    NO_SCRIPT,
     PER_ARM,
     TRACE,
     OpenJobs,
+    Plans,
     Room,
+    Script,
     Simulation,
     Tables,
     empty_state,
     event_buffer,
     form_of,
     room_for,
+    script_of,
 )
 from fleet.heat.thermal import NODES
 from fleet.jit import kernel, nonnegative
@@ -224,7 +224,6 @@ class Engine:
         arms, slots, jobs = layout.arms, layout.slots, max(jobs, FEWEST_JOBS)
         self.tables, self.layout = tables, layout
         self._options = (events, trace, compiled, threads)
-        self._weights = weights_per_unit(weights)
         self._all = np.arange(envs)
         offers = OpenJobs(
             slot_job=np.full((envs, slots), -1, np.int32),
@@ -244,6 +243,8 @@ class Engine:
             np.zeros((envs, arms), INFO),
             form_of(layout),
             room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK)),
+            weights_per_unit(weights),
+            NO_SCRIPT,
         )
         self._prepare()
 
@@ -255,12 +256,15 @@ class Engine:
         self._shares = [self._all[first : first + size] for first in range(0, len(self._all), size)]
         mine, room = self._simulation, self._simulation.room
         rooms = [room, *(Room(*(each.copy() for each in room)) for _ in self._shares[1:])]
-        self._bundles: list[Any] = [mine._replace(room=each) for each in rooms]  # numba's where the loops are compiled
+        self._bundles = [self._bundle(mine._replace(room=each)) for each in rooms]
         """One for each thread."""
-        if self._step is not step_rows.interpreted:
-            from fleet.engine.bundle import bundle_of
 
-            self._bundles = [bundle_of(each) for each in self._bundles]
+    def _bundle(self, simulation: Simulation) -> Any:  # numba's where the loops are compiled
+        if self._step is step_rows.interpreted:
+            return simulation
+        from fleet.engine.bundle import bundle_of
+
+        return bundle_of(simulation)
 
     @property
     def envs(self) -> int:
@@ -378,7 +382,8 @@ class Engine:
         over = (self.state.tick >= until) | ((self.state.unfinished == 0) & (self.state.number > 0))
         rows = np.flatnonzero(~over[: len(script.reward)])
         self._run(OFFER, actions, terms, rows, _NO_VECTORS)
-        self._run(PLAY + CLAIM + MOVE + OFFER, actions, terms, rows, _NO_VECTORS, until, script)
+        bundle = self._bundle(self._simulation._replace(script=script))
+        self._step(bundle, PLAY + CLAIM + MOVE + OFFER, actions, terms, until, rows, *_NO_VECTORS)
         return script
 
     def _stepped(self, parts: int, actions: Array, out: Parts, until: Array | None = None) -> Array:
@@ -407,11 +412,10 @@ class Engine:
         rows: Array,
         out: Parts,
         until: Array | None = None,
-        script: Script = NO_SCRIPT,
         thread: int = 0,
     ) -> None:
         until = _ONE_INTERVAL if until is None else until
-        self._step(self._bundles[thread], parts, actions, self._weights, terms, until, script, rows, *out)
+        self._step(self._bundles[thread], parts, actions, terms, until, rows, *out)
 
     def load(self, state: State) -> None:
         """Take over a state with at most as many jobs, and what follows from it."""

@@ -47,41 +47,6 @@ ROUNDING_S = 1e-9
 _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 
 
-class Script(NamedTuple):
-    """Schedules (`agents.schedules.Schedules`), one for each env, and their results; without rows there is none."""
-
-    arm: Array
-    """int [env, job]."""
-    option: Array
-    """int [env, job]."""
-    order: Array
-    """[env, job]."""
-    not_before_s: Array
-    """[env, job]."""
-    discount: Array
-    """Factor on the reward of each step of a shift, [tick]."""
-    reward: Array
-    """Discounted, [env]."""
-    start_s: Array
-    """When each job was last awarded, inf if never, [env, job]."""
-    claims: Array
-    """The claims that were won, in the order of time: decision interval, arm and action, int [env, claim, 3]."""
-    won: Array
-    """Their number, int [env]."""
-
-
-def script_of(schedules: "Plans", discount: Array) -> Script:
-    """A script of schedules [schedule, job], not yet played."""
-    given, jobs = schedules[0].shape
-    claims, won = np.zeros((given, MOST_FAULTS * jobs, 3), np.int64), np.zeros(given, np.int64)
-    return Script(*schedules, discount, np.zeros(given), np.full((given, jobs), np.inf), claims, won)
-
-
-Plans = tuple[Array, Array, Array, Array]
-"""Arm, option, order and earliest time of each job of schedules, [schedule, job]."""
-NO_SCRIPT = script_of((np.zeros((0, 0), int), np.zeros((0, 0), int), np.zeros((0, 0)), np.zeros((0, 0))), np.zeros(0))
-
-
 class Spent(NamedTuple):
     """What an arm does in a step, unless a fault stops it."""
 
@@ -94,11 +59,10 @@ class Spent(NamedTuple):
 
 
 @jit_inline
-def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> None:
+def step_arms(sim: Simulation, terms: Array, rows: Array) -> None:
     """Take every arm of some envs through one step.
 
     Args:
-        weights: Reward per unit of each term, [term], in the order of `fleet.engine.batch.TERMS`.
         terms: Outcomes, [env, OUTCOME], to whose reward terms those of the step are added.
         rows: Envs, int [row].
     """
@@ -147,11 +111,11 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
             if mode == WORKING:
                 arm["busy_s"] += min(spent.away_s, crossed.cut_s)
             if next_phase or at_limit:
-                settle(sim, weights, terms, e, a, spent, crossed)
+                settle(sim, terms, e, a, spent, crossed)
             elif mode == WORKING:
                 arm["progress_s"] += dt_s
-        terms[e, 2] += above_s * weights[2]
-        terms[e, 4] += energy_j * weights[4]
+        terms[e, 2] += above_s * sim.weights[2]
+        terms[e, 4] += energy_j * sim.weights[4]
         terms[e, TOTAL] = terms[e, 0] + terms[e, 1] + terms[e, 2] + terms[e, 3] + terms[e, 4]
         env["tick"] += 1
 
@@ -281,7 +245,7 @@ def trace_arm(
 
 
 @jit_inline
-def settle(sim: Simulation, weights: Array, terms: Array, e: int, a: int, spent: Spent, crossed: Crossed) -> None:
+def settle(sim: Simulation, terms: Array, e: int, a: int, spent: Spent, crossed: Crossed) -> None:
     """Let an arm end its job, come home, fault and recover, where that happens in this step."""
     t, s, events, recording = sim.tables, sim.state, sim.events, len(sim.events.what) > 0
     arm, mode, cut_s = s.arms[e, a], s.arms[e, a]["mode"], crossed.cut_s
@@ -291,7 +255,7 @@ def settle(sim: Simulation, weights: Array, terms: Array, e: int, a: int, spent:
         record_event(events, WARNING, e, a, arm["job"], crossed.warned_joint, crossed.warned_s, t.warning_c)
     if mode == WORKING:
         if spent.done_s <= cut_s:
-            end_job(sim, weights, terms, e, a, spent.done_s)
+            end_job(sim, terms, e, a, spent.done_s)
         arm["progress_s"] += cut_s
         if spent.home_s <= cut_s:
             if recording:
@@ -302,7 +266,7 @@ def settle(sim: Simulation, weights: Array, terms: Array, e: int, a: int, spent:
         arm["lost_s"] += t.dt_s
     if cut_s < t.dt_s:
         stop(sim, e, a, cut_s, crossed.fault_joint)
-        terms[e, 3] += weights[3]
+        terms[e, 3] += sim.weights[3]
     if arm["mode"] == FAULTED:
         recover(sim, e, a, crossed.cool_s)
     if arm["mode"] == WORKING:
@@ -310,7 +274,7 @@ def settle(sim: Simulation, weights: Array, terms: Array, e: int, a: int, spent:
 
 
 @jit
-def end_job(sim: Simulation, weights: Array, terms: Array, e: int, a: int, done_s: float) -> None:
+def end_job(sim: Simulation, terms: Array, e: int, a: int, done_s: float) -> None:
     """Finish the job of an arm, or return it to the queue where the arm gives it back.
 
     Args:
@@ -330,8 +294,8 @@ def end_job(sim: Simulation, weights: Array, terms: Array, e: int, a: int, done_
     job["status"], job["cycles"], job["finished_s"] = DONE, job["repetitions"], now_s + done_s
     env["unfinished"] -= 1
     gained = t.value[env["fleet"], nonnegative(arm["kind"])]
-    terms[e, 0] += gained * weights[0]
-    terms[e, 1] += gained * (max(now_s + done_s - job["due_s"], 0.0) / 60.0) * weights[1]
+    terms[e, 0] += gained * sim.weights[0]
+    terms[e, 1] += gained * (max(now_s + done_s - job["due_s"], 0.0) / 60.0) * sim.weights[1]
     if recording:
         record_event(events, FINISH, e, a, j, -1, done_s, 0.0)
 
@@ -432,10 +396,8 @@ def take_steps(
     sim: Simulation,
     parts: int,
     actions: Array,
-    weights: Array,
     terms: Array,
     until: Array,
-    script: Script,
     rows: Array,
     shared: Array,
     own: Array,
@@ -452,17 +414,17 @@ def take_steps(
         while count > 0:
             going = room[:count]
             if now & PLAY:
-                choose_claims(sim, script, going, actions)
+                choose_claims(sim, going, actions)
             if now & CLAIM:
                 resolve_claims(sim, actions, going)
             if now & PLAY:
-                note_awards(sim, script, going, actions)
+                note_awards(sim, going, actions)
             if now & MOVE:
-                step_arms(sim, weights, terms, going)
+                step_arms(sim, terms, going)
             if now & OFFER:
                 update_offers(sim, going)
             if now & PLAY:
-                collect_rewards(sim, script, going, terms)
+                collect_rewards(sim, going, terms)
             else:
                 now &= ~CLAIM  # of the first step only
             count = keep_going(sim, until, now & PLAY != 0, going)
@@ -477,10 +439,8 @@ def step_rows(
     sim: Simulation,
     parts: int,
     actions: Array,
-    weights: Array,
     terms: Array,
     until: Array,
-    script: Script,
     rows: Array,
     shared: Array,
     own: Array,
@@ -491,7 +451,6 @@ def step_rows(
         parts: CLAIM resolves claims, MOVE steps the arms, OFFER updates the offers, OBSERVE fills `out`, and PLAY takes
             the claims from the script.
         actions: int64 [env, arm].
-        weights: Reward per unit of each term, [term].
         terms: Receives the outcomes, [env, OUTCOME]; without columns, nothing.
         until: Tick until which each env goes on while no arm has a choice, or while it plays, int [env]; not at all if
             empty.
@@ -500,8 +459,10 @@ def step_rows(
         own: Receives what each arm knows of itself, float32 [env, arm, own].
     """
     s = sim
-    whole = Simulation(s.tables, s.state, s.offers, s.events, s.trace, s.drive, s.infos, s.form, s.room)
-    take_steps(whole, parts, actions, weights, terms, until, script, rows, shared, own)
+    whole = Simulation(
+        s.tables, s.state, s.offers, s.events, s.trace, s.drive, s.infos, s.form, s.room, s.weights, s.script
+    )
+    take_steps(whole, parts, actions, terms, until, rows, shared, own)
 
 
 @jit_inline
@@ -537,9 +498,9 @@ def keep_going(sim: Simulation, until: Array, plays: bool, rows: Array) -> int:
 
 
 @jit_inline
-def choose_claims(sim: Simulation, script: Script, rows: Array, actions: Array) -> None:
+def choose_claims(sim: Simulation, rows: Array, actions: Array) -> None:
     """Let each arm claim, of its jobs that it may claim, the one that comes first in its script."""
-    t, o, arms = sim.tables, sim.offers, nonnegative(actions.shape[1])
+    t, o, script, arms = sim.tables, sim.offers, sim.script, nonnegative(actions.shape[1])
     options, first = t.work.shape[3], sim.room.key
     for row in rows:
         e = nonnegative(row)
@@ -555,8 +516,9 @@ def choose_claims(sim: Simulation, script: Script, rows: Array, actions: Array) 
 
 
 @jit_inline
-def note_awards(sim: Simulation, script: Script, rows: Array, actions: Array) -> None:
+def note_awards(sim: Simulation, rows: Array, actions: Array) -> None:
     """Note which claims were won, and when."""
+    script = sim.script
     for row in rows:
         e = nonnegative(row)
         tick = sim.state.env[e]["tick"]
@@ -571,8 +533,9 @@ def note_awards(sim: Simulation, script: Script, rows: Array, actions: Array) ->
 
 
 @jit_inline
-def collect_rewards(sim: Simulation, script: Script, rows: Array, terms: Array) -> None:
+def collect_rewards(sim: Simulation, rows: Array, terms: Array) -> None:
     """Add the discounted rewards of a step to those of the script."""
+    script = sim.script
     for row in rows:
         e = nonnegative(row)
         tick = nonnegative(sim.state.env[e]["tick"] - 1)

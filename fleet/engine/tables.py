@@ -283,6 +283,43 @@ class Form(NamedTuple):
     """Arms that are home later than this have no options, float32 [1]."""
 
 
+class Script(NamedTuple):
+    """Schedules (`agents.schedules.Schedules`), one for each env, and their results; without rows there is none."""
+
+    arm: Array
+    """int [env, job]."""
+    option: Array
+    """int [env, job]."""
+    order: Array
+    """[env, job]."""
+    not_before_s: Array
+    """[env, job]."""
+    discount: Array
+    """Factor on the reward of each step of a shift, [tick]."""
+    reward: Array
+    """Discounted, [env]."""
+    start_s: Array
+    """When each job was last awarded, inf if never, [env, job]."""
+    claims: Array
+    """The claims that were won, in the order of time: decision interval, arm and action, int [env, claim, 3]."""
+    won: Array
+    """Their number, int [env]."""
+
+
+Plans = tuple[Array, Array, Array, Array]
+"""Arm, option, order and earliest time of each job of schedules, [schedule, job]."""
+
+
+def script_of(schedules: Plans, discount: Array) -> Script:
+    """A script of schedules [schedule, job], not yet played."""
+    given, jobs = schedules[0].shape
+    claims, won = np.zeros((given, MOST_FAULTS * jobs, 3), np.int64), np.zeros(given, np.int64)
+    return Script(*schedules, discount, np.zeros(given), np.full((given, jobs), np.inf), claims, won)
+
+
+NO_SCRIPT = script_of((np.zeros((0, 0), int), np.zeros((0, 0), int), np.zeros((0, 0)), np.zeros((0, 0))), np.zeros(0))
+
+
 class Room(NamedTuple):
     """Arrays in which the loops of one thread keep what they need for a moment."""
 
@@ -351,6 +388,9 @@ class Simulation(NamedTuple):
     """`INFO` [env, arm]."""
     form: Form
     room: Room
+    weights: Array
+    """Reward per unit of each term, [term], in the order of `fleet.engine.batch.TERMS`."""
+    script: Script
 
 
 def form_of(layout: Layout) -> Form:

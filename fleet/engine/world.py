@@ -88,6 +88,7 @@ class Arm:
         """`known`, or a nominal arm with this arm's cooling."""
         return self.known or (thermal_model(gen3_network(cooling=self.robot.cooling)), gen3_motors())
 
+    @lru_cache(maxsize=64)  # noqa: B019  # of the arms of the last fleets
     def believed_housings(self, ambient_c: float) -> Array:
         """Housing temperatures that the arm expects after hours at home, °C, [joint]; the ambient if none settle."""
         thermal, motors = self.beliefs

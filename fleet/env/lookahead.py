@@ -12,8 +12,7 @@ import numpy as np
 
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
 from fleet.engine.state import DONE, GIVEN_UP, RUNNING, State
-from fleet.engine.step import Plans, Script
-from fleet.engine.tables import Tables
+from fleet.engine.tables import Plans, Script, Tables
 from fleet.heat.thermal import HOUSING, WINDING
 from fleet.observation import Layout, Observation
 
