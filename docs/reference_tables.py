@@ -203,20 +203,23 @@ _SHAPES = {
     ("joint",): "7",
     ("slot",): "K",
     ("option",): "K P",
-    ("peer",): "n − 1",
-    ("peer", "slot"): "(n − 1) K",
+    ("member",): "n",
+    ("member", "slot"): "n K",
 }
 _EXAMPLE = Layout(arms=4, slots=16, plans=2)
 
 
 def _observation_table() -> str:
     rows: list[tuple[str, ...]] = []
-    for field, start in zip(FIELDS, _EXAMPLE.offsets, strict=True):
+    start = 0
+    for field in FIELDS:
         last = start + prod(_EXAMPLE.shape(field)) - 1
         place = str(start) if last == start else f"{start}–{last}"
         span = f"{_number(field.low)} … {_number(field.high)}"
-        rows.append((f"`{field.name}`", place, _SHAPES[field.axes], field.unit, span, field.text))
-    return table(("field", "columns (4 arms, 16 slots, 2 plans)", "shape", "unit", "range", "meaning"), rows)
+        row = (field.part, place, _SHAPES[field.axes], field.unit, span, _number(field.scale), field.text)
+        rows.append((f"`{field.name}`", *row))
+        start = last + 1
+    return table(("field", "part", "columns", "shape", "unit", "range", "scale", "meaning"), rows)
 
 
 def _reward_table() -> str:

@@ -34,7 +34,7 @@ def deliver(
         twins: Version of each arm's difficulty model.
     """
     view = exchange.share(broadcast(engine, parts, names, twins, env))
-    write_members(engine.layout, view, parts[1][env])
+    write_members(engine.layout, view, engine.offers.slot_job[env] >= 0, parts[1][env])
 
 
 def broadcast(engine: Engine, parts: Parts, names: Sequence[str], twins: tuple[str, ...], env: int = 0) -> Broadcast:
@@ -60,8 +60,12 @@ def broadcast(engine: Engine, parts: Parts, names: Sequence[str], twins: tuple[s
     )
 
 
-def write_members(layout: Layout, view: PeerView, own: Array) -> None:
-    """Put what each arm received of its members into their parts of the observation, [arm, own]."""
+def write_members(layout: Layout, view: PeerView, filled: Array, own: Array) -> None:
+    """Put what each arm received of its members into their parts of the observation, [arm, own].
+
+    Args:
+        filled: Whether a slot holds a job, bool [slot].
+    """
     rows, members = np.arange(layout.arms)[:, None], layout.members
 
     def received(values: Array) -> Array:
@@ -75,7 +79,7 @@ def write_members(layout: Layout, view: PeerView, own: Array) -> None:
         "fleet_faulted": ~never & (mode == FAULTED),
         "fleet_busy_s": np.nan_to_num(received(view.busy_s)),
         "fleet_headroom_k": np.nan_to_num(received(view.headroom_k)),
-        "fleet_difficulty": np.nan_to_num(received(view.difficulty), nan=-1.0),
+        "fleet_difficulty": np.where(filled, np.nan_to_num(received(view.difficulty), nan=-1.0), 0.0),
     }
     layout.write(own, fields)
 

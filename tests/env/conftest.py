@@ -86,9 +86,11 @@ def rows(given: Any, which: Any) -> dict[str, Any]:
 
 def single(env: AllocationEnv, given: Any) -> dict[str, Any]:
     """What a single env returned at a step or a reset, as the only row of a batch."""
-    arms = env.possible_agents
+    arms, cut = env.possible_agents, env.layout.shared
     seen, infos = given[0], given[-1]
-    out = {name: np.stack([seen[arm][name] for arm in arms])[None] for name in ("observation", "action_mask")}
+    vectors, masks = (np.stack([seen[arm][name] for arm in arms])[None] for name in ("observation", "action_mask"))
+    assert (vectors[..., :cut] == vectors[:, :1, :cut]).all()  # all arms alike
+    out = {"shared": vectors[:, 0, :cut], "own": vectors[..., cut:], "action_mask": masks}
     for name, each in zip(RETURNED, given[1:-1], strict=False):
         assert len(set(each.values())) == 1  # all arms alike
         out[name] = np.array([each[arms[0]]])

@@ -93,7 +93,7 @@ def test_zero_is_a_seed_and_none_is_not(make, batch, play) -> None:
     assert play.plain(make().reset()) != play.plain(make().reset())
     for seeded in ({"seed": 0}, {"seed": [0, 0]}):
         play.same(batch(2, **seeded).reset()[0], batch(2, **seeded).reset()[0])
-    assert (batch(2).reset()[0]["observation"] != batch(2).reset()[0]["observation"]).any()
+    assert (batch(2).reset()[0]["own"] != batch(2).reset()[0]["own"]).any()
     obs, _ = batch(2).reset(seed=0)
     play.same(obs, batch(2, seed=0).reset()[0])
 
@@ -216,11 +216,16 @@ def test_the_order_of_arms_does_not_matter(small, order, keep_events) -> None:
     while one.agents:
         for arm in names:
             mine, its = one.knowledge()[arm], other.knowledge()[arm]
-            peers = [p for p in names if p != arm]
-            place = [[p for p in other.possible_agents if p != arm].index(p) for p in peers]
+            place = [other.possible_agents.index(name) for name in names]
             for field, values in vars(mine).items():
                 actual = getattr(its, field)
-                np.testing.assert_array_equal(actual[place] if field.startswith("peer_") else actual, values, field)
+                if field == "peers":
+                    actual, values = (
+                        {env.possible_agents[m] for m in each} for env, each in ((other, actual), (one, values))
+                    )
+                    assert actual == values == set(names) - {arm}
+                    continue
+                np.testing.assert_array_equal(actual[place] if field.startswith("fleet_") else actual, values, field)
         actions = {arm: int(rng.choice([1, 1, 1, 0, 2, 3, 4])) for arm in names}  # so that claims compete
         given, actual = one.step(actions), other.step(actions)
         for arm in names:
@@ -294,7 +299,7 @@ def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None
         check_equal(batch.state.copy(slice(1, 2)), logged.truth, jobs)
         check_plans(library.tables, batch.state.plan[1], logged.world, logged.truth.plan[0])
         for a, arm in enumerate(arms):
-            np.testing.assert_array_equal(obs["observation"][1, a], logged.state().reshape(3, -1)[a])
+            np.testing.assert_array_equal(batch.joined(obs)["observation"][1, a], logged.state().reshape(3, -1)[a])
             np.testing.assert_array_equal(obs["action_mask"][1, a], logged.knowledge()[arm].action_mask)
         together = np.zeros((3, 3), int)
         together[1] = list(actions.values())

@@ -24,7 +24,7 @@ def test_tables_are_current() -> None:
 
 def test_the_command_reports_an_outdated_table(tmp_path, capsys) -> None:
     page, docs = tmp_path / "env.md", ["--docs", str(tmp_path)]
-    page.write_text(TEXT.replace("| `clock` | 0 |", "| `clock` | 7 |"), encoding="utf-8")
+    page.write_text(TEXT.replace("| `left_s` | jobs | 0 |", "| `left_s` | jobs | 7 |"), encoding="utf-8")
     assert main([*docs, "--check"]) == 1
     assert "env.md" in capsys.readouterr().out
     assert main(docs) == 0
@@ -34,18 +34,22 @@ def test_the_command_reports_an_outdated_table(tmp_path, capsys) -> None:
 
 def test_offsets_of_the_table_are_correct() -> None:
     layout = Layout(4, 16, plans=2)
-    rows = dict(re.findall(r"^\| `(\w+)` \| ([\d–]+) \| [^|]+ \| [^|]+ \| [^|]+ …", TEXT, re.MULTILINE))
+    rows = dict(re.findall(r"^\| `(\w+)` \| \w+ \| ([\d–]+) \| [^|]+ \| [^|]+ \| [^|]+ …", TEXT, re.MULTILINE))
     assert list(rows) == [field.name for field in FIELDS]
     ends = [int(place.split("–")[-1]) for place in rows.values()]
     assert [int(place.split("–")[0]) for place in rows.values()] == [0, *(end + 1 for end in ends[:-1])]
-    assert ends[-1] == layout.size - 1 == 573
+    assert ends[-1] == layout.size - 1 == 381
+    parts = "(213 of the 382\nnumbers)", "own\npart (169)"
+    assert all(part in TEXT for part in parts)
+    assert (layout.shared, layout.size - layout.shared) == (213, 169)
 
 
 @pytest.mark.parametrize(("n", "slots", "plans"), [(1, 1, 1), (4, 16, 2), (7, 3, 2)])
 def test_the_size_in_the_page_is_correct(n, slots, plans) -> None:
-    formula = r"size = (\d+) \+ (\d+) K \+ (\d+) K P \+ \(n − 1\)\((\d+) \+ (\d+) K\)"
-    a, b, c, d, e = map(int, re.findall(formula, TEXT)[0])
-    assert Layout(n, slots, plans=plans).size == a + (b + c * plans) * slots + (n - 1) * (d + e * slots)
+    formula = r"size = (\d+) \+ (\d+) K \+ (\d+) K P \+ n \((\d+) \+ K\)"
+    a, b, c, d = map(int, re.findall(formula, TEXT)[0])
+    assert Layout(n, slots, plans=plans).size == a + (b + c * plans) * slots + n * (d + slots)
+    assert Layout(n, slots, ((),) * n, plans=plans).size == a + (b + c * plans) * slots
 
 
 def test_every_info_is_in_the_page(make, batch) -> None:

@@ -60,7 +60,7 @@ def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batc
                 assert mask[a, :-1].tolist() == [1] + [0] * slots
         counts["at work"] += int((before.mode[0] == WORKING).sum())
         counts["faulted"] += int((before.mode[0] == FAULTED).sum())
-        offered = env.layout.read(obs["observation"][0], mask).offered.astype(bool)
+        offered = env.layout.read_parts(obs["shared"][0], obs["own"][0], mask).offered
         counts["taken"] += int((offered & (mask[:, 1:-1] == 0))[before.mode[0] == IDLE].sum())
     assert min(counts.values()) > 10, counts
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 from scipy.special import expit
 
-from fleet.bus.exchange.channel import Channel
+from fleet.bus.exchange.channel import Channel, Partition
 from fleet.bus.exchange.memory import UNHEARD, Exchange, PeerView
-from fleet.engine.batch import Engine, RewardWeights, shifts_of
+from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts, shifts_of
 from fleet.engine.profile_plant import sensor_noise
-from fleet.engine.shift import Episode, ShiftRunner, broadcast, initial, write_peers
+from fleet.engine.shift import Episode, ShiftRunner, broadcast, initial, step, write_members
 from fleet.engine.state import State, World
 from fleet.engine.tables import tables_of
 from fleet.env.allocation_v2 import parallel_env
@@ -31,32 +31,72 @@ from tests.profiles import examples
 
 
 def test_fields_and_attributes_are_the_same_in_the_same_order() -> None:
-    assert [f.name for f in FIELDS] == [f.name for f in fields(Observation) if f.name != "action_mask"]
+    assert [f.name for f in FIELDS] == [f.name for f in fields(Observation) if f.name not in ("peers", "action_mask")]
+
+
+def random_fields(layout: Layout, lead: tuple[int, ...], rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return values of all fields within their bounds, of all arms of some envs, [..., arm, ...]."""
+    return {
+        f.name: rng.uniform(f.low, f.high, (*lead, layout.arms, *layout.shape(f))).astype(np.float32) for f in FIELDS
+    }
 
 
 @examples(60)
 @given(
-    arms=st.integers(1, 6), slots=st.integers(1, 9), plans=st.integers(1, 3),
-    lead=st.sampled_from([(), (2,), (3, 2)]), seed=st.integers(0, 99),
+    arms=st.integers(1, 6), slots=st.integers(1, 9), plans=st.integers(1, 3), scaled=st.booleans(),
+    delivered=st.booleans(), lead=st.sampled_from([(), (2,), (3, 2)]), seed=st.integers(0, 99),
 )  # fmt: skip
-def test_a_packed_observation_is_read_back(arms, slots, plans, lead, seed) -> None:
-    layout, rng = Layout(arms, slots, plans=plans), np.random.default_rng(seed)
-    named = {f.name: rng.uniform(f.low, f.high, (*lead, *layout.shape(f))).astype(np.float32) for f in FIELDS}
-    mask = rng.integers(0, 2, (*lead, layout.actions)).astype(np.int8)
-    vector = layout.pack(Observation(**named, action_mask=mask))
-    assert vector.shape == (*lead, layout.size)
+def test_a_packed_observation_is_read_back(arms, slots, plans, scaled, delivered, lead, seed) -> None:
+    """Exactly, also if scaled: scales are powers of two."""
+    rng = np.random.default_rng(seed)
+    layout = Layout(arms, slots, plans=plans, scaled=scaled, delivered=delivered)
+    named = random_fields(layout, lead, rng)
+    mask = rng.integers(0, 2, (*lead, arms, layout.actions)).astype(np.int8)
+    vector = layout.pack(Observation(**named, peers=layout.peers, action_mask=mask))
+    assert vector.shape == (*lead, arms, layout.size)
     assert vector.dtype == np.float32
     again = layout.read(vector, mask)
     for name, value in named.items():
         np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
     assert again.action_mask is mask
+    low, high = layout.bounds
+    assert ((low <= vector) & (vector <= high)).all()
     assert layout.size == sum(int(np.prod(layout.shape(f))) for f in FIELDS)
+
+
+def test_the_vector_is_both_parts_one_after_the_other() -> None:
+    rng = np.random.default_rng(0)
+    for delivered in (False, True):
+        layout = Layout(3, 4, plans=2, delivered=delivered)
+        parts = rng.random((2, layout.shared), np.float32), rng.random((2, 3, layout.size - layout.shared), np.float32)
+        vectors, mask = layout.join(*parts), np.ones((2, 3, layout.actions), np.int8)
+        for e, a in np.ndindex(2, 3):
+            assert vectors[e, a].tolist() == [*parts[0][e], *parts[1][e, a]]
+        one, other = layout.read(vectors, mask), layout.read_parts(*parts, mask)
+        begin = 0
+        for f in FIELDS:
+            end = begin + int(np.prod(layout.shape(f)))
+            np.testing.assert_array_equal(getattr(one, f.name).reshape(2, 3, -1), vectors[..., begin:end])
+            np.testing.assert_array_equal(getattr(other, f.name), getattr(one, f.name))
+            begin = end
+        # What all arms of a fleet know alike, unless messages between them take time.
+        first_own = "fleet_age_s" if delivered else "working"
+        place = [f.name for f in FIELDS].index(first_own)
+        assert layout.shared == sum(int(np.prod(layout.shape(f))) for f in FIELDS[:place])
+
+
+def test_the_scales_are_powers_of_two() -> None:
+    layout = Layout(4, 16, plans=2, scaled=True)
+    assert (np.frexp(layout.scales)[0] == 0.5).all()
+    assert (Layout(4, 16, plans=2).scales == 1.0).all()
+    assert len(layout.scales) == layout.size
 
 
 def test_values_out_of_range_are_clipped() -> None:
     layout = Layout(2, 3)
-    named = {f.name: np.full(layout.shape(f), 1e9) for f in FIELDS}
-    again = layout.read(layout.pack(Observation(**named, action_mask=np.ones(4, np.int8))), np.ones(4, np.int8))
+    named = {f.name: np.full((2, *layout.shape(f)), 1e9) for f in FIELDS}
+    mask = np.ones((2, layout.actions), np.int8)
+    again = layout.read(layout.pack(Observation(**named, peers=layout.peers, action_mask=mask)), mask)
     for f in FIELDS:
         assert (getattr(again, f.name) == np.float32(f.high)).all()
 
@@ -64,7 +104,7 @@ def test_values_out_of_range_are_clipped() -> None:
 def test_vectors_of_wrong_size_are_refused() -> None:
     layout = Layout(2, 3)
     with pytest.raises(
-        ValueError, match=rf"An observation of 3 slots and 1 peer\(s\) has {layout.size} elements, got 5"
+        ValueError, match=rf"An observation of 3 slots and 2 member\(s\) has {layout.size} elements, got 5"
     ):
         layout.read(np.zeros(5, np.float32), np.ones(4, np.int8))
 
@@ -120,21 +160,54 @@ def prediction(world: World, at: tuple[int, ...], known_c: np.ndarray, left_s: f
     return 0.5 if np.isnan(p) else float(p), max(peak_c, -60.0)
 
 
-def reference(world: World, state: State, slots: list[int], key: int) -> dict[str, np.ndarray]:
-    """Compute the fields of all arms of env 0, [arm, ...], one by one; peers as of this moment."""
+def groups_of(world: World, slots: list[int]) -> list[int]:
+    """Return the group of each slot: a job takes that of the first one before it with which it shares a station."""
+    groups: list[int] = []
+    for k, j in enumerate(slots):
+        taken = [set(world.jobs.stations[0, i].tolist()) - {-1} for i in slots[: k + 1]]
+        shared = [groups[i] for i in range(k) if taken[i] & taken[k]]
+        groups.append(0 if j < 0 else shared[0] if shared else k + 1)
+    return groups
+
+
+def blockers(world: World, state: State, a: int, plan: int) -> list[int]:
+    """Return the arms away from home whose volumes exclude that of a plan of arm `a`."""
+    volume, away = world.plans.volume, state.plan[0].tolist()
+    others = [b for b in range(len(away)) if b != a and away[b] >= 0]
+    return [b for b in others if world.conflicts[volume[plan], volume[away[b]]]]
+
+
+def least_difficulty(world: World, a: int, j: int) -> float:
+    """Return the least difficulty of an arm's plans for a job, -1 without any, 0 for an empty slot."""
+    known = [] if j < 0 else [d for d in world.offers.difficulty[0, a, j].tolist() if not np.isnan(d)]
+    return 0.0 if j < 0 else min(known, default=-1.0)
+
+
+def reference(world: World, state: State, slots: list[int], key: int, layout: Layout) -> dict[str, np.ndarray]:
+    """Compute the fields of all arms of env 0, [arm, ...], one by one; members as of this moment.
+
+    Besides the fields: whether a plan has `free` space, and whether an arm may `give_back` its job.
+    """
     arms, now_s, jobs, offers = len(world.arms), state.tick[0] * world.dt_s, world.jobs, world.offers
     measured_c = state.temp_c[0, :, :7] + world.motors.sensor_noise_k * sensor_noise(key, state.tick[0], arms, 7)
     ambient_c = world.ambient_c[min(int(state.tick[0]), world.ticks - 1)]
-    volume, times_s, away = world.plans.volume, world.plans.times_s, state.plan[0]
+    times_s, away = world.plans.times_s, state.plan[0]
     occupied = {s for j in state.job[0].tolist() if j >= 0 for s in jobs.stations[0, j].tolist() if s >= 0}
+    shared: dict[str, object] = {"left_s": world.horizon_s - now_s, "group": groups_of(world, slots)}
+    each_slot = [
+        [not occupied & set(jobs.stations[0, j].tolist()), now_s - state.queued_s[0, j], jobs.due_s[0, j] - now_s,
+         jobs.payload_kg[0, j], jobs.value[0, j], state.returns[0, j], jobs.expires[0, j]] if j >= 0 else [0] * 7
+        for j in slots
+    ]  # fmt: skip
+    names = ("station_free", "age_s", "due_in_s", "payload_kg", "value", "returns", "expires")
+    shared |= dict(zip(names, np.array(each_slot, dtype=float).T, strict=True))
     own: list[dict[str, object]] = []
     for a in range(arms):
         mode, todo = state.mode[0, a], int(state.todo[0, a])
         known_c = np.concatenate([measured_c[a], state.housing_c[0, a], ambient_c[a : a + 1]])
-        busy_s = times_s[away[a]] @ [1, todo, 1] - state.progress_s[0, a] if mode == WORKING else 0.0
-        mine = {
-            "clock": now_s / world.horizon_s, "left_s": world.horizon_s - now_s,
-            "idle": mode == IDLE, "working": mode == WORKING, "faulted": mode == FAULTED,
+        busy_s = float(times_s[away[a]] @ [1, todo, 1] - state.progress_s[0, a]) if mode == WORKING else 0.0
+        mine: dict[str, object] = {
+            "working": mode == WORKING, "faulted": mode == FAULTED,
             "last_award": state.last_award[0, a], "temp_c": measured_c[a],
             "busy_s": busy_s, "headroom_k": world.limits.warning_c - measured_c[a].max(),
             "error_headroom_k": world.limits.error_c - measured_c[a].max(),
@@ -153,88 +226,99 @@ def reference(world: World, state: State, slots: list[int], key: int) -> dict[st
                 "job_cycles": jobs.repetitions[0, j] - state.cycles[0, j] - int(cycles + 1e-9),
                 "give_back": np.ceil(cycles - 1e-9) < todo,
             }  # fmt: skip
-        rows, options, blocks = [], [], np.zeros((arms, len(slots)))
-        for k, j in enumerate(slots):
-            if j < 0:
-                rows.append([0] * 8)
-                options += [[0, 0, 0, 0, 0.5, 0, 0, 0]] * world.plans_per_job
-                continue
-            free = not occupied & set(jobs.stations[0, j].tolist())
-            age_s = now_s - state.queued_s[0, j]
-            rows.append(
-                [1, free, age_s, jobs.payload_kg[0, j], jobs.value[0, j], state.returns[0, j], jobs.expires[0, j],
-                 offers.too_heavy[0, a, j]]
-            )  # fmt: skip
-            for n, plan in enumerate(offers.plan[0, a, j].tolist()):
+        blocked, options = [], []
+        for j in slots:
+            plans = offers.plan[0, a, j].tolist() if j >= 0 else [-1] * world.plans_per_job
+            blocked.append(plans[0] >= 0 and len(blockers(world, state, a, plans[0])) > 0)
+            for n, plan in enumerate(plans):
                 if plan < 0:
-                    options.append([0, 0, 0, 0, 0.5, 0, 0, 0])
+                    options.append([0.0] * 5)
                     continue
-                closed = [
-                    b for b in range(arms) if b != a and away[b] >= 0 and world.conflicts[volume[plan], volume[away[b]]]
-                ]
-                if n == 0:
-                    blocks[closed, k] = 1.0
-                left_s = times_s[plan] @ [1, jobs.repetitions[0, j] - state.cycles[0, j], 1]
-                d = offers.difficulty[0, a, j, n]
-                p, peak_c = prediction(world, (0, a, j, n), known_c)
-                slack_s = jobs.due_s[0, j] - now_s - left_s
-                options.append([1, not closed, not np.isnan(d), np.nan_to_num(d), p, peak_c, left_s, slack_s])
-        names = ("offered", "station_free", "age_s", "payload_kg", "value", "returns", "expires", "too_heavy")
-        mine |= dict(zip(names, np.array(rows, dtype=float).T, strict=True))
-        names = ("feasible", "space_free", "known", "difficulty", "p_saturation", "peak_c", "duration_s", "slack_s")
-        mine |= dict(zip(names, np.array(options, dtype=float).T, strict=True))
-        own.append(mine | {"peer_blocks": np.delete(blocks, a, axis=0)})
-    shared = []
-    for mine in own:
-        known, d = (np.reshape(mine[name], (len(slots), -1)) for name in ("known", "difficulty"))
-        least = np.where(known > 0, d, np.inf).min(axis=1)
-        shared.append({"known": known.any(axis=1), "difficulty": np.where(np.isinf(least), 0.0, least)})
-    told = ("working", "faulted", "headroom_k", "busy_s", "known", "difficulty")
+                duration_s = times_s[plan] @ [1, jobs.repetitions[0, j] - state.cycles[0, j], 1]
+                d, predicted = offers.difficulty[0, a, j, n], prediction(world, (0, a, j, n), known_c)
+                options.append(
+                    [duration_s, np.nan_to_num(d, nan=-1.0), *predicted, not blockers(world, state, a, plan)]
+                )
+        names = ("duration_s", "difficulty", "p_saturation", "peak_c", "free")
+        mine |= dict(zip(names, np.array(options, dtype=float).T, strict=True)) | {"blocked": blocked}
+        if busy_s > layout.ahead_s:
+            mine |= {name: np.zeros(np.shape(mine[name])) for name in (*names, "blocked")}
+        own.append(mine)
+    least = np.array([[least_difficulty(world, b, j) for j in slots] for b in range(arms)])
     for a, mine in enumerate(own):
-        others = [{**own[b], **shared[b]} for b in range(arms) if b != a]
-        mine |= {f"peer_{n}": [o[n] for o in others] for n in told}
-        mine |= {"peer_heard": [1.0] * len(others), "peer_age_s": [0.0] * len(others)}
-    return {name: np.array([each[name] for each in own], dtype=float) for name in own[0]}
+        members = list(range(arms)) if layout.near is None else list(layout.near[a])
+        for name in ("working", "faulted", "busy_s", "headroom_k"):
+            mine[f"fleet_{name}"] = [own[b][name] for b in members]
+        mine["fleet_age_s"] = [0.0] * len(members)
+        mine["fleet_difficulty"] = least[members]
+    return {name: np.array([(shared | each)[name] for each in own], dtype=float) for name in shared | own[0]}
 
 
-def reference_mask(expected: dict[str, np.ndarray], plans: int) -> np.ndarray:
-    """Legal actions by the fields: wait, every plan of an idle arm with free stations and space, and give back."""
-    legal = expected["idle"][:, None] * expected["feasible"] * expected["space_free"]
-    legal *= np.repeat(expected["station_free"], plans, axis=1)
+def reference_mask(world: World, state: State, slots: list[int], expected: dict[str, np.ndarray]) -> np.ndarray:
+    """Legal actions: wait, every plan of an idle arm with free stations and space, and give back."""
+    idle = state.mode[0] == IDLE
+    legal = idle[:, None] * (expected["duration_s"] > 0) * expected["free"]
+    legal *= np.repeat(expected["station_free"], world.plans_per_job, axis=1)
     return np.concatenate([np.ones((len(legal), 1)), legal, expected["give_back"][:, None]], axis=1)
 
 
-def compare_with_reference(play, episode: Episode, seed: int) -> tuple[State, int]:
-    """Play a shift and compare every vector; return the last state, and the number of plans without free space."""
+COMPARED = {"temp_c": 1e-4, "housing_c": 1e-4, "ambient_c": 1e-4, "headroom_k": 1e-4, "error_headroom_k": 1e-4,
+            "fleet_headroom_k": 1e-4, "peak_c": 1e-3, "job_peak_c": 1e-3}  # fmt: skip
+"""Absolute tolerances of the fields in °C and K; of others it is 2e-5."""
+
+
+def compare_with_reference(
+    play, episode: Episode, seed: int, exchange: Exchange | None = None, **options
+) -> tuple[State, int]:
+    """Play a shift and compare every vector; return the last state, and the number of plans without free space.
+
+    Args:
+        exchange: Delivers at once.
+        options: Of the layout.
+    """
     world, rng = episode.world, np.random.default_rng(seed)
-    runner, closed = ShiftRunner(episode, RewardWeights()), 0
-    layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+    options |= {"plans": world.plans_per_job, "delivered": exchange is not None}
+    layout = Layout(len(world.arms), world.slots, **options)
+    runner, closed = ShiftRunner(episode, RewardWeights(), exchange=exchange, layout=layout), 0
+    assert runner.layout == layout
     while True:
         slots = play.slots_of(world, runner.state)
         assert runner.slot_job.tolist() == slots
-        actual = layout.read(runner.vectors, runner.mask)
-        expected = reference(world, runner.state, slots, episode.noise_key)
-        assert set(expected) - {"give_back"} == {field.name for field in FIELDS}
+        actual = layout.read_parts(*runner.parts, runner.mask)
+        expected = reference(world, runner.state, slots, episode.noise_key, layout)
+        assert set(expected) - {"give_back", "free"} == {field.name for field in FIELDS}
         for name in (field.name for field in FIELDS):
-            values = expected[name]
-            observed = getattr(actual, name)
-            np.testing.assert_allclose(observed, values.reshape(observed.shape), rtol=1e-6, atol=2e-5, err_msg=name)
-        np.testing.assert_array_equal(runner.mask, reference_mask(expected, layout.plans))
-        closed += int((expected["feasible"] > expected["space_free"]).sum())
+            values, observed = expected[name], getattr(actual, name)
+            atol = COMPARED.get(name, 2e-5)
+            np.testing.assert_allclose(observed, values.reshape(observed.shape), rtol=1e-5, atol=atol, err_msg=name)
+        np.testing.assert_array_equal(runner.mask, reference_mask(world, runner.state, slots, expected))
+        closed += int(((expected["duration_s"] > 0) > expected["free"]).sum())
         if runner.tick == world.ticks:
             return runner.state.copy(), closed
         runner.step(play.chosen(runner.mask, rng.random((len(world.arms), 2))))
 
 
+@st.composite
+def layouts(draw, arms: int):
+    """Draw options of a layout."""
+    near = draw(st.none() | st.integers(0, arms - 1))
+    order = [draw(st.permutations([b for b in range(arms) if b != a])) for a in range(arms)]
+    return {
+        "scaled": draw(st.booleans()),
+        "near": None if near is None else tuple(tuple(peers[:near]) for peers in order),
+        "ahead_s": draw(st.sampled_from([np.inf, 0.0, 12.3, 40.3])),
+    }
+
+
 @pytest.mark.ci_slow
 @examples(40)
-@given(draft=drafts(), two_plans=st.booleans())
-def test_vectors_equal_the_reference(small, play, draft, two_plans) -> None:
+@given(draft=drafts(), two_plans=st.booleans(), data=st.data())
+def test_vectors_equal_the_reference(small, play, draft, two_plans, data) -> None:
     world, plant = world_of(small, draft)
     if two_plans:
         world = with_second_plans(world, np.random.default_rng(draft.seed))
     episode = Episode(world, plant, ("t",) * len(world.arms), np.random.SeedSequence(draft.seed))
-    compare_with_reference(play, episode, draft.seed)
+    compare_with_reference(play, episode, draft.seed, **data.draw(layouts(len(world.arms))))
 
 
 def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(small, play) -> None:
@@ -261,6 +345,64 @@ def test_risks_equal_the_reference(small, play, pieces, curve) -> None:
     compare_with_reference(play, Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), 3)
 
 
+@pytest.mark.parametrize("near", [None, ((2,), (0,), (1,))])
+def test_messages_that_arrive_at_once_give_what_the_arms_know_of_each_other(small, play, near) -> None:
+    """Over a channel with a partition that never comes."""
+    make = small.Shifts(arms=3, jobs=5, ticks=40, crowding=0.3)
+    never = Channel(partitions=(Partition(1e8, 2e8, (("arm_0",),)),))
+    compare_with_reference(
+        play, make(np.random.SeedSequence(4)), 4, Exchange(("arm_0", "arm_1", "arm_2"), never), near=near
+    )
+
+
+def test_options_of_arms_that_are_home_later_are_zero_and_others_unchanged(small, play) -> None:
+    episode, rng = (
+        small.Shifts(arms=3, jobs=9, ticks=60, crowding=0.3)(np.random.SeedSequence(2)),
+        np.random.default_rng(2),
+    )
+    world, ahead_s = episode.world, 11.5
+    layout = Layout(3, world.slots)
+    whole, some = (
+        ShiftRunner(episode, RewardWeights(), layout=replace(layout, ahead_s=each)) for each in (np.inf, ahead_s)
+    )
+    hidden = shown = 0
+    while whole.tick < world.ticks:
+        one, other = (layout.read_parts(*runner.parts, runner.mask) for runner in (whole, some))
+        late = one.busy_s > ahead_s
+        for name, values in vars(one).items():
+            if name in ("duration_s", "difficulty", "p_saturation", "peak_c", "blocked"):
+                hidden, shown = hidden + int((values[late] != 0).sum()), shown + int((values[~late] != 0).sum())
+                values = np.where(late[:, None], 0.0, values)
+            np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
+        actions = play.chosen(whole.mask, rng.random((3, 2)))
+        whole.step(actions), some.step(actions)
+    assert min(hidden, shown) > 50
+
+
+@pytest.mark.parametrize("near", [None, ((2,), (0,), (1,))])
+def test_scaled_values_times_their_scales_are_the_values(small, play, near) -> None:
+    """Exactly: scales are powers of two."""
+    content = [small.work(place, payload) for place in ("a", "b") for payload in (small.LIGHT, small.HOT)]
+    arms = [small.arm(a, content, model=play.Learned(2, curve=True)) for a in range(3)]
+    jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]
+    world, plant = small.shop([jobs], arms=arms, ticks=50, space=small.crowded(0.3))
+    episode, rng = Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), np.random.default_rng(1)
+    plain, scaled = (
+        ShiftRunner(episode, RewardWeights(), layout=Layout(3, world.slots, near, scaled=each))
+        for each in (False, True)
+    )
+    layout = scaled.layout
+    for _ in range(world.ticks):
+        vectors = layout.join(*scaled.parts)
+        np.testing.assert_array_equal(vectors * layout.scales, layout.join(*plain.parts))
+        assert np.abs(vectors).max() < 30.0  # of order 1
+        one, other = plain.layout.read_parts(*plain.parts, plain.mask), layout.read(vectors, scaled.mask)
+        for name, values in vars(one).items():
+            np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
+        actions = play.chosen(plain.mask, rng.random((3, 2)))
+        plain.step(actions), scaled.step(actions)
+
+
 NO_NOISE = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
 
 
@@ -278,28 +420,33 @@ def received(arms: int, slots: int, **changes: np.ndarray) -> PeerView:
 
 
 def peers_of(layout: Layout, view: PeerView) -> Observation:
-    """Return the peer fields of the vectors, leading axis [arm]."""
+    """Return the received fields of the vectors, leading axis [arm]; all slots hold jobs."""
     vectors = np.zeros((layout.arms, layout.size), np.float32)
-    write_peers(layout, view, vectors)
+    layout.write(vectors, {"group": np.ones(layout.slots)})
+    write_members(layout, view, np.ones(layout.slots, bool), vectors[:, layout.shared :])
     return layout.read(vectors, np.ones((layout.arms, layout.slots + 1), np.int8))
 
 
-def engine_at(world: World, state: State) -> tuple[Engine, np.ndarray]:
-    """Return an engine in this state, and the vectors of its arms, [env, arm, size]."""
+def engine_at(world: World, state: State, **options) -> tuple[Engine, Parts]:
+    """Return an engine in this state, and the parts of its observations.
+
+    Args:
+        options: Of the layout.
+    """
     tables, drawn = tables_of(world)
-    layout, rows = Layout(len(world.arms), world.slots, plans=world.plans_per_job), np.arange(world.envs)
+    layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job, **options)
     engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=state.status.shape[1], compiled=False)
+    rows, parts = np.arange(world.envs), empty_parts(layout, world.envs)
     engine.reset(rows, shifts_of(drawn, [0] * world.envs))
     engine.load(state)
-    vectors = np.empty((world.envs, layout.arms, layout.size), np.float32)
-    engine.observe(rows, vectors)
-    return engine, vectors
+    engine.observe(rows, parts)
+    return engine, parts
 
 
-def observe(world: World, state: State) -> Observation:
+def observe(world: World, state: State, **options) -> Observation:
     """Return the observations in a state, leading axes [env, arm]."""
-    engine, vectors = engine_at(world, state)
-    return engine.layout.read(vectors, engine.mask)
+    engine, parts = engine_at(world, state, **options)
+    return engine.layout.read_parts(*parts, engine.mask)
 
 
 # Single fields
@@ -314,14 +461,16 @@ def test_peers_are_the_others_in_order() -> None:
         difficulty=np.stack([receiver + sender / 10, np.full((4, 4), np.nan)], axis=-1),
         mode=np.where(sender == 3, FAULTED, np.where(sender == 1, WORKING, IDLE)),
     )  # fmt: skip
-    observed = peers_of(Layout(4, 2), view)
+    observed = peers_of(Layout(4, 2, delivered=True), view)
     for me in range(4):
         others = [a for a in range(4) if a != me]
         assert observed.peer_headroom_k[me].tolist() == [10.0 * me + a for a in others]
         assert observed.peer_age_s[me].tolist() == [100.0 * me + a for a in others]
         assert observed.peer_difficulty[me, :, 0].tolist() == pytest.approx([me + a / 10 for a in others])
         assert observed.peer_known[me].tolist() == [[1, 0]] * 3
-        assert (observed.peer_difficulty[me, :, 1] == 0).all()
+        assert (observed.peer_difficulty[me, :, 1] == -1).all()
+        assert observed.peers[me].tolist() == others
+        assert observed.fleet_headroom_k[me].tolist() == [10.0 * me + a for a in range(4)]
         assert observed.peer_working[me].tolist() == [a == 1 for a in others]
         assert observed.peer_faulted[me].tolist() == [a == 3 for a in others]
         assert observed.peer_heard[me].all()
@@ -330,8 +479,10 @@ def test_peers_are_the_others_in_order() -> None:
 def test_nearest_peers_are_in_the_order_of_the_layout() -> None:
     near = ((2, 1), (3, 0), (3, 1), (0, 2))
     _, sender = np.indices((4, 4))
-    observed = peers_of(Layout(4, 2, near), received(4, 2, headroom_k=1.0 * sender))
+    observed = peers_of(Layout(4, 2, near, delivered=True), received(4, 2, headroom_k=1.0 * sender))
     assert observed.peer_headroom_k.tolist() == [list(map(float, peers)) for peers in near]
+    assert observed.fleet_headroom_k.tolist() == observed.peer_headroom_k.tolist()
+    assert observed.peers.tolist() == [[0, 1]] * 4
 
 
 def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
@@ -342,7 +493,7 @@ def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
         headroom_k=np.where(silent, np.nan, 5.0),
         age_s=np.where(silent, np.inf, 7.0),
     )  # fmt: skip
-    observed = peers_of(Layout(3, 2), view)
+    observed = peers_of(Layout(3, 2, delivered=True), view)
     assert observed.peer_heard[0].tolist() == [0, 1]
     assert observed.peer_age_s[0].tolist() == [LONG_S, 7.0]
     assert observed.peer_headroom_k[0].tolist() == [0.0, 5.0]
@@ -374,9 +525,44 @@ def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     expected = arms[1].model.score(arms[1].plans[bench][0], 5)
     assert expected is not None
     assert observed.difficulty[0, 1].tolist() == pytest.approx([expected.total, 0.0, 0.0])
-    assert observed.p_saturation[0, 1].tolist() == pytest.approx([expected.p_saturation, 0.5, 0.5])
-    assert observed.clock[0].tolist() == pytest.approx([20.0 / world.horizon_s] * 2)
+    assert observed.p_saturation[0, 1].tolist() == pytest.approx([expected.p_saturation, 0.0, 0.0])
+    assert observed.left_s[0].tolist() == [world.horizon_s - 20.0] * 2
+    assert observed.due_in_s[0].tolist() == [[80.0, 30.0, 0.0]] * 2
+    assert observed.group[0].tolist() == [[1, 2, 0]] * 2
     assert observed.action_mask[0].tolist() == [[1, 1, 1, 0, 0], [1, 1, 0, 0, 0]]
+
+
+def test_jobs_that_share_a_station_have_the_group_of_the_first(small) -> None:
+    """Three at the bench, of which one goes on to the rack."""
+    content = [small.work("bench"), small.work("press"), small.work("bench", to="rack"), small.work("rack"),
+               small.work("bench", small.HOT)]  # fmt: skip
+    world, _ = small.shop([[small.job(f"j{i}", each) for i, each in enumerate(content)]], slots=6)
+    observed = observe(world, initial(world))
+    assert observed.group[0].tolist() == [[1, 2, 1, 1, 1, 0]] * 2
+    assert observed.offered[0].tolist() == [[True] * 5 + [False]] * 2
+    assert observed.station_free[0].tolist() == [[1] * 5 + [0]] * 2
+
+
+def test_a_job_is_blocked_for_an_arm_whose_fastest_plan_needs_taken_space(small) -> None:
+    """`blocked` follows from the volumes of the plans of arms away from home; an arm does not block itself."""
+    bench, rack = small.work("bench"), small.work("rack")
+    arms = [small.arm(i, [bench, rack]) for i in range(3)]
+    jobs = [small.job("a", bench), small.job("b", rack), small.job("c", rack)]
+
+    def excluding(plans) -> tuple[np.ndarray, np.ndarray]:
+        one = [plan.arm == "arm_0" and plan.work == bench for plan in plans]
+        other = [plan.arm == "arm_1" and plan.work == rack for plan in plans]
+        conflicts = np.outer(one, other) | np.outer(other, one)
+        return np.arange(len(plans)), conflicts
+
+    world, plant = small.shop([jobs], arms=arms, slots=3, space=excluding)
+    before = initial(world)
+    assert not observe(world, before).blocked.any()
+    after = step(world, before, np.array([[1, 0, 0]]), plant, compiled=False).state
+    assert after.mode[0].tolist() == [WORKING, IDLE, IDLE]
+    observed = observe(world, after)
+    assert observed.blocked[0].tolist() == [[0, 0, 0], [1, 1, 0], [0, 0, 0]]
+    assert observed.action_mask[0].tolist() == [[1, 0, 0, 0, 1], [1, 0, 0, 0, 0], [1, 1, 1, 0, 0]]
 
 
 def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
@@ -386,14 +572,14 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     state = initial(world)
     measured = np.arange(14.0).reshape(1, 2, 7) + 40.0
     state.temp_c[..., :7] = measured
-    engine, vectors = engine_at(world, state)
-    message = broadcast(engine, vectors[0], world.jobs.names[0], ("x", "y"))
+    engine, parts = engine_at(world, state, scaled=True, delivered=True)
+    message = broadcast(engine, parts, world.jobs.names[0], ("x", "y"))
     assert message.time_s == 0.0
     assert message.twin == ("x", "y")
     assert message.jobs == ("a", "", "")
     assert message.headroom_k.tolist() == [60.0 - 46.0, 60.0 - 53.0]
     assert message.temp_c.tolist() == measured[0].tolist()
-    np.testing.assert_array_equal(message.difficulty[:, 0], world.offers.difficulty[0, :, 0, 0])
+    assert message.difficulty[:, 0] == pytest.approx(world.offers.difficulty[0, :, 0, 0])
     assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0, 0])
     assert np.isnan(message.difficulty[:, 1:]).all()
     assert np.isnan(message.p_saturation[:, 1:]).all()
@@ -451,20 +637,21 @@ def test_fields_of_the_nearest_peers_equal_those_of_all_peers(plans) -> None:
     alone, _ = single.reset(seed=5)
     near = near_of(load("quickstart"), 2)
     assert near is not None
-    assert few.layout.size == all_.layout.size - (6 + 3 * few.layout.slots)
+    assert few.layout.size == all_.layout.size - 2 * (5 + few.layout.slots)
     rng = np.random.default_rng(0)
     for _ in range(40):
         whole, part = all_.knowledge(), few.knowledge()
         for name, values in vars(whole).items():
-            if name.startswith("peer_"):
-                place = [[b - (b > a) for b in own] for a, own in enumerate(near)]
-                values = values[:, np.arange(len(near))[:, None], place]
+            if name == "peers":
+                values = np.tile(np.arange(2), (3, 4, 1))
+            elif name.startswith("fleet_"):
+                values = values[:, np.arange(len(near))[:, None], np.array(near)]
             np.testing.assert_array_equal(getattr(part, name), values, err_msg=name)
         mask = whole.action_mask
         actions = (rng.random(mask.shape) * mask).argmax(-1)
         _, (obs, *_) = all_.step(actions), few.step(actions)
         alone, *_ = single.step(dict(zip(single.agents, actions[0], strict=True)))
-        np.testing.assert_array_equal(alone["arm_2"]["observation"], obs["observation"][0, 2])
+        np.testing.assert_array_equal(alone["arm_2"]["observation"], few.joined(obs)["observation"][0, 2])
 
 
 @pytest.mark.parametrize("peers", [-1, 4, 1.5, True, "all"])

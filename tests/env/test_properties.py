@@ -67,7 +67,7 @@ def test_arms_of_a_crowded_cell_do_not_touch(small, play, seed) -> None:
         check_progress(env, before, now)
         assert all(env.observation_space(arm).contains(seen) for arm, seen in observed.items())
         stopped += int(((now.mode == FAULTED) & (now.plan >= 0)).sum())
-        kept_apart += sum(int((seen.feasible > seen.space_free).sum()) for seen in env.knowledge().values())
+        kept_apart += sum(int(seen.blocked.sum()) for seen in env.knowledge().values())
         before = now
     assert stopped > 0
     assert kept_apart > 0

@@ -109,7 +109,7 @@ def test_a_row_equals_the_single_env_over_several_episodes(many, make, play, e, 
         actual, expected = play.single(env, env.step(actions)), row(step, e)
         assert expected["ended"][0] == (not env.agents)
         if not env.agents:
-            last = {name: actual[name] for name in ("observation", "action_mask")}
+            last = {name: actual[name] for name in ("shared", "own", "action_mask")}
             play.same(last, {name: expected[f"final_{name}"] for name in last})
             first = play.single(env, env.reset())
             actual |= {name: first[name] for name in last}
@@ -168,7 +168,7 @@ def test_resetting_other_rows_keeps_delivered_messages(batch, play) -> None:
         kept = one.step(np.zeros((3, 3), int))[0]
         spoilt = other.step(np.zeros((3, 3), int))[0]
     kept = {name: values[1:].copy() for name, values in kept.items()}
-    spoilt["observation"][:] = -1.0
+    spoilt["shared"][:] = spoilt["own"][:] = -1.0
     again, _ = other.reset(rows=[0])
     play.same({name: values[1:] for name, values in again.items()}, kept)
     known = other.knowledge()
@@ -185,7 +185,7 @@ def test_one_seed_counts_up_and_a_list_gives_one_per_row(batch, play) -> None:
     for seed in (7, np.int64(7), np.arange(7, 12)):
         play.same(again.reset(seed=seed)[0], up[0])
     alike = batch(3, SHIFT, seed=[4, 4, 4]).reset()[0]
-    assert (alike["observation"] == alike["observation"][:1]).all()
+    assert all((values == values[:1]).all() for values in alike.values())
 
 
 # Resets
@@ -208,7 +208,7 @@ def test_autoreset_returns_the_first_observation_of_a_reset(batch, play) -> None
         play.same(one[4]["final_obs"], {name: values[over] for name, values in other[0].items()})
         for name in ("faults", "peak_c", "jobs_done", "reward_energy"):  # infos are of the step, not of the new shift
             np.testing.assert_array_equal(one[4][name], other[4][name])
-        assert len(other[4]["final_obs"]["observation"]) == 0
+        assert all(len(values) == 0 for values in other[4]["final_obs"].values())
         if over.any():
             ends += 1
             fresh, _ = by_hand.reset(rows=over if ends % 2 else np.flatnonzero(over))
@@ -453,9 +453,12 @@ def test_rows_of_two_variants_equal_batches_of_each(cell, plans, play) -> None:
     both = make_batch(cell, 12, LAST_SEED, randomise=Randomisation(variants=[variant]), **options)
     alone = [make_batch(cell, 12, LAST_SEED, **options, **each) for each in ({}, variant)]
     obs, given = both.reset()[0], [env.reset()[0] for env in alone]
-    fleet = (obs["observation"] == given[1]["observation"]).all(axis=(1, 2)).astype(int)
+    fleet = (obs["own"] == given[1]["own"]).all(axis=(1, 2)).astype(int)
     for step in range(70):
-        is_one = [(obs["observation"] == each["observation"]).all(axis=(1, 2)) for each in given]
+        is_one = [
+            (obs["own"] == each["own"]).all(axis=(1, 2)) & (obs["shared"] == each["shared"]).all(axis=1)
+            for each in given
+        ]
         assert np.choose(fleet, is_one).all()
         assert not (is_one[0] & is_one[1]).any()
         for each, env in enumerate(alone):
