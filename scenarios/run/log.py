@@ -216,11 +216,12 @@ def check_format(run: Mapping[str, Any], folder: Path) -> None:
         run: The content of its run.json.
 
     Raises:
-        FleetError: it is of another format.
+        FleetError: it is of another format or environment.
     """
-    if run["format"] != RUN_FORMAT:
+    environment = run.get("environment", "allocation_v0")
+    if (run["format"], environment) != (RUN_FORMAT, VERSION):
         raise FleetError(
-            f"'{folder}' is a run of format {run['format']} in {run.get('environment', 'allocation_v0')}; this "
+            f"'{folder}' is a run of format {run['format']} in {environment}; this "
             f"version reads {RUN_FORMAT}, {VERSION}. Run the scenario again."
         )
 
