@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 import zenoh
 
+VERSIONS = {"ActRequest": 5, "ActReply": 4, "Refusal": 4}
 MOST_WAITING = 32
 """Waiting requests, each of up to 4 MiB; when more wait, the oldest is dropped."""
 
@@ -22,7 +23,7 @@ def act(request):
     """Return the actions of arms by name; those that are left out wait."""
     claims = []
     for place, seen in enumerate(request["observations"]):
-        plans = len(seen["difficulty"]) // max(1, len(seen["offered"]))  # of each job
+        plans = len(seen["difficulty"]) // max(1, len(seen["group"]))  # of each job
         for option, legal in enumerate(seen["action_mask"][1:-1]):
             if legal:
                 job = option // plans
@@ -39,8 +40,8 @@ def act(request):
 def reply_to(query):
     """Reply to a query; a malformed request is refused."""
     try:
-        if str(query.encoding) != encoding("ActRequest"):
-            raise ValueError(f"encoding {query.encoding}")
+        if str(query.encoding) != (expected := encoding("ActRequest")):
+            raise ValueError(f"encoding '{query.encoding}', not '{expected}'")
         name, message = "ActReply", {"actions": act(json.loads(query.payload.to_bytes()))}
     except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         name, message = "Refusal", {"reason": f"Malformed ActRequest: {error!r}"}
@@ -49,7 +50,7 @@ def reply_to(query):
 
 def encoding(name):
     """Return the Zenoh encoding of a message type; messages with another one are malformed."""
-    return f"application/json;thermofleet.{name}.v4"
+    return f"application/json;thermofleet.{name}.v{VERSIONS[name]}"
 
 
 def main(port, policy):

@@ -16,6 +16,8 @@ from fleet.errors import BusError
 from fleet.telemetry import Mode
 
 VERSION = 4
+CHANGED = {"ActRequest": 5}
+"""Version of each message that has changed since, by name."""
 MOST_BYTES = 65_536
 """Largest message with its attachment, in bytes; a request to a policy may be larger."""
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
@@ -173,7 +175,7 @@ def _decoder(kind: type[Message]) -> msgspec.json.Decoder[Message]:
 
 def schema(kind: type[msgspec.Struct]) -> str:
     """Name and version of a message's schema, for example `thermofleet.State.v4`."""
-    return f"thermofleet.{kind.__name__}.v{VERSION}"
+    return f"thermofleet.{kind.__name__}.v{CHANGED.get(kind.__name__, VERSION)}"
 
 
 @cache
