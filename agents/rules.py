@@ -339,8 +339,7 @@ class Ahead:
     """Base of assignments in which arms that are home soon take part, by the time until they would finish.
 
     A pair of such an arm claims nothing: its job waits for it, and the next decision finds it free or makes another
-    plan. The arm's predicted peak is that from its present temperatures. Whether its space will be free is unknown:
-    `space_free` of an arm at work is always 0.
+    plan. The arm's predicted peak is that from its present temperatures. Whether its space will be free is unknown.
     """
 
     soon_s: ClassVar = 120.0

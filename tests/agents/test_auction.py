@@ -84,8 +84,7 @@ def fleet(difficulty, **other) -> list[Observation]:
     d = np.array(difficulty, dtype=float)
     arms, slots = d.shape
     base = {
-        "known": ~np.isnan(d),
-        "difficulty": np.nan_to_num(d),
+        "difficulty": np.nan_to_num(d, nan=-1.0),
         "slack_s": np.full(d.shape, LONG_S),
         "value": np.ones(d.shape),
         **{name: np.broadcast_to(np.array(value, dtype=float), d.shape) for name, value in other.items()},
@@ -160,8 +159,8 @@ def test_the_arm_that_would_get_hot_does_not_get_the_job():
 
 def test_a_job_waits_for_the_arm_that_is_home_soon_and_finishes_it_first() -> None:
     """A free arm needs 900 s; another one 100 s, once it is home."""
-    free, busy = fleet([[1.0], [1.0]], duration_s=[[900.0], [100.0]], value=[4.0], feasible=1.0, offered=1.0)
-    free, busy = replace(free, idle=np.array(1.0)), replace(busy, working=np.array(1.0))
+    free, busy = fleet([[1.0], [1.0]], duration_s=[[900.0], [100.0]], value=[4.0])
+    busy = replace(busy, working=np.array(1.0))
     none, stations = np.array([1, 0, 0], np.int8), np.ones(1)
 
     def claim(name: str, busy_s: float, station_free=stations, **changes) -> dict[str, int]:
@@ -174,7 +173,7 @@ def test_a_job_waits_for_the_arm_that_is_home_soon_and_finishes_it_first() -> No
     assert claim("wsept_ahead", 60.0, np.zeros(1)) == {"free": 1, "busy": 0}
     assert claim("wsept", 60.0) == {"free": 1, "busy": 0}
     # Late by 2 min, a job of value 4 costs 0.13 of difficulty: 0.8 is still better than 1, 0.9 is not.
-    late = {"slack_s": np.zeros(1), "duration_s": np.array([900.0])}
+    late = {"due_in_s": np.array([900.0]), "duration_s": np.array([900.0])}
     assert claim("matching_ahead", 120.0, difficulty=np.array([0.8]), **late) == {"free": 0, "busy": 0}
     assert claim("matching_ahead", 120.0, difficulty=np.array([0.9]), **late) == {"free": 1, "busy": 0}
 
@@ -187,10 +186,14 @@ def test_a_central_policy_reads_no_messages(name, seed):
     mask = np.pad(rng.integers(0, 2, (3, 4)), ((0, 0), (1, 1)), constant_values=((0, 0), (1, 0))).astype(np.int8)
     low, high = layout.bounds
     vectors = rng.uniform(np.maximum(low, -100.0), np.minimum(high, 100.0), (2, 3, layout.size)).astype(np.float32)
-    first = [layout.read(vectors[0, arm], mask[arm]) for arm in range(3)]
-    other = [layout.read(vectors[1, arm], mask[arm]) for arm in range(3)]
+    modes = np.eye(3)[rng.integers(0, 3, 3)]  # an arm is idle, working or faulted
+    alike = {"working": modes[:, 1], "faulted": modes[:, 2]}
+    first, other = (
+        [Observation(**{field: values[arm] for field, values in vars(seen).items()}) for arm in range(3)]
+        for seen in (replace(layout.read(each, mask), **alike) for each in vectors)
+    )
     told = [
-        replace(one, **{field: value for field, value in vars(two).items() if field.startswith("peer_")})
+        replace(one, **{field: value for field, value in vars(two).items() if field.startswith("fleet_")})
         for one, two in zip(first, other, strict=True)
     ]
     named = [dict(zip("abc", seen, strict=True)) for seen in (first, told)]

@@ -33,7 +33,6 @@ def seen(value: list[float], peak_c: list[float], *, temp_c=40.0, error_c=75.0, 
         "error_headroom_k": error_c - temp_c,
         "duration_s": np.tile([FAST, SLOW], slots),
         "p_saturation": np.full(2 * slots, 0.5),
-        "offered": np.ones(slots),
     }
     return observation(slots, plans=2, legal=1 if legal is None else legal, **{**known, **fields})
 
@@ -128,7 +127,7 @@ def guarded(
         plans=2,
         legal=idle,
         gives_back=not idle,
-        idle=float(idle),
+        working=float(not idle),
         temp_c=np.full(7, temp_c),
         housing_c=np.full(7, temp_c - excess_k),
         headroom_k=WARNING_C - temp_c,

@@ -51,27 +51,27 @@ def random_observation(layout: Layout, rng: np.random.Generator, rows: int) -> n
     return values.astype(np.float32)
 
 
-def reordered(layout: Layout, vectors: np.ndarray, slots: np.ndarray, peers: np.ndarray) -> np.ndarray:
-    """The same knowledge with slots and peers in another order."""
+def reordered(layout: Layout, vectors: np.ndarray, slots: np.ndarray, members: np.ndarray) -> np.ndarray:
+    """The same knowledge with slots and members in another order."""
     seen = layout.read(vectors.copy(), vectors[:, :0])
     named = {}
     for field in FIELDS:
         part = getattr(seen, field.name)
-        for axis, order in (("slot", slots), ("option", slots), ("peer", peers)):
+        for axis, order in (("slot", slots), ("option", slots), ("member", members)):
             if axis in field.axes:
                 part = np.take(part, order, axis=1 + field.axes.index(axis))
         named[field.name] = part
-    return layout.pack(Observation(**named, action_mask=vectors[:, :0]))
+    return layout.pack(Observation(**named, peers=seen.peers, action_mask=vectors[:, :0]))
 
 
 @pytest.mark.parametrize(("arms", "slots"), [(1, 1), (2, 3), (4, 8), (9, 5)])
-def test_logits_move_with_the_slots_and_do_not_know_the_order_of_peers(arms, slots) -> None:
+def test_logits_move_with_the_slots_and_do_not_know_the_order_of_members(arms, slots) -> None:
     rng, layout = np.random.default_rng(arms), Layout(arms, slots)
     torch.manual_seed(0)
     actor, critic = Actor().double(), Critic().double()
     vectors = random_observation(layout, rng, 6)
-    slot_order, peer_order = rng.permutation(slots), rng.permutation(arms - 1)
-    other = reordered(layout, vectors, slot_order, peer_order)
+    slot_order, member_order = rng.permutation(slots), rng.permutation(arms)
+    other = reordered(layout, vectors, slot_order, member_order)
     one, two = (actor(layout, torch.from_numpy(v).double()) for v in (vectors, other))
     torch.testing.assert_close(two[:, [0, -1]], one[:, [0, -1]])
     torch.testing.assert_close(two[:, 1:-1], one[:, 1:-1][:, slot_order.copy()])
@@ -243,7 +243,7 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
     save_policy(Actor(), size, tmp_path)
     with pytest.raises(CheckpointError, match="size mismatch"):
         load_policy(tmp_path)
-    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 5"), ("[]", "not the")):
+    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 6"), ("[]", "not the")):
         (tmp_path / CARD).write_text(text)
         with pytest.raises(CheckpointError, match=reason):
             load_policy(tmp_path)

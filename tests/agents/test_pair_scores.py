@@ -21,7 +21,8 @@ def drawn(rng: np.random.Generator) -> Observation:
     """What five arms might know: three free, one at work, one stopped; the jobs of all slots are offered."""
     blank = LAYOUT.read(np.zeros((5, LAYOUT.size), np.float32), np.zeros((5, LAYOUT.actions), np.int8))
     jobs = {
-        "offered": np.ones((5, 6)),
+        "group": np.tile(np.arange(1.0, 7.0), (5, 1)),
+        "due_in_s": np.tile(rng.uniform(-240.0, 1500.0, 6), (5, 1)),
         "value": np.tile(rng.uniform(0.5, 4.0, 6), (5, 1)),
         "age_s": np.tile(rng.uniform(0.0, 900.0, 6), (5, 1)),
         "payload_kg": np.tile(rng.uniform(0.0, 4.0, 6), (5, 1)),
@@ -29,10 +30,8 @@ def drawn(rng: np.random.Generator) -> Observation:
     }
     options = {
         "duration_s": rng.uniform(60.0, 900.0, (5, 12)),
-        "slack_s": rng.uniform(-300.0, 900.0, (5, 12)),
         "peak_c": rng.uniform(40.0, 80.0, (5, 12)) * (rng.random((5, 12)) < 0.8),
         "difficulty": rng.uniform(0.0, 1.0, (5, 12)),
-        "feasible": np.ones((5, 12)),
         "p_saturation": rng.random((5, 12)),
     }
     temp_c = rng.uniform(30.0, 50.0, (5, 7))
@@ -43,10 +42,9 @@ def drawn(rng: np.random.Generator) -> Observation:
         "temp_c": temp_c,
         "headroom_k": 60.0 - temp_c.max(axis=1),
         "error_headroom_k": 67.0 - temp_c.max(axis=1),
-        "idle": free,
         "working": working,
+        "faulted": 1 - free - working,
         "busy_s": 60.0 * working,
-        "clock": np.full(5, 0.7),
         "left_s": np.full(5, rng.uniform(100.0, 5000.0)),
     }
     return replace(blank, **jobs, **options, **arms, action_mask=mask.astype(np.int8))
@@ -54,7 +52,7 @@ def drawn(rng: np.random.Generator) -> Observation:
 
 def of_arms(seen: Observation) -> dict[str, Observation]:
     """The observation of each arm."""
-    names = [*(field.name for field in FIELDS), "action_mask"]
+    names = [*(field.name for field in FIELDS), "peers", "action_mask"]
     return {f"arm{a}": Observation(**{name: getattr(seen, name)[a] for name in names}) for a in range(5)}
 
 
@@ -91,7 +89,7 @@ def test_scores_follow_arms_and_slots_in_any_order() -> None:
         if field.axes in order
         else getattr(seen, field.name)[arms]
         for field in FIELDS
-        if "peer" not in field.axes
+        if "member" not in field.axes
     }
     mask = seen.action_mask[arms][:, [0, *(1 + options), -1]]
     found = scores(batched(replace(seen, **moved, action_mask=mask)), parameters)[0]

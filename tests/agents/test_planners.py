@@ -13,7 +13,7 @@ from agents.planners import NONE, Mpc, RollingHorizon, Sequences, pack
 from agents.policy import WAIT, EveryArm, Local, PlanningPolicy
 from agents.registry import RULES, make_policy
 from agents.schedules import Schedules
-from fleet.engine.batch import Engine, RewardWeights, shifts_of
+from fleet.engine.batch import Engine, RewardWeights, empty_parts, shifts_of
 from fleet.engine.tables import tables_of
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.errors import FleetError
@@ -44,16 +44,12 @@ def seen(
     """What an arm knows that has one plan for each job."""
     d, idle = np.array(duration_s, dtype=float), busy_s == 0.0
     known = {
-        "idle": float(idle),
         "working": float(not idle),
         "busy_s": busy_s,
-        "offered": np.ones(len(d)),
-        "feasible": np.ones(len(d)),
-        "space_free": np.full(len(d), float(idle)),
         "station_free": np.broadcast_to(station_free, d.shape),
         "duration_s": d,
         "value": np.array(value, dtype=float),
-        "slack_s": np.broadcast_to(due_s, d.shape) - d,
+        "due_in_s": np.broadcast_to(due_s, d.shape),
         "peak_c": np.broadcast_to(peak_c, d.shape),
         "p_saturation": np.full(len(d), 0.001),
         "temp_c": np.full(7, temp_c),
@@ -145,18 +141,19 @@ def simulator_of(world, weights=WEIGHTS):
 
 
 def begun(world):
-    """An engine at the beginning of the shift of a world, and the vectors of its arms."""
+    """An engine at the beginning of the shift of a world, and both parts of its observations."""
     tables, drawn = tables_of(world)
     layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
     engine = Engine(tables, 1, layout, WEIGHTS, jobs=len(world.jobs.names[0]))
-    vectors = np.zeros((1, len(world.arms), layout.size), np.float32)
+    parts = empty_parts(layout, 1)
     engine.reset(np.arange(1), shifts_of(drawn, [0]))
-    engine.observe(np.arange(1), vectors)
-    return engine, vectors
+    engine.observe(np.arange(1), parts)
+    return engine, parts
 
 
-def seen_by(world, engine, vectors):
-    return engine.layout.read_each(world.arms, vectors[0], engine.mask[0])
+def seen_by(world, engine, parts):
+    shared, own = parts
+    return engine.layout.read_each(world.arms, shared[0], own[0], engine.mask[0])
 
 
 def alone(name):
@@ -214,11 +211,11 @@ def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
     schedule = Schedules(
         rng.integers(0, 3, (1, 6)), np.zeros((1, 6), int), rng.uniform(0, 1, (1, 6)), rng.uniform(0, 300, (1, 6))
     )
-    engine, vectors = begun(world)
+    engine, parts = begun(world)
     for _ in range(ticks):
-        engine.step(np.array([[rng.choice(np.flatnonzero(m[:-1])) for m in engine.mask[0]]]), vectors)
+        engine.step(np.array([[rng.choice(np.flatnonzero(m[:-1])) for m in engine.mask[0]]]), parts)
     cell = Lookahead(simulator_of(world), engine)
-    present = cell.look(seen_by(world, engine, vectors))
+    present = cell.look(seen_by(world, engine, parts))
     assert present.now_s == cell.now_s == ticks * 10.0
     others = ~np.isin(np.arange(6), present.open)
     assert not present.can[:, others].any()
@@ -232,8 +229,8 @@ def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
 def test_a_later_reward_is_worth_less(small):
     world, _ = small.Shifts(arms=1, jobs=1).shop([small.job("a")])
     simulator = simulator_of(world, RewardWeights(tardiness=0.0, energy=0.0))
-    engine, vectors = begun(world)
-    simulator.look(engine, 0, seen_by(world, engine, vectors))
+    engine, parts = begun(world)
+    simulator.look(engine, 0, seen_by(world, engine, parts))
     discount = 0.5 ** np.arange(world.ticks)
     whole = Schedules(np.zeros((1, 1), int), np.zeros((1, 1), int), np.zeros((1, 1)), np.zeros((1, 1)))
     value, later = (float(simulator.run(whole, each).reward[0]) for each in (np.ones(world.ticks), discount))
@@ -284,8 +281,8 @@ def test_a_guard_stops_claims_of_a_planner(small):
 def test_schedules_that_the_simulator_cannot_hold_are_refused(small, change, said):
     """Compiled code does not check indices."""
     world, _ = small.Shifts().shop(small.Shifts().drawn(np.random.SeedSequence(1))[0])
-    simulator, (engine, vectors) = simulator_of(world), begun(world)
-    simulator.look(engine, 0, seen_by(world, engine, vectors))
+    simulator, (engine, parts) = simulator_of(world), begun(world)
+    simulator.look(engine, 0, seen_by(world, engine, parts))
     none = np.zeros((1, 8), int)
     whole, discount = Schedules(none, none, np.zeros((1, 8)), np.zeros((1, 8))), np.ones(world.ticks)
     assert np.isfinite(simulator.run(whole, discount).reward).all()
@@ -296,11 +293,11 @@ def test_schedules_that_the_simulator_cannot_hold_are_refused(small, change, sai
 def test_heat_costs_nothing_where_limits_are_out_of_reach(small):
     jobs = [small.job(f"job_{i}", small.work(payload_kg=small.HOT), repetitions=5, due_s=1e4) for i in range(4)]
     world, _ = small.Shifts(arms=1, jobs=4, ticks=120, ambient_c=40.0).shop(jobs)
-    engine, vectors = begun(world)
+    engine, parts = begun(world)
     none = np.zeros((1, 4), int)
     all_, rewards = Schedules(none, none, np.arange(4.0)[None], np.zeros((1, 4))), []
     for cell in (near := Lookahead(simulator_of(world), engine)), near.with_limits(1e6, 1e6):
-        cell.look(seen_by(world, engine, vectors))
+        cell.look(seen_by(world, engine, parts))
         rewards.append(float(cell.simulator.run(all_, np.ones(world.ticks)).reward[0]))
     assert rewards[0] < rewards[1]
 

@@ -16,7 +16,7 @@ from agents.registry import RULES, make_policy
 from agents.rules import RandomLegal, Wspt, WsptCool
 from fleet.env.allocation_v2 import parallel_env
 from fleet.observation import LONG_S, Observation
-from tests.agents.observations import observation
+from tests.agents.observations import observation, with_peers
 from tests.profiles import examples
 
 
@@ -38,27 +38,23 @@ def fleet(
     able = np.ones((arms, slots)) if feasible is None else np.array(feasible)
     idle = np.ones(arms) if free is None else np.array(free)
     legal = (able if mask is None else np.array(mask)) * idle[:, None]
-    known = ~np.isnan(d) & (able > 0)
-    values = np.where(known, d, 0.0)
+    shared = np.where(~np.isnan(d) & (able > 0), d, -1.0)
 
     def seen(me: int) -> Observation:
         peers = [p for p in range(arms) if p != me]
         return observation(
             slots,
             peers=arms - 1,
+            place=me,
             legal=legal[me],
-            idle=idle[me],
-            offered=np.ones(slots),
+            working=1.0 - idle[me],
             value=np.ones(slots),
-            feasible=able[me],
-            known=known[me].astype(float),
-            difficulty=values[me],
+            duration_s=60.0 * able[me],
+            difficulty=np.where(able[me] > 0, shared[me], 0.0),
             headroom_k=0.0 if headroom_k is None else headroom_k[me],
             error_headroom_k=15.0,
-            peer_heard=np.ones(arms - 1),
             peer_working=1.0 - idle[peers],
-            peer_known=known[peers].astype(float),
-            peer_difficulty=values[peers],
+            peer_difficulty=shared[peers],
         )
 
     return {f"arm_{me}": seen(me) for me in range(arms)}
@@ -231,14 +227,11 @@ def cut(seen: dict[str, Observation], links: list[tuple[int, int]]) -> dict[str,
     out = {}
     for me, (arm, obs) in enumerate(seen.items()):
         peers = [p for p in range(len(seen)) if p != me]
-        heard = np.array([float((me, p) in links or (p, me) in links) for p in peers])
-        known = obs.peer_known * heard[:, None]
-        out[arm] = replace(
+        heard = np.array([(me, p) in links or (p, me) in links for p in peers])
+        out[arm] = with_peers(
             obs,
-            peer_heard=heard,
-            peer_known=known,
-            peer_difficulty=obs.peer_difficulty * known,
-            peer_age_s=np.where(heard > 0, obs.peer_age_s, LONG_S),
+            peer_difficulty=np.where(heard[:, None], obs.peer_difficulty, -1.0),
+            peer_age_s=np.where(heard, obs.peer_age_s, LONG_S),
         )
     return out
 
@@ -251,7 +244,7 @@ def test_consensus_agrees_through_those_between_and_least_difficulty_cannot() ->
 
 
 def test_consensus_lets_every_arm_bid_for_itself_where_words_are_late() -> None:
-    late = {arm: replace(o, peer_age_s=np.full(2, 10.0)) for arm, o in fleet([[1.0, 2.0]] * 3).items()}
+    late = {arm: with_peers(o, peer_age_s=np.full(2, 10.0)) for arm, o in fleet([[1.0, 2.0]] * 3).items()}
     assert act("consensus", late) == [[1, 1, 1]]
 
 
@@ -305,8 +298,8 @@ def test_no_other_first_pair_is_worth_more(data, arms, slots) -> None:
 def queue(duration_s, due_s, value, now_s: float = 0.0, **fields) -> Observation:
     """What a free arm knows that may claim every job of a queue, the oldest first."""
     d = np.array(duration_s, dtype=float)
-    known = {"duration_s": d, "slack_s": np.array(due_s) - now_s - d, "value": np.array(value, dtype=float)}
-    return observation(len(d), offered=np.ones(len(d)), feasible=np.ones(len(d)), **known, **fields)
+    known = {"duration_s": d, "due_in_s": np.array(due_s) - now_s, "value": np.array(value, dtype=float)}
+    return observation(len(d), **known, **fields)
 
 
 def sequence(name: str, duration_s, due_s, value) -> list[int]:

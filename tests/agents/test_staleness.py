@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,26 +12,19 @@ from hypothesis import strategies as st
 from agents import staleness
 from agents.rules import LeastDifficulty
 from agents.staleness import advantage, fading_weights
-from fleet.observation import LONG_S, Observation
-from tests.agents.observations import observation
+from fleet.observation import Observation
+from tests.agents.observations import observation, with_peers
 
 
 def heard(own: list[float], peers: list[list[float]], ages_s: list[float]) -> Observation:
     """What the first arm knows that finds the slots so difficult, and was told so much, so long ago; NaN not told."""
     told = np.array(peers, dtype=float).reshape(len(ages_s), len(own))
-    slots, known = len(own), ~np.isnan(told)
     return observation(
-        slots,
+        len(own),
         peers=len(ages_s),
-        idle=1.0,
-        offered=np.ones(slots),
-        feasible=np.ones(slots),
-        known=(~np.isnan(own)).astype(float),
-        difficulty=np.nan_to_num(np.array(own)),
-        peer_heard=np.array([float(age < LONG_S) for age in ages_s]),
-        peer_age_s=np.array(ages_s, dtype=np.float32),
-        peer_known=known.astype(float),
-        peer_difficulty=np.where(known, told, 0.0),
+        difficulty=np.nan_to_num(np.array(own), nan=-1.0),
+        peer_age_s=np.array(ages_s),
+        peer_difficulty=np.nan_to_num(told, nan=-1.0),
     )
 
 
@@ -89,7 +81,7 @@ def test_a_job_is_left_to_a_better_peer_only_as_long_as_it_may_be_free():
 
 @pytest.mark.parametrize("state", ["peer_working", "peer_faulted"])
 def test_nothing_is_left_to_a_peer_that_is_not_free(state):
-    assert choice(replace(heard([2.0], [[1.0]], [0.0]), **{state: np.ones(1)})) == 1
+    assert choice(with_peers(heard([2.0], [[1.0]], [0.0]), **{state: np.ones(1)})) == 1
 
 
 def test_a_peer_with_an_old_claim_gives_way_to_one_with_a_fresh_one():
