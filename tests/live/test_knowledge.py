@@ -37,14 +37,14 @@ from scenarios.live.auctioneer import CentralAllocation, job_spec
 
 MAY_DIFFER = {
     "last_award": "a live fleet counts rounds, and there is a round only when a job can begin",
-    "peer_age_s": "live messages travel for some time",
+    "fleet_age_s": "live messages travel for some time",
 }
 """Fields that may differ, and why. Two more differ in special cases: `peak_c` and `p_saturation` of a returned job, as
 live arms predict the cycles that are left, and simulated arms the whole job; and an arm above the warning limit counts
-as working (`idle`, `working`, `peer_working`), as a live one takes no job."""
+as working (`working`, `fleet_working`), as a live one takes no job."""
 HOUR_S = 3600.0
 NAMES = ("arm_0", "arm_1", "arm_2")
-CONSTANT = {"offered", "peer_heard", "peer_age_s"}
+CONSTANT = {"fleet_age_s"}
 """Fields that have one value in these shifts."""
 TOO_HEAVY = 6.0
 """Rating of the last arm, kg."""
@@ -282,7 +282,7 @@ def test_a_live_policy_observes_what_it_observes_in_simulation(small, error_c, c
         world = replace(world, ambient_c=np.array([[ambient_c(tick * world.dt_s)] * 3 for tick in range(world.ticks)]))
         return Episode(world=world, plant=plant, twins=("scores",) * len(arms), sensors=seed)
 
-    env = parallel_env(episode)
+    env = parallel_env(episode, ahead_s=np.inf)
     env.reset(seed=0)
     policy = Comparing(env)
     live = LiveFleet(arms=NAMES, limits=limits, horizon_s=env.world.horizon_s)
@@ -307,8 +307,8 @@ def test_a_live_policy_observes_what_it_observes_in_simulation(small, error_c, c
 def without_hot_arms(o: Observation) -> Observation:
     """Return what an arm observes in simulation, with arms above the warning limit at work."""
     hot = (o.idle > 0) & (o.headroom_k <= 0)
-    peers = (o.peer_working > 0) | ((o.peer_faulted == 0) & (o.peer_headroom_k <= 0))
-    return replace(o, idle=o.idle * ~hot, working=np.where(hot, 1.0, o.working), peer_working=peers * 1.0)
+    fleet = (o.fleet_working > 0) | ((o.fleet_faulted == 0) & (o.fleet_headroom_k <= 0))
+    return replace(o, working=np.where(hot, 1.0, o.working), fleet_working=fleet * 1.0)
 
 
 class Comparing:

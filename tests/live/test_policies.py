@@ -27,11 +27,11 @@ from tests.profiles import examples
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central" and not rule.plans]
 SIMULATED_ONLY = {
-    *("last_award", "clock", "station_free", "space_free", "housing_c", "too_heavy"),
-    *("job_value", "job_cycles", "job_p", "peer_blocks"),
+    *("last_award", "station_free", "blocked", "housing_c"),
+    *("job_value", "job_cycles", "job_p"),
 }
 """Fields that quotes of a working arm do not contain."""
-GIVEN = ("station_free", "space_free")
+GIVEN = ("station_free", "blocked")
 """Of these, those that rules read: taken over as they are."""
 
 
@@ -59,22 +59,21 @@ def one_plan(job: str, **figures) -> Estimate:
 
 
 def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
-    """Return observations as quotes to an auctioneer; every job has a separate station."""
+    """Return observations as quotes to an auctioneer; the jobs of a group have one station."""
     first = next(iter(seen.values()))
     slots = [slot for slot in range(len(first.offered)) if first.offered[slot]]
     jobs, quotes, states = [], {}, {}
     for slot in slots:
-        fastest = slot * PLANS
-        due_s = {float(o.slack_s[fastest]) + float(o.duration_s[fastest]) + time_s for o in seen.values()}
+        due_s = float(first.due_in_s[slot]) + time_s
         jobs.append(
             JobSpec(
                 name=f"j{slot}",
                 kind="hold",
-                places=(f"p{slot}",),
+                places=(f"p{first.group[slot]:g}",),
                 payload_kg=float(first.payload_kg[slot]),
                 value=float(first.value[slot]),
-                release_s=max(0.0, min(time_s - float(first.age_s[slot]), *due_s)),
-                due_s=None if max(due_s) > LONG_S / 2 else max(due_s),
+                release_s=max(0.0, min(time_s - float(first.age_s[slot]), due_s)),
+                due_s=None if due_s > LONG_S / 2 else due_s,
                 expires=bool(first.expires[slot]),
             )
         )
@@ -115,7 +114,7 @@ def fresh(name: str) -> Policy:
 @pytest.mark.parametrize("name", [name for name, rule in RULES.items() if not rule.plans])
 def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, name) -> None:
     """Each step of a shift at which an arm may choose, converted to quotes and back."""
-    env = parallel_env(small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0, plans_per_job=PLANS))
+    env = parallel_env(small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0, plans_per_job=PLANS), ahead_s=np.inf)
     env.reset(seed=4)
     simulated, live, compared = fresh(name), fresh(name), 0
     while env.agents:
@@ -129,8 +128,7 @@ def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, na
             for arm, o in seen.items():
                 # A quote does not contain busy stations, and no job is given back.
                 mask = np.append(o.action_mask[: len(open_slots) * PLANS + 1], 0)
-                options = {"station_free": len(open_slots), "space_free": len(open_slots) * PLANS}
-                given = {name: getattr(o, name)[: options[name]] for name in GIVEN}
+                given = {name: getattr(o, name)[: len(open_slots)] for name in GIVEN}
                 live_seen[arm] = replace(live_seen[arm], action_mask=mask, **given)
                 for field in FIELDS:
                     if field.name not in SIMULATED_ONLY:
@@ -176,7 +174,7 @@ def test_quotes_become_observations() -> None:
         [1, 0, 0, 0, 0, 0],
         [1, 0, 0, 0, 0, 0],
     ]
-    assert (one.clock, one.busy_s, one.last_award, two.last_award) == (0.25, 0.0, -1.0, 0.0)
+    assert (one.busy_s, one.last_award, two.last_award) == (0.0, -1.0, 0.0)
     assert [(o.left_s, o.headroom_k, o.error_headroom_k) for o in (one, two)] == [
         (300.0, 20.0, 27.0),
         (300.0, 5.0, 12.0),
@@ -184,12 +182,12 @@ def test_quotes_become_observations() -> None:
     endless, over = (observe(bidding, LiveFleet(arms=("one",), horizon_s=end_s)) for end_s in (np.inf, 50.0))
     assert (endless["one"].left_s, over["one"].left_s, endless["one"].error_headroom_k) == (LONG_S, 0.0, 35.0)
     assert [float(o.idle) for o in (one, two, three, four)] == [1, 1, 0, 0]
-    assert [float(o.working) for o in (one, two, three, four)] == [0, 0, 1, 0]
+    assert [float(o.working) for o in (one, two, three, four)] == [0, 0, 1, 1]  # four: not heard
     assert one.known.tolist() == [1, 1, 0, 0]
     assert one.difficulty.tolist() == [1.5, 1.25, 0, 0]
     assert one.peak_c.tolist() == [55.0, 50.0, 0, 0]
-    assert one.p_saturation.tolist() == [0.25, 0.125, 0.5, 0.5]
-    assert two.p_saturation.tolist() == [0.5, 0.5, 0.5, 0.5]  # unknown without a model
+    assert one.p_saturation.tolist() == [0.25, 0.125, 0, 0]
+    assert two.p_saturation.tolist() == [0, 0, 0.5, 0]  # unknown without a model
     assert one.duration_s.tolist() == [60.0, 55.0, 0, 0]
     assert two.duration_s.tolist() == [0, 0, 60.0, 0]  # missing: as the longest
     assert one.slack_s.tolist() == [-10.0, -5.0, 0.0, 0.0]
@@ -203,12 +201,14 @@ def test_quotes_become_observations() -> None:
     assert (three.job_value, three.job_cycles, three.job_peak_c, three.job_p) == (3.0, 4.0, 57.0, 0.25)
     assert (two.job_value, two.job_cycles, two.job_peak_c, two.job_p) == (0.0, 0.0, 0.0, 0.0)
     assert one.peer_busy_s.tolist() == [0.0, 0.0, 80.0]
-    assert one.too_heavy.tolist() == [0, 1]
+    assert one.group.tolist() == [1, 2]
+    assert one.blocked.tolist() == [0, 0]
     assert one.peer_heard.tolist() == [1, 0, 1]  # two, four, three
     assert one.peer_age_s.tolist() == [7.0, LONG_S, 2.0]
     assert one.peer_working.tolist() == [0, 0, 1]
     assert two.peer_known.tolist() == [[1, 0], [0, 0], [0, 0]]
-    assert two.peer_difficulty.tolist() == [[1.25, 0], [0, 0], [0, 0]]
+    assert two.peer_difficulty.tolist() == [[1.25, -1], [-1, -1], [-1, -1]]
+    assert two.fleet_difficulty.tolist() == [[-1, -1], [1.25, -1], [-1, -1], [-1, -1]]
 
 
 @pytest.mark.parametrize("name", CENTRAL)

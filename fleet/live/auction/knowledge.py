@@ -17,6 +17,8 @@ _LOG = logging.getLogger(__name__)
 
 Array = np.ndarray
 
+LEAST_S = 1e-3
+"""Shortest duration of a plan: 0 stands for no plan."""
 NO_CLAIMS: Mapping[str, int] = {}
 
 
@@ -42,9 +44,10 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     An option is a quoted plan, by its number; plans of a number from `PLANS` on are left out. What an arm knows of
     itself is in its quote and its last state, as is what its peers know of it; a peer without either is not heard.
 
-    An arm without capacity counts as working and can claim nothing. A plan without difficulty and without P(saturation)
-    has an unknown P and peak, as in simulation. A missing duration counts as the longest of the round, a missing
-    housing temperature as that of the motor, and a missing ambient temperature as that of the coolest motor.
+    An arm without capacity, or without a message, counts as working and can claim nothing. A plan without difficulty
+    and without P(saturation) has an unknown P and peak, as in simulation. A missing duration counts as the longest of
+    the round, a missing housing temperature as that of the motor, and a missing ambient temperature as that of the
+    coolest motor.
 
     Args:
         last: Outcome of the last claim of each arm: 1 won, -1 lost.
@@ -88,7 +91,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     scored = known | ~np.isnan(p_saturation)
     quoted_s = table(lambda offer: offer.duration_s)
     longest_s = np.nan_to_num(quoted_s).max(initial=0.0)
-    duration_s = np.where(feasible, np.where(np.isnan(quoted_s), longest_s, quoted_s), 0.0)
+    duration_s = np.where(feasible, np.maximum(np.where(np.isnan(quoted_s), longest_s, quoted_s), LEAST_S), 0.0)
     queued_s = [max(job.release_s, bidding.returned.get(job.name, (0, 0.0))[1]) for job in bidding.jobs]
     due_s = per_job([LONG_S + time_s if job.due_s is None else job.due_s for job in bidding.jobs])
     busy_s = stated(lambda state: state.busy_s)
@@ -96,7 +99,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     temp_c = _per_joint(states, "temp_c", np.repeat(limits.warning_c - headroom_k[:, None], JOINTS, axis=1))
     fields = Observation(
         left_s=np.full(len(arms), fleet.horizon_s - time_s),
-        working=working,
+        working=working | (modes == ""),
         faulted=modes == "faulted",
         busy_s=busy_s,
         last_award=np.array([last.get(arm, 0) for arm in arms]),
