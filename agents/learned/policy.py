@@ -21,7 +21,7 @@ from agents.learned.config import NetworkSize
 from agents.policy import WAIT, plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
-from fleet.observation import Layout, Observation
+from fleet.observation import VERSION, Layout, Observation
 
 OWN, OPTION, PEER, PAIR = 27, 15, 5, 3
 """Number of features of the arm itself, of an option, of an arm of the fleet, and of its score of an option."""
@@ -271,8 +271,8 @@ def load_policy(folder: Path) -> LearnedPolicy:
         card = json.loads((folder / CARD).read_text(encoding="utf-8"))
         if card["format"] != FORMAT:
             raise CheckpointError(
-                f"{folder / CARD}: format {card['format']} is not {FORMAT}: its network takes other observations. "
-                "Train the policy again."
+                f"{folder / CARD}: format {card['format']} is not {FORMAT}: its network takes no observations of "
+                f"version {VERSION}. Train the policy again."
             )
         size = NetworkSize(**card["size"])
     except FileNotFoundError as error:
