@@ -79,6 +79,17 @@ def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, dam
         open_run(copied)
 
 
+def test_a_run_in_another_version_of_the_environment_is_refused_by_name(run_folder: Path, tmp_path: Path) -> None:
+    copied = shutil.copytree(run_folder, tmp_path / "run")
+    card = json.loads((copied / "run.json").read_text(encoding="utf-8"))
+    assert card["environment"] == "allocation_v2"
+    (copied / "run.json").write_text(json.dumps(card | {"environment": "allocation_v1"}), encoding="utf-8")
+    with pytest.raises(
+        FleetError, match=r"is a run of format 6 in allocation_v1; this version reads 6, allocation_v2\."
+    ):
+        open_run(copied)
+
+
 def test_a_run_without_readings_or_with_events_of_another_fleet_is_refused(run_folder: Path, tmp_path: Path) -> None:
     telemetry, events = (pq.read_table(run_folder / f"{name}.parquet") for name in ("telemetry", "events"))
     ghosts = pa.array(["ghost"] * events.num_rows)
