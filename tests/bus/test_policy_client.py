@@ -40,8 +40,9 @@ def seen(arms: int = 2, slots: int = 3, rng: np.random.Generator | None = None) 
     layout = Layout(arms, slots, plans=2)
     low, high = layout.bounds
     vectors = np.zeros((arms, layout.size), np.float32) if rng is None else rng.uniform(low, high, (arms, layout.size))
-    mask = np.ones(layout.actions, np.int8)
-    return {f"arm_{a}": layout.read(vectors[a].astype(np.float32), mask) for a in range(arms)}
+    shared, own = vectors[0, : layout.shared].astype(np.float32), vectors[:, layout.shared :].astype(np.float32)
+    names = [f"arm_{a}" for a in range(arms)]
+    return layout.read_each(names, shared, own, np.ones((arms, layout.actions), np.int8))
 
 
 class Server:
@@ -110,6 +111,7 @@ def test_a_request_is_as_the_contract_says_and_has_every_field_exactly(router, s
     for message, (arm, observation) in zip(json.loads(payload)["observations"], observations.items(), strict=True):
         assert message.pop("arm") == arm
         assert message.pop("action_mask") == [1] * 8
+        assert message.pop("peers") == [int(arm == "arm_0")]
         assert set(message) == {field.name for field in FIELDS}
         for name, value in message.items():
             np.testing.assert_array_equal(np.array(value, np.float64), getattr(observation, name), strict=False)

@@ -3,6 +3,7 @@
 import json
 import os
 import queue
+import re
 import signal
 import subprocess
 import sys
@@ -42,7 +43,7 @@ class Quickest:
         claims = [
             (float(own.duration_s[option]) / float(own.value[option // plans]), place, option, option // plans, arm)
             for place, (arm, own) in enumerate(observations.items())
-            for plans in [len(own.difficulty) // len(own.offered)]
+            for plans in [len(own.difficulty) // len(own.group)]
             for option in own.action_mask[1:-1].nonzero()[0].tolist()
         ]
         actions, taken = {}, set()
@@ -118,6 +119,15 @@ def test_a_process_that_ends_or_hangs_in_a_shift_fails_the_shift(fleet, served):
     process.wait(PATIENCE_S)
     ended = play(fleet, on_bus, [0, 1])
     assert all("No process serves the policy 'mine'" in str(shift.error) for shift in ended)
+
+
+def test_a_process_refuses_observations_of_another_version(served):
+    on_bus, _ = served
+    before = encoding(ActRequest).replace("v5", "v4")
+    with open_client(on_bus.partition("@")[2], timeout_s=PATIENCE_S) as session:
+        (reply,) = session.get(KEY, payload="{}", encoding=before, timeout=PATIENCE_S)
+    expected = "Malformed ActRequest: .*thermofleet.ActRequest.v4', not 'application/json;thermofleet.ActRequest.v5'"
+    assert re.search(expected, json.loads(reply.ok.payload.to_bytes())["reason"])
 
 
 def test_few_requests_wait_for_a_process_and_the_oldest_are_dropped():
