@@ -58,31 +58,31 @@ def draw(rng: np.random.Generator, arms: int, jobs: int) -> dict[str, Observatio
     value, payload_kg, station = rng.integers(1, 5, jobs), rng.uniform(0, 4, jobs), rng.random(jobs) < 0.7
     difficulty = rng.uniform(0, 3, (arms, options))
     free = np.arange(arms) % 2 == 0
-    least = difficulty.reshape(arms, jobs, PLANS).min(axis=2)
     headroom_k, busy_s = rng.uniform(0, 35, arms), np.where(free, 0.0, rng.uniform(0, 1200, arms))
+    shared = {
+        "fleet_working": ~free, "fleet_headroom_k": headroom_k, "fleet_busy_s": busy_s,
+        "fleet_difficulty": difficulty.reshape(arms, jobs, PLANS).min(axis=2), "left_s": 3600.0,
+        "group": np.arange(1, jobs + 1), "station_free": station, "due_in_s": due_s, "age_s": age_s,
+        "payload_kg": payload_kg, "value": value,
+    }  # fmt: skip
     seen = {}
     for arm in range(arms):
-        peers = np.arange(arms) != arm
         feasible = np.repeat(rng.random(jobs) < 0.6, PLANS)
         space = feasible & (rng.random(options) < 0.8) & free[arm]
         duration_s = np.sort(rng.uniform(120, 1800, (jobs, PLANS)), axis=1).ravel()
         legal = space & np.repeat(station, PLANS)
         temp_c = WARNING_C - headroom_k[arm] - np.append(0.0, rng.uniform(0, 10, 6))
         known = {
-            "idle": float(free[arm]), "working": float(not free[arm]), "busy_s": busy_s[arm], "temp_c": temp_c,
+            "working": float(not free[arm]), "busy_s": busy_s[arm], "temp_c": temp_c,
             "housing_c": temp_c - 3.0, "ambient_c": 25.0, "headroom_k": headroom_k[arm],
-            "error_headroom_k": headroom_k[arm] + 15.0, "left_s": 3600.0, "offered": np.ones(jobs),
-            "station_free": station, "feasible": feasible, "space_free": space, "known": feasible,
-            "difficulty": difficulty[arm], "peak_c": rng.uniform(35, 75, options),
-            "p_saturation": rng.uniform(0, 0.8, options), "duration_s": duration_s,
-            "slack_s": np.repeat(due_s, PLANS) - duration_s, "age_s": age_s, "payload_kg": payload_kg, "value": value,
-            "peer_heard": np.ones(arms - 1), "peer_working": ~free[peers], "peer_headroom_k": headroom_k[peers],
-            "peer_busy_s": busy_s[peers], "peer_known": np.ones((arms - 1, jobs)), "peer_difficulty": least[peers],
+            "error_headroom_k": headroom_k[arm] + 15.0, "difficulty": difficulty[arm] * feasible,
+            "peak_c": rng.uniform(35, 75, options), "p_saturation": rng.uniform(0, 0.8, options),
+            "duration_s": duration_s * feasible, "blocked": (feasible & ~space)[::PLANS],
         }  # fmt: skip
         mask = np.pad(legal, 1, constant_values=(1, 0)).astype(np.int8)
         blank = layout.read(np.zeros(layout.size, np.float32), mask)
-        fields = {name: np.asarray(each, np.float32) for name, each in known.items()}
-        seen[f"arm_{arm}"] = replace(blank, **fields)
+        fields = {name: np.asarray(each, np.float32) for name, each in (shared | known).items()}
+        seen[f"arm_{arm}"] = replace(blank, peers=layout.peers[arm], **fields)
     return seen
 
 

@@ -70,24 +70,17 @@ def toml_of(scenario: Scenario) -> str:
     return "\n".join(lines) + "\n"
 
 
-_PER_ARM = (
-    "thermal_step", "to_ambient", "root_capacity", "rates", "modes", "sensor_noise_k", "copper_w_per_a2", "idle_w",
-    "rest_current_sq", "rest_friction_w", "start_c", "work", "housing_keep", "housing_gain", "housing_winding",
-    "housing_ambient", "housing_idle_w", "start_housing_c",
-)  # fmt: skip
-"""Tables with a row for each arm."""
+_PER_ARM = {"law": 1, "modal": 1, "start": 1, "ambient_c": 2, "work": 2, "least": 2}
+"""Tables with an axis of arms, and which axis it is."""
 
 
 def repeated(one: Library, times: int, peers: int = 1) -> Library:
     """Return a fleet several times, without stations or space that arms share; each observes its next few peers."""
     arms = len(one.arms) * times
     tables = one.tables._replace(
-        ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),
-        feasible=np.tile(one.tables.feasible, (1, 1, times)),
-        too_heavy=np.tile(one.tables.too_heavy, (1, 1, times)),
         stations=np.zeros_like(one.tables.stations),
         excluded=np.zeros_like(one.tables.excluded),
-        **{name: np.concatenate([getattr(one.tables, name)] * times, axis=1) for name in _PER_ARM},
+        **{name: np.concatenate([getattr(one.tables, name)] * times, axis) for name, axis in _PER_ARM.items()},
     )
     near = tuple(tuple((a + n) % arms for n in range(1, peers + 1)) for a in range(arms))  # peers are not read
     return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, tables, one.draw, near)
