@@ -210,8 +210,8 @@ def test_large_fleets_fit_and_larger_ones_are_told_to(router, served):
     assert client(router).act(seen(16, 50, np.random.default_rng(2))) == {}
     size = len(server.requests.get(timeout=PATIENCE_S)[2])
     assert MOST_BYTES < size < MOST_REQUEST_BYTES
-    with refused("observations of 48 arms have .* bytes, and a request to a policy at most 4,194,304"):
-        client(router, LIMIT_S).act(seen(48, 256))
+    with refused("observations of 64 arms have .* bytes, and a request to a policy at most 4,194,304"):
+        client(router, LIMIT_S).act(seen(64, 256))
 
 
 def test_what_goes_to_others_is_not_larger_than_before(router):
