@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fleet.engine.claims import set_phase
+from fleet.engine.crossings import hottest
 from fleet.engine.state import DONE, RUNNING, WAITING, State
 from fleet.engine.step import (
     BLOCK,
@@ -110,12 +111,12 @@ def reset_rows(
             job["queued_s"] = job["release_s"]
         for a in range(s.arms.shape[1]):
             s.arms[e, a] = t.start[fleet[n], a]
-            arm, offset_k = s.arms[e, a], np.float32(ambient_offset_k[n])
-            arm["peak_c"] += offset_k
+            arm, net = s.arms[e, a], t.modal[fleet[n], a]
             for node in range(NODES):
-                arm["temp_c"][node] += offset_k
+                arm["temp_c"][node] = net["start_c"][node] + ambient_offset_k[n]
             for k in range(JOINTS):
-                arm["housing_c"][k] += offset_k
+                arm["housing_c"][k] = net["start_housing_c"][k] + ambient_offset_k[n]
+            arm["peak_c"] = hottest(arm["temp_c"])
 
 
 @dataclass(frozen=True, kw_only=True)

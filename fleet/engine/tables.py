@@ -162,11 +162,14 @@ MODAL = np.dtype(
         ("modes", "f8", (NODES, NODES)),
         ("to_ambient", "f8", NODES),
         ("idle_w", "f8", JOINTS),
+        ("start_c", "f8", NODES),
+        ("start_housing_c", "f8", JOINTS),
     ],
     align=True,
 )
 """The thermal network by its modes [node, mode], for the moments at which a limit is crossed: square roots of the heat
-capacities, inverse time constants, 1/s, conductances to ambient, W/K, and idle heat, W."""
+capacities, inverse time constants, 1/s, conductances to ambient, W/K, and idle heat, W. Then the temperatures at the
+start of a shift, and what the arm estimates those of its housings to be, without the shift's offset of the ambient."""
 
 PLAN = np.dtype(
     [("times_s", "f8", 3), ("current_sq", "f4", (3, LANES)), ("friction_w", "f4", (3, LANES))],
@@ -205,7 +208,7 @@ class Tables(NamedTuple):
     modal: Array
     """`MODAL` [fleet, arm]."""
     start: Array
-    """An arm at the start of a shift, at home, `ARM` [fleet, arm]."""
+    """An arm at the start of a shift, at home, `ARM` [fleet, arm]; its temperatures are in `modal`."""
     plans: Array
     """`PLAN` [plan]."""
     excluded: Array
@@ -439,17 +442,16 @@ def tables_of(world: World) -> tuple[Tables, State]:
         modes=thermal.modes,
         to_ambient=thermal.to_ambient,
         idle_w=motors.idle_w,
+        start_c=world.start_c,
+        start_housing_c=world.start_housing_c,
     )
     start = records(
         ARM,
         (arms,),
-        temp_c=world.start_c,
-        housing_c=world.start_housing_c,
         current_sq=rest.current_sq,
         friction_w=rest.friction_w,
     )
     start["mode"], start["plan"], start["job"], start["kind"] = IDLE, -1, -1, jobs.exists.shape[1]
-    start["peak_c"] = start["temp_c"][:, :JOINTS].max(axis=-1)
     for name in ("phase_end_s", "clear_at_s", "moved_at_s"):
         start[name] = np.inf
     can = offers.plan >= 0

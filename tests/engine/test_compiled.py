@@ -7,6 +7,7 @@ from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import RewardWeights
 from fleet.engine.shift import Episode, ShiftRunner
+from fleet.engine.step import FINISHED
 from fleet.motion import Drive
 from fleet.robot import ThermalLimits
 
@@ -37,13 +38,13 @@ def check_equal(episode: Episode, seed: int, **options) -> ShiftRunner:
         actions = np.array([rng.choice(np.flatnonzero(row)) for row in slow.mask])
         illegal = rng.random(len(actions)) < 0.1
         actions[illegal] = rng.integers(-2, episode.world.slots + 3, illegal.sum())
-        (terms, reward, done), (fast_terms, fast_reward, fast_done) = slow.step(actions), fast.step(actions)
-        np.testing.assert_array_equal(fast_terms, terms)
-        assert (fast_reward, fast_done) == (reward, done)
+        outcome = slow.step(actions)
+        np.testing.assert_array_equal(fast.step(actions), outcome)
+        done = bool(outcome[FINISHED])
         for name, values in slow.state.named().items():
             np.testing.assert_array_equal(getattr(fast.state, name), values, err_msg=name)
     assert list(map(repr, fast.events)) == list(map(repr, slow.events))  # NaN equals itself in text
-    assert (fast.messages, fast.jobs_done) == (slow.messages, slow.jobs_done)
+    assert (fast.messages, fast.infos) == (slow.messages, slow.infos)
     for one, other in zip(*records, strict=True):
         for name, values in vars(one).items():
             np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)

@@ -164,9 +164,8 @@ def test_results_of_a_batch_are_in_its_spaces(batch, play) -> None:
                     fits(env.single_observation_space, {"observation": vector, "action_mask": mask})
         assert list(info) == keys
         assert {name: (v.dtype.kind, v.shape) for name, v in info.items() if not name.startswith("final")} == {
-            **{name: ("i", (9, 3)) for name in ("faults", "illegal")},
-            **{name: ("f", (9, 3)) for name in ("peak_c", "above_warning_s")},
-            "jobs_done": ("i", (9,)),
+            **{name: ("f", (9, 3)) for name in ("faults", "illegal", "peak_c", "above_warning_s")},
+            "jobs_done": ("f", (9,)),
             "elapsed_s": ("f", (9,)),
             **{f"reward_{name}": ("f", (9,)) for name in TERMS},
         }
