@@ -24,9 +24,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.heat import Wsept
-from agents.policy import WAIT
-from agents.rules import LeastDifficulty, least_difficult
-from agents.staleness import advantage
+from agents.policy import WAIT, legal_options
+from agents.rules import LeastDifficulty, each_env, least_difficult
+from agents.staleness import advantage, in_fleet
 from fleet.observation import Observation
 from fleet.robot import JOINTS
 
@@ -79,14 +79,13 @@ class Auction(Wsept):
     relative_epsilon = 0.01
     """ε as a share of the largest benefit."""
 
-    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
-        """Pairs (arm, option) of a cost matrix [arm, option], for which the arms bid minus the cost."""
-        benefit = np.where(np.isfinite(cost), -cost, 0.0).reshape(len(cost), -1, plans)
-        best, by_slot = benefit.argmax(axis=2), benefit.max(axis=2)
-        if not by_slot.max(initial=0.0) > 0:
-            return []
-        won = auction(by_slot, self.relative_epsilon * float(by_slot.max()))
-        return [(arm, slot * plans + int(best[arm, slot])) for arm, slot in won]
+    def options(self, cost: Array, plans: int) -> Array:
+        """The option of each arm or NONE, int [env, arm], for which the arms bid minus the cost."""
+        return each_env(self._won, np.where(cost < 0, cost, np.inf), plans)
+
+    def _won(self, cost: Array) -> list[tuple[int, int]]:
+        benefit = np.where(np.isfinite(cost), -cost, 0.0)
+        return auction(benefit, self.relative_epsilon * float(benefit.max()))
 
 
 _UNKNOWN = JOINTS + 1.0
@@ -108,15 +107,18 @@ class Agreement:
     """Beliefs of the arms after the last round."""
 
     belief: Belief
-    """[arm, job]."""
+    """[..., arm, job]."""
     rounds: int
     """Number of rounds in which some arm's belief changed."""
 
     @property
     def claims(self) -> Array:
-        """The job each arm has by its own belief, int [arm], NOBODY for none."""
-        won = self.belief.winner == np.arange(len(self.belief.winner))[:, None]
-        return np.where(won.any(axis=1), won.argmax(axis=1) if won.size else NOBODY, NOBODY)
+        """The job each arm has by its own belief, int [..., arm], NOBODY for none."""
+        winner = self.belief.winner
+        if not winner.size:
+            return np.full(winner.shape[:-1], NOBODY)
+        won = winner == np.arange(winner.shape[-2])[:, None]
+        return np.where(won.any(axis=-1), won.argmax(axis=-1), NOBODY)
 
 
 def bid(belief: Belief, cost: Array, me: Array | int) -> Belief:
@@ -144,21 +146,22 @@ def merge(received: Belief) -> Belief:
 
 
 def agree(cost: Array, links: Array) -> Agreement:
-    """Rounds of bids and messages until no arm's belief changes.
+    """Rounds of bids and messages until no arm's belief changes; leading axes [...] are those of fleets.
 
     Args:
-        cost: Of each job to each arm, [arm, job], inf for infeasible ones.
-        links: Whether messages are delivered, bool, [receiver, sender].
+        cost: Of each job to each arm, [..., arm, job], inf for infeasible ones.
+        links: Whether messages are delivered, bool, [..., receiver, sender].
     """
-    arms, jobs = cost.shape
-    belief = Belief(np.full((arms, jobs), np.inf), np.full((arms, jobs), NOBODY))
+    arms, jobs = cost.shape[-2:]
+    belief = Belief(np.full(cost.shape, np.inf), np.full(cost.shape, NOBODY))
     if not jobs:
         return Agreement(belief, 0)
-    received = (links | np.eye(arms, dtype=bool))[..., None]  # [receiver, sender, 1]
+    received = (links | np.eye(arms, dtype=bool))[..., None]  # [..., receiver, sender, 1]
     # Every change is a better bid for a job, or a forwarded bid, which bounds the rounds also with one-way links.
     for rounds in range(arms * (jobs * arms + 1)):
         sent = bid(belief, cost, np.arange(arms))
-        merged = merge(Belief(np.where(received, sent.cost, np.inf), np.where(received, sent.winner, NOBODY)))
+        heard = Belief(sent.cost[..., None, :, :], sent.winner[..., None, :, :])
+        merged = merge(Belief(np.where(received, heard.cost, np.inf), np.where(received, heard.winner, NOBODY)))
         if np.array_equal(merged.cost, belief.cost) and np.array_equal(merged.winner, belief.winner):
             return Agreement(belief, rounds)
         belief = merged
@@ -178,22 +181,19 @@ class Consensus(LeastDifficulty):
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """Each arm's claim after the last round."""
-        seen = list(observations.values())
-        cost = np.array([self._bids(obs, place) for place, obs in enumerate(seen)])
-        if not np.isfinite(cost).any():
-            return dict.fromkeys(observations, WAIT)
-        online = [(obs.peer_heard > 0) & (obs.peer_age_s <= 0) for obs in seen]
-        links = np.array([np.insert(row, place, False) for place, row in enumerate(online)], dtype=bool)
-        claims = agree(cost, links).claims.tolist()
-        return {
-            arm: WAIT if claim == NOBODY else least_difficult(observations[arm], claim) + 1
-            for arm, claim in zip(observations, claims, strict=True)
-        }
+        return self.act_in_fleet(observations)
 
-    def _bids(self, observation: Observation, place: int) -> Array:
-        """Cost of each slot to this arm, [slot]; inf for those that it may not claim."""
-        legal = np.any(observation.action_mask[1:-1].reshape(len(observation.offered), -1), axis=1)
-        if not legal.any():
-            return np.full(len(legal), np.inf)
-        relative = advantage(observation, place, legal)[place]
-        return np.where(legal, np.where(np.isnan(relative), _UNKNOWN, relative), np.inf).round(9)
+    def actions(self, seen: Observation) -> Array:
+        """Each arm's claim after the last round."""
+        place = np.arange(seen.action_mask.shape[1])
+        online = (seen.peer_heard > 0) & (seen.peer_age_s <= 0)
+        claims = agree(_bids(seen, place), in_fleet(online, place, False)).claims
+        claimed = least_difficult(seen, np.maximum(claims, 0))
+        return np.where(claims == NOBODY, WAIT, claimed + 1)
+
+
+def _bids(seen: Observation, place: Array) -> Array:
+    """Cost of each slot to each arm, [env, arm, slot]; inf for those that it may not claim."""
+    legal = np.any(legal_options(seen).reshape(*seen.offered.shape, -1), axis=-1)
+    relative = advantage(seen, place, np.asarray(legal))[:, place, place]
+    return np.where(legal, np.where(np.isnan(relative), _UNKNOWN, relative), np.inf).round(9)

@@ -10,14 +10,13 @@ error limit follow from the observed headrooms.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import ClassVar, Protocol
 
 import numpy as np
 
 from agents.policy import WAIT, ArmPolicy, CellLookahead, Local, PlanningPolicy, Policy, per_option, plans_of
 from agents.rules import Ahead, CentralRule, Matched
-from fleet.observation import Observation
+from fleet.observation import LazyObservation, Observation
 from fleet.robot import RATING
 
 Array = np.ndarray
@@ -151,7 +150,7 @@ class _GuardOfArm:
             return seen
         narrower = seen.action_mask.copy()
         narrower[1:-1] &= allowed
-        return replace(seen, action_mask=narrower)
+        return LazyObservation(lambda name: getattr(seen, name), action_mask=narrower)
 
     def decide(self, seen: Observation, action: int) -> int:
         """The action of the wrapped policy, or that which gives the job back."""
@@ -237,9 +236,9 @@ class Thermometer(Matched, CentralRule):
     only_choices = True
 
     def index(self, seen: Observation) -> Array:
-        """Value per second of every option, [option]; −inf for those that must not be claimed."""
+        """Value per second of every option, [env, arm, option]; −inf for those that must not be claimed."""
         needed_k = per_option(seen, seen.payload_kg) * np.minimum(seen.duration_s, QUARTER_S) / QUARTER_S
-        cool = warning_of(seen) - seen.temp_c[:LARGE].max() >= needed_k
+        cool = (warning_of(seen) - seen.temp_c[..., :LARGE].max(axis=-1))[..., None] >= needed_k
         return np.where(cool, per_option(seen, seen.value) / np.maximum(seen.duration_s, 1.0), -np.inf)
 
 
@@ -274,9 +273,9 @@ class Wsept(Matched, CentralRule):
     of `wsept` has no tardiness."""
 
     def index(self, seen: Observation) -> Array:
-        """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
-        value, hottest_c = per_option(seen, seen.value), float(seen.temp_c.max())
-        warning_c, error_c = warning_of(seen), error_of(seen)
+        """Expected worth per second of every option, [env, arm, option]; −inf for those that must not be claimed."""
+        value, hottest_c = per_option(seen, seen.value), seen.temp_c.max(axis=-1)[..., None]
+        warning_c, error_c = warning_of(seen)[..., None], error_of(seen)[..., None]
         peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
         worth = self.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c)
         return np.where(worth > 0, worth / np.maximum(seen.duration_s, 1.0), -np.inf)
@@ -337,11 +336,11 @@ class WseptLocal(Local):
 LEAST_P = 1e-3
 
 
-def warning_of(seen: Observation) -> float:
-    """The warning limit, °C."""
-    return float(seen.headroom_k) + float(seen.temp_c.max())
+def warning_of(seen: Observation) -> Array:
+    """The warning limit, °C, [...]."""
+    return seen.headroom_k + seen.temp_c.max(axis=-1)
 
 
-def error_of(seen: Observation) -> float:
-    """The error limit, °C."""
-    return float(seen.error_headroom_k) + float(seen.temp_c.max())
+def error_of(seen: Observation) -> Array:
+    """The error limit, °C, [...]."""
+    return seen.error_headroom_k + seen.temp_c.max(axis=-1)

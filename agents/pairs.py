@@ -9,8 +9,6 @@ and slots.
 """
 
 import json
-from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -24,7 +22,7 @@ from agents.policy import Local, plans_of
 from agents.rules import CentralRule, Matched
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
-from fleet.observation import FIELDS, Observation
+from fleet.observation import FIELDS, LazyObservation, Observation
 
 Array = np.ndarray
 
@@ -235,11 +233,11 @@ class PairPolicy(Matched, CentralRule):
     only_choices = True
 
     def __init__(self, parameters: Array) -> None:
-        self._parameters = np.asarray(parameters, dtype=float)[None]
+        self._parameters = np.asarray(parameters, dtype=float)
 
-    def cost(self, observations: Sequence[Observation]) -> Array:
-        """Minus the scores, [arm, option]; inf for claims that are not wanted."""
-        return -scores(_stacked(observations), self._parameters)[0]
+    def cost(self, seen: Observation) -> Array:
+        """Minus the scores, [env, arm, option]; inf for claims that are not wanted."""
+        return -scores(seen, np.broadcast_to(self._parameters, (len(seen.action_mask), PARAMETERS)))
 
 
 PAIRS_FORMAT = 4
@@ -323,13 +321,7 @@ def _without_empty(seen: Observation) -> Observation:
     slots = int(used[-1]) + 1 if len(used) else 1
     if slots == seen.offered.shape[-1]:
         return seen
-    ends: dict[tuple[str, ...], int] = {("slot",): slots, ("option",): slots * plans}
-    short = {f.name: getattr(seen, f.name)[..., : ends[f.axes]] for f in FIELDS if f.axes in ends}
-    short["fleet_difficulty"] = seen.fleet_difficulty[..., :slots]
-    return replace(seen, **short, action_mask=seen.action_mask[..., [*range(1 + slots * plans), -1]])
-
-
-def _stacked(seen: Sequence[Observation]) -> Observation:
-    """Observations of arms as one with the axes [1, arm]."""
-    names = [*(field.name for field in FIELDS), "peers", "action_mask"]
-    return Observation(**{name: np.stack([getattr(each, name) for each in seen])[None] for name in names})
+    ends: dict[tuple[str, ...], int] = {("slot",): slots, ("member", "slot"): slots, ("option",): slots * plans}
+    short = {field.name: ends[field.axes] for field in FIELDS if field.axes in ends}
+    mask = seen.action_mask[..., [*range(1 + slots * plans), -1]]
+    return LazyObservation(lambda name: getattr(seen, name)[..., : short.get(name)], action_mask=mask)

@@ -37,13 +37,12 @@ Source: Ovacik & Uzsoy, International Journal of Production Research 32, 1994 (r
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from agents.heat import Wsept, error_of, warning_of
+from agents.heat import Wsept
 from agents.policy import WAIT, CellLookahead, no_simulator, per_option, plans_of
-from agents.rules import claims_of
 from agents.schedules import LEAST_GAIN, Changes, Schedules
 from fleet.observation import Observation
 
@@ -67,8 +66,10 @@ class Mpc:
     suite among 300, 600, 900, 1200, 2400, 3600 and 7200."""
     every_s: ClassVar = 300.0
     """Age of a search after which the next decision searches again, also without a new job."""
+    least_discount: ClassVar = 0.01
+    """The simulation of a schedule ends where a reward counts less."""
     evaluations: ClassVar = 128
-    """Simulated changes of each search."""
+    """Changes that each search tries, in steps of `CellSimulator.rows`; it ends before if a step has nothing new."""
 
     def __init__(self) -> None:
         self._cell: CellLookahead | None = None
@@ -113,15 +114,16 @@ class Mpc:
         jobs, now_s, horizon_s, dt_s = present.can.shape[1], present.now_s, simulator.horizon_s, simulator.dt_s
         later_s = np.maximum(np.arange(round(horizon_s / dt_s)) * dt_s - now_s, 0.0)
         discount, released_s = np.exp(-later_s / self.tau_s), np.full(jobs, now_s)
+        memory = _Memory(simulator, discount[discount >= self.least_discount], now_s)
         changes = Changes(present.can, present.stations, released_s, horizon_s, dt_s, rng, present.open)
         best = self._schedule or _no_job(jobs)
         best.not_before_s[best.not_before_s <= now_s] = 0.0
-        reward = float(simulator.run(best, discount).reward[0])
+        reward = float(memory.run(best)[0][0])
 
         for job in new:
             if job in changes.choices:
                 tried = _inserted(best, job, changes.choices[job], present.open, now_s, simulator.rows, rng)
-                rewards = simulator.run(tried, discount).reward
+                rewards, _ = memory.run(tried)
                 at = int(rewards.argmax())
                 if rewards[at] > reward + LEAST_GAIN:
                     best, reward = tried.at([at]), float(rewards[at])
@@ -129,11 +131,32 @@ class Mpc:
         joint: list[Schedules] = []
         for _ in range(0 if changes.none else self.evaluations // simulator.rows):
             tried = changes.neighbours(best, joint, simulator.rows)
-            result = simulator.run(tried, discount)
-            at, joint = int(result.reward.argmax()), changes.joined(best, reward, tried, result.reward)
-            if result.reward[at] > reward + LEAST_GAIN:
-                best, reward = changes.in_order(tried, result.start_s, at), float(result.reward[at])
+            known = len(memory.results)
+            rewards, start_s = memory.run(tried)
+            if len(memory.results) == known:
+                break
+            at, joint = int(rewards.argmax()), changes.joined(best, reward, tried, rewards)
+            if rewards[at] > reward + LEAST_GAIN:
+                best, reward = changes.in_order(tried, start_s, at), float(rewards[at])
         return best
+
+
+class _Memory:
+    """The results of the schedules of one search: most random changes of a few jobs repeat an earlier schedule."""
+
+    def __init__(self, simulator: Any, discount: Array, now_s: float) -> None:
+        self._simulator, self._discount, self._now_s = simulator, discount, now_s
+        self.results: dict[bytes, tuple[float, Array]] = {}
+
+    def run(self, schedules: Schedules) -> tuple[Array, Array]:
+        """Discounted rewards, [schedule], and when each job was last awarded, inf if never, [schedule, job]."""
+        keys = schedules.keys(self._now_s)
+        new = {key: row for row, key in enumerate(keys) if key not in self.results}
+        if new:
+            found = self._simulator.run(schedules.at(list(new.values())), self._discount)
+            self.results.update(zip(new, zip(found.reward.tolist(), found.start_s, strict=True), strict=True))
+        rewards, start_s = zip(*(self.results[key] for key in keys), strict=True)
+        return np.array(rewards), np.stack(start_s)
 
 
 def _no_job(jobs: int) -> Schedules:
@@ -244,7 +267,8 @@ class RollingHorizon(Wsept):
         self.solution = solution._replace(seconds=time.perf_counter() - began_s)
         arm = np.repeat(np.arange(len(found)), [len(each.first) for each in found])
         first, waits = (np.concatenate([getattr(each, name) for each in found]) for name in ("first", "waits"))
-        return claims_of(observations, [(int(arm[i]), int(first[i])) for i in solution.chosen if not waits[i]])
+        actions = {list(observations)[arm[i]]: 1 + int(first[i]) for i in solution.chosen if not waits[i]}
+        return dict.fromkeys(observations, WAIT) | actions
 
     def sequences(self, seen: Observation, home_s: float) -> Sequences:
         """The sequences of an arm with a positive worth.
@@ -259,7 +283,7 @@ class RollingHorizon(Wsept):
         open_now = (legal | (seen.working > 0)) & (per_option(seen, seen.station_free) > 0)
         begin_s = np.maximum(free_s, np.where(open_now, 0.0, home_s))
         can = (seen.feasible > 0) & (per_option(seen, seen.offered) > 0) & (seen.faulted == 0)
-        peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_of(seen)).astype(float)
+        peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, float(seen.headroom_k) + hottest_c).astype(float)
         d = seen.duration_s.astype(float)
         one, one_c = self._earn(seen, peak_c, begin_s, self._cooled(free_c, seen, begin_s - free_s), hottest_c)
         one = np.where(can & (begin_s < self.horizon_s), one, -np.inf)
@@ -306,7 +330,8 @@ class RollingHorizon(Wsept):
         due_s = seen.slack_s.astype(float)[options] + d
         warmer_k = np.maximum(start_c - hottest_c, 0.0)
         later_c = np.maximum(peak_c[options] + warmer_k * np.exp(-d / self.tau_s), start_c)
-        worth = self.worth_of(value, d, later_c, start_c, warning_of(seen), error_of(seen))
+        warning_c, error_c = float(seen.headroom_k) + hottest_c, float(seen.error_headroom_k) + hottest_c
+        worth = self.worth_of(value, d, later_c, start_c, warning_c, error_c)
         late_s = np.maximum(self.horizon_s + d - due_s, 0.0) - np.maximum(begin_s + d - due_s, 0.0)
         late = self.tardiness_share * self.tardiness_price * value * late_s / 60.0
         earned = worth * np.exp(-(begin_s + d) / self.discount_s) + late

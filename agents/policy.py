@@ -5,13 +5,13 @@ auctioneer. An `arm` policy sees one observation: an arm's own state and what it
 in the process of each arm.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from fleet.errors import FleetError
-from fleet.observation import Observation
+from fleet.observation import LazyObservation, Observation
 
 Array = np.ndarray
 
@@ -97,7 +97,53 @@ class ArmPolicy(_Resettable, Protocol):
         ...
 
 
-class Local:
+class ArrayPolicy:
+    """Base of policies that decide for any number of fleets at once, on arrays.
+
+    Without a state a policy has `actions`, with one `decide`. One of scope `arm` has `choose` as well, for one arm.
+    """
+
+    scope: ClassVar[str] = "central"
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift; there is nothing to reset."""
+
+    def actions(self, seen: Observation) -> Array:
+        """Actions, int [env, arm], for observations [env, arm]."""
+        raise NotImplementedError
+
+    @classmethod
+    def decide(cls, policies: Sequence[Any], seen: Observation, arms: Sequence[str]) -> Array:
+        """Actions, int [env, arm], for observations [env, arm].
+
+        Args:
+            policies: Of each env, of this class and with equal parameters.
+            arms: Names of the arms.
+        """
+        return policies[0].actions(seen)
+
+    def act_in_fleet(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """Actions for one fleet; see `Policy.act`."""
+        if only_choices(self) and not any(seen.action_mask[1:-1].any() for seen in observations.values()):  # pyright: ignore
+            return dict.fromkeys(observations, WAIT)
+        actions = self.decide([self], one_fleet(tuple(observations.values())), tuple(observations))
+        return dict(zip(observations, actions[0].tolist(), strict=True))
+
+
+class CentralArrayPolicy(ArrayPolicy):
+    """An `ArrayPolicy` that sees the observations of all arms."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """One action per arm; see `Policy`."""
+        return self.act_in_fleet(observations)
+
+
+def one_fleet(observations: Sequence[Observation]) -> Observation:
+    """Observations of the arms of a fleet as one, with the axes [1, arm]."""
+    return LazyObservation(lambda name: np.stack([getattr(each, name) for each in observations])[None])
+
+
+class Local(ArrayPolicy):
     """Base of policies of scope `arm`: a central policy that is given the arm's own observation only.
 
     It needs no message of a peer. Arms may claim the same job; then the env decides, and the others claim again.
@@ -131,6 +177,12 @@ class Local:
         """The action of the central policy for a fleet of this arm."""
         return self._policy.act({"": observation})[""]
 
+    def actions(self, seen: Observation) -> Array:
+        """Those of every arm for itself, if the central policy is an `ArrayPolicy` without a state."""
+        alone = LazyObservation(lambda name: (field := getattr(seen, name)).reshape(-1, 1, *field.shape[2:]))
+        assert isinstance(self._policy, ArrayPolicy)
+        return self._policy.actions(alone).reshape(seen.action_mask.shape[:2])
+
 
 class EveryArm:
     """Runs an arm policy for all arms: one instance per arm, which sees this arm's observation only."""
@@ -152,11 +204,18 @@ class EveryArm:
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The choice of each arm."""
-        for arm in observations:
-            if arm not in self._instances:
-                self._instances[arm] = self._make()
-                self._instances[arm].reset(self._rng)
-        return {arm: self._instances[arm].choose(seen, i) for i, (arm, seen) in enumerate(observations.items())}
+        together = on_arrays({0: self}, tuple(observations))
+        if together:
+            actions = together(np.zeros(1, dtype=int), one_fleet(tuple(observations.values())))
+            return dict(zip(observations, actions[0].tolist(), strict=True))
+        return {arm: self.of(arm).choose(seen, i) for i, (arm, seen) in enumerate(observations.items())}
+
+    def of(self, arm: str) -> ArmPolicy:
+        """The instance of an arm."""
+        if arm not in self._instances:
+            self._instances[arm] = self._make()
+            self._instances[arm].reset(self._rng)
+        return self._instances[arm]
 
 
 def for_all_arms(make: Callable[[], Policy] | Callable[[], ArmPolicy]) -> Policy:
@@ -165,6 +224,37 @@ def for_all_arms(make: Callable[[], Policy] | Callable[[], ArmPolicy]) -> Policy
     if hasattr(policy, "act"):
         return policy  # pyright: ignore[reportReturnType]  # hasattr does not narrow the type
     return EveryArm(make)  # pyright: ignore[reportArgumentType]
+
+
+def on_arrays(policies: Mapping[int, Policy], arms: Sequence[str]) -> Callable[[Array, Observation], Array] | None:
+    """The actions, int [n, arm], of the policies of some envs, int [n], for their observations [n, arm].
+
+    Args:
+        policies: By env, all of one kind.
+
+    Returns:
+        None if the policies do not decide on arrays: then call `act` of each.
+    """
+    first = next(iter(policies.values()), None)
+    kind: Any = first.kind if isinstance(first, EveryArm) else type(first)
+    if not _decides(kind):
+        return None
+    each = {e: policy.of(arms[0]) if isinstance(policy, EveryArm) else policy for e, policy in policies.items()}
+    return lambda envs, seen: kind.decide([each[e] for e in envs.tolist()], seen, arms)
+
+
+def _decides(kind: type) -> bool:
+    """Whether a class decides on arrays, and no subclass of its replaces the method for one fleet or arm."""
+    if issubclass(kind, Local):
+        central: Any = kind.central
+        if not _decides(central) or central.decide.__func__ is not ArrayPolicy.decide.__func__:
+            return False
+    for each in kind.__mro__ if issubclass(kind, ArrayPolicy) else ():
+        if not vars(each).keys().isdisjoint(("decide", "actions")):
+            return True
+        if not vars(each).keys().isdisjoint(("act", "choose")):
+            return False
+    return False
 
 
 def only_choices(policy: Policy) -> bool:
@@ -177,9 +267,9 @@ def only_choices(policy: Policy) -> bool:
     return vars(kind).get("only_choices") is True
 
 
-def legal_options(observation: Observation) -> list[int]:
-    """Options (from 0) that this arm may claim now, oldest job first, then the fastest plan."""
-    return np.flatnonzero(observation.action_mask[1:-1]).tolist()
+def legal_options(observation: Observation) -> Array:
+    """Whether an arm may claim each option now, bool [..., option]: oldest job first, then the fastest plan."""
+    return observation.action_mask[..., 1:-1] > 0
 
 
 def plans_of(observation: Observation) -> int:
@@ -187,6 +277,6 @@ def plans_of(observation: Observation) -> int:
     return observation.difficulty.shape[-1] // observation.group.shape[-1]
 
 
-def per_option(observation: Observation, per_slot: np.ndarray) -> np.ndarray:
+def per_option(observation: Observation, per_slot: Array) -> Array:
     """Values of slots, [..., slot], for each option, [..., option]."""
     return np.repeat(per_slot, plans_of(observation), axis=-1)

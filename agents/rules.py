@@ -1,4 +1,4 @@
-"""Dispatching rules, and policies that assign jobs by a cost matrix [arm, option].
+"""Dispatching rules, and policies that assign jobs by costs [env, arm, option].
 
 Except `wspt_cool` the rules are non-idling: a free arm that may claim a job does so. Costs are +inf where an arm may
 not claim a job; lower is better, and only differences count.
@@ -9,27 +9,22 @@ with the lower difficulty then gets its job, and the other arm chooses again.
 Source of the rules: Pinedo, Scheduling, 6th ed., Springer 2022, chapter 14.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 
-from agents.policy import WAIT, legal_options, per_option, plans_of
-from agents.staleness import advantage, free_peers, known_difficulty
-from fleet.observation import Observation
+from agents.policy import WAIT, ArrayPolicy, CentralArrayPolicy, legal_options, one_fleet, per_option, plans_of
+from agents.staleness import advantage, free_peers, in_fleet, known_difficulty
+from fleet.observation import LazyObservation, Observation
 
 Array = np.ndarray
 
-
-class Stateless:
-    """A policy without state from step to step."""
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to reset."""
+NONE = -1
+"""Option of an arm that claims nothing; the action of an option is one more."""
 
 
-class RandomLegal:
+class RandomLegal(ArrayPolicy):
     """Every free arm claims a random legal job. Scope arm: it reads the arm's own mask."""
 
     scope: ClassVar = "arm"
@@ -44,14 +39,22 @@ class RandomLegal:
 
     def choose(self, observation: Observation, place: int) -> int:
         """A uniform choice among the legal claims; WAIT without one."""
-        choices = legal_options(observation)
-        return int(self._rng.choice(choices)) + 1 if choices else WAIT
+        return int(self.decide([self], one_fleet([observation]), ("",))[0, 0])
+
+    @classmethod
+    def decide(cls, policies: Sequence[Any], seen: Observation, arms: Sequence[str]) -> Array:
+        """Those of every arm, in the order of the arms."""
+        legal = legal_options(seen)
+        actions = np.full(legal.shape[:2], WAIT)
+        for env, arm in np.argwhere(legal.any(axis=-1)).tolist():
+            options = legal[env, arm].nonzero()[0]
+            actions[env, arm] = 1 + options[policies[env]._rng.integers(len(options))]
+        return actions
 
 
-class RoundRobin:
+class RoundRobin(CentralArrayPolicy):
     """The oldest job goes to the next able arm in turn."""
 
-    scope: ClassVar = "central"
     only_choices = True
 
     def __init__(self) -> None:
@@ -61,31 +64,28 @@ class RoundRobin:
         """Begin a shift: the first arm's turn."""
         self._turn = 0
 
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+    @classmethod
+    def decide(cls, policies: Sequence[Any], seen: Observation, arms: Sequence[str]) -> Array:
         """One pass over the slots from the oldest job; each goes to the next able arm."""
-        arms = list(observations)
-        actions = dict.fromkeys(arms, WAIT)
-        for slot in range(len(observations[arms[0]].offered)):
-            in_turn = [arms[(self._turn + step) % len(arms)] for step in range(len(arms))]
-            arm, option = _first_able(in_turn, slot, observations, actions)
-            if arm is not None:
-                actions[arm] = option + 1
-                self._turn = (arms.index(arm) + 1) % len(arms)
+        turn = np.array([policy._turn for policy in policies])
+        rank = (np.arange(len(arms)) - turn[:, None]) % len(arms)
+        actions = oldest_jobs_to(rank, seen, in_turn=True)
+        for policy, first in zip(policies, rank.argmin(axis=1).tolist(), strict=True):
+            policy._turn = first
         return actions
 
 
-class CoolestFirst(Stateless):
+class CoolestFirst(CentralArrayPolicy):
     """The oldest job goes to the free arm with most headroom."""
 
-    scope: ClassVar = "central"
     only_choices = True
 
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+    def actions(self, seen: Observation) -> Array:
         """One pass over the slots from the oldest job; each goes to the coolest able arm."""
-        return oldest_jobs_to(sorted(observations, key=lambda arm: -float(observations[arm].headroom_k)), observations)
+        return oldest_jobs_to(_ranks(-seen.headroom_k), seen)
 
 
-class LeastDifficulty(Stateless):
+class LeastDifficulty(ArrayPolicy):
     """The pair of free arm and job with the least difficulty relative to the fleet's average for that job first.
 
     With absolute difficulties no arm would claim a task that is new to every twin. Scope arm: each arm computes it from
@@ -98,57 +98,64 @@ class LeastDifficulty(Stateless):
 
     def choose(self, observation: Observation, place: int) -> int:
         """This arm's claim under the assumption that its peers follow the same rule."""
-        mine = legal_options(observation)
-        if not mine:
-            return WAIT
-        plans = plans_of(observation)
-        slots = list(dict.fromkeys(option // plans for option in mine))
-        relative = advantage(observation, place, _open(observation, slots))
-        free = free_peers(observation)
-        able = ~np.isnan(relative) & np.insert(free, place, True)[:, None]
-        for arm, slot in cheapest_pairs(np.where(able, relative, np.inf).round(9)):
-            if arm == place:
-                return least_difficult(observation, slot) + 1
-        if observation.known[mine].any():
-            return WAIT
-        before = int(free[:place].sum())  # free arms that choose first
-        return least_difficult(observation, slots[min(before, len(slots) - 1)]) + 1
+        return int(_claims_of_arms(one_fleet([observation]), np.array([place]))[0, 0])
+
+    def actions(self, seen: Observation) -> Array:
+        """The claim of every arm by its own observation."""
+        return _claims_of_arms(seen, np.arange(seen.action_mask.shape[1]))
 
 
-class CentralRule(Stateless):
-    """Claims of pairs of arm and option by a cost matrix [arm, option], the cheapest pair first.
+def _claims_of_arms(seen: Observation, places: Array) -> Array:
+    """Actions of `LeastDifficulty`, int [env, arm], of the arms at some places, int [arm]."""
+    actions = np.full(seen.action_mask.shape[:2], WAIT)
+    env, arm = np.nonzero(legal_options(seen).any(axis=-1))
+    if not len(env):
+        return actions
+    own, place = LazyObservation(lambda name: getattr(seen, name)[env, arm]), places[arm]  # [n, …]
+    legal, slots = legal_options(own), own.offered.shape[-1]
+    may, able = (each.reshape(len(env), slots, -1).any(axis=-1) for each in (legal, own.feasible > 0))
+    # Not empty, and not closed only by a busy station.
+    relative = advantage(own, place, (own.offered > 0) & (may | ~able))
+    free = free_peers(own)
+    able = ~np.isnan(relative) & in_fleet(free, place, True)[..., None]
+    mine = np.minimum(place, free.shape[-1])
+    slot = cheapest_options(np.where(able, relative, np.inf).round(9))[np.arange(len(env)), mine]
+    before = (free & (np.arange(free.shape[-1]) < place[:, None])).sum(axis=-1)  # free arms that choose first
+    in_order = (may & (may.cumsum(axis=-1) > np.minimum(before, may.sum(axis=-1) - 1)[:, None])).argmax(axis=-1)
+    unknown = ~(legal & (own.known > 0)).any(axis=-1)
+    slot = np.where((slot == NONE) & unknown, in_order, slot)
+    actions[env, arm] = 1 + np.where(slot == NONE, NONE, least_difficult(own, slot))
+    return actions
+
+
+class CentralRule(CentralArrayPolicy):
+    """Claims of pairs of arm and option by costs [env, arm, option], the cheapest pair first.
 
     Ties go to the older job, then to the first arm. This is a sequential single-item auction with one job per arm.
     """
 
-    scope: ClassVar = "central"
-
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+    def actions(self, seen: Observation) -> Array:
         """The claims of the pairs."""
-        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
-            return dict.fromkeys(observations, WAIT)
-        seen = list(observations.values())
-        return claims_of(observations, self.pairs(self.cost(seen), plans_of(seen[0])))
+        return 1 + self.options(self.cost(seen), plans_of(seen))
 
-    def cost(self, observations: Sequence[Observation]) -> Array:
-        """Minus the index, [arm, option]; inf where an arm may not claim."""
-        legal = [seen.action_mask[1:-1] > 0 for seen in observations]
-        return np.where(legal, [-self.index(seen).astype(float) for seen in observations], np.inf)
+    def cost(self, seen: Observation) -> Array:
+        """Minus the index, [env, arm, option]; inf where an arm may not claim."""
+        return np.where(legal_options(seen), -self.index(seen).astype(float), np.inf)
 
     def index(self, seen: Observation) -> Array:
-        """Index of every option, legal or not, [option]; −inf for those that must not be claimed."""
+        """Index of every option, legal or not, [env, arm, option]; −inf for those that must not be claimed."""
         raise NotImplementedError
 
-    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
-        """Pairs (arm, option) of a cost matrix [arm, option] of jobs with `plans` options each."""
-        return cheapest_pairs(cost, plans)
+    def options(self, cost: Array, plans: int) -> Array:
+        """The option of each arm or NONE, int [env, arm], by costs of jobs with `plans` options each."""
+        return cheapest_options(cost, plans)
 
 
 class Matched:
     """Base of rules that make as many pairs as possible, at the least total cost."""
 
-    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
-        """Pairs (arm, option) of a cost matrix [arm, option] of jobs with `plans` options each."""
+    def options(self, cost: Array, plans: int) -> Array:
+        """The option of each arm or NONE, int [env, arm], by costs of jobs with `plans` options each."""
         return matched_options(cost, plans)
 
 
@@ -164,7 +171,7 @@ class Wspt(CentralRule):
     """Largest P(saturation) of a claim."""
 
     def index(self, seen: Observation) -> Array:
-        """Value per second of every option, [option]; −inf for those that must not be claimed."""
+        """Value per second of every option, [env, arm, option]; −inf for those that must not be claimed."""
         rate = per_option(seen, seen.value) / np.maximum(seen.duration_s, 1.0)
         return np.where(seen.p_saturation <= self.most_p, rate, -np.inf)
 
@@ -179,65 +186,70 @@ class WsptCool(Wspt):
     most_p = 0.5
 
 
-def cheapest_pairs(cost: Array, plans: int = 1) -> list[tuple[int, int]]:
-    """Pairs (arm, option) of a cost matrix [arm, option], chosen greedily, the cheapest first.
+def cheapest_options(cost: Array, plans: int = 1) -> Array:
+    """Options of arms by costs [..., arm, option], chosen greedily, the cheapest pair first: int [..., arm] or NONE.
 
     Each arm and each slot, which has `plans` options, is in at most one pair; inf is never paired. Ties go to the first
     option, then to the first arm. This is the outcome of a sequential single-item auction with one job per arm
     (Lagoudakis et al. 2005, Robotics: Science and Systems; Koenig et al. 2006, AAAI).
     """
-    left, pairs = cost.T.astype(float), list[tuple[int, int]]()  # by option, then by arm: the order of ties
+    if not cost.size:
+        return np.full(cost.shape[:-1], NONE)
+    arms, options = cost.shape[-2:]
+    left = np.swapaxes(cost, -1, -2).reshape(-1, options, arms).astype(float)  # the order of ties
+    chosen, row = np.full((len(left), arms), NONE), np.arange(len(left))
     while left.size:
-        option, arm = divmod(int(left.argmin()), len(cost))
-        if left[option, arm] == np.inf:
-            break
-        pairs.append((arm, option))
-        first = option - option % plans
-        left[:, arm] = left[first : first + plans] = np.inf
-    return pairs
+        option, arm = np.divmod(left.reshape(len(left), -1).argmin(axis=1), arms)
+        paired = left[np.arange(len(left)), option, arm] != np.inf
+        if not paired.all():
+            left, row, option, arm = left[paired], row[paired], option[paired], arm[paired]
+        chosen[row, arm], each = option, np.arange(len(row))
+        left[each, :, arm] = np.inf
+        left.reshape(len(row), options // plans, plans, arms)[each, option // plans] = np.inf
+    return chosen.reshape(cost.shape[:-1])
 
 
-def claims_of(observations: Mapping[str, Observation], pairs: list[tuple[int, int]]) -> dict[str, int]:
-    """The actions of pairs of arm and option, each by its index; arms in no pair wait."""
-    arms = list(observations)
-    return dict.fromkeys(arms, WAIT) | {arms[arm]: option + 1 for arm, option in pairs}
+def oldest_jobs_to(rank: Array, seen: Observation, *, in_turn: bool = False) -> Array:
+    """Actions, int [env, arm], after one pass over the slots from the oldest job; each goes to the first able arm.
 
-
-def oldest_jobs_to(order: Sequence[str], observations: Mapping[str, Observation]) -> dict[str, int]:
-    """Actions after one pass over the slots from the oldest job; each goes to the first able arm of an order."""
-    actions = dict.fromkeys(observations, WAIT)
-    for slot in range(len(observations[order[0]].offered)):
-        arm, option = _first_able(order, slot, observations, actions)
-        if arm is not None:
-            actions[arm] = option + 1
+    Args:
+        rank: Order of the arms, int [env, arm], from 0.
+        in_turn: Whether the arm after the last one that gets a job is then the first; `rank` is changed.
+    """
+    envs, arms = rank.shape
+    legal = legal_options(seen).reshape(envs, arms, -1, plans_of(seen))
+    may = np.any(legal, axis=-1)
+    actions = np.full((envs, arms), WAIT)
+    for slot in np.unique(may.nonzero()[2]).tolist():
+        order = np.where(may[:, :, slot] & (actions == WAIT), rank, arms)
+        arm = order.argmin(axis=1)
+        env = np.flatnonzero(order[np.arange(envs), arm] < arms)
+        arm = arm[env]
+        actions[env, arm] = 1 + slot * legal.shape[-1] + legal[env, arm, slot].argmax(axis=-1)
+        if in_turn:
+            rank[env] = (rank[env] - rank[env, arm][:, None] - 1) % arms
     return actions
 
 
-def least_difficult(observation: Observation, slot: int) -> int:
-    """The legal option of a slot with the least difficulty; the fastest one if none is known."""
-    plans, difficulty = plans_of(observation), np.nan_to_num(known_difficulty(observation), nan=np.inf)
-    here = [option for option in legal_options(observation) if option // plans == slot]
-    return min(here, key=lambda option: float(difficulty[option]))
+def _ranks(values: Array) -> Array:
+    """Rank of each arm by a value, the least first, int [env, arm]; ties: the first arm."""
+    return values.argsort(axis=-1, kind="stable").argsort(axis=-1)
 
 
-def _open(observation: Observation, mine: list[int]) -> Array:
-    """Slots that some arm may claim now, bool, [slot]: not empty, and not closed only by a busy station."""
-    slots = len(observation.offered)
-    may, able = np.isin(np.arange(slots), mine), observation.feasible.reshape(slots, -1).any(axis=1)
-    return (observation.offered > 0) & (may | ~able)
+UNKNOWN = 1e9
+"""More than any difficulty."""
 
 
-def _first_able(
-    arms: Sequence[str], slot: int, observations: Mapping[str, Observation], actions: Mapping[str, int]
-) -> tuple[str | None, int]:
-    """The first of the arms that may claim the slot and has no claim yet, and its fastest legal option."""
-    plans = plans_of(observations[arms[0]])
-    for arm in arms:
-        if actions[arm] == WAIT:
-            for option in range(slot * plans, (slot + 1) * plans):
-                if observations[arm].action_mask[option + 1]:
-                    return arm, option
-    return None, -1
+def least_difficult(seen: Observation, slot: Array) -> Array:
+    """The legal option of a slot with the least difficulty, int [...]; the fastest one if none is known.
+
+    Args:
+        slot: With a legal option, int [...].
+    """
+    plans, known = plans_of(seen), np.nan_to_num(known_difficulty(seen), nan=UNKNOWN)
+    here = np.where(legal_options(seen), known, np.inf)
+    of_slot = np.take_along_axis(here, slot[..., None] * plans + np.arange(plans), axis=-1)
+    return slot * plans + of_slot.argmin(axis=-1)
 
 
 RISK = 9.0
@@ -250,57 +262,50 @@ COST_DIGITS = 9
 """Costs are rounded to this many digits, so that rounding errors do not break ties."""
 
 
-def thermal(observations: Sequence[Observation]) -> Array:
+def thermal(seen: Observation) -> Array:
     """Difficulty weighted by risk, relative to the fleet's average for that job; late and valuable jobs come first.
 
     The difficulty is weighted by 1 + RISK · P(saturation). As in `agents.rules.LeastDifficulty` it is relative to the
     average of the arms that may claim the job, and an unknown difficulty equals that average. If no arm has a
     difficulty, the risk decides, then the time until the finish.
-    """
-    able, one = _able(observations), observations[0]
-    difficulty, known = _stack(observations, "difficulty"), _stack(observations, "known") > 0
-    difficulty = np.where(known, difficulty, _mean(difficulty, known & able, one, otherwise=1.0))
-    tardiness_s = np.maximum(0.0, _busy_s(observations) - _stack(observations, "slack_s"))
-    late = LATE_PER_H * per_option(one, _stack(observations, "value")) * tardiness_s / 3600.0
-    time = TIME_PER_H * _finish_s(observations) / 3600.0
-    cost = difficulty * (1.0 + RISK * _stack(observations, "p_saturation")) + late + time
-    # Waiting makes a job late for every arm: the average lateness decides between jobs, not between arms.
-    return np.where(able, cost - _mean(cost, able, one) - _mean(late, able, one), np.inf).round(COST_DIGITS)
-
-
-def quickest(observations: Sequence[Observation]) -> Array:
-    """Seconds until the arm would finish the job; heat is ignored."""
-    return np.where(_able(observations), _finish_s(observations), np.inf).round(COST_DIGITS)
-
-
-def _able(observations: Sequence[Observation]) -> Array:
-    """Whether the arm may claim the job now, bool, [arm, option]."""
-    return np.stack([seen.action_mask[1:-1] for seen in observations]) > 0
-
-
-def _finish_s(observations: Sequence[Observation]) -> Array:
-    """Seconds until the arm would finish the job, after its current one, [arm, option]."""
-    return _busy_s(observations) + _stack(observations, "duration_s")
-
-
-def _busy_s(observations: Sequence[Observation]) -> Array:
-    return np.array([[float(seen.busy_s)] for seen in observations])
-
-
-def _stack(observations: Sequence[Observation], field: str) -> Array:
-    return np.stack([np.asarray(getattr(seen, field), dtype=float) for seen in observations])
-
-
-def _mean(values: Array, where: Array, one: Observation, otherwise: float = 0.0) -> Array:
-    """Average over some of the arms and the plans of a job, [option]; the same for all plans of a job.
 
     Args:
-        one: Any observation of the fleet.
+        seen: Observations [env, arm].
+
+    Returns:
+        Cost [env, arm, option], inf where an arm may not claim.
     """
-    plans = plans_of(one)
-    total = np.where(where, values, 0.0).sum(axis=0).reshape(-1, plans).sum(axis=1)
-    count = where.sum(axis=0).reshape(-1, plans).sum(axis=1)
-    return per_option(one, np.where(count > 0, total / np.maximum(count, 1), otherwise))
+    able, plans = legal_options(seen), plans_of(seen)
+    difficulty, known = seen.difficulty.astype(float), seen.known > 0
+    difficulty = np.where(known, difficulty, _mean(difficulty, known & able, plans, otherwise=1.0))
+    tardiness_s = np.maximum(0.0, _busy_s(seen) - seen.slack_s)
+    late = LATE_PER_H * per_option(seen, seen.value.astype(float)) * tardiness_s / 3600.0
+    time = TIME_PER_H * _finish_s(seen) / 3600.0
+    cost = difficulty * (1.0 + RISK * seen.p_saturation.astype(float)) + late + time
+    # Waiting makes a job late for every arm: the average lateness decides between jobs, not between arms.
+    return np.where(able, cost - _mean(cost, able, plans) - _mean(late, able, plans), np.inf).round(COST_DIGITS)
+
+
+def quickest(seen: Observation) -> Array:
+    """Seconds until the arm would finish the job; heat is ignored. Arguments and shape as of `thermal`."""
+    return np.where(legal_options(seen), _finish_s(seen), np.inf).round(COST_DIGITS)
+
+
+def _finish_s(seen: Observation) -> Array:
+    """Seconds until the arm would finish the job, after its current one, [env, arm, option]."""
+    return _busy_s(seen) + seen.duration_s
+
+
+def _busy_s(seen: Observation) -> Array:
+    return seen.busy_s.astype(float)[..., None]
+
+
+def _mean(values: Array, where: Array, plans: int, otherwise: float = 0.0) -> Array:
+    """Average over some of the arms and the plans of a job, [env, 1, option]; the same for all plans of a job."""
+    shape = (len(values), 1, -1, plans)
+    total = np.where(where, values, 0.0).sum(axis=1).reshape(shape).sum(axis=-1)
+    count = where.sum(axis=1).reshape(shape).sum(axis=-1)
+    return np.repeat(np.where(count > 0, total / np.maximum(count, 1), otherwise), plans, axis=-1)
 
 
 class Ssi(CentralRule):
@@ -308,9 +313,9 @@ class Ssi(CentralRule):
 
     only_choices = True
 
-    def cost(self, observations: Sequence[Observation]) -> Array:
-        """[arm, option] of the observations of all arms."""
-        return thermal(observations)
+    def cost(self, seen: Observation) -> Array:
+        """[env, arm, option]."""
+        return thermal(seen)
 
 
 class Matching(Matched, Ssi):
@@ -324,9 +329,9 @@ class QuickestSsi(CentralRule):
 
     only_choices = True
 
-    def cost(self, observations: Sequence[Observation]) -> Array:
-        """[arm, option] of the observations of all arms."""
-        return quickest(observations)
+    def cost(self, seen: Observation) -> Array:
+        """[env, arm, option]."""
+        return quickest(seen)
 
 
 class QuickestMatching(Matched, QuickestSsi):
@@ -345,25 +350,23 @@ class Ahead:
     soon_s: ClassVar = 120.0
     """Longest time until such an arm is home."""
 
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+    def actions(self, seen: Observation) -> Array:
         """The claims of the pairs whose arm is free."""
-        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
-            return dict.fromkeys(observations, WAIT)
-        actions = super().act({arm: self._soon(seen) for arm, seen in observations.items()})  # pyright: ignore
-        return {arm: action if observations[arm].action_mask[action] else WAIT for arm, action in actions.items()}
+        actions: Array = super().actions(self._soon(seen))  # pyright: ignore
+        legal = np.take_along_axis(seen.action_mask, actions[..., None], axis=-1)[..., 0]
+        return np.where(legal > 0, actions, WAIT)
 
     def _soon(self, seen: Observation) -> Observation:
-        """The observation of an arm that is home soon, with the claims that it could make and their times then."""
-        if not (seen.working and seen.busy_s <= self.soon_s):
-            return seen
-        mask = seen.action_mask.copy()
-        mask[1:-1] = (seen.feasible > 0) & (per_option(seen, seen.station_free) > 0)
-        late_s = float(seen.busy_s)
-        return replace(
-            seen,
+        """The observations; of arms that are home soon with the claims that they could make, and their times then."""
+        soon = (seen.working > 0) & (seen.busy_s <= self.soon_s)
+        mask, late_s = seen.action_mask.copy(), np.where(soon, seen.busy_s, 0)[..., None]
+        could = (seen.feasible > 0) & (per_option(seen, seen.station_free) > 0)
+        mask[..., 1:-1] = np.where(soon[..., None], could, mask[..., 1:-1])
+        return LazyObservation(
+            lambda name: getattr(seen, name),
             action_mask=mask,
-            busy_s=np.zeros_like(seen.busy_s),
-            duration_s=np.where(seen.feasible, seen.duration_s + np.float32(late_s), np.float32(0.0)),
+            busy_s=np.where(soon, 0, seen.busy_s),
+            duration_s=np.where(seen.feasible, seen.duration_s + late_s, 0),
         )
 
 
@@ -373,11 +376,27 @@ class MatchingAhead(Ahead, Matching):
     only_choices = True
 
 
-def matched_options(cost: Array, plans: int) -> list[tuple[int, int]]:
-    """As `matching`, pairs (arm, option) of a cost matrix [arm, option]: each arm has the cheapest plan for its job."""
-    by_slot = cost.reshape(len(cost), -1, plans)
-    best = by_slot.argmin(axis=2)
-    return [(arm, slot * plans + int(best[arm, slot])) for arm, slot in matching(by_slot.min(axis=2))]
+def each_env(pairs: Callable[[Array], list[tuple[int, int]]], cost: Array, plans: int) -> Array:
+    """The option of each arm or NONE, int [..., arm], by an assignment of arms and slots in each env.
+
+    Args:
+        pairs: Pairs (arm, slot) by costs [arm, slot]; each arm has the cheapest plan for its job.
+        cost: [..., arm, option].
+    """
+    if not cost.size:
+        return np.full(cost.shape[:-1], NONE)
+    by_slot = cost.reshape(-1, cost.shape[-2], cost.shape[-1] // plans, plans)
+    best, least = by_slot.argmin(axis=-1), by_slot.min(axis=-1)
+    chosen = np.full(least.shape[:2], NONE)
+    for env in np.flatnonzero(np.isfinite(least).any(axis=(1, 2))).tolist():
+        for arm, slot in pairs(least[env]):
+            chosen[env, arm] = slot * plans + best[env, arm, slot]
+    return chosen.reshape(cost.shape[:-1])
+
+
+def matched_options(cost: Array, plans: int) -> Array:
+    """As `matching`, the option of each arm or NONE, int [..., arm], by costs [..., arm, option]."""
+    return each_env(matching, cost, plans)
 
 
 def matching(cost: Array) -> list[tuple[int, int]]:
@@ -407,8 +426,8 @@ class Fifo(CentralRule):
     only_choices = True
 
     def index(self, seen: Observation) -> Array:
-        """Place in the queue from its end, then the shorter duration, [option]."""
-        return _first_by(per_option(seen, np.arange(len(seen.offered))), seen.duration_s)
+        """Place in the queue from its end, then the shorter duration, [env, arm, option]."""
+        return _first_by(per_option(seen, np.arange(seen.offered.shape[-1])), seen.duration_s)
 
 
 class Edd(CentralRule):
@@ -420,7 +439,7 @@ class Edd(CentralRule):
     only_choices = True
 
     def index(self, seen: Observation) -> Array:
-        """Minus the time until the due date, then the shorter duration, [option]."""
+        """Minus the time until the due date, then the shorter duration, [env, arm, option]."""
         return _first_by((seen.slack_s.astype(float) + seen.duration_s).round(TIME_DIGITS), seen.duration_s)
 
 
@@ -446,14 +465,17 @@ class Atc(CentralRule):
     """k."""
 
     def index(self, seen: Observation) -> Array:
-        """Value per second times urgency, [option]."""
-        duration_s, legal = np.maximum(seen.duration_s, 1.0).astype(float), seen.action_mask[1:-1] > 0
-        mean_s = duration_s[legal].mean() if legal.any() else 1.0
+        """Value per second times urgency, [env, arm, option]."""
+        duration_s, legal = np.maximum(seen.duration_s, 1.0).astype(float), legal_options(seen)
+        count = legal.sum(axis=-1, keepdims=True)
+        mean_s = np.where(
+            count > 0, np.where(legal, duration_s, 0.0).sum(axis=-1, keepdims=True) / np.maximum(count, 1), 1.0
+        )
         urgency = np.exp(-np.maximum(seen.slack_s, 0.0) / (self.look_ahead * mean_s))
         return per_option(seen, seen.value) / duration_s * urgency
 
 
-class LeastLoaded:
+class LeastLoaded(CentralArrayPolicy):
     """The oldest job goes to the able arm with the least working time in this shift, by the durations of its claimed
     plans.
 
@@ -461,7 +483,6 @@ class LeastLoaded:
     that lost.
     """
 
-    scope: ClassVar = "central"
     only_choices = False
     """A lost claim becomes known in the next interval."""
 
@@ -473,20 +494,22 @@ class LeastLoaded:
         self._load_s: dict[str, float] = {}
         self._claimed_s: dict[str, float] = {}
 
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+    @classmethod
+    def decide(cls, policies: Sequence[Any], seen: Observation, arms: Sequence[str]) -> Array:
         """One pass over the slots from the oldest job; each goes to the able arm with the least working time."""
-        for arm, claimed_s in self._claimed_s.items():
-            if arm in observations and observations[arm].last_award < 0:
-                self._load_s[arm] -= claimed_s
-        self._claimed_s = {}
-        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
-            return dict.fromkeys(observations, WAIT)
-        actions = oldest_jobs_to(sorted(observations, key=lambda arm: self._load_s.get(arm, 0.0)), observations)
-        self._claimed_s = {
-            arm: float(observations[arm].duration_s[action - 1]) for arm, action in actions.items() if action != WAIT
-        }
-        for arm, claimed_s in self._claimed_s.items():
-            self._load_s[arm] = self._load_s.get(arm, 0.0) + claimed_s
+        for env, policy in enumerate(policies):
+            for arm, claimed_s in policy._claimed_s.items():
+                if arm in arms and seen.last_award[env, arms.index(arm)] < 0:
+                    policy._load_s[arm] -= claimed_s
+            policy._claimed_s = {}
+        if not seen.action_mask[..., 1:-1].any():
+            return np.full(seen.action_mask.shape[:2], WAIT)
+        load_s = np.array([[policy._load_s.get(arm, 0.0) for arm in arms] for policy in policies])
+        actions = oldest_jobs_to(_ranks(load_s), seen)
+        for env, arm in np.argwhere(actions != WAIT).tolist():
+            policy, claimed_s = policies[env], float(seen.duration_s[env, arm, actions[env, arm] - 1])
+            policy._claimed_s[arms[arm]] = claimed_s
+            policy._load_s[arms[arm]] = policy._load_s.get(arms[arm], 0.0) + claimed_s
         return actions
 
 

@@ -11,6 +11,10 @@ LEAST_GAIN = 1e-9
 """A smaller difference of rewards is no gain."""
 
 
+_SHARES = np.array([2, 1, 1, 1, 1, 1, 1]) / 8
+"""Probabilities of the kinds of random changes, as in `Changes`."""
+
+
 class Schedules(NamedTuple):
     """Arm, plan and order of each job; arrays [schedule, job].
 
@@ -30,6 +34,20 @@ class Schedules(NamedTuple):
         """Copies of some schedules."""
         chosen = np.asarray(rows, dtype=int)
         return Schedules(*(values[chosen].copy() for values in self))
+
+    def keys(self, now_s: float) -> list[bytes]:
+        """A key of each schedule; schedules with the same one have the same result from a time on.
+
+        Only the order of the jobs of an arm counts, and waiting until later than `now_s`.
+        """
+        planned = np.isfinite(self.order)
+        arm, option = (np.where(planned, each, -1) for each in (self.arm, self.option))
+        job = np.lexsort((self.order, arm), axis=-1)
+        ordered = np.take_along_axis(np.where(planned, self.order, -1.0), job, axis=-1)
+        later = np.diff(ordered, axis=-1, prepend=-1.0) != 0  # not at once with the one before
+        waits = np.where(planned & (self.not_before_s > now_s), self.not_before_s, 0.0)
+        parts = np.concatenate([arm, option, job * 2 + later, waits.view(np.int64)], axis=-1)
+        return [row.tobytes() for row in parts]
 
 
 def stack(schedules: Sequence[Schedules]) -> Schedules:
@@ -65,6 +83,18 @@ class Changes:
         self.choices = {job: found for job in every if len(found := np.argwhere(can[:, job]))}
         """Arm and option of every plan for a job that some arm can do, int [choice, 2]."""
         self._jobs = np.array(list(self.choices), dtype=int)
+        self._plans = np.concatenate([np.zeros((0, 2), int), *self.choices.values()])
+        """The choices of all jobs, one after the other, int [plan, 2]."""
+        self._count = np.zeros((can.shape[1], len(can)), int)
+        """Number of plans of each arm for each job, int [job, arm]."""
+        self._count[self._jobs] = can[:, self._jobs].sum(axis=-1).T
+        first = np.cumsum([0, *self._count[self._jobs].ravel()])[:-1].reshape(-1, len(can))
+        self._first = np.zeros_like(self._count)
+        """The first of them among the choices, int [job, arm]."""
+        self._first[self._jobs] = first
+        self._kinds = (
+            self._move, self._swap, self._reorder, self._free, self._delay, self._leave_out, self._window
+        )  # fmt: skip
 
     @property
     def none(self) -> bool:
@@ -124,102 +154,113 @@ class Changes:
 
     def neighbours(self, schedule: Schedules, first: Sequence[Schedules], count: int) -> Schedules:
         """Some schedules, and random neighbours of a schedule up to a number."""
-        return stack([*first, *(self.changed(schedule) for _ in range(count - len(first)))])
+        new = schedule.at([0] * (count - len(first)))
+        times = np.array(self._rng.multinomial(self._rng.geometric(0.6, len(new.arm)), _SHARES))  # [schedule, kind]
+        for k, change in enumerate(self._kinds):
+            for made in range(times[:, k].max(initial=0)):
+                change(new, np.flatnonzero(times[:, k] > made))
+        return stack([*first, new])
 
     def changed(self, schedule: Schedules) -> Schedules:
         """A random neighbour of a schedule."""
-        new, rng = schedule.at([0]), self._rng
-        kinds = (
-            self._move,
-            self._move,
-            self._swap,
-            self._reorder,
-            self._free,
-            self._delay,
-            self._leave_out,
-            self._window,
-        )
-        for _ in range(1 + int(rng.geometric(0.6) - 1)):
-            kinds[int(rng.integers(len(kinds)))](new)
-        return new
+        return self.neighbours(schedule, [], 1)
 
-    def _one(self) -> int:
-        return int(self._rng.choice(self._jobs))
+    # Each of these changes some rows, int [n], of schedules.
 
-    def _assign(self, new: Schedules, job: int) -> None:
-        choices = self.choices[job]
-        new.arm[0, job], new.option[0, job] = choices[int(self._rng.integers(len(choices)))]
+    def _one(self, rows: Array) -> Array:
+        """A random job for each row."""
+        return self._jobs[self._rng.integers(len(self._jobs), size=len(rows))]
 
-    def _time(self, job: int, order: float) -> float:
+    def _assign(self, new: Schedules, rows: Array, job: Array) -> None:
+        """A random plan for a job of each row."""
+        plan = self._first[job, 0] + self._rng.integers(self._count[job].sum(axis=-1))
+        new.arm[rows, job], new.option[rows, job] = self._plans[plan].T
+
+    def _place(self, new: Schedules, rows: Array, job: Array) -> None:
         """A moment near that of a job, not before its release."""
-        near = order if np.isfinite(order) else self._release_s[job]
-        shifted = near + self._rng.normal() * self._rng.choice(2.0 * self._waits_s)
-        return float(np.clip(shifted, self._release_s[job], self._horizon_s))
+        order, release_s = new.order[rows, job], self._release_s[job]
+        near_s = np.where(np.isfinite(order), order, release_s)
+        shift_s = self._rng.normal(size=len(rows)) * self._rng.choice(2.0 * self._waits_s, len(rows))
+        new.order[rows, job] = np.clip(near_s + shift_s, release_s, self._horizon_s)
+        new.not_before_s[rows, job] = 0.0
 
-    def _move(self, new: Schedules) -> None:
+    def _move(self, new: Schedules, rows: Array) -> None:
         """Another arm or plan, and another place in the order."""
-        job = self._one()
-        self._assign(new, job)
-        new.order[0, job], new.not_before_s[0, job] = self._time(job, new.order[0, job]), 0.0
+        job = self._one(rows)
+        self._assign(new, rows, job)
+        self._place(new, rows, job)
 
-    def _reorder(self, new: Schedules) -> None:
+    def _reorder(self, new: Schedules, rows: Array) -> None:
         """Another place in the order of its arm."""
-        job = self._one()
-        new.order[0, job], new.not_before_s[0, job] = self._time(job, new.order[0, job]), 0.0
+        self._place(new, rows, self._one(rows))
 
-    def _swap(self, new: Schedules) -> None:
+    def _swap(self, new: Schedules, rows: Array) -> None:
         """Two jobs that are near in time exchange their places, half of the time their arms, too."""
-        job = self._one()
-        begun = self._jobs[np.isfinite(new.order[0, self._jobs])]
-        if not np.isfinite(new.order[0, job]):
-            return
-        others = begun[np.argsort(np.abs(new.order[0, begun] - new.order[0, job]), kind="stable")[:12]]
-        other = int(self._rng.choice(others))
-        first, second = [job, other], [other, job]
-        new.order[0, first], new.not_before_s[0, first] = new.order[0, second], 0.0
-        if self._rng.random() < 0.5:
-            for one, arm in zip(first, new.arm[0, second].tolist(), strict=True):
-                fits = np.flatnonzero(self.choices[one][:, 0] == arm)
-                if len(fits):
-                    new.arm[0, one], new.option[0, one] = self.choices[one][int(self._rng.choice(fits))]
+        job = self._one(rows)
+        planned = np.isfinite(new.order[rows, job])
+        rows, job = rows[planned], job[planned]
+        distance_s = np.abs(new.order[rows][:, self._jobs] - new.order[rows, job][:, None])
+        nearest = np.argsort(distance_s, axis=-1, kind="stable")
+        among = np.minimum(np.isfinite(distance_s).sum(axis=-1), 12)
+        other = self._jobs[nearest[np.arange(len(rows)), self._rng.integers(among)]]
+        new.order[rows, job], new.order[rows, other] = new.order[rows, other], new.order[rows, job]
+        new.not_before_s[rows, job] = new.not_before_s[rows, other] = 0.0
+        half = self._rng.random(len(rows)) < 0.5
+        rows, job, other = rows[half], job[half], other[half]
+        arms = new.arm[rows, other], new.arm[rows, job]
+        for each, arm in zip((job, other), arms, strict=True):
+            fits = self._count[each, arm] > 0
+            at, arm = (rows[fits], each[fits]), arm[fits]
+            plan = self._first[at[1], arm] + self._rng.integers(self._count[at[1], arm])
+            new.arm[at], new.option[at] = arm, self._plans[plan, 1]
 
-    def _free(self, new: Schedules) -> None:
+    def _free(self, new: Schedules, rows: Array) -> None:
         """The arms no longer wait with the jobs of a stretch of time."""
-        begin_s, length_s = self._rng.uniform(0.0, self._horizon_s), self._rng.choice([1800.0, 7200.0, np.inf])
-        inside = (new.order[0] >= begin_s) & (new.order[0] <= begin_s + length_s)
-        if self._rng.random() < 0.5:
-            inside &= new.arm[0] == new.arm[0, self._one()]
-        new.not_before_s[0, inside] = 0.0
+        begin_s = self._rng.uniform(0.0, self._horizon_s, (len(rows), 1))
+        length_s = self._rng.choice([1800.0, 7200.0, np.inf], (len(rows), 1))
+        inside = (new.order[rows] >= begin_s) & (new.order[rows] <= begin_s + length_s)
+        same = new.arm[rows] == new.arm[rows, self._one(rows)][:, None]
+        inside &= same | (self._rng.random((len(rows), 1)) < 0.5)
+        new.not_before_s[rows] = np.where(inside, 0.0, new.not_before_s[rows])
 
-    def _delay(self, new: Schedules) -> None:
+    def _delay(self, new: Schedules, rows: Array) -> None:
         """The arm waits before it claims a job."""
-        job = self._one()
-        if np.isfinite(new.order[0, job]):
-            new.not_before_s[0, job] = new.order[0, job] + self._rng.exponential(self._rng.choice(self._waits_s))
+        job = self._one(rows)
+        planned = np.isfinite(new.order[rows, job])
+        rows, job = rows[planned], job[planned]
+        wait_s = self._rng.exponential(self._rng.choice(self._waits_s, len(rows)))
+        new.not_before_s[rows, job] = new.order[rows, job] + wait_s
 
-    def _leave_out(self, new: Schedules) -> None:
+    def _leave_out(self, new: Schedules, rows: Array) -> None:
         """Mostly a job that is left out is taken up; otherwise one is left out."""
-        missing = self._jobs[~np.isfinite(new.order[0, self._jobs])]
-        if len(missing) and self._rng.random() < 0.8:
-            job = int(self._rng.choice(missing))
-            self._assign(new, job)
-            new.order[0, job], new.not_before_s[0, job] = self._time(job, np.inf), 0.0
-        else:
-            new.order[0, self._one()] = np.inf
+        missing = ~np.isfinite(new.order[rows][:, self._jobs])
+        takes_up = missing.any(axis=-1) & (self._rng.random(len(rows)) < 0.8)
+        new.order[rows[~takes_up], self._one(rows[~takes_up])] = np.inf
+        rows, missing = rows[takes_up], missing[takes_up]
+        job = self._jobs[np.where(missing, self._rng.random(missing.shape), -1.0).argmax(axis=-1)]
+        self._assign(new, rows, job)
+        self._place(new, rows, job)
 
-    def _window(self, new: Schedules) -> None:
+    def _window(self, new: Schedules, rows: Array) -> None:
         """Some jobs that are near in time, or share a station, get new arms and places; no job within an hour waits."""
-        job = self._one()
-        centre_s = new.order[0, job] if np.isfinite(new.order[0, job]) else self._release_s[job]
-        near = np.abs(np.where(np.isfinite(new.order[0]), new.order[0], self._release_s) - centre_s)
-        pool = self._jobs[np.argsort(near[self._jobs], kind="stable")[:10]]
-        if self._rng.random() < 0.4:
-            same = self._jobs[(self._stations[self._jobs] & self._stations[job]).any(axis=1)]
-            pool = same[np.argsort(near[same], kind="stable")[:8]]
-        chosen = self._rng.permutation(pool)[: int(self._rng.integers(2, 6))]
-        for each in chosen.tolist():
-            if self._rng.random() < 0.6:
-                self._assign(new, each)
-        new.order[0, chosen] = new.order[0, self._rng.permutation(chosen)]
-        late = np.abs(new.order[0] - centre_s) < 3600.0
-        new.not_before_s[0, late] = 0.0
+        job, rng = self._one(rows), self._rng
+        time_s = np.where(np.isfinite(new.order[rows]), new.order[rows], self._release_s)
+        centre_s = time_s[np.arange(len(rows)), job][:, None]
+        distance_s = np.abs(time_s - centre_s)[:, self._jobs]
+        by_station = rng.random((len(rows), 1)) < 0.4
+        shares = (self._stations[self._jobs] & self._stations[job][:, None]).any(axis=-1)
+        distance_s = np.where(shares | ~by_station, distance_s, np.inf)
+        pool = np.argsort(distance_s, axis=-1, kind="stable")[:, :10]
+        size = np.where(by_station, 8, 10).clip(max=np.isfinite(distance_s).sum(axis=-1, keepdims=True))
+        count = rng.integers(2, 6, (len(rows), 1)).clip(max=size)
+        lot = np.where(np.arange(pool.shape[1]) < size, rng.random(pool.shape), np.inf)
+        chosen = self._jobs[np.take_along_axis(pool, np.argsort(lot, axis=-1), axis=-1)]
+        inside = np.arange(pool.shape[1]) < count
+        other = np.argsort(np.where(inside, rng.random(pool.shape), np.inf), axis=-1)
+        order = new.order[rows[:, None], np.take_along_axis(chosen, other, axis=-1)]
+        at = np.broadcast_to(rows[:, None], inside.shape)[inside], chosen[inside]
+        new.order[at] = order[inside]
+        moved = rng.random(len(at[0])) < 0.6
+        self._assign(new, at[0][moved], at[1][moved])
+        late = np.abs(new.order[rows] - centre_s) < 3600.0
+        new.not_before_s[rows] = np.where(late, 0.0, new.not_before_s[rows])

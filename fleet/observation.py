@@ -9,10 +9,10 @@ peers of its own, what the arms share belongs to the second part; the order of t
 """
 
 from collections import namedtuple
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from typing import Annotated, Any, Literal, get_type_hints
+from functools import cache, cached_property, partial
+from typing import Annotated, Literal, get_type_hints
 
 import numpy as np
 
@@ -192,6 +192,25 @@ class Observation:
         return np.take_along_axis(values, self.peers, axis=-1)
 
 
+class LazyObservation(Observation):
+    """Observations whose fields are read when they are first used: few policies use more than ten.
+
+    Args:
+        read: Returns a field by its name; not needed if all of them are given.
+        fields: Fields by name, instead of those of `read`.
+    """
+
+    def __init__(self, read: Callable[[str], Array] | None = None, **fields: Array) -> None:
+        vars(self).update(fields, _read=read)
+
+    def __getattr__(self, name: str) -> Array:
+        """The field, kept for the next use."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        read: Callable[[str], Array] = vars(self)["_read"]
+        return vars(self).setdefault(name, read(name))
+
+
 def _fields() -> Iterator[Field]:
     for name, kind in get_type_hints(Observation, include_extras=True).items():
         for field in getattr(kind, "__metadata__", ()):
@@ -330,39 +349,45 @@ class Layout:
         return out
 
     def read(self, vector: Array, action_mask: Array) -> Observation:
-        """The observation of vectors [..., arm, size] of all arms, or of some, [..., size] without any peer."""
+        """The observation of vectors [..., arm, size] of all arms, or of some, [..., size] without any peer.
+
+        Its arrays are views, unless the vectors are scaled; of one vector, values without an axis are NumPy scalars.
+        """
         if vector.shape[-1] != self.size:
             raise ValueError(
                 f"An observation of {self.slots} slots and {self.members.shape[1]} member(s) has {self.size} elements, "
                 f"got {vector.shape[-1]}."
             )
-        return self._read(vector[..., : self.shared], vector[..., self.shared :], action_mask)
+        return self._lazy(vector[..., : self.shared], vector[..., self.shared :], action_mask)
 
     def read_parts(self, shared: Array, own: Array, action_mask: Array) -> Observation:
-        """The observation of both parts of vectors, [..., shared] and [..., arm, own]; its arrays are views of them."""
+        """The observation of both parts of vectors, [..., shared] and [..., arm, own]; see `read`."""
         one_each = np.broadcast_to(shared[..., None, :], (*own.shape[:-1], self.shared))
-        return self._read(one_each, own, action_mask)
-
-    def _read(self, shared: Array, own: Array, action_mask: Array) -> Observation:
-        lead, cut = own.shape[:-1], self.shared
-        if self.scaled:
-            some: Any = self.scales if isinstance(own, np.ndarray) else own.new_tensor(self.scales)
-            shared, own = shared * some[:cut], own * some[cut:]
-        named: dict[str, Any] = {}
-        for name, (span, shape) in self._spans.items():
-            part = shared[..., span] if span.stop <= cut else own[..., span.start - cut : span.stop - cut]
-            named[name] = part.reshape((*lead, *shape))
-        many = len(lead) > 0 and lead[-1] == self.arms
-        peers = np.broadcast_to(self.peers, (*lead[:-1], *self.peers.shape)) if many else self.peers[:0]
-        return Observation(**named, peers=peers, action_mask=action_mask)
+        return self._lazy(one_each, own, action_mask)
 
     def read_each(self, arms: Sequence[str], shared: Array, own: Array, action_masks: Array) -> dict[str, Observation]:
-        """The observation of each arm by name, from [shared], [arm, own] and masks [arm, option + 2], for policies.
+        """The observation of each arm by name, from [shared], [arm, own] and masks [arm, option + 2]; see `read`."""
+        each = zip(arms, own, action_masks, self.peers, strict=True)
+        return {arm: self._lazy(shared, mine, mask, peers) for arm, mine, mask, peers in each}
 
-        Its arrays are views; values without an axis are NumPy scalars. Cheaper than `read` for one arm after another.
-        """
-        fields = vars(self.read_parts(shared, own, action_masks)).values()
-        return {arm: Observation(*each) for arm, *each in zip(arms, *fields, strict=True)}
+    def _lazy(self, shared: Array, own: Array, action_mask: Array, peers: Array | None = None) -> Observation:
+        """The observation of both parts, which have the same leading axes."""
+        lead = own.shape[:-1]
+        if peers is None:
+            all_arms = len(lead) > 0 and lead[-1] == self.arms
+            peers = np.broadcast_to(self.peers, (*lead[:-1], *self.peers.shape)) if all_arms else self.peers[:0]
+        return LazyObservation(partial(self._field, shared, own), peers=peers, action_mask=action_mask)
+
+    def _field(self, shared: Array, own: Array, name: str) -> Array:
+        if name not in self._spans:
+            raise AttributeError(f"An observation has no field '{name}'.")
+        (span, shape), cut = self._spans[name], self.shared
+        part, first = (shared, span.start) if span.stop <= cut else (own, span.start - cut)
+        if not shape:
+            values = part[first] if part.ndim == 1 else part[..., first]
+        else:
+            values = part[..., first : first + span.stop - span.start].reshape((*part.shape[:-1], *shape))
+        return values * _BY_NAME[name].scale if self.scaled else values
 
 
 @cache

@@ -113,8 +113,8 @@ def test_the_heat_of_a_shift_is_that_of_its_most_aged_winding_and_of_the_largest
     temp_c[..., WINDING] = 40.0 + 1.5 * course[:, None, None] * shape[:, None] * np.linspace(0.2, 1.0, JOINTS)
     temp_c[..., HOUSING] = 40.0 + course[:, None, None] * shape[:, None]
     heat = HeatUse(temp_c[0], burn_c=65.0)
-    for after_c in temp_c[1:]:
-        heat.add(after_c, dt_s)
+    heat.add(temp_c[1:100], dt_s)
+    heat.add(temp_c[100:], dt_s)
     used_h = simpson(arrhenius_rate(temp_c[..., JOINTS - 1]), dx=dt_s, axis=0) / 3600.0
     assert heat.insulation_ppb == pytest.approx(1e9 * used_h / RATED_LIFE_H, rel=1e-3)
     assert heat.tool_drift_mm == pytest.approx(1e3 * 23.6e-6 * 30.0 * shape * sum(GEN3_SEGMENTS_M))
@@ -155,7 +155,7 @@ def test_surfaces_are_housings_and_their_hot_minutes_add_up():
     for minute in range(1, 21):
         temp_c = temp_c.copy()
         temp_c[1, JOINTS + 2] = 40.0 + minute
-        heat.add(temp_c, 60.0)
+        heat.add(temp_c[None], 60.0)
     np.testing.assert_allclose(heat.hot_surface_min, [0.0, 12.0])
     np.testing.assert_allclose(heat.surface_c, [40.0, 60.0])
     np.testing.assert_allclose(surface_c(temp_c), [40.0, 60.0])

@@ -205,6 +205,7 @@ class Engine:
         jobs: Room for this many jobs a shift from the start; more is made when needed.
         events: Record the events of each step in `events`.
         trace: Record in `trace` how each arm spent the last step.
+        path: Keep the temperatures at the end of all intervals of a shift in `path_c`.
         compiled: Compile the loops, or run them in plain Python; by default as `Kernel.chosen` decides.
         threads: Rows are divided among this many threads; results do not depend on it.
     """
@@ -219,6 +220,7 @@ class Engine:
         jobs: int = 1,
         events: bool = False,
         trace: bool = False,
+        path: bool = False,
         compiled: bool | None = None,
         threads: int = 1,
     ) -> None:
@@ -242,6 +244,7 @@ class Engine:
             np.zeros((envs if trace else 0, arms), TRACE),
             np.zeros((0, arms), DRIVE),
             np.zeros((envs, arms), INFO),
+            np.zeros((envs if path else 0, tables.ticks, arms, NODES), np.float32),
             form_of(layout),
             room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK)),
             weights_per_unit(weights),
@@ -301,6 +304,11 @@ class Engine:
     def trace(self) -> Array:
         """How each arm spent the last step, `TRACE` [env, arm]."""
         return self._simulation.trace
+
+    @property
+    def path_c(self) -> Array:
+        """Temperatures at the end of each interval of the present shifts, °C, float32 [env, tick, arm, node]."""
+        return self._simulation.path_c
 
     @property
     def infos(self) -> Array:
@@ -375,11 +383,11 @@ class Engine:
         """Execute one schedule in each of the first rows, from the present state to the end of the shift.
 
         Args:
-            discount: Factor on the reward of each step of a shift, [tick].
+            discount: Factor on the reward of each step of a shift, [tick]; a shorter one ends the execution.
         """
         script = script_of(schedules, discount)
         terms, actions = np.empty((self.envs, OUTCOME)), np.zeros((self.envs, self.layout.arms), np.int64)
-        until = np.full(self.envs, self.tables.ticks)
+        until = np.full(self.envs, len(discount))
         over = (self.state.tick >= until) | ((self.state.unfinished == 0) & (self.state.number > 0))
         rows = np.flatnonzero(~over[: len(script.reward)])
         self._run(OFFER, actions, terms, rows, _NO_VECTORS)

@@ -421,6 +421,8 @@ def take_steps(
                 note_awards(sim, going, actions)
             if now & MOVE:
                 step_arms(sim, terms, going)
+                if len(sim.path_c) > 0:
+                    keep_path(sim, going)
             if now & OFFER:
                 update_offers(sim, going)
             if now & PLAY:
@@ -460,9 +462,20 @@ def step_rows(
     """
     s = sim
     whole = Simulation(
-        s.tables, s.state, s.offers, s.events, s.trace, s.drive, s.infos, s.form, s.room, s.weights, s.script
+        s.tables, s.state, s.offers, s.events, s.trace, s.drive, s.infos, s.path_c, s.form, s.room, s.weights, s.script
     )
     take_steps(whole, parts, actions, terms, until, rows, shared, own)
+
+
+@jit_inline
+def keep_path(sim: Simulation, rows: Array) -> None:
+    """Keep the temperatures of some envs at the end of a step."""
+    for row in rows:
+        e = nonnegative(row)
+        tick = nonnegative(sim.state.env[e]["tick"] - 1)
+        for a in range(nonnegative(sim.state.arms.shape[1])):
+            for n in range(NODES):
+                sim.path_c[e, tick, a, n] = sim.state.arms[e, a]["temp_c"][n]
 
 
 @jit_inline

@@ -389,6 +389,8 @@ class Simulation(NamedTuple):
     """`DRIVE` [env, arm]; without rows the planned drive counts."""
     infos: Array
     """`INFO` [env, arm]."""
+    path_c: Array
+    """Temperatures at the end of each interval of a shift, float32 [env, tick, arm, node]; without rows none."""
     form: Form
     room: Room
     weights: Array

@@ -109,7 +109,7 @@ class CellSimulator:
 
         Args:
             schedules: An `agents.schedules.Schedules`.
-            discount: Factor on the reward of each step of a shift, [tick].
+            discount: Factor on the reward of each step of a shift, [tick]; a shorter one ends the simulation.
 
         Raises:
             RuntimeError: before the first look.
@@ -140,9 +140,9 @@ def _check(schedules: Plans, discount: Array, rows: int, work: tuple[int, ...], 
                 f"The {name} of a schedule must be an integer from 0 to {most - 1}, also of a job that is "
                 f"left out (got {values.dtype} from {values.min()} to {values.max()})."
             )
-    if np.shape(discount) != (ticks,) or not np.isfinite(discount).all():
+    if np.ndim(discount) != 1 or len(discount) > ticks or not np.isfinite(discount).all():
         raise ValueError(
-            f"The discount must be {ticks} finite factors, one for each step of a shift "
+            f"The discount must be at most {ticks} finite factors, one for each step of a shift "
             f"(got shape {np.shape(discount)})."
         )
 

@@ -124,6 +124,7 @@ class BatchEnv:
         decisions: Length of a step: one decision "interval", or until an arm may claim a job ("events"), which takes no
             exchanges.
         scaled, ahead_s: As in `fleet.env.allocation_v2.AllocationEnv`.
+        keep_path: Keep the temperatures of the whole shift in `path_c`.
     """
 
     def __init__(
@@ -141,6 +142,7 @@ class BatchEnv:
         decisions: Decisions = "interval",
         scaled: bool = True,
         ahead_s: float = AHEAD_S,
+        keep_path: bool = False,
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
         self.agents = library.arms
@@ -168,7 +170,12 @@ class BatchEnv:
         self._shelves = [Shelf(each.shape, np.float32) for each in empty_parts(self.layout, num_envs)]
         self._library = library
         self._engine = Engine(
-            library.tables, num_envs, self.layout, weights or RewardWeights(), threads=at_least_one("threads", threads)
+            library.tables,
+            num_envs,
+            self.layout,
+            weights or RewardWeights(),
+            path=keep_path,
+            threads=at_least_one("threads", threads),
         )
         self._seeds = seeds_of(seed, num_envs)
         self._fresh = np.ones(num_envs, dtype=bool)
@@ -191,6 +198,12 @@ class BatchEnv:
         """Copy of the true state of all envs (not for policies)."""
         self._check_begun("looking at its state")
         return self._engine.state.copy()
+
+    @property
+    def path_c(self) -> Array:
+        """True temperatures at the end of each interval of the current shifts, °C, [env, tick, arm, node] (not for
+        policies); only with `keep_path`."""
+        return self._engine.path_c
 
     @property
     def temp_c(self) -> Array:

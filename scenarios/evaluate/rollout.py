@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from agents.policy import WAIT, PlanningPolicy, Policy, only_choices
+from agents.policy import WAIT, PlanningPolicy, Policy, on_arrays, only_choices
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.env.lookahead import CellSimulator
@@ -113,62 +113,65 @@ def play(
         limit_s: Most time for a decision, s of real time.
     """
     library, channel = _library(fleet), fleet.scenario.channel(channel)
-    exchanges = None if channel.perfect else [Exchange(library.arms, channel) for _ in seeds]
-    env = BatchEnv(
-        library,
-        len(seeds),
-        seed=list(seeds),
-        weights=weights_of(fleet.scenario),
-        autoreset=False,
-        exchanges=exchanges,
-        scaled=False,
-        ahead_s=np.inf,
-    )
-    obs, _ = env.reset()
-    heat = HeatUse(env.temp_c, fleet.scenario.people.burn_c)
-    running = np.ones(len(seeds), dtype=bool)
+    running, time_s = np.ones(len(seeds), dtype=bool), np.zeros(len(seeds))
     results: dict[int, ShiftResult] = {}
     policies: dict[int, Policy] = {}
-    limit, dt_s, tick = DecisionLimit(limit_s), library.tables.dt_s, 0
+    limit, dt_s = DecisionLimit(limit_s), library.tables.dt_s
 
     @contextmanager
-    def guarded(e: int) -> Iterator[None]:
+    def guarded(envs: Sequence[int]) -> Iterator[None]:
         try:
             with limit.decision():
                 yield
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # of the policy
-            results[e], running[e] = ShiftResult(None, 0, error, tick * dt_s), False
+            for e in envs:
+                results[e], running[e] = ShiftResult(None, 0, error, float(time_s[e])), False
 
-    def after_step(reward: Array, ended: Array) -> None:
-        nonlocal tick
-        tick += 1
-        heat.add(env.temp_c, dt_s)
+    def after_step(reward: Array, elapsed_s: Array, ended: Array) -> None:
+        time_s[:] += elapsed_s
         if not ended.any():
             return
         state = env.state
         for e in np.flatnonzero(ended).tolist():
             shift = library.draw(np.random.SeedSequence(int(seeds[e])))
             value = library.tables.value[shift.fleet, shift.kind]
+            heat = HeatUse(start_c[e], fleet.scenario.people.burn_c)
+            heat.add(env.path_c[e, : state.tick[e]], dt_s)
             found = Outcome(
                 **common_figures(state, e, value, shift.due_s, dt_s),
                 reward=float(reward[e]),
                 peak_c=float(state.peak_c[e].max()),
-                insulation_ppb=float(heat.insulation_ppb[e].max()),
-                tool_drift_mm=float(heat.tool_drift_mm[e].max()),
-                hot_surface_min=float(heat.hot_surface_min[e].sum()),
+                insulation_ppb=float(heat.insulation_ppb.max()),
+                tool_drift_mm=float(heat.tool_drift_mm.max()),
+                hot_surface_min=float(heat.hot_surface_min.sum()),
             )
             results[e] = ShiftResult(found, int(state.illegal[e].sum()))
 
     with limit.watching():
         for e, seed in enumerate(seeds):
-            with guarded(e):
+            with guarded([e]):
                 policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
+        waits = channel.perfect and all(only_choices(each) for each in policies.values())
+        env = BatchEnv(
+            library,
+            len(seeds),
+            seed=list(seeds),
+            weights=weights_of(fleet.scenario),
+            autoreset=False,
+            exchanges=None if channel.perfect else [Exchange(library.arms, channel) for _ in seeds],
+            decisions="events" if waits else "interval",
+            scaled=False,
+            ahead_s=np.inf,
+            keep_path=True,
+        )
+        obs, _ = env.reset()
+        start_c = env.temp_c.copy()
         for e, each in policies.items():
             if isinstance(each, PlanningPolicy):
                 cell = env.lookahead(_simulator(fleet), e)  # may compile, which is no time of the policy
-                with guarded(e):
+                with guarded([e]):
                     each.plan_in(cell)
         rollout(env, obs, acts_of(env, policies, guarded), running=running, after_step=after_step)
     policies.clear()  # the traceback of an error keeps this frame, and a policy may have an open connection
@@ -177,8 +180,9 @@ def play(
 
 Act = Callable[[Obs, Array], Array]
 """Actions, int [env, arm], of what the arms know and of the envs whose shift goes on, bool [env]."""
-AfterStep = Callable[[Array, Array], None]
-"""What is done after a step, with the reward so far [env] and the envs whose shift ended in it, bool [env]."""
+AfterStep = Callable[[Array, Array, Array], None]
+"""What is done after a step, with the reward so far [env], the length of the step, s, [env], and the envs whose shift
+ended in it, bool [env]."""
 
 
 def rollout(
@@ -192,11 +196,11 @@ def rollout(
     """
     reward, running = np.zeros(env.num_envs), np.ones(env.num_envs, dtype=bool) if running is None else running
     while running.any():
-        obs, earned, terminated, truncated, _ = env.step(act(obs, running))
+        obs, earned, terminated, truncated, info = env.step(act(obs, running))
         over = terminated | truncated
         reward += np.where(running, earned, 0.0)
         if after_step:
-            after_step(reward, over & running)
+            after_step(reward, info["elapsed_s"], over & running)
         running &= ~over
         if over.any() and running.any() and not env.autoreset:
             obs, _ = env.reset(rows=over)
@@ -206,22 +210,27 @@ def rollout(
 def acts_of(
     env: BatchEnv,
     policies: Mapping[int, Policy],
-    guarded: Callable[[int], AbstractContextManager[None]] = lambda e: nullcontext(),
+    guarded: Callable[[Sequence[int]], AbstractContextManager[None]] = lambda envs: nullcontext(),
 ) -> Act:
     """The actions of one policy of a kind for each env; those that want to choose only are asked if there is a choice.
 
     Args:
         policies: By env, each at the beginning of its shift.
-        guarded: Context of the decision of an env.
+        guarded: Context of the decisions of some envs: of one, or of all if the policy decides on arrays.
     """
     only_when_asked = bool(policies) and only_choices(next(iter(policies.values())))
+    together = on_arrays(policies, env.agents)
 
     def act(obs: Obs, running: Array) -> Array:
         mask = obs["action_mask"]
         asked = running & mask[..., 1:-1].any(axis=(1, 2)) if only_when_asked else running
-        actions = np.full(mask.shape[:2], WAIT)
-        for e in np.flatnonzero(asked).tolist():
-            with guarded(e):
+        actions, envs = np.full(mask.shape[:2], WAIT), np.flatnonzero(asked)
+        if together and len(envs):
+            with guarded(envs.tolist()):
+                actions[envs] = together(envs, env.layout.read_parts(obs["shared"][envs], obs["own"][envs], mask[envs]))
+            return actions
+        for e in envs.tolist():
+            with guarded([e]):
                 actions[e] = actions_of(env.agents, policies[e].act(known_in(env, e, obs)))
         return actions
 

@@ -106,16 +106,20 @@ class HeatUse:
         self._drift_m = np.zeros(self._rate.shape[:-1])
 
     def add(self, temp_c: Array, dt_s: float) -> None:
-        """Add a step of `dt_s` that ends at these temperatures, °C, [..., arm, node]."""
-        rate = arrhenius_rate(temp_c[..., WINDING])
-        self._used += life_used(self._rate, rate, dt_s)
-        self._rate = rate
+        """Add steps one after the other.
+
+        Args:
+            temp_c: Temperatures at their ends, °C, [step, ..., arm, node].
+            dt_s: Length of each, s.
+        """
+        rate = np.concatenate([self._rate[None], arrhenius_rate(temp_c[..., WINDING])])
+        self._used += life_used(rate[:-1], rate[1:], dt_s).sum(axis=0)
         rise_k = segment_temperatures(temp_c[..., HOUSING]) - self._start_c
-        np.maximum(self._drift_m, most_drift_m(rise_k), out=self._drift_m)
-        now_c = surface_c(temp_c)
-        self._hot_s += seconds_above(self._surface_c, now_c, self._burn_c, dt_s)
-        np.maximum(self.surface_c, now_c, out=self.surface_c)
-        self._surface_c = now_c
+        np.maximum(self._drift_m, most_drift_m(rise_k).max(axis=0), out=self._drift_m)
+        each_c = np.concatenate([self._surface_c[None], surface_c(temp_c)])
+        self._hot_s += seconds_above(each_c[:-1], each_c[1:], self._burn_c, dt_s).sum(axis=0)
+        np.maximum(self.surface_c, each_c.max(axis=0), out=self.surface_c)
+        self._rate, self._surface_c = rate[-1], each_c[-1]
 
     @property
     def insulation_ppb(self) -> Array:

@@ -172,7 +172,7 @@ class _Recorder:
 
     def __call__(self, record: StepRecord) -> None:
         self.heat = self.heat or HeatUse(record.start_c[0], self._burn_c)
-        self.heat.add(record.end_c[0], self._dt_s)
+        self.heat.add(record.end_c, self._dt_s)
         if not self._reads:
             return
         self._records.append(record)

@@ -13,9 +13,8 @@ from agents.learned.policy import save_policy
 from agents.learned.ppo import PpoConfig, Trainer, imitate
 from fleet.engine.batch import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
-from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
-from scenarios.evaluate.rollout import Act, acts_of, known_in, rollout
+from scenarios.evaluate.rollout import Act, acts_of, rollout
 from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.batch import library_of
 from scenarios.prepare.fleet import prepare
@@ -169,12 +168,13 @@ def _demonstrations(env: BatchEnv, rule: str, progress: Progress) -> Iterator[tu
     policies = [policy_of(rule) for _ in range(env.num_envs)]
     for policy, child in zip(policies, np.random.SeedSequence(0).spawn(env.num_envs), strict=True):
         policy.reset(np.random.default_rng(child))
+    act, everywhere = acts_of(env, dict(enumerate(policies))), np.ones(env.num_envs, dtype=bool)
     obs, _ = env.reset()
     for number in range(DEMONSTRATIONS):
         progress(f"imitating {rule}", Count(number, DEMONSTRATIONS))
         rows: list[tuple[Array, Array, Array]] = []
         for _ in range(STEPS):
-            actions = np.array([actions_of(env.agents, p.act(known_in(env, e, obs))) for e, p in enumerate(policies)])
+            actions = act(obs, everywhere)
             rows.append((env.layout.join(obs["shared"], obs["own"]), obs["action_mask"], actions))
             obs, *_ = env.step(actions)
         vectors, masks, actions = (np.concatenate(part) for part in zip(*rows, strict=True))

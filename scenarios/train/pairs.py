@@ -103,10 +103,7 @@ def rewards(instance: TrainingInstance, parameters: Array, seeds: Sequence[int])
         asked = np.flatnonzero(running & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
         if len(asked):
             seen = env.layout.read_parts(obs["shared"][asked], obs["own"][asked], obs["action_mask"][asked])
-            score = scores(seen, parameters[asked])
-            for k in np.flatnonzero(np.isfinite(score).any(axis=(1, 2))).tolist():
-                for arm, option in matched_options(-score[k], env.layout.plans):
-                    actions[asked[k], arm] = 1 + option
+            actions[asked] = 1 + matched_options(-scores(seen, parameters[asked]), env.layout.plans)
         return actions
 
     return rollout(env, env.reset(seed=list(seeds))[0], act)

@@ -11,22 +11,25 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from agents.auction import NOBODY, agree, auction
+from agents.policy import one_fleet
 from agents.registry import RULES, make_policy
-from agents.rules import RISK, cheapest_pairs, matching, quickest, thermal
+from agents.rules import NONE, RISK, cheapest_options, matched_options, quickest, thermal
 from fleet.observation import LONG_S, Layout, Observation
 from tests.agents.observations import observation
 from tests.profiles import examples
 
 INF = np.inf
-ASSIGNMENTS = {"ssi": cheapest_pairs, "matching": matching}
+ASSIGNMENTS = {"ssi": cheapest_options, "matching": matched_options}
 COSTS = {"thermal": thermal, "quickest": quickest}
+
+
+CELL = st.sampled_from([-2.0, 0.0, 0.5, 0.5, 1.0, 3.0, 10.0, INF])
 
 
 @st.composite
 def costs(draw) -> np.ndarray:
     arms, jobs = draw(st.integers(1, 4)), draw(st.integers(1, 4))
-    cell = st.sampled_from([-2.0, 0.0, 0.5, 0.5, 1.0, 3.0, 10.0, INF])
-    return np.array(draw(st.lists(st.lists(cell, min_size=jobs, max_size=jobs), min_size=arms, max_size=arms)))
+    return np.array(draw(st.lists(st.lists(CELL, min_size=jobs, max_size=jobs), min_size=arms, max_size=arms)))
 
 
 def allowed(cost: np.ndarray, pairs: list[tuple[int, int]]) -> bool:
@@ -47,33 +50,42 @@ def worth(cost: np.ndarray, pairs: list[tuple[int, int]]) -> tuple[int, float]:
     return -len(pairs), float(sum(cost[a, j] for a, j in pairs))
 
 
+def pairs_of(options: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs (arm, option)."""
+    return [(arm, option) for arm, option in enumerate(options.tolist()) if option != NONE]
+
+
 @examples(200)
 @given(costs())
 def test_matching_is_the_best_of_all_assignments(cost):
     best = min(worth(cost, pairs) for pairs in every_assignment(cost))
-    assert allowed(cost, matching(cost))
-    assert worth(cost, matching(cost)) == pytest.approx(best)
+    pairs = pairs_of(matched_options(cost, 1))
+    assert allowed(cost, pairs)
+    assert worth(cost, pairs) == pytest.approx(best)
 
 
 @examples(200)
-@given(costs())
-def test_ssi_leaves_nothing_that_an_arm_could_have(cost):
-    pairs = cheapest_pairs(cost)
-    assert allowed(cost, pairs)
-    for arm, job in np.argwhere(np.isfinite(cost)).tolist():
-        assert not allowed(cost, [*pairs, (arm, job)])
-
-
-def test_ssi_takes_the_cheapest_pair_first_and_settles_ties_by_order():
-    assert cheapest_pairs(np.array([[1.0, 2.0], [0.0, 9.0]])) == [(1, 0), (0, 1)]
-    assert cheapest_pairs(np.array([[1.0, 1.0], [1.0, 1.0]])) == [(0, 0), (1, 1)]
+@given(st.data(), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3), st.integers(1, 3))
+def test_ssi_takes_the_cheapest_pair_first_in_each_of_many_fleets_and_settles_ties_by_order(
+    data, envs, arms, slots, plans
+):
+    cells = st.lists(CELL, min_size=envs * arms * slots * plans, max_size=envs * arms * slots * plans)
+    cost = np.array(data.draw(cells)).reshape(envs, arms, slots * plans)
+    found = cheapest_options(cost, plans)
+    for env in range(envs):
+        expected, jobs = {}, set()
+        for _, option, arm in sorted((cost[env, a, o], o, a) for a, o in np.argwhere(cost[env] < INF).tolist()):
+            if arm not in expected and option // plans not in jobs:
+                expected[arm] = option
+                jobs.add(option // plans)
+        assert dict(pairs_of(found[env])) == expected
 
 
 @pytest.mark.parametrize("rule", ASSIGNMENTS.values(), ids=ASSIGNMENTS)
 def test_nothing_is_given_where_nothing_is_possible(rule):
-    assert rule(np.array([[INF, INF]])) == []
-    assert rule(np.zeros((0, 2))) == []
-    assert rule(np.zeros((2, 0))) == []
+    assert rule(np.array([[INF, INF]]), 1).tolist() == [NONE]
+    assert rule(np.zeros((0, 2)), 1).tolist() == []
+    assert rule(np.zeros((2, 0)), 1).tolist() == [NONE, NONE]
 
 
 # cost
@@ -96,22 +108,22 @@ def fleet(difficulty, **other) -> list[Observation]:
 
 def test_thermal_cost_is_difficulty_against_the_average_by_probability_and_unknown_is_average():
     # Job 0 is new to both twins; what counts is who finds it easier.
-    assert thermal(fleet([[5.0, 1.0], [5.5, 0.2]])).tolist() == [[-0.25, 0.4], [0.25, -0.4]]
+    assert thermal(one_fleet(fleet([[5.0, 1.0], [5.5, 0.2]])))[0].tolist() == [[-0.25, 0.4], [0.25, -0.4]]
     # Alike but for the risk: 1·(1 + RISK·0.5) against 1.
-    cost = thermal(fleet([[1.0], [1.0]], p_saturation=[[0.5], [0.0]]))
+    cost = thermal(one_fleet(fleet([[1.0], [1.0]], p_saturation=[[0.5], [0.0]])))[0]
     assert cost[:, 0].tolist() == [RISK / 4, -RISK / 4]
     nan = np.nan
-    assert thermal(fleet([[2.0], [nan], [4.0]]))[:, 0].tolist() == [-1.0, 0.0, 1.0]
-    cost = thermal(fleet([[np.nan], [np.nan]], duration_s=[[600.0], [60.0]]))
+    assert thermal(one_fleet(fleet([[2.0], [nan], [4.0]])))[0][:, 0].tolist() == [-1.0, 0.0, 1.0]
+    cost = thermal(one_fleet(fleet([[np.nan], [np.nan]], duration_s=[[600.0], [60.0]])))[0]
     assert cost[1, 0] < cost[0, 0]
 
 
 def test_late_and_valuable_work_comes_first_and_quickest_is_the_time_until_the_finish():
     late = {"slack_s": [[-3600.0, 0.0, -3600.0]], "value": [1.0, 1.0, 4.0]}
-    cost = thermal(fleet([[1.0, 1.0, 1.0]], **late))[0]
+    cost = thermal(one_fleet(fleet([[1.0, 1.0, 1.0]], **late)))[0][0]
     assert cost[2] < cost[0] < cost[1]
     one, two = fleet([[9.0, 0.0], [0.0, 0.0]], duration_s=[[5.0, 7.0], [5.0, 7.0]])
-    assert quickest([one, replace(two, busy_s=np.float32(10.0))]).tolist() == [[5.0, 7.0], [15.0, 17.0]]
+    assert quickest(one_fleet([one, replace(two, busy_s=np.float32(10.0))]))[0].tolist() == [[5.0, 7.0], [15.0, 17.0]]
 
 
 @pytest.mark.parametrize("cost", COSTS.values(), ids=COSTS)
@@ -134,7 +146,7 @@ def test_every_cost_is_infinite_exactly_where_an_arm_may_not_claim(cost, data):
         replace(seen, action_mask=np.pad(row, 1, constant_values=(1, 0)).astype(np.int8))
         for seen, row in zip(some, legal, strict=True)
     ]
-    matrix = cost(some)
+    matrix = cost(one_fleet(some))[0]
     assert not np.isnan(matrix).any()
     assert (np.isposinf(matrix) == (legal == 0)).all()
 
@@ -143,9 +155,9 @@ def test_every_cost_is_infinite_exactly_where_an_arm_may_not_claim(cost, data):
 @given(st.lists(st.floats(0, 7), min_size=2, max_size=5), st.data())
 def test_more_risk_never_makes_an_arm_cheaper_than_before(difficulty, data):
     p = data.draw(st.lists(st.floats(0, 0.5), min_size=len(difficulty), max_size=len(difficulty)))
-    before = thermal(fleet([[d] for d in difficulty], p_saturation=[[x] for x in p]))[:, 0]
+    before = thermal(one_fleet(fleet([[d] for d in difficulty], p_saturation=[[x] for x in p])))[0][:, 0]
     p[0] += data.draw(st.floats(0, 0.5))
-    after = thermal(fleet([[d] for d in difficulty], p_saturation=[[x] for x in p]))[:, 0]
+    after = thermal(one_fleet(fleet([[d] for d in difficulty], p_saturation=[[x] for x in p])))[0][:, 0]
     assert (after[0] - after[1:] >= before[0] - before[1:] - 1e-8).all()
 
 

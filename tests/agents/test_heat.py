@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from agents.heat import FuzzySpeed, GuardedArm, GuardedFleet, Shutdown, TorqueLimiter, Wsept
 from agents.pairs import Worth, worth_per_second
-from agents.policy import WAIT, for_all_arms
+from agents.policy import WAIT, for_all_arms, one_fleet
 from agents.registry import WRAPPERS, make_policy
 from fleet.arm.model import ArmModel
 from fleet.env.allocation_v2 import parallel_env
@@ -58,7 +58,7 @@ def test_a_claim_of_positive_worth_is_made_and_its_worth_is_the_expectation() ->
     peak_c = 75.0 - 2.0 * Wsept.peak_sd_k
     assert peak_c == 70.0
     heat = 0.0227501 * (1.0 + Wsept.fault_price) + 0.05 * (10.0 / 30.0) * FAST / 60.0
-    rates = -Wsept().cost([seen([1.0], [peak_c, 95.0])])[0]
+    rates = -Wsept().cost(one_fleet([seen([1.0], [peak_c, 95.0])]))[0, 0]
     assert rates[0] == pytest.approx((1.0 - heat) / FAST, rel=1e-4)
     assert action("wsept", seen([heat * 1.01], [peak_c, 95.0])) == 1
     assert action("wsept", seen([heat * 0.9], [peak_c, 95.0])) == WAIT
@@ -69,11 +69,10 @@ def test_the_probability_of_a_fault_is_that_of_a_peak_above_the_error_limit(erro
     """Φ(0.4) and Φ(−2.8): a peak predicted as 68 °C, 1 K above or 7 K below the limit, with a deviation of 2.5 K."""
     one = seen([40.0], [68.0, 95.0], error_c=error_c)
     worth = 40.0 - p_fault * (40.0 + Wsept.fault_price) - 0.05 * (8.0 / 28.0) * FAST / 60.0
-    assert -Wsept().cost([one])[0, 0] == pytest.approx(worth / FAST, rel=1e-5)
-    batch = replace(one, **{name: np.asarray(each)[None, None] for name, each in vars(one).items()})
+    assert -Wsept().cost(one_fleet([one]))[0, 0, 0] == pytest.approx(worth / FAST, rel=1e-5)
     untrained = Worth(*np.zeros((len(Worth._fields), 1)))
     first = (np.array([0]), np.array([0]), np.array([0]))
-    assert worth_per_second(batch, first, untrained) == pytest.approx(worth / FAST, rel=1e-5)
+    assert worth_per_second(one_fleet([one]), first, untrained) == pytest.approx(worth / FAST, rel=1e-5)
     assert (action("wsept", seen([4.0], [68.0, 95.0], error_c=error_c)) == 1) == claims
 
 

@@ -10,7 +10,7 @@ from agents.heat import Wsept
 from agents.learned.evolution import Evolution, EvolutionConfig
 from agents.pairs import PAIRS, PAIRS_CARD, PARAMETERS, PairPolicy, Worth, load_pairs, save_pairs, scores
 from fleet.errors import CheckpointError
-from fleet.observation import FIELDS, LONG_S, Layout, Observation
+from fleet.observation import FIELDS, LONG_S, Layout, LazyObservation, Observation
 from scenarios.policy_loader import policy_of, scope_of
 
 LAYOUT = Layout(5, 6, plans=2)
@@ -58,7 +58,7 @@ def of_arms(seen: Observation) -> dict[str, Observation]:
 
 def batched(seen: Observation) -> Observation:
     """With an axis of one env."""
-    return replace(seen, **{name: getattr(seen, name)[None] for name in vars(seen)})
+    return LazyObservation(lambda name: getattr(seen, name)[None])
 
 
 def trained(rng: np.random.Generator) -> np.ndarray:
@@ -100,8 +100,7 @@ def test_envs_of_a_batch_do_not_affect_each_other() -> None:
     rng = np.random.default_rng(2)
     several = [drawn(rng) for _ in range(3)]
     parameters = np.stack([trained(rng) for _ in range(3)])
-    names = vars(several[0])
-    together = Observation(**{name: np.stack([getattr(each, name) for each in several]) for name in names})
+    together = LazyObservation(lambda name: np.stack([getattr(each, name) for each in several]))
     found = scores(together, parameters)
     for e, seen in enumerate(several):
         alone = scores(batched(seen), parameters[e : e + 1])

@@ -274,7 +274,7 @@ def test_a_guard_stops_claims_of_a_planner(small):
         (lambda s, d: (s._replace(arm=s.arm - 1), d), "The arm of a schedule must be an integer from 0 to 2"),
         (lambda s, d: (s._replace(arm=s.arm + 3), d), "from 0 to 2"),
         (lambda s, d: (s._replace(option=s.option + 0.5), d), "option of a schedule must be an integer from 0 to 0"),
-        (lambda s, d: (s, d[1:]), "one for each step"),
+        (lambda s, d: (s, np.ones(len(d) + 1)), "one for each step"),
         (lambda s, d: (s, d * np.nan), "finite factors"),
     ],
 )

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from agents.policy import WAIT, EveryArm, for_all_arms, only_choices
+from agents.policy import WAIT, EveryArm, for_all_arms, on_arrays, only_choices
 from agents.registry import RULES, make_policy
 from agents.rules import RandomLegal, Wspt, WsptCool
 from fleet.env.allocation_v2 import parallel_env
-from fleet.observation import LONG_S, Observation
+from fleet.observation import FIELDS, LONG_S, Observation
 from tests.agents.observations import observation, with_peers
 from tests.profiles import examples
 
@@ -124,6 +124,34 @@ def test_every_rule_lets_a_single_free_arm_work(name) -> None:
 def test_an_unknown_rule_names_the_nearest() -> None:
     with pytest.raises(ValueError, match="No policy 'coolest'; did you mean 'coolest_first'"):
         make_policy("coolest")
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_fleets_side_by_side_get_the_actions_of_each_alone(name) -> None:
+    draw = rng(1)
+    alone, together = ({e: make_policy(name) for e in range(4)} for _ in range(2))
+    for e in range(4):
+        alone[e].reset(rng(e))
+        together[e].reset(rng(e))
+    decide = on_arrays(together, ("arm_0", "arm_1", "arm_2"))
+    if decide is None:
+        assert name == "rolling_horizon"
+        return
+    for _ in range(20):
+        envs = np.flatnonzero(draw.random(4) < 0.7)
+        fleets = [
+            fleet(np.where(draw.random((3, 5)) < 0.3, np.nan, draw.integers(0, 4, (3, 5))).tolist(),
+                  mask=draw.integers(0, 2, (3, 5)).tolist(), headroom_k=draw.integers(0, 3, 3).tolist())
+            for _ in envs
+        ]  # fmt: skip
+        if not len(envs):
+            continue
+        expected = [list(alone[e].act(seen).values()) for e, seen in zip(envs.tolist(), fleets, strict=True)]
+        names = [*(field.name for field in FIELDS), "action_mask"]
+        stacked = {
+            name: np.stack([[getattr(seen, name) for seen in each.values()] for each in fleets]) for name in names
+        }
+        assert decide(envs, Observation(**stacked)).tolist() == expected
 
 
 # round_robin

@@ -13,6 +13,7 @@ from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.state import DONE, WAITING, State, World
 from fleet.env.allocation_v2 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
+from fleet.observation import FIELDS, Observation
 from fleet.robot import JOINTS
 from scenarios.spec.parse import parse_scenario
 from scenarios.spec.schema import Scenario
@@ -69,6 +70,11 @@ def plain(trace: Any) -> Any:
     if isinstance(trace, list | tuple):
         return [plain(value) for value in trace]
     return trace.tolist() if isinstance(trace, np.ndarray) else trace
+
+
+def named(observed: Observation) -> dict[str, Any]:
+    """Every field of an observation by its name."""
+    return {name: getattr(observed, name) for name in (*(field.name for field in FIELDS), "action_mask")}
 
 
 def rows(given: Any, which: Any) -> dict[str, Any]:
@@ -151,8 +157,8 @@ class Learned:
 def play() -> SimpleNamespace:
     """Play environments through, and compare what they returned."""
     return SimpleNamespace(
-        wild=wild, go_on=go_on, chosen=chosen, slots_of=slots_of, plain=plain, rows=rows, same=same, single=single,
-        digest=digest, Learned=Learned, PATH=__file__,
+        wild=wild, go_on=go_on, chosen=chosen, slots_of=slots_of, plain=plain, named=named, rows=rows, same=same,
+        single=single, digest=digest, Learned=Learned, PATH=__file__,
     )  # fmt: skip
 
 

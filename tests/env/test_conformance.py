@@ -231,7 +231,7 @@ def test_returned_objects_belong_to_the_caller(make, play, keep_events) -> None:
             observed.action_mask[:] = 0
         assert play.plain(env.state()) == play.plain(untouched.state())
         for arm, observed in untouched.knowledge().items():
-            assert play.plain(vars(env.knowledge()[arm])) == play.plain(vars(observed))
+            assert play.plain(play.named(env.knowledge()[arm])) == play.plain(play.named(observed))
         env.agents.reverse()
         handed, kept = env.step(play.wild(env, rng)), untouched.step(play.wild(untouched, other))
 
@@ -250,10 +250,10 @@ def test_returned_arrays_of_a_batch_belong_to_the_caller(batch, play) -> None:
         for values in (*handed[1:-1], *env.state):
             values[...] = 1
         if step % 3 == 0:  # reading may refresh cached arrays
-            for values in vars(env.knowledge()).values():
+            for values in play.named(env.knowledge()).values():
                 if values.flags.writeable:
                     values[...] = 1
-            play.same(vars(env.knowledge()), vars(untouched.knowledge()))
+            play.same(play.named(env.knowledge()), play.named(untouched.knowledge()))
         play.same(env.state.named(), untouched.state.named())
         if step % 7 == 3:
             some = {"rows": [1, 4]}

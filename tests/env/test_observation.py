@@ -499,7 +499,7 @@ def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
     assert observed.peer_headroom_k[0].tolist() == [0.0, 5.0]
     assert observed.peer_working[0].tolist() == [0, 1]
     assert observed.peer_faulted[0].tolist() == [0, 0]
-    assert all(np.isfinite(values).all() for values in vars(observed).values())
+    assert all(np.isfinite(getattr(observed, field.name)).all() for field in FIELDS)
 
 
 def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:

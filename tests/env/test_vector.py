@@ -145,7 +145,8 @@ def test_a_row_with_an_exchange_equals_the_single_env(make, batch, play, e) -> N
         play.same({n: actual[n] for n in given[0]}, {n: values[[e]] for n, values in given[0].items()})
         for a, observed in enumerate(env.knowledge().values()):
             arrived.append(observed.peer_heard.mean())
-            play.same({n: values[e, a] for n, values in vars(many.knowledge()).items()}, vars(observed))
+            together = play.named(many.knowledge())
+            play.same({name: values[e, a] for name, values in together.items()}, play.named(observed))
         actions = play.chosen(given[0]["action_mask"], each)
         step = env.step(dict(zip(arms, actions[e].tolist(), strict=True)))
         actual, given = play.single(env, step), many.step(actions)
@@ -215,7 +216,7 @@ def test_autoreset_returns_the_first_observation_of_a_reset(batch, play) -> None
             play.same(one[0], fresh)
         else:
             play.same(one[0], other[0])
-        play.same(vars(by_itself.knowledge()), vars(by_hand.knowledge()))
+        play.same(play.named(by_itself.knowledge()), play.named(by_hand.knowledge()))
         play.same(by_itself.state.named(), by_hand.state.named())
     assert ends > 10
 
