@@ -147,7 +147,8 @@ def test_without_autoreset_a_mask_says_who_begins_anew(many) -> None:
         vector.step(vector.legal_sample())
     again, _ = vector.reset(options={"reset_mask": over})
     np.testing.assert_array_equal(again["observation"][~over], seen["observation"][~over])
-    np.testing.assert_array_equal(again["observation"][over, :, 0], 0.0)  # the clock
+    left_s = vector.batch.layout.read(again["observation"], again["action_mask"]).left_s
+    np.testing.assert_array_equal(left_s[over], 10.0 * BRIEF.get("ticks", TICKS))
 
 
 def test_a_seed_repeats_and_another_does_not(many) -> None:

@@ -103,7 +103,7 @@ def test_the_rows_are_the_arms_of_the_batch(small_batch, shift, kind) -> None:
     rows, batch = ArmsVecEnv(small_batch(num_envs=ENVS, **shift), observation=kind), small_batch(num_envs=ENVS, **shift)
     assert list(rows.seed(5)) == [5] * ARMS + [6] * ARMS + [7] * ARMS + [8] * ARMS
     seen = rows.reset()
-    obs, _ = batch.reset(5)
+    obs = batch.joined(batch.reset(5)[0])
     rng = np.random.default_rng(5)
     returns, ends = np.zeros(ENVS), 0
     for _ in range(40):
@@ -116,7 +116,8 @@ def test_the_rows_are_the_arms_of_the_batch(small_batch, shift, kind) -> None:
                 np.testing.assert_array_equal(seen["action_mask"][row], legal)
         actions = rng.integers(0, 5, ENVS * ARMS)
         seen, reward, over, infos = rows.step(actions)
-        obs, there, terminated, truncated, info = batch.step(actions.reshape(ENVS, ARMS))
+        parts, there, terminated, truncated, info = batch.step(actions.reshape(ENVS, ARMS))
+        obs, ended = batch.joined(parts), batch.joined(info["final_obs"])
         np.testing.assert_array_equal(reward, np.float32(there).repeat(ARMS))
         np.testing.assert_array_equal(over, (terminated | truncated).repeat(ARMS))
         returns += there
@@ -125,7 +126,7 @@ def test_the_rows_are_the_arms_of_the_batch(small_batch, shift, kind) -> None:
             env, arm = divmod(row, ARMS)
             assert bool(told) == (env in final)
             if told:
-                last = {key: value[final.index(env), arm] for key, value in info["final_obs"].items()}
+                last = {key: value[final.index(env), arm] for key, value in ended.items()}
                 here = (
                     {"observation": told["terminal_observation"]} if kind == "vector" else told["terminal_observation"]
                 )
