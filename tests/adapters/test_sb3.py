@@ -9,6 +9,8 @@ pytestmark = pytest.mark.adapter
 ARMS, ENVS, TICKS = 3, 4, 15
 BRIEF = {"jobs": 1, "ambient_c": 20.0, "ticks": 30}
 """Shifts of one job: every env finishes it, each at another time."""
+MANY = {"jobs": 16}
+"""More jobs than the arms can do until the horizon."""
 
 
 class Watch:
@@ -57,7 +59,7 @@ def trained(workshop, seed: int, *, observation: str = "vector", algo: str = "Ma
 @pytest.fixture(scope="module", params=["vector", "dict"])
 def session(request, small_workshop):
     """A training, what it left, and what reached the batch."""
-    workshop = small_workshop()
+    workshop = small_workshop(**MANY)
     return workshop.log, request.param, *trained(workshop, seed=0, observation=request.param), trained.agent
 
 
@@ -80,8 +82,8 @@ def test_it_counts_the_episodes(session) -> None:
 
 def test_a_seed_repeats_the_training_and_another_does_not(session, small_workshop) -> None:
     _, kind, _, after, _ = session
-    _, again = trained(small_workshop(), seed=0, observation=kind)
-    _, other = trained(small_workshop(), seed=1, observation=kind)
+    _, again = trained(small_workshop(**MANY), seed=0, observation=kind)
+    _, other = trained(small_workshop(**MANY), seed=1, observation=kind)
     for name in after:
         np.testing.assert_array_equal(again[name], after[name])
     assert any((other[name] != after[name]).any() for name in after)
