@@ -5,12 +5,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import RewardSum, TransformedEnv, check_env_specs
+from torchrl.envs import PettingZooWrapper, RewardSum, TransformedEnv, check_env_specs
 from torchrl.modules import MaskedCategorical
 from torchrl.objectives.value import GAE
 
 from fleet.engine.batch import TERMS
 from fleet.env.adapters.torchrl import TorchRLEnv
+from fleet.env.allocation_v2 import parallel_env
 from fleet.env.vector import BatchEnv
 
 ARMS, TICKS = 3, 15
@@ -273,3 +274,14 @@ def test_other_losses_take_the_expanded_flags(example) -> None:
     plain.set_keys(**keys, done=("arms", "done"), terminated=("arms", "terminated"))
     plain(frames)
     assert frames["advantage"].shape == frames["next", "arms", "reward"].shape
+
+
+@pytest.mark.parametrize("mask_in", ["obs", "info"])
+def test_torchrls_own_wrapper_takes_the_single_env(small, mask_in) -> None:
+    env = parallel_env(small.Shifts(arms=ARMS, ticks=TICKS), mask_in=mask_in)
+    with pytest.warns(UserWarning, match="PettingZoo in TorchRL"):
+        wrapped = PettingZooWrapper(env)
+    frames = wrapped.rollout(5)
+    assert frames["next", "arm", "action_mask"].any(-1).all()
+    vector = ("observation", "observation") if mask_in == "obs" else ("observation",)
+    assert frames[("next", "arm", *vector)].shape[-1] == env.layout.size

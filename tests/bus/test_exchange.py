@@ -1,5 +1,6 @@
 """The exchange in memory and on the bus: who hears whom through which channel, when, and what is then known."""
 
+import copy
 import json
 import os
 import pickle
@@ -7,6 +8,7 @@ import queue
 import subprocess
 import sys
 import threading
+import warnings
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -434,6 +436,24 @@ def test_a_closed_exchange_says_so(make_words):
     exchange.close()
     with pytest.raises(BusError, match="closed"):
         exchange.share(make_words(np.random.default_rng(0), 4, 0.0))
+
+
+def test_an_exchange_over_zenoh_stays_in_its_process(make_words):
+    """Its sessions have threads, which a copy, a pickle or a forked process does not have."""
+    exchange = ZenohExchange(ARMS, "stays")
+    for copied in (copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="neither copied nor pickled"):
+            copied(exchange)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # this process has threads
+        child = os.fork()
+    if not child:
+        try:
+            exchange.share(make_words(np.random.default_rng(0), len(ARMS), 0.0))
+        except BusError as error:
+            os._exit("belongs to process" not in str(error))
+        os._exit(2)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")

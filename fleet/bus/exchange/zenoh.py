@@ -7,10 +7,11 @@ of a shift depends neither on the load of the machine nor on others on the bus.
 
 import logging
 import math
+import os
 import weakref
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Self
+from typing import NoReturn, Self
 
 import numpy as np
 import zenoh
@@ -63,11 +64,23 @@ class ZenohExchange(Exchange):
         self._fleet, self._timeout_s = fleet, timeout_s
         self._endpoint = None if endpoint is None else reachable(endpoint)
         self._publishers: list[_ArmPublishers] = []
+        self._process = os.getpid()
         self._published = 0
         """Steps, over all episodes."""
         self._resources = ExitStack()
         # A process that exits without closing its router would hang.
         self._at_exit = weakref.finalize(self, self._resources.close)
+
+    def __getstate__(self) -> NoReturn:
+        """Refuse to be copied or pickled.
+
+        Raises:
+            TypeError: always: its connections belong to it.
+        """
+        raise TypeError(
+            "An exchange over Zenoh can be neither copied nor pickled: its connections belong to it. Make another "
+            "environment, or use bus='memory'."
+        )
 
     @property
     def perfect(self) -> bool:
@@ -113,6 +126,11 @@ class ZenohExchange(Exchange):
             ValueError: as an `Exchange`.
             BusError: the bus could not be opened, was lost, or is closed.
         """
+        if self._process != os.getpid():
+            raise BusError(
+                f"This exchange belongs to process {self._process}: a forked process has none of its connections. Make "
+                "the environment in the process that steps it, or use bus='memory'."
+            )
         view = super().share(broadcast)
         self.open()
         messages = messages_of(broadcast, self.arms, self._published)
