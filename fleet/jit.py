@@ -145,7 +145,7 @@ def _note_of(function: Callable[..., Any]) -> Path:
 
 @cache
 def _announce(folder: Path) -> None:
-    log.warning("Compiling the simulation engine (once, up to a minute of one core); cached in %s.", folder)
+    log.warning("Compiling the simulation engine (once, about half a minute of one core); cached in %s.", folder)
 
 
 def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
