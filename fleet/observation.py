@@ -375,7 +375,9 @@ class Layout:
         lead = own.shape[:-1]
         if peers is None:
             all_arms = len(lead) > 0 and lead[-1] == self.arms
-            peers = np.broadcast_to(self.peers, (*lead[:-1], *self.peers.shape)) if all_arms else self.peers[:0]
+            peers = (
+                np.broadcast_to(self.peers, (*lead[:-1], *self.peers.shape)) if all_arms else np.zeros((*lead, 0), int)
+            )
         return LazyObservation(partial(self._field, shared, own), peers=peers, action_mask=action_mask)
 
     def _field(self, shared: Array, own: Array, name: str) -> Array:

@@ -170,7 +170,7 @@ def test_normal_values_are_standard_normal_and_independent() -> None:
     assert np.mean(np.abs(values) < 1.0) == pytest.approx(0.6827, abs=0.003)
     assert np.mean(np.abs(values) > 3.0) == pytest.approx(0.0027, abs=0.0004)
     assert np.abs(np.corrcoef(values.reshape(-1, 3).T) - np.eye(3)).max() < 0.01
-    assert len(np.unique(values)) > 0.9 * LEVELS * (LEVELS + 1) / 2  # sums of two levels
+    assert len(np.unique(values)) > 0.99 * LEVELS * (LEVELS + 1) / 2  # sums of two of the table's values
 
 
 def test_a_value_depends_on_its_key_and_its_count_alone() -> None:

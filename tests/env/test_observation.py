@@ -85,6 +85,16 @@ def test_the_vector_is_both_parts_one_after_the_other() -> None:
         assert layout.shared == sum(int(np.prod(layout.shape(f))) for f in FIELDS[:place])
 
 
+def test_the_peers_of_an_unknown_arm_are_unknown() -> None:
+    layout = Layout(3, 4)
+    alone, all_ = (
+        layout.read(np.zeros((*lead, layout.size), np.float32), np.ones((*lead, layout.actions), np.int8))
+        for lead in ((), (2, 3))
+    )
+    assert (alone.peer_age_s.shape, alone.peer_difficulty.shape, alone.fleet_age_s.shape) == ((0,), (0, 4), (3,))
+    assert (all_.peer_age_s.shape, all_.peer_difficulty.shape) == ((2, 3, 2), (2, 3, 2, 4))
+
+
 def test_the_scales_are_powers_of_two() -> None:
     layout = Layout(4, 16, plans=2, scaled=True)
     assert (np.frexp(layout.scales)[0] == 0.5).all()
