@@ -5,7 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from fleet.observation import Layout, Observation
+from fleet.observation import FIELDS, Layout, Observation
+
+NAMES = (*(field.name for field in FIELDS), "peers", "action_mask")
+"""Names of the fields of an observation."""
 
 
 def observation(
@@ -32,7 +35,7 @@ def observation(
     layout = Layout(peers + 1, slots, plans=plans)
     mask = np.concatenate([[1], np.broadcast_to(legal, slots * plans), [gives_back]]).astype(np.int8)
     blank = layout.read(np.zeros((peers + 1, layout.size), np.float32), np.tile(mask, (peers + 1, 1)))
-    first = Observation(**{name: values[place] for name, values in vars(blank).items()})
+    first = Observation(**{name: getattr(blank, name)[place] for name in NAMES})
     base = {
         "group": np.arange(1.0, slots + 1.0),
         "duration_s": np.ones(slots * plans),

@@ -15,7 +15,7 @@ from agents.policy import one_fleet
 from agents.registry import RULES, make_policy
 from agents.rules import NONE, RISK, cheapest_options, matched_options, quickest, thermal
 from fleet.observation import LONG_S, Layout, Observation
-from tests.agents.observations import observation
+from tests.agents.observations import NAMES, observation
 from tests.profiles import examples
 
 INF = np.inf
@@ -201,7 +201,7 @@ def test_a_central_policy_reads_no_messages(name, seed):
     modes = np.eye(3)[rng.integers(0, 3, 3)]  # an arm is idle, working or faulted
     alike = {"working": modes[:, 1], "faulted": modes[:, 2]}
     first, other = (
-        [Observation(**{field: values[arm] for field, values in vars(seen).items()}) for arm in range(3)]
+        [Observation(**{field: getattr(seen, field)[arm] for field in NAMES}) for arm in range(3)]
         for seen in (replace(layout.read(each, mask), **alike) for each in vectors)
     )
     told = [

@@ -15,8 +15,8 @@ from agents.policy import WAIT, EveryArm, for_all_arms, on_arrays, only_choices
 from agents.registry import RULES, make_policy
 from agents.rules import RandomLegal, Wspt, WsptCool
 from fleet.env.allocation_v2 import parallel_env
-from fleet.observation import FIELDS, LONG_S, Observation
-from tests.agents.observations import observation, with_peers
+from fleet.observation import LONG_S, Observation
+from tests.agents.observations import NAMES, observation, with_peers
 from tests.profiles import examples
 
 
@@ -147,9 +147,8 @@ def test_fleets_side_by_side_get_the_actions_of_each_alone(name) -> None:
         if not len(envs):
             continue
         expected = [list(alone[e].act(seen).values()) for e, seen in zip(envs.tolist(), fleets, strict=True)]
-        names = [*(field.name for field in FIELDS), "action_mask"]
         stacked = {
-            name: np.stack([[getattr(seen, name) for seen in each.values()] for each in fleets]) for name in names
+            name: np.stack([[getattr(seen, name) for seen in each.values()] for each in fleets]) for name in NAMES
         }
         assert decide(envs, Observation(**stacked)).tolist() == expected
 
