@@ -14,7 +14,6 @@ from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, WINDING, drive_heat, gen3_network, thermal_model
 from fleet.motion import drive
 from fleet.robot import Mount, Robot
-from scenarios.prepare import twins
 from scenarios.prepare import twins as rehearse
 from scenarios.prepare.arms import ArmHardware, PlannedArm
 from scenarios.prepare.twins import cold_peaks, cool_plans, records, require_cool_plans
@@ -62,7 +61,7 @@ def test_a_fleet_that_gets_hot_at_everything_is_told_what_to_change(plans, scena
 
 
 def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, tmp_path, tiny, monkeypatch):
-    monkeypatch.setattr(twins, "cpu_count", lambda: 1)
+    monkeypatch.setattr("joblib.cpu_count", lambda: 1)
     told = []
     first = rehearse.train_twins(scenario, arms(2, plans), tmp_path, lambda *tell: told.append(tell))
     assert told[-1] == ("training", 1.0)
@@ -71,7 +70,7 @@ def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, t
     def never(*_args, **_more):
         raise AssertionError("trained again")
 
-    monkeypatch.setattr(twins, "worker_processes", never)
+    monkeypatch.setattr("scenarios.processes.worker_processes", never)
     again = rehearse.train_twins(scenario, arms(2, plans), tmp_path, silent)
     assert [t.version for t in again] == [t.version for t in first]
     other = replace(scenario, twin=replace(scenario.twin, cool_c=200.0))  # hot motion is in the records as well
@@ -82,7 +81,7 @@ def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, t
 @pytest.mark.ci_slow
 def test_twins_do_not_depend_on_how_many_work(plans, scenario, tmp_path, tiny, monkeypatch):
     both = rehearse.train_twins(scenario, arms(2, plans), tmp_path / "two", silent)
-    monkeypatch.setattr(twins, "cpu_count", lambda: 1)
+    monkeypatch.setattr("joblib.cpu_count", lambda: 1)
     alone = rehearse.train_twins(scenario, arms(2, plans), tmp_path / "one", silent)
     assert [t.version for t in both] == [t.version for t in alone]
 

@@ -43,7 +43,7 @@ def scenario(small_toml, plans, monkeypatch) -> Scenario:
 def fleet(scenario, monkeypatch, plans) -> list[Twin]:
     """The twins with which the scenario's fleet works."""
     monkeypatch.setattr(TwinConfig, "quick", classmethod(lambda cls: TINY))
-    monkeypatch.setattr("scenarios.prepare.twins.cpu_count", lambda: 1)
+    monkeypatch.setattr("joblib.cpu_count", lambda: 1)
     planned = plan_arms(scenario, range(2), rehearsal_works(scenario), plans, quiet)
     return train_twins(scenario, planned, plans, quiet)
 
