@@ -127,7 +127,7 @@ def trainer(small, **changes) -> Trainer:
         return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, decisions=config.decisions))
 
     config = PpoConfig(**{"envs": 8, "steps": 30, "minibatch": 128, **changes})
-    return Trainer([(make_env, Layout(2, 4, plans=library.tables.work.shape[3]))], config)
+    return Trainer([(make_env, BatchEnv(library, 1).layout)], config)
 
 
 def test_advantages_of_unequal_steps_in_closed_form() -> None:
