@@ -79,12 +79,12 @@ def optimum(world: World, weights: RewardWeights, at_least: float = -np.inf) -> 
 
 
 def _state_of(state: State, row: int) -> State:
-    return State(*(values[row].copy() for values in state))
+    return state.copy(slice(row, row + 1))
 
 
 def _load(engine: Engine, states: list[State], parts: Parts) -> None:
     """Put states into the first rows, and find their legal actions."""
-    for name, values in engine.state._asdict().items():
-        values[: len(states)] = np.stack([getattr(state, name) for state in states])
+    for values, *own in zip(engine.state, *states, strict=True):
+        values[: len(states)] = np.concatenate(own)
     engine.refresh()
     engine.observe(np.arange(engine.envs), parts)

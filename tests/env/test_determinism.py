@@ -217,7 +217,7 @@ def test_the_order_of_arms_does_not_matter(small, order, keep_events) -> None:
         for arm in names:
             mine, its = one.knowledge()[arm], other.knowledge()[arm]
             place = [other.possible_agents.index(name) for name in names]
-            for field, values in vars(mine).items():
+            for field, values in play.named(mine).items():
                 actual = getattr(its, field)
                 if field == "peers":
                     actual, values = (

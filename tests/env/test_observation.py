@@ -379,7 +379,7 @@ def test_options_of_arms_that_are_home_later_are_zero_and_others_unchanged(small
     while whole.tick < world.ticks:
         one, other = (layout.read_parts(*runner.parts, runner.mask) for runner in (whole, some))
         late = one.busy_s > ahead_s
-        for name, values in vars(one).items():
+        for name, values in play.named(one).items():
             if name in ("duration_s", "difficulty", "p_saturation", "peak_c", "blocked"):
                 hidden, shown = hidden + int((values[late] != 0).sum()), shown + int((values[~late] != 0).sum())
                 values = np.where(late[:, None], 0.0, values)
@@ -407,7 +407,7 @@ def test_scaled_values_times_their_scales_are_the_values(small, play, near) -> N
         np.testing.assert_array_equal(vectors * layout.scales, layout.join(*plain.parts))
         assert np.abs(vectors).max() < 30.0  # of order 1
         one, other = plain.layout.read_parts(*plain.parts, plain.mask), layout.read(vectors, scaled.mask)
-        for name, values in vars(one).items():
+        for name, values in play.named(one).items():
             np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
         actions = play.chosen(plain.mask, rng.random((3, 2)))
         plain.step(actions), scaled.step(actions)
@@ -651,7 +651,7 @@ def test_fields_of_the_nearest_peers_equal_those_of_all_peers(plans) -> None:
     rng = np.random.default_rng(0)
     for _ in range(40):
         whole, part = all_.knowledge(), few.knowledge()
-        for name, values in vars(whole).items():
+        for name, values in play.named(whole).items():
             if name == "peers":
                 values = np.tile(np.arange(2), (3, 4, 1))
             elif name.startswith("fleet_"):

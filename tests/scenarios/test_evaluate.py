@@ -315,8 +315,8 @@ def test_peaks_equal_those_of_a_shift(small, payload_kg, repetitions) -> None:
     plan = arms[0].plans[content][0]
     start = np.full(14, 25.0)
     (actual,) = peaks([plan], [10.0 * repetitions], motors=MOTORS, thermal=THERMAL, start_c=start, ambient_c=25.0)
-    assert actual == pytest.approx(state.temp_c[0, 0, WINDING], abs=1e-3)
-    assert actual.max() == pytest.approx(state.peak_c[0, 0], abs=1e-3)
+    assert actual == pytest.approx(state.temp_c[0, 0, WINDING], abs=5e-5)  # the engine has temperatures in float32
+    assert actual.max() == pytest.approx(state.peak_c[0, 0], abs=5e-5)
 
 
 @pytest.mark.parametrize("duration_s", [0.0, 2.0, 12.0, 99.0])
