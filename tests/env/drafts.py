@@ -48,7 +48,7 @@ def drafts(draw: Any) -> Draft:
     jobs = []
     for j in range(draw(st.integers(0, 10))):
         before = draw(st.frozensets(st.integers(0, j - 1), max_size=2)) if j else frozenset[int]()
-        release = draw(st.just(0.0) | st.floats(0.0, TICKS * DT_S, allow_nan=False))
+        release = draw(st.just(0.0) | st.floats(0.0, TICKS * DT_S, allow_nan=False, width=32))
         jobs.append((draw(st.integers(0, len(works) - 1)), draw(st.integers(1, 5)), release, before))
     return Draft(
         works=tuple(works),
