@@ -74,7 +74,7 @@ def plain(trace: Any) -> Any:
 
 def named(observed: Observation) -> dict[str, Any]:
     """Every field of an observation by its name."""
-    return {name: getattr(observed, name) for name in (*(field.name for field in FIELDS), "action_mask")}
+    return {name: getattr(observed, name) for name in (*(field.name for field in FIELDS), "peers", "action_mask")}
 
 
 def rows(given: Any, which: Any) -> dict[str, Any]:

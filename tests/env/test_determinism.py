@@ -192,7 +192,7 @@ def test_a_copy_of_a_batch_continues_identically(batch, play, way) -> None:
 
 @pytest.mark.parametrize("keep_events", [False, True])
 @pytest.mark.parametrize("order", [(2, 0, 1), (0, 2, 1), (2, 1, 0)])
-def test_the_order_of_arms_does_not_matter(small, order, keep_events) -> None:
+def test_the_order_of_arms_does_not_matter(small, play, order, keep_events) -> None:
     """Without sensor noise, which depends on the order of the arms."""
     exact = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
     works = [small.work(place, kg) for place in ("bench", "rack") for kg in (small.LIGHT, small.HOT)]

@@ -639,7 +639,7 @@ def test_the_peers_are_the_nearest_in_space(name, peers) -> None:
 
 
 @pytest.mark.ci_slow
-def test_fields_of_the_nearest_peers_equal_those_of_all_peers(plans) -> None:
+def test_fields_of_the_nearest_peers_equal_those_of_all_peers(plans, play) -> None:
     options = {"difficulty": "blind", "cache": plans, "horizon_s": 600}
     all_, few = (make_batch("quickstart", 3, seed=5, peers=n, **options) for n in (None, 2))
     single = make_env("quickstart", peers=2, **options)
