@@ -66,7 +66,16 @@ class Observation:
         Array, Field("jobs", (), "s", 0, LONG_S, 4096, "time until the end of the episode; 100000 without end")
     ]
     group: Annotated[
-        Array, Field("jobs", _SLOT, "1", 0, MOST_SLOTS, 16, "0 for an empty slot; jobs of a group exclude each other")
+        Array,
+        Field(
+            "jobs",
+            _SLOT,
+            "1",
+            0,
+            MOST_SLOTS,
+            16,
+            "0 if empty; jobs with one number share a station with the first of it",
+        ),
     ]
     station_free: Annotated[Array, Field("jobs", _SLOT, "1", 0, 1, 1, "1 when no arm occupies its stations")]
     age_s: Annotated[Array, Field("jobs", _SLOT, "s", 0, LONG_S, 1024, "time since its release or return to the queue")]

@@ -119,6 +119,7 @@ def test_three_quarters_of_the_arms_of_a_cell_can_work_at_once(cell) -> None:
 OTHERWISE = {
     **dict.fromkeys(("ssi", "matching", "matching_ahead", "wsept_learned"), "predictions from noisy sensors"),
     "quickest_matching": "two assignments that take equally long",
+    "mpc": "no schedule is simulated twice, and rewards of less than a hundredth do not count",
 }
 """Policies that claim other jobs than in the stored shift, and why: it had another stream of sensor noise, and float64.
 
