@@ -530,7 +530,9 @@ class Participant:
         bids = self._fresh_bids(real_s)
         if len(bids) < self.claimant.majority:
             return
-        early = self._present - bids.keys() or real_s < self.changed_s + QUIET_S
+        mine = {offer.job for offer in own.estimates}
+        behind = any(bid.capacity and not mine <= {offer.job for offer in bid.estimates} for bid in bids.values())
+        early = self._present - bids.keys() or behind or real_s < self.changed_s + QUIET_S
         if early and real_s < self._bid_s + self._timing.window_s:
             return
         self._new_bids, self._chosen_s, self.rounds = False, real_s, self.rounds + 1
