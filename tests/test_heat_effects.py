@@ -1,6 +1,7 @@
 """Insulation ageing, drift of the tool point, burns and housings: closed forms, sources, geometry of MuJoCo."""
 
 from itertools import pairwise
+from math import fsum
 
 import numpy as np
 import pytest
@@ -159,6 +160,15 @@ def test_surfaces_are_housings_and_their_hot_minutes_add_up():
     np.testing.assert_allclose(heat.hot_surface_min, [0.0, 12.0])
     np.testing.assert_allclose(heat.surface_c, [40.0, 60.0])
     np.testing.assert_allclose(surface_c(temp_c), [40.0, 60.0])
+
+
+def test_hot_minutes_add_up_in_float64_also_of_temperatures_in_float32():
+    """720 times through the limit; the sum by a second method, of exact sums."""
+    course_c = np.random.default_rng(1).uniform(46.0, 50.0, 721).astype(np.float32)
+    heat = HeatUse(np.full((1, 2 * JOINTS), course_c[0], np.float32), 48.0)
+    heat.add(np.broadcast_to(course_c[1:, None, None], (720, 1, 2 * JOINTS)), 10.0)
+    each_s = seconds_above(course_c[:-1].astype(float), course_c[1:].astype(float), 48.0, 10.0)
+    np.testing.assert_allclose(heat.hot_surface_min, fsum(each_s) / 60.0, rtol=1e-13)
 
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())

@@ -96,6 +96,7 @@ class HeatUse:
     """
 
     def __init__(self, temp_c: Array, burn_c: float) -> None:
+        temp_c = temp_c.astype(float)
         self._burn_c, self._surface_c = burn_c, surface_c(temp_c)
         self.surface_c = self._surface_c.copy()
         """Hottest surface of each arm so far, °C, [..., arm]."""
@@ -112,6 +113,7 @@ class HeatUse:
             temp_c: Temperatures at their ends, °C, [step, ..., arm, node].
             dt_s: Length of each, s.
         """
+        temp_c = temp_c.astype(float)  # sums over a shift need more digits than a temperature
         rate = np.concatenate([self._rate[None], arrhenius_rate(temp_c[..., WINDING])])
         self._used += life_used(rate[:-1], rate[1:], dt_s).sum(axis=0)
         rise_k = segment_temperatures(temp_c[..., HOUSING]) - self._start_c
