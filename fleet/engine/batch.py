@@ -337,8 +337,8 @@ class Engine:
         )  # fmt: skip
 
     def observe(self, envs: Array, out: Parts) -> None:
-        """Put what the arms of some envs know now into `out`."""
-        self._run(OFFER + OBSERVE, _NO_ACTIONS, _no_terms(self.envs), envs, out)
+        """Put what the arms of some envs know now into `out`, and what has become of them into `infos`."""
+        self._run(OFFER + OBSERVE, _NO_ACTIONS, np.empty((self.envs, OUTCOME)), envs, out)
 
     def step(self, actions: Array | None, out: Parts, until: Array | None = None) -> Array:
         """One decision interval of every env, or more.

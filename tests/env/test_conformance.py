@@ -178,6 +178,22 @@ def test_results_of_a_batch_are_in_its_spaces(batch, play) -> None:
         np.testing.assert_array_equal(np.flatnonzero(terminated | truncated), info["final_envs"])
 
 
+def test_infos_of_a_reset_are_of_the_new_shift(batch, small) -> None:
+    env = batch(4, HOT, seed=0)
+    for _ in range(2):
+        _, info = env.reset()
+        np.testing.assert_array_equal(info["peak_c"], env.state.peak_c)
+        assert info["peak_c"].min() > 0.0
+        assert not any(info[name].any() for name in ("faults", "illegal", "above_warning_s", "jobs_done"))
+        for _ in range(20):
+            env.step(np.full((4, 3), -1))
+    _, info = env.reset(rows=[0, 2])
+    assert (info["illegal"] > 0).any(axis=1).tolist() == [False, True, False, True]
+    single = allocation_v2.parallel_env(small.Shifts(arms=2))
+    _, infos = single.reset(seed=0)
+    assert [info["peak_c"] for info in infos.values()] == single.truth.peak_c[0].tolist()
+
+
 def fits(space: Any, observed: Any) -> None:
     """Assert that an observation is in its space and finite."""
     assert space.contains(observed)
