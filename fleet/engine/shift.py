@@ -187,7 +187,7 @@ class ShiftRunner:
         self._episode, self._watch = episode, watch
         at_once = exchange is None or exchange.perfect
         layout = layout or Layout(len(world.arms), world.slots, plans=world.plans_per_job)
-        self._layout = replace(layout, delivered=not at_once)
+        layout = replace(layout, delivered=not at_once)
         self._reports_contacts = keep_events and not episode.plant.follows_plans
         self._exchange = None if at_once else exchange
         self._delivered_before = 0
@@ -198,11 +198,9 @@ class ShiftRunner:
         tables, drawn = tables_of(world)
         room = world.jobs.exists.shape[1]
         trace = watch is not None or self._reports_contacts
-        self._engine = Engine(
-            tables, 1, self._layout, weights, jobs=room, events=keep_events, trace=trace, compiled=compiled
-        )
+        self._engine = Engine(tables, 1, layout, weights, jobs=room, events=keep_events, trace=trace, compiled=compiled)
         self._engine.reset(_FIRST, shifts_of(drawn, [episode.noise_key]))
-        self._parts = empty_parts(self._layout, 1)
+        self._parts = empty_parts(layout, 1)
         self._engine.observe(_FIRST, self._parts)
         self._deliver()
 
@@ -217,7 +215,7 @@ class ShiftRunner:
     @property
     def layout(self) -> Layout:
         """Of the observation."""
-        return self._layout
+        return self._engine.layout
 
     @property
     def parts(self) -> Parts:
@@ -244,7 +242,7 @@ class ShiftRunner:
         """Messages delivered to a peer."""
         if self._exchange is not None:
             return self._exchange.delivered - self._delivered_before
-        return self._layout.arms * (self._layout.arms - 1) * (self.tick + 1)
+        return self.layout.arms * (self.layout.arms - 1) * (self.tick + 1)
 
     @property
     def infos(self) -> list[tuple[float, float, float, float]]:

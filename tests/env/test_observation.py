@@ -543,7 +543,7 @@ def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
 
 
 def test_jobs_that_share_a_station_have_the_group_of_the_first(small) -> None:
-    """Three at the bench, of which one goes on to the rack."""
+    """Three jobs at the bench, one of them to the rack as well."""
     content = [small.work("bench"), small.work("press"), small.work("bench", to="rack"), small.work("rack"),
                small.work("bench", small.HOT)]  # fmt: skip
     world, _ = small.shop([[small.job(f"j{i}", each) for i, each in enumerate(content)]], slots=6)

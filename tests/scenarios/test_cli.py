@@ -46,12 +46,12 @@ def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml,
     said = thermofleet("run", small_toml, *QUICK, "--out", out)
     assert said.code == 0
     assert sorted(p.name for p in out.iterdir()) == sorted(FILES)
-    told = run_json(out)
-    assert told["status"] == "finished"
+    printed = run_json(out)
+    assert printed["status"] == "finished"
     for label in ("jobs finished", "value", "on time", "faults", "min above warning", "energy, Wh"):
         assert label in said.out
-    assert f"{told['metrics']['finished']} of {told['metrics']['jobs']}" in said.out
-    for arm, peak_c in told["metrics"]["peak_c"].items():
+    assert f"{printed['metrics']['finished']} of {printed['metrics']['jobs']}" in said.out
+    for arm, peak_c in printed["metrics"]["peak_c"].items():
         assert f"peak {arm}, °C" in said.out
         assert f"{peak_c:.1f}" in said.out
     assert str(out / "report.html") in said.out
@@ -76,9 +76,9 @@ def test_the_same_seed_gives_the_same_files_also_in_another_process(thermofleet,
 
 def test_json_is_one_object_and_nothing_else(thermofleet, small_toml, tmp_path):
     said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run", "--json")
-    told = json.loads(said.out)
-    assert told["out"] == str(tmp_path / "run")
-    assert told["metrics"] == run_json(tmp_path / "run")["metrics"]
+    printed = json.loads(said.out)
+    assert printed["out"] == str(tmp_path / "run")
+    assert printed["metrics"] == run_json(tmp_path / "run")["metrics"]
 
 
 def test_without_out_the_run_goes_into_runs(thermofleet, small_toml, tmp_path, monkeypatch):
@@ -128,8 +128,8 @@ def test_compare_prints_a_table_or_json_against_round_robin_or_the_first_policy(
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
     some = ("compare", small_toml, "--seeds", 2, "--difficulty", "blind", "--policies")
     for policies, baseline in (("random,coolest_first", "random"), ("random, round_robin", "round_robin")):
-        told = json.loads(thermofleet(*some, policies, "--json").out)
-        assert (set(told["figures"]), told["baseline"]) == (set(policies.replace(" ", "").split(",")), baseline)
+        printed = json.loads(thermofleet(*some, policies, "--json").out)
+        assert (set(printed["figures"]), printed["baseline"]) == (set(policies.replace(" ", "").split(",")), baseline)
     assert "min above warning" in thermofleet(*some, "random, round_robin").out
 
 
@@ -140,9 +140,9 @@ def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path):
     head = said.out.splitlines()[1].split()
     assert head == ["round_robin", "wsept", "difference"]
     for policy in head[:2]:
-        told = run_json(tmp_path / "demo" / policy)
-        assert (told["policy"], told["status"], told["scenario"]["name"]) == (policy, "finished", "quickstart")
-        assert f"{told['metrics']['above_warning_min']:.1f}" in said.out
+        printed = run_json(tmp_path / "demo" / policy)
+        assert (printed["policy"], printed["status"], printed["scenario"]["name"]) == (policy, "finished", "quickstart")
+        assert f"{printed['metrics']['above_warning_min']:.1f}" in said.out
         assert str(tmp_path / "demo" / policy / "report.html") in said.out
     page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
     for link in re.findall(r'href="([^"]+)"', page):
@@ -482,22 +482,22 @@ def test_options_make_a_channel(small_toml):
 
 
 def test_a_run_records_its_channel_and_is_the_same_over_either_bus(thermofleet, small_toml, tmp_path):
-    told = {}
+    printed = {}
     for bus in ("memory", "zenoh"):
         out = tmp_path / bus
         assert thermofleet("run", small_toml, *BLIND, *HARD, "--bus", bus, "--out", out).code == 0
-        told[bus] = json.loads((out / "run.json").read_text(encoding="utf-8"))
-    assert told["memory"]["channel"] == {
+        printed[bus] = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    assert printed["memory"]["channel"] == {
         "topology": "line",
         "delay_s": 20.0,
         "jitter_s": 5.0,
         "loss": 0.2,
         "partitions": [{"from_s": 30.0, "to_s": 60.0, "groups": [["left"], ["right"]]}],
     }
-    assert told["memory"] | {"bus": "zenoh"} == told["zenoh"]
+    assert printed["memory"] | {"bus": "zenoh"} == printed["zenoh"]
     assert (tmp_path / "memory/events.parquet").read_bytes() == (tmp_path / "zenoh/events.parquet").read_bytes()
     words = 2 * 19  # 18 ticks and the one of the reset, two links
-    assert 0 < told["memory"]["metrics"]["messages"] < words
+    assert 0 < printed["memory"]["metrics"]["messages"] < words
 
 
 def test_a_comparison_states_its_channel(thermofleet, small_toml):
