@@ -34,7 +34,7 @@ test-slow: $(STAMP)
 
 # The slow tests that CI runs: whole demos, notebooks, tutorials, builds.
 test-ci-slow: $(STAMP)
-	@$(BIN)/python -m pytest -n 2 --dist worksteal -m ci_slow
+	@$(BIN)/python -m pytest -n 2 --dist worksteal -m 'ci_slow and not slow'
 
 ifneq ($(filter $(ADAPTER),$(ADAPTERS)),)
 test-adapter: test-adapter-$(ADAPTER)

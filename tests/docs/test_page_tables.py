@@ -234,7 +234,7 @@ def test_pages_are_made_from_readme_docstrings_and_notebooks(site: Path) -> None
         assert content in (site / page).read_text(encoding="utf-8"), page
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_search_works_from_a_folder_without_network(site: Path) -> None:
     from playwright.sync_api import sync_playwright

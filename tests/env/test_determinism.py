@@ -334,7 +334,7 @@ def test_bus_and_watcher_do_not_change_a_run(fleet, recorded) -> None:
     assert over_zenoh.reward == recorded.reward
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_both_plants_agree_over_half_an_hour(cell, plans) -> None:
     """All arms in MuJoCo, with the actions recorded with the profile plant."""
     streams = tuple(replace(s, arrivals=replace(s.arrivals, stop_s=None)) for s in cell.jobs[:2])

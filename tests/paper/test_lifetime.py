@@ -158,7 +158,7 @@ def test_only_jobs_that_stayed_cool_over_the_horizon_are_learned_from(study):
     assert not any(day.peak_c[i].max() <= study.cool_c for day in days for i in range(6) if (id(day), i) not in chosen)
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_no_retraining_learns_from_hot_work(monkeypatch):
     learned = []
 

@@ -53,7 +53,7 @@ class Plain:
         return Features(np.full((len(plans), 7, PARTS), 0.1))
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_p_and_peaks_agree_with_the_outcomes_of_a_shift(monkeypatch) -> None:
     monkeypatch.setattr(
         twins, "train_twins", lambda scenario, planned, folder, progress, seed: [Plain()] * len(planned)

@@ -78,7 +78,7 @@ def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, t
         rehearse.train_twins(other, arms(2, plans), tmp_path, silent)
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_twins_do_not_depend_on_how_many_work(plans, scenario, tmp_path, tiny, monkeypatch):
     both = rehearse.train_twins(scenario, arms(2, plans), tmp_path / "two", silent)
     monkeypatch.setattr("joblib.cpu_count", lambda: 1)

@@ -211,7 +211,7 @@ with limit.watching(), limit.decision():
     assert "longer than 0.05 s, and the policy catches what should end it" in ended.stderr
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_shifts_of_a_process_that_dies_are_run_again(scenario, plans, bad, monkeypatch):
     monkeypatch.setattr(runner, "HERE_S", 0.0)
     told: list[str] = []

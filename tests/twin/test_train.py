@@ -249,7 +249,7 @@ def test_a_seed_gives_the_same_weights_and_leaves_global_states_alone(records, t
     assert torch.get_num_threads() == threads
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_another_process_trains_the_same_twin(records, tiny):
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         there = pool.submit(train, records[:8], tiny, SEED, arm="a").result(timeout=300)
