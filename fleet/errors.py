@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import chain
 from math import inf
 
 
@@ -137,14 +138,15 @@ def is_name(text: str) -> bool:
 
 
 def check_names(owner: object, *fields: str) -> None:
-    """Check that these fields, or all elements of a tuple, are names.
+    """Check that these fields, or all elements of a tuple of names or of such tuples, are names.
 
     Raises:
         ValueError: names the field, the value and the rule.
     """
     for field in fields:
         given = getattr(owner, field)
-        for name in given if isinstance(given, tuple) else (given,):
+        several = given if isinstance(given, tuple) else (given,)
+        for name in chain.from_iterable((each,) if isinstance(each, str) else each for each in several):
             if not is_name(name):
                 raise ValueError(f"{type(owner).__name__}.{field} must have {NAME_RULE} (got '{printable(name)}').")
 

@@ -25,6 +25,8 @@ LONGEST_JOB_S = 7 * 24 * 3600.0
 """Longest planned duration of a job."""
 
 
+MOST_ALTERNATIVES = 64
+"""Most alternative places of one job."""
 MOST_FAULTS_OF_ONE_ARM = 2
 MOST_FAULTS = 3
 """Faults of one arm, and of all arms together, after which a job is abandoned."""
@@ -91,6 +93,28 @@ def check_places(owner: object, kind: str, names: Sequence[str]) -> None:
     if len(names) != 1 + two or len(set(names)) != len(names):
         wanted = "two different places, from and to," if two else "one place"
         raise ValueError(f"{type(owner).__name__}.places must be {wanted} for a {kind} (got {', '.join(names)}).")
+
+
+def shared_stations(alternatives: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """The stations of the first alternative that all others need, too."""
+    first, *others = alternatives
+    return tuple(name for name in first if all(name in other for other in others))
+
+
+def check_alternatives(owner: object, kind: str, alternatives: Sequence[Sequence[str]]) -> None:
+    """Check the places of each alternative, and that there are not too many and none twice.
+
+    Raises:
+        ValueError: names the places.
+    """
+    for names in alternatives:
+        check_places(owner, kind, names)
+    if not 1 <= len(alternatives) <= MOST_ALTERNATIVES:
+        raise ValueError(
+            f"{type(owner).__name__}.places must have 1 to {MOST_ALTERNATIVES} alternatives (got {len(alternatives)})."
+        )
+    if len({tuple(names) for names in alternatives}) < len(alternatives):
+        raise ValueError(f"{type(owner).__name__}.places must name each alternative once (got {list(alternatives)}).")
 
 
 def check_dwell(owner: object, kind: str, dwell_s: float) -> None:
@@ -217,6 +241,18 @@ class Job:
     """Names of the jobs that must finish first."""
     expires: bool = False
     """A hard due date: a job that waits then is abandoned, also if an arm has begun and returned it."""
+    alternatives: tuple[Work, ...] = ()
+    """The same work at other places, any of which serves as well: parallel stations."""
+
+    @cached_property
+    def works(self) -> tuple[Work, ...]:
+        """The works of which one must be done."""
+        return (self.work, *self.alternatives)
+
+    @cached_property
+    def stations(self) -> tuple[str, ...]:
+        """Names of the stations that each of its works occupies."""
+        return shared_stations([work.stations for work in self.works])
 
     def __post_init__(self) -> None:
         check_bounds(self, "repetitions", "release_s", "value")

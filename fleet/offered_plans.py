@@ -24,13 +24,17 @@ AMBIENT_C = 25.0
 def offered_plans(variants: Sequence[Plan], repetitions: int) -> list[Plan]:
     """The fastest plan, then the coolest if it is clearly cooler (`COOLER_K`); empty without variants.
 
+    Where there are plans at other stations, the second plan is the coolest of those: one station may be taken.
+
     Args:
-        variants: Plans for the same work.
+        variants: Plans for the same work, or for works that serve alike.
         repetitions: Cycles of the job.
     """
     if not variants:
         return []
     fastest = min(variants, key=lambda plan: plan.duration_s(repetitions))
+    if elsewhere := [plan for plan in variants if not set(plan.work.stations) & set(fastest.work.stations)]:
+        return [fastest, elsewhere[int(predicted_rise(tuple(elsewhere), repetitions).argmin())]]
     rise_k = predicted_rise(tuple(variants), repetitions)
     coolest, least_k = variants[int(rise_k.argmin())], float(rise_k.min())
     most_k = float(rise_k[[plan is fastest for plan in variants]][0])

@@ -49,7 +49,7 @@ class Arm:
     """What the arm knows of its own heat, for its estimate of the housings; None: a nominal arm with its cooling."""
 
     @cached_property
-    def _offered(self) -> dict[Work, "ScoredPlans"]:
+    def _offered(self) -> dict[tuple[Work, ...], "ScoredPlans"]:
         return {}
 
     @cached_property
@@ -61,11 +61,12 @@ class Arm:
     def _driven(self) -> dict[int, tuple[Plan, tuple[Array, Array, Array, Array]]]:
         return {}
 
-    def offers(self, work: Work) -> "ScoredPlans":
-        """Its plans for a work, by number of repetitions; kept, because shift after shift asks for the same."""
-        if work not in self._offered:
-            self._offered[work] = ScoredPlans(self.model, self.plans.get(work, ()))
-        return self._offered[work]
+    def offers(self, *works: Work) -> "ScoredPlans":
+        """Its plans for works that serve alike, by repetitions; kept, because shift after shift asks for the same."""
+        if works not in self._offered:
+            variants = [plan for work in works for plan in self.plans.get(work, ())]
+            self._offered[works] = ScoredPlans(self.model, variants)
+        return self._offered[works]
 
     def driven(self, plan: Plan) -> tuple[Array, Array, Array, Array]:
         """Of one of its plans: durations, s, [phase], mean squared current and friction heat, [phase, joint], and
@@ -98,7 +99,7 @@ class Arm:
 
 
 class ScoredPlans(dict[int, list[tuple[Plan, Difficulty | None]]]):
-    """The plans on offer for a work by number of repetitions, with their scores; scored when first asked for."""
+    """The plans on offer for a job by number of repetitions, with their scores; scored when first asked for."""
 
     def __init__(self, model: DifficultyModel, variants: Sequence[Plan]) -> None:
         super().__init__()
@@ -152,13 +153,13 @@ def build_world(
     """
     motors, thermal, rest, phi, gamma, observer = _laws(tuple(arms), dt_s)
     plans, offers = _offers(arms, shifts, plans_per_job)
-    volume, conflicts = space(plans) if space and plans else (np.zeros(max(1, len(plans)), int), np.zeros((1, 1), bool))
+    volume, conflicts = (space or station_space)(plans) if plans else (np.zeros(1, int), np.zeros((1, 1), bool))
     start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
     housing_c = np.repeat(ambient_c[0][:, None], len(GEN3.velocity), axis=1)
     if start_warm:
         housing_c = np.stack([a.believed_housings(c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
         start = np.stack([warm_start(a, c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
-    stations = tuple(dict.fromkeys(name for jobs in shifts for job in jobs for name in job.work.stations))
+    stations = tuple(dict.fromkeys(name for jobs in shifts for job in jobs for name in job.stations))
     world = World(
         arms=tuple(arm.robot.name for arm in arms),
         stations=stations,
@@ -184,6 +185,15 @@ def build_world(
     return world, plans
 
 
+def station_space(plans: Sequence[Plan]) -> tuple[Array, Array]:
+    """Space of arms that never touch: plans exclude each other only at a station; see `Space`."""
+    numbers: dict[tuple[str, tuple[str, ...]], int] = {}
+    volume = [numbers.setdefault((plan.arm, plan.work.stations), len(numbers)) for plan in plans]
+    stations = list(dict.fromkeys(name for _, names in numbers for name in names))
+    needs = np.array([[station in names for station in stations] for _, names in numbers])
+    return np.array(volume, dtype=int), needs.astype(int) @ needs.T > 0
+
+
 @lru_cache(maxsize=8)
 def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Drive, Array, Array, HousingObserver]:
     """Motors, thermal models and rest of a fleet, [arm, ...], the matrices of a step, and the observers of the arms'
@@ -207,12 +217,14 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> 
         return -1 if forecast is None else forecasts.setdefault(id(forecast), (len(forecasts), forecast))[0]
 
     able = _arms_of_works(tuple(arms))
-    offered: dict[int, list[tuple[int, ScoredPlans]]] = {}  # by id: hashing a work takes longer than the rest
+    offered: dict[tuple[int, int], list[tuple[int, ScoredPlans]]] = {}  # by id: hashing takes longest
     for e, jobs in enumerate(shifts):
         for j, job in enumerate(jobs):
-            if id(job.work) not in offered:
-                offered[id(job.work)] = [(a, arms[a].offers(job.work)) for a in able.get(job.work, ())]
-            for a, offers in offered[id(job.work)]:
+            alike = id(job.work), id(job.alternatives)
+            if alike not in offered:
+                those = sorted({a for work in job.works for a in able.get(work, ())})
+                offered[alike] = [(a, arms[a].offers(*job.works)) for a in those]
+            for a, offers in offered[alike]:
                 for n, (offer, score) in enumerate(offers[job.repetitions][:most]):
                     if id(offer) not in rows:
                         rows[id(offer)] = len(plans)
@@ -275,5 +287,5 @@ def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobT
         repetitions=table(lambda job: job.repetitions, 1, int),
         after=lists(after),
         expires=table(lambda job: job.expires, False, bool),
-        stations=lists([[[station[name] for name in job.work.stations] for job in jobs] for jobs in shifts]),
+        stations=lists([[[station[name] for name in job.stations] for job in jobs] for jobs in shifts]),
     )

@@ -212,6 +212,7 @@ def job_spec(job: Job) -> JobSpec:
         value=job.value,
         after=job.after,
         expires=job.expires,
+        alternatives=tuple(tuple(place.name for place in work.places) for work in job.alternatives),
     )
 
 

@@ -8,6 +8,7 @@ import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from fleet.motion import Plan
 from fleet.robot import JOINTS, Robot
 from scenarios.prepare.shipped import unpack_shipped
 from scenarios.progress import Count, Progress
-from scenarios.spec.jobs import works_of
+from scenarios.spec.jobs import alternatives_of
 from scenarios.spec.schema import Scenario
 
 log = logging.getLogger(__name__)
@@ -182,10 +183,11 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
     infeasible = [error for arm in arms for error in arm.infeasible]
     possible = {work for arm in arms for work in arm.plans}
     for i, stream in enumerate(scenario.jobs if arms else ()):
-        loads = [f"{work.payload_kg:g}" for work in works_of(scenario, stream) if work not in possible]
+        loads = [f"{kg:g}" for kg in stream.payload_kg if possible.isdisjoint(alternatives_of(scenario, stream, kg))]
         if not loads:
             continue
-        here = [error for error in infeasible if error.place in stream.places]
+        names = set(chain.from_iterable(stream.alternatives))
+        here = [error for error in infeasible if error.place in names]
         reasons = list(dict.fromkeys(f"{error.arm} at '{error.place}': {error.reason}" for error in here))
         if near and any(reason.endswith("at home") for reason in reasons):
             continue  # it may be possible once the homes are apart

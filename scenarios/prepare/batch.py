@@ -17,7 +17,7 @@ from scenarios.cell_layout import near_of
 from scenarios.prepare.fleet import Fleet, prepare, world_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, check_progress, quiet
-from scenarios.spec.jobs import JobSampler, weights_of, works_of
+from scenarios.spec.jobs import JobSampler, alternatives_of, weights_of
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, DifficultyName, RiskName
 from scenarios.spec.schema import Scenario
@@ -81,12 +81,13 @@ def library_of(fleet: Fleet) -> Library:
 
 
 def _kinds(scenario: Scenario) -> list[Job]:
-    """One job of every kind in a scenario's streams: each work, each number of repetitions."""
+    """One job of every kind in a scenario's streams: each payload, each number of repetitions."""
     return [
-        Job(name=f"{stream.name}/{p}/{repetitions}", work=work, repetitions=repetitions, release_s=0.0, due_s=0.0,
-            value=stream.value)
+        Job(name=f"{stream.name}/{p}/{repetitions}", work=works[0], alternatives=works[1:], repetitions=repetitions,
+            release_s=0.0, due_s=0.0, value=stream.value)
         for stream in scenario.jobs
-        for p, work in enumerate(works_of(scenario, stream))
+        for p, payload_kg in enumerate(stream.payload_kg)
+        for works in [alternatives_of(scenario, stream, payload_kg)]
         for repetitions in range(stream.repetitions[0], stream.repetitions[1] + 1)
     ]  # fmt: skip
 

@@ -320,7 +320,7 @@ def _work(stream: JobStream) -> str:
     loads = " or ".join(f"{p:g}" for p in stream.payload_kg)
     low, high = stream.repetitions
     times = f"{low}" if low == high else f"{low}–{high}"
-    where = " → ".join(stream.places)
+    where = " or ".join(" → ".join(names) for names in stream.alternatives)
     match stream.kind:
         case "hold":
             return f"hold {loads} kg at {where}, {times} × {stream.dwell_s:g} s"

@@ -81,7 +81,7 @@ def with_verdicts(rows: Sequence[ScoreRow], rule: Rule, features: Features) -> l
 def _repetitions(scenario: Scenario, plan: Plan) -> int:
     """Largest number of repetitions in the streams of this work."""
     names = tuple(place.name for place in plan.work.places)
-    return max(s.repetitions[1] for s in scenario.jobs if s.kind == plan.work.kind and tuple(s.places) == names)
+    return max(s.repetitions[1] for s in scenario.jobs if s.kind == plan.work.kind and names in s.alternatives)
 
 
 def window_rows(twin: Twin, recording: Recording) -> list[ScoreRow]:

@@ -28,17 +28,23 @@ Array = np.ndarray
 
 
 def works_of(scenario: Scenario, stream: JobStream, payload_kg: Sequence[float] | None = None) -> tuple[Work, ...]:
-    """The works of a stream, one per payload (its own payloads unless others are given)."""
+    """The works of a stream, of each payload (its own payloads unless others are given) at each alternative."""
+    payloads = stream.payload_kg if payload_kg is None else payload_kg
+    return tuple(work for payload in payloads for work in alternatives_of(scenario, stream, payload))
+
+
+def alternatives_of(scenario: Scenario, stream: JobStream, payload_kg: float) -> tuple[Work, ...]:
+    """The works of a stream with a payload, of which one must be done."""
     place = {p.name: p for p in scenario.places}
     return tuple(
         Work(
             kind=stream.kind,
-            places=tuple(place[name] for name in stream.places),
-            payload_kg=float(payload),
+            places=tuple(place[name] for name in names),
+            payload_kg=float(payload_kg),
             dwell_s=stream.dwell_s,
             force_n=stream.force_n,
         )
-        for payload in (stream.payload_kg if payload_kg is None else payload_kg)
+        for names in stream.alternatives
     )
 
 
@@ -124,7 +130,8 @@ class JobSampler:
     def __init__(self, scenario: Scenario) -> None:
         streams = scenario.jobs
         self._streams = streams
-        self._works = [works_of(scenario, stream) for stream in streams]
+        self._works = [[alternatives_of(scenario, each, load) for load in each.payload_kg] for each in streams]
+        self._others = [[works[1:] for works in of_stream] for of_stream in self._works]
         self._arrivals = [stream.arrivals for stream in streams]
         self._horizon_s = scenario.ticks * scenario.decision_interval_s
         self._table = arrival_table(self._arrivals, self._horizon_s)
@@ -173,7 +180,8 @@ class JobSampler:
         return tuple(
             Job(
                 name=names[j],
-                work=self._works[i][payload[j]],
+                work=self._works[i][payload[j]][0],
+                alternatives=self._others[i][payload[j]],
                 repetitions=repetitions[j],
                 release_s=release_s[j],
                 due_s=release_s[j] + streams[i].due_s,

@@ -11,7 +11,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
-from itertools import combinations, pairwise
+from itertools import chain, combinations, pairwise
 from math import dist, isfinite
 from pathlib import Path
 from types import UnionType
@@ -241,7 +241,7 @@ def _check(scenario: Scenario, path: Path) -> None:
     places = [place.name for place in scenario.places]
     streams = [stream.name for stream in scenario.jobs]
     for i, stream in enumerate(scenario.jobs):
-        for name in stream.places:
+        for name in chain.from_iterable(stream.alternatives):
             if name not in places:
                 raise ScenarioError(f"{file}: jobs[{i}].places: no place '{name}'{nearest(name, places)}")
         for name in stream.after:

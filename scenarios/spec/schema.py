@@ -11,7 +11,17 @@ from fleet.engine.batch import RewardWeights
 from fleet.env.validation import Decisions
 from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
 from fleet.heat.effects import LONGEST_CONTACT_S, SHORTEST_CONTACT_S, burn_threshold_c
-from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_dwell, check_places
+from fleet.job import (
+    BOUNDS,
+    DWELL_S,
+    Fixture,
+    Kind,
+    Place,
+    check_alternatives,
+    check_bounds,
+    check_duration,
+    check_dwell,
+)
 from fleet.observation import MOST_SLOTS
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
@@ -65,8 +75,9 @@ class JobStream:
 
     name: str
     kind: Kind
-    places: tuple[str, ...]
-    """Names of places: [from, to] for pick_place and sort, one for hold and press."""
+    places: tuple[str | tuple[str, ...], ...]
+    """Names of places: [from, to] for pick_place and sort, one for hold and press. Or a list of such lists: parallel
+    stations, of which each arm takes those that suit it."""
     arrivals: Arrivals
     payload_kg: tuple[float, ...] = (0.0,)
     repetitions: tuple[int, int] = (1, 1)
@@ -82,10 +93,18 @@ class JobStream:
     after: tuple[str, ...] = ()
     """Streams whose job of the same number must finish first."""
 
+    @property
+    def alternatives(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the places of each alternative."""
+        alike = tuple(each for each in self.places if not isinstance(each, str))
+        return alike or (tuple(each for each in self.places if isinstance(each, str)),)
+
     def __post_init__(self) -> None:
         if not self.payload_kg:
             raise ValueError("JobStream.payload_kg must not be an empty list")
-        check_places(self, self.kind, self.places)
+        if len({isinstance(each, str) for each in self.places}) > 1:
+            raise ValueError(f"JobStream.places must be names, or lists of names (got {list(self.places)})")
+        check_alternatives(self, self.kind, self.alternatives)
         check_bounds(self, "payload_kg", "repetitions", "dwell_s", "force_n", "value", "due_s")
         low, high = self.repetitions
         if low > high:

@@ -21,7 +21,17 @@ import msgspec
 from fleet.bus.protocol.messages import Count, FiniteStruct, Name, Number, Person, Share
 from fleet.errors import check_names
 from fleet.fields import MAX_SPEED, MIN_SPEED
-from fleet.job import BOUNDS, DWELL_S, Kind, check_bounds, check_duration, check_dwell, check_places
+from fleet.job import (
+    BOUNDS,
+    DWELL_S,
+    MOST_ALTERNATIVES,
+    Kind,
+    check_alternatives,
+    check_bounds,
+    check_duration,
+    check_dwell,
+    shared_stations,
+)
 from fleet.telemetry import Mode
 
 LeaseTime = Annotated[float, msgspec.Meta(gt=0, le=3600)]
@@ -64,10 +74,22 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     """Jobs that must be finished before."""
     expires: bool = False
     """The due date is hard: a job that still waits then becomes `given_up`."""
+    alternatives: Annotated[tuple[tuple[Name, ...], ...], msgspec.Meta(max_length=MOST_ALTERNATIVES - 1)] = ()
+    """Other places that serve as well as `places`: parallel stations."""
+
+    @property
+    def every_places(self) -> tuple[tuple[str, ...], ...]:
+        """`places` and the alternatives."""
+        return (self.places, *self.alternatives)
+
+    @property
+    def stations(self) -> tuple[str, ...]:
+        """The places that the job occupies wherever it is done."""
+        return shared_stations(self.every_places)
 
     def __post_init__(self) -> None:
-        check_names(self, "name", "places", "after")
-        check_places(self, self.kind, self.places)
+        check_names(self, "name", "places", "after", "alternatives")
+        check_alternatives(self, self.kind, self.every_places)
         check_bounds(self, "repetitions", "payload_kg", "dwell_s", "force_n", "release_s", "due_s", "value")
         check_dwell(self, self.kind, self.dwell_s)
         check_duration(self, self.dwell_s, self.repetitions)

@@ -57,7 +57,7 @@ class ClaimEntry(msgspec.Struct, frozen=True):
     award: Name
     """Unique per job and attempt; this arm never uses it again."""
     job: Name
-    places: Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, max_length=2)]
+    places: Annotated[tuple[Name, ...], msgspec.Meta(max_length=2)]
     """Stations that it occupies."""
     cycles: Count
     """Done so far, by any arm."""

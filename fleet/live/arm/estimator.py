@@ -111,8 +111,8 @@ class Estimator:
         """Variants of the works known at the start, and of others, oldest first."""
         self._bytes = 0
         """Size of the plans of requested works."""
-        self._offers: dict[tuple[Work, int, int], Offers] = {}
-        """By work, number of repetitions and how many of them are done."""
+        self._offers: dict[tuple[tuple[Work, ...], int, int], Offers] = {}
+        """By works that serve alike, number of repetitions and how many of them are done."""
 
     def plan_ahead(self, works: Iterable[Work]) -> None:
         """Plan some works before they are requested; they are never dropped."""
@@ -134,16 +134,16 @@ class Estimator:
         """
         for cycles in {0, done}:
             if not self.is_prepared(job, cycles):
-                work = self._work(job)
-                assert isinstance(work, Work)
+                works = self._works(job)
+                assert not isinstance(works, NoPlan)
                 try:
                     with time_limit(PLAN_S):
-                        offers = self._scored_or_reason(work, job.repetitions, cycles)
+                        offers = self._scored_or_reason(works, job.repetitions, cycles)
                 except Exception as error:  # whatever it is, the arm goes on
                     offers = failed(job, error)
                 while len(self._offers) >= MAX_SCORES:
                     del self._offers[next(iter(self._offers))]
-                self._offers[work, job.repetitions, cycles] = offers
+                self._offers[works, job.repetitions, cycles] = offers
 
     def _variants(self, work: Work) -> tuple[Plan, ...] | NoPlan:
         """Variants of a work, kept within `MAX_WORKS` and `MAX_BYTES`."""
@@ -156,14 +156,15 @@ class Estimator:
         while self._requested and (len(self._requested) > MAX_WORKS or self._bytes > MAX_BYTES):
             oldest = next(iter(self._requested))
             self._bytes -= _size(self._requested.pop(oldest))
-            for key in [key for key in self._offers if key[0] == oldest]:
+            for key in [key for key in self._offers if oldest in key[0]]:
                 del self._offers[key]
         return variants
 
-    def _scored_or_reason(self, work: Work, repetitions: int, done: int) -> Offers:
-        variants = self._variants(work)
-        if isinstance(variants, NoPlan):
-            return variants
+    def _scored_or_reason(self, works: tuple[Work, ...], repetitions: int, done: int) -> Offers:
+        each = [self._variants(work) for work in works]
+        variants = [plan for own in each if not isinstance(own, NoPlan) for plan in own]
+        if not variants:
+            return next(reason for reason in each if isinstance(reason, NoPlan))
         offered = offered_plans(variants, repetitions)  # the plans and their numbers stay the same when cycles are done
         if (takes_s := offered[0].duration_s(repetitions)) > LONGEST_JOB_S:
             days = f"it would take {takes_s / 86400:.1f} days; at most {LONGEST_JOB_S / 86400:g} are allowed"
@@ -180,12 +181,13 @@ class Estimator:
         Raises:
             ValueError: it is not possible in this cell.
         """
-        work = self._work(job)
-        if isinstance(work, NoPlan):
-            raise ValueError(work.reason)
+        works = self._works(job)
+        if isinstance(works, NoPlan):
+            raise ValueError(works.reason)
         return Job(
             name=job.name,
-            work=work,
+            work=works[0],
+            alternatives=works[1:],
             repetitions=job.repetitions,
             release_s=job.release_s,
             due_s=np.inf if job.due_s is None else job.due_s,
@@ -247,23 +249,26 @@ class Estimator:
 
     def _offers_or_reason(self, job: JobSpec, done: int = 0) -> Offers:
         """Plans of a prepared job, or why there is none."""
-        work = self._work(job)
-        return (
-            work if isinstance(work, NoPlan) else self._offers.get((work, job.repetitions, done), NoPlan(NOT_PLANNED))
-        )
+        works = self._works(job)
+        if isinstance(works, NoPlan):
+            return works
+        return self._offers.get((works, job.repetitions, done), NoPlan(NOT_PLANNED))
 
-    def _work(self, job: JobSpec) -> Work | NoPlan:
-        """Return the work, or why it is not possible."""
-        unknown = [name for name in job.places if name not in self._places]
+    def _works(self, job: JobSpec) -> tuple[Work, ...] | NoPlan:
+        """Return the works of which one must be done, or why one is not possible."""
+        unknown = [name for names in job.every_places for name in names if name not in self._places]
         if unknown:
             return NoPlan(f"there is no place '{unknown[0]}' in this cell; places: {', '.join(self._places)}")
         try:
-            return Work(
-                kind=job.kind,
-                places=tuple(self._places[name] for name in job.places),
-                payload_kg=job.payload_kg,
-                dwell_s=job.dwell_s,
-                force_n=job.force_n,
+            return tuple(
+                Work(
+                    kind=job.kind,
+                    places=tuple(self._places[name] for name in names),
+                    payload_kg=job.payload_kg,
+                    dwell_s=job.dwell_s,
+                    force_n=job.force_n,
+                )
+                for names in job.every_places
             )
         except ValueError as error:
             return NoPlan(str(error))

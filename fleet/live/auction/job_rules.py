@@ -67,7 +67,7 @@ def admit(
     new: dict[str, JobSpec] = {}
     for index, job in enumerate(jobs):
         same_name = known.get(job.name) or new.get(job.name)
-        unknown = [place for place in job.places if places is not None and place not in places]
+        unknown = [place for names in job.every_places for place in names if places is not None and place not in places]
         if ended:
             rejected[index] = "The shift is over: no more jobs are accepted."
         elif same_name == job or past.is_same(job):
@@ -199,7 +199,7 @@ def ready_jobs(
     ready = [job for job in jobs if job.release_s <= time_s and all(map(finished, job.after))]
     ready.sort(key=queued_s)
     if len(ready) > limit:
-        ready = sorted(ready, key=lambda job: not busy.isdisjoint(job.places))[:limit]
+        ready = sorted(ready, key=lambda job: not busy.isdisjoint(job.stations))[:limit]
         ready.sort(key=queued_s)
     return ready
 

@@ -145,7 +145,7 @@ def _groups(bidding: Bidding) -> list[float]:
     """Return a number for each job of the round: jobs that share a station have the same."""
     groups: list[float] = []
     for k, job in enumerate(bidding.jobs):
-        alike = [groups[i] for i, other in enumerate(bidding.jobs[:k]) if set(job.places) & set(other.places)]
+        alike = [groups[i] for i, other in enumerate(bidding.jobs[:k]) if set(job.stations) & set(other.stations)]
         groups.append(alike[0] if alike else k + 1.0)
     return groups
 

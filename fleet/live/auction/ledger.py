@@ -201,7 +201,7 @@ class LedgerView:
     def busy_stations(self) -> frozenset[str]:
         """Return the stations at which an arm may be at work; a silent arm does not block its station."""
         active = (award.record.job for award in self.open.values() if not award.silent)
-        return frozenset(place for job in active for place in self.jobs[job].spec.places)
+        return frozenset(place for job in active for place in self.jobs[job].spec.stations)
 
     def taken_space(self) -> Mapping[str, frozenset[str]]:
         """Return the names of the spaces that each arm may take."""

@@ -126,7 +126,7 @@ class Bidding:
 
     def has_free_stations(self, job: JobSpec) -> bool:
         """Return whether no arm is at work at the stations of a job."""
-        return self.busy.isdisjoint(job.places)
+        return self.busy.isdisjoint(job.stations)
 
     def in_the_way(self, arm: str, space: str | None) -> tuple[str, ...]:
         """Return the arms that take a space which excludes this one of an arm."""
@@ -214,7 +214,7 @@ def drop_invalid(bidding: Bidding, allocation: Mapping[str, Assignment]) -> dict
 
 def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, Assignment]]) -> dict[str, Assignment]:
     """Return the assignment of each job with an offer; of two with one job, arm, station or space the first is kept."""
-    places = {job.name: frozenset(job.places) for job in bidding.jobs}
+    places = {job.name: frozenset(job.stations) for job in bidding.jobs}
     kept: dict[str, Assignment] = {}
     busy: set[str] = set()
     taken: dict[str, list[str]] = {}
@@ -589,7 +589,7 @@ class Rounds:
         self._planned &= ledger.waiting.keys()
         jobs = tuple(ledger.ready(time_s, self._timing.max_jobs, excluded=self._later_s))
         busy = ledger.busy_stations()
-        if not any(busy.isdisjoint(job.places) for job in jobs):
+        if not any(busy.isdisjoint(job.stations) for job in jobs):
             return
         self._count += 1
         auction = f"{self._name}-{self._boot}-{self._count}"

@@ -574,11 +574,11 @@ class Claimant:
         entries: list[ClaimEntry] = []
         for lease in self.executor.lease_entries(self.arm):
             job, space = awards[lease.award].job, self._space_of(awards[lease.award].job, awards[lease.award].plan)
-            entries.append(ClaimEntry(lease.award, job.name, job.places, lease.cycles, lease.phase, space))
+            entries.append(ClaimEntry(lease.award, job.name, job.stations, lease.cycles, lease.phase, space))
             self._votes.setdefault(lease.award, Vote())
         for award, pending in self.pending.items():
             job, space = pending.job, self._space_of(pending.job, pending.plan)
-            entries.append(ClaimEntry(award, job.name, job.places, 0, "requested", space))
+            entries.append(ClaimEntry(award, job.name, job.stations, 0, "requested", space))
         outcomes: list[JobOutcome] = []
         for report, on_disk in self.executor.pending_reports():
             if on_disk:
