@@ -1,61 +1,147 @@
-"""Compute the suite anew: python -m benchmarks.freeze_suite [CELL …]. What is frozen must not change any more.
+"""Compute the suite anew: python -m benchmarks.freeze_suite [CELL …] [--check]. Frozen files must not change any more.
 
-Time loads are computed for the named cells, and for those without any; then all manifests are written. It plans every
-cell (minutes) and needs no twins.
+The named cells, and those without any calibration, are calibrated; then all manifests are written. It plans every cell
+and needs no twins. With --check it calibrates nothing, and plays `wspt` on other seeds of each cell and level.
+
+Calibration: the duration of a job of each task is the mean over able arms, payloads, and fewest and most repetitions.
+The ambient temperature of a level is that at which `wspt` has the level's expected number of faults, found by bisection
+on shifts with the same seeds at every temperature (common random numbers).
 """
 
 import json
 import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import get_args
 
-from fleet.job import Job
-from scenarios.prepare.fleet import prepare, world_of
-from scenarios.prepare.load_factor import load_factor
-from scenarios.spec.jobs import works_of
-from scenarios.spec.schema import SPLITS, JobStream
-from scenarios.suite.instances import CELLS, TRADES, Axes, SuiteCell, scenario_of
+import numpy as np
+
+from scenarios.evaluate.rollout import outcomes
+from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.spec.jobs import alternatives_of
+from scenarios.spec.schema import SPLITS
+from scenarios.suite.instances import (
+    CELLS,
+    COOL_C,
+    FAULTS,
+    Calibration,
+    Level,
+    SuiteCell,
+    calibrations,
+    draw_axes,
+    scenario_of,
+    tasks_of,
+)
 from scenarios.suite.splits import drawn_rows, line_of
 
 FOLDER = Path(__file__).parents[1] / "scenarios" / "suite"
-PLAIN = Axes(
-    heat="warm", due="usual", arrivals="poisson", precedence="none", air="warm", faults="attended", bus="perfect"
-)
+DRAWS, SHIFTS = 12, 8
+"""Draws of the axes, and shifts of each, that an expected number of faults is the mean of."""
+LOWEST_C, HIGHEST_C, STEP_C = 4.0, 36.0, 0.1
+"""Ambient temperatures that are tried, and how close the bisection comes."""
+APART_C = 8.0
+"""Most by which a level is warmer than the one below, if that is enough."""
+TOLERANCE = 0.25
+"""Share by which the faults of a level may differ on other seeds."""
 
 
-def time_loads_of(cell: SuiteCell) -> tuple[float, float]:
-    """Time load of one job of each stream and payload, of the tasks that heat and of the others."""
-    scenario = scenario_of(cell.name, cell, PLAIN, 0, (1.0, 1.0))
-    fleet = prepare(scenario, difficulty="blind")
-    jobs: dict[bool, list[Job]] = {True: [], False: []}
-    heats = {task.name: task.heats for task in TRADES[cell.trade]}
-    for stream in scenario.jobs:
-        jobs[heats[_task_of(stream)]] += [
-            Job(name=f"{stream.name}-{i}", work=work, repetitions=round(sum(stream.repetitions) / 2), release_s=0.0,
-                due_s=stream.due_s, value=stream.value)
-            for i, work in enumerate(works_of(scenario, stream))
-        ]  # fmt: skip
-    heating, rest = (load_factor(world_of(fleet, jobs[kind])[0]).time for kind in (True, False))
-    return round(heating, 5), round(rest, 5)
+def minutes_of(cell: SuiteCell) -> tuple[dict[str, float], Fleet]:
+    """Mean duration of a job of each task, min, and the fleet."""
+    some = Calibration(
+        dict.fromkeys([task.name for task in tasks_of(cell)], 10.0), dict.fromkeys(get_args(Level), 25.0)
+    )
+    axes = replace(draw_axes(np.random.default_rng(0), 0), arrivals="poisson")
+    fleet = prepare(scenario_of(cell.name, cell, axes, 0, some), difficulty="blind")
+    minutes: dict[str, list[float]] = {}
+    for stream in fleet.scenario.jobs:
+        task = next(task.name for task in tasks_of(cell) if stream.name.startswith(task.name))
+        for payload_kg in stream.payload_kg:
+            works = alternatives_of(fleet.scenario, stream, payload_kg)
+            for arm in fleet.arms:
+                for repetitions in stream.repetitions:
+                    offered = arm.offers(*works)[repetitions]
+                    minutes.setdefault(task, []).extend(plan.duration_s(repetitions) / 60.0 for plan, _ in offered[:1])
+    return {task: round(float(np.mean(each)), 3) for task, each in minutes.items()}, fleet
 
 
-def _task_of(stream: JobStream) -> str:
-    return stream.name.rpartition("_")[0]
+def faults_of(
+    cell: SuiteCell, known: Calibration, level: Level, fleet: Fleet, first_seed: int, draws: int = DRAWS
+) -> np.ndarray:
+    """Faults of `wspt` in shifts of a level, [draw · shift]; of many arms, half as many draws."""
+    draws = draws // 2 if cell.arms > 8 else draws
+    counts: list[float] = []
+    for draw in range(draws):
+        axes = replace(draw_axes(np.random.default_rng([first_seed, draw]), 0), heat=level)
+        scenario = scenario_of(cell.name, cell, axes, first_seed + draw, known)
+        own = prepare(scenario, difficulty="blind", like=fleet)
+        seeds = range(first_seed + SHIFTS * draw, first_seed + SHIFTS * (draw + 1))
+        counts += [each.faults for each in outcomes(own, "wspt", seeds)]
+    return np.array(counts)
 
 
-def main(names: list[str]) -> None:
-    """Compute the time loads of cells, and write the manifests."""
-    path = FOLDER / "time_loads.json"
+def calibrated(cell: SuiteCell) -> Calibration:
+    """Durations of the tasks, and the ambient temperature of each level."""
+    minutes, fleet = minutes_of(cell)
+    ambient_c: dict[Level, float] = {"cool": COOL_C}
+    if cell.asks == "light_work":
+        return Calibration(minutes, ambient_c)
+
+    def is_cooler(level: Level, air_c: float) -> bool:
+        tried = Calibration(minutes, {**ambient_c, level: air_c})
+        return bool(faults_of(cell, tried, level, fleet, 1_000_000).mean() < FAULTS[level])
+
+    low_c = LOWEST_C
+    for level in list(FAULTS)[1:]:
+        high_c = HIGHEST_C if level == "warm" else min(HIGHEST_C, low_c + APART_C)
+        if high_c < HIGHEST_C and is_cooler(level, high_c):
+            low_c, high_c = high_c, HIGHEST_C
+        while high_c - low_c > STEP_C:
+            middle_c = (low_c + high_c) / 2.0
+            low_c, high_c = (middle_c, high_c) if is_cooler(level, middle_c) else (low_c, middle_c)
+        ambient_c[level] = round((low_c + high_c) / 2.0, 2)
+    return Calibration(minutes, ambient_c)
+
+
+def check(cells: Sequence[SuiteCell]) -> bool:
+    """Print the faults of every cell and level on other seeds; whether all are as expected."""
+    right = True
+    print(f"{'cell':28s}{'asks':14s}" + "".join(f"{level:>22s}" for level in FAULTS))
+    for cell in cells:
+        _, fleet = minutes_of(cell)
+        texts: list[str] = []
+        for level in calibrations()[cell.name].ambient_c:
+            wanted = FAULTS[level]
+            found = faults_of(cell, calibrations()[cell.name], level, fleet, 2_000_000, 2 * DRAWS)
+            mean, error = float(found.mean()), float(found.std() / np.sqrt(len(found)))
+            fits = abs(mean - wanted) <= max(TOLERANCE * wanted, 0.02)
+            right &= fits
+            ambient_c = calibrations()[cell.name].ambient_c[level]
+            texts.append(f"{mean:.2f} ± {error:.2f}{' ' if fits else '!'}({ambient_c:.1f} °C)")
+        print(f"{cell.name:28s}{cell.asks:14s}" + "".join(f"{text:>22s}" for text in texts), flush=True)
+    return right
+
+
+def main(names: list[str]) -> int:
+    """Calibrate cells, and write the manifests; or check."""
+    cells = [cell for cell in CELLS if cell.name in names] or list(CELLS)
+    if "--check" in names:
+        return 0 if check(cells) else 1
+    path = FOLDER / "calibration.json"
     known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    known = {cell.name: known[cell.name] for cell in CELLS if cell.name in known}
     for cell in CELLS:
         if cell.name in names or cell.name not in known:
-            known[cell.name] = time_loads_of(cell)
-            lines = ",\n".join(f' "{each}": {json.dumps(loads)}' for each, loads in known.items())
+            known[cell.name] = asdict(calibrated(cell))
+            lines = ",\n".join(f' "{each}": {json.dumps(own)}' for each, own in known.items())
             path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
             print(cell.name, known[cell.name], flush=True)
+    calibrations.cache_clear()
     for name in SPLITS:
         text = "".join(line_of(row) + "\n" for row in drawn_rows(name))
         (FOLDER / f"{name}.jsonl").write_text(text, encoding="utf-8")
+    return 0
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

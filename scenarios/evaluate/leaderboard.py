@@ -342,10 +342,8 @@ class Board:
         remark = (
             f"{scores.instances} of {self.instances} instances; differences to `{base.policy}` ({base.difficulty})."
         )
-        if missing := self.instances - scores.instances - len(scores.flat):
+        if missing := self.instances - scores.instances:
             remark += f" {missing} have no reference yet and are not scored."
-        if scores.flat:
-            remark += f" {scores.flat_remark}"
         if len({each.card.code_hash for each in self.entries.values()}) > 1:
             remark += " Results are of several versions of the code."
         return remark

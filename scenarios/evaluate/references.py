@@ -43,6 +43,9 @@ from scenarios.spec.parse import scenario_hash
 from scenarios.suite.splits import Instance
 from scenarios.table import Table
 
+LEAST_UNIT, TINY = 0.1, 1e-9
+"""The unit of a score is at least this share of the reward of the hindsight, so that a shift in which nothing is to be
+decided weighs little; and at least this reward."""
 RANDOM_SHIFTS = 20
 """Draws of the policy `random` that its reward is the mean of."""
 STARTS = tuple(name for name in RULES if name != "random")
@@ -87,10 +90,14 @@ class ShiftReference:
     claims: tuple[Claim, ...]
     """The schedule of the hindsight: decision interval, arm and action of every claim."""
 
+    @property
+    def unit(self) -> float:
+        """Reward of one unit of the score: from random to hindsight, and at least `LEAST_UNIT` of the hindsight."""
+        return max(self.hindsight - self.random, LEAST_UNIT * abs(self.hindsight), TINY)
+
     def normalised(self, reward: float) -> float:
-        """0 for random, 1 for hindsight; NaN where the search found nothing better than random."""
-        span = self.hindsight - self.random
-        return (reward - self.random) / span if span > 0 else float("nan")
+        """Score of a reward: 0 for random, 1 for `unit` more."""
+        return (reward - self.random) / self.unit
 
     @property
     def gap(self) -> float:

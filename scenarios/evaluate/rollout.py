@@ -21,7 +21,7 @@ from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Obs
 from fleet.observation import Observation
 from scenarios.evaluate.statistics import FigureKind
-from scenarios.policy_loader import OnBus, failure, policy_at
+from scenarios.policy_loader import OnBus, failure, policy_at, scope_of
 from scenarios.prepare.batch import library_of
 from scenarios.prepare.fleet import Fleet, as_known, simulator_of
 from scenarios.run.metrics import HeatUse, common_figures
@@ -113,6 +113,8 @@ def play(
         limit_s: Most time for a decision, s of real time.
     """
     library, channel = _library(fleet), fleet.scenario.channel(channel)
+    if scope_of(policy) == "central":
+        channel = PERFECT  # it reads the arms' own observations, and no message
     running, time_s = np.ones(len(seeds), dtype=bool), np.zeros(len(seeds))
     results: dict[int, ShiftResult] = {}
     policies: dict[int, Policy] = {}

@@ -28,7 +28,7 @@ FEWEST_CELLS = 3
 
 @dataclass(frozen=True, eq=False)
 class Normalised:
-    """Scores of the same instances under several policies; 0 is the mean of random, 1 the hindsight."""
+    """Scores of the same instances under several policies; see `ShiftReference.normalised`."""
 
     instances: tuple[str, ...]
     """A scenario and a seed each."""
@@ -40,8 +40,6 @@ class Normalised:
     """(upper bound − reward) / (upper bound − random), in the same shape."""
     missing: int = 0
     """Shifts of each policy that have no reference."""
-    flat: tuple[str, ...] = ()
-    """Instances left out because their hindsight is not better than random."""
 
     def only(self, chosen: Array) -> "Normalised":
         """Some of the instances, bool [instance]."""
@@ -106,28 +104,19 @@ class SuiteScores:
     unit: str
     """As of `Normalised`."""
     missing: int
-    flat: tuple[str, ...]
     trainings: int = 1
     """Most trainings of a policy."""
     policies: dict[str, Score]
-
-    @property
-    def flat_remark(self) -> str:
-        """Which instances were left out; "" if none."""
-        names = ", ".join(self.flat)
-        return f"Not scored, as hindsight is no better than random there: {names}." if names else ""
 
     @property
     def remarks(self) -> list[str]:
         """What a reader must know of the instances."""
         remarks = [
             f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = "
-            "hindsight, the best schedule that a clairvoyant search found."
+            "hindsight, the best known schedule; the unit is at least a tenth of its reward."
         ]
         if self.missing:
             remarks.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
-        if self.flat:
-            remarks.append(self.flat_remark)
         return remarks
 
 
@@ -149,7 +138,6 @@ def scores_of(values: Normalised, baseline: str) -> SuiteScores:
         instances=len(values.instances),
         unit=values.unit,
         missing=values.missing,
-        flat=values.flat,
         trainings=max(map(len, values.score.values())),
         policies={
             name: Score(
@@ -244,13 +232,10 @@ def normalised(
     first = next(iter(by_policy.values()), ())
     shifts = list(dict.fromkeys((row.key.instance, row.key.seed) for row in first if row.key.fleet == 0))
     scored = [shift for shift in shifts if shift in references]
-    spread = [shift for shift in scored if references[shift].hindsight > references[shift].random]
-    if len(spread) < FEWEST:
+    if len(scored) < FEWEST:
         return None
-    known = [references[shift] for shift in spread]
-    random, best, upper = (
-        np.array([getattr(each, name) for each in known]) for name in ("random", "hindsight", "upper")
-    )
+    known = [references[shift] for shift in scored]
+    random, unit, upper = (np.array([getattr(each, name) for each in known]) for name in ("random", "unit", "upper"))
     score, to_bound = dict[str, np.ndarray](), dict[str, np.ndarray]()
     for policy, rows in by_policy.items():
         rewards: dict[int, dict[Shift, list[float]]] = {}
@@ -260,8 +245,8 @@ def normalised(
                 assert row.outcome is not None or failed_as_random
                 own = rewards.setdefault(row.key.training if has_trainings(row.key.policy) else 0, {})
                 own.setdefault(shift, []).append(row.outcome.reward if row.outcome else references[shift].random)
-        reward = np.array([[np.mean(own[shift]) for shift in spread] for own in rewards.values()])
-        score[policy] = (reward - random) / (best - random)
+        reward = np.array([[np.mean(own[shift]) for shift in scored] for own in rewards.values()])
+        score[policy] = (reward - random) / unit
         to_bound[policy] = (upper - reward) / (upper - random)
     return Normalised(
         instances=tuple(each.instance for each in known),
@@ -269,5 +254,4 @@ def normalised(
         score=score,
         to_bound=to_bound,
         missing=len({(row.key.fleet, row.key.instance, row.key.seed) for row in first}) - len(scored),
-        flat=tuple(references[shift].instance for shift in scored if shift not in set(spread)),
     )

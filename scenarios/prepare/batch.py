@@ -83,11 +83,12 @@ def library_of(fleet: Fleet) -> Library:
 def _kinds(scenario: Scenario) -> list[Job]:
     """One job of every kind in a scenario's streams: each payload, each number of repetitions."""
     return [
-        Job(name=f"{stream.name}/{p}/{repetitions}", work=works[0], alternatives=works[1:], repetitions=repetitions,
+        Job(name=f"{stream.name}/{p}/{repetitions}", work=work, alternatives=others, repetitions=repetitions,
             release_s=0.0, due_s=0.0, value=stream.value)
         for stream in scenario.jobs
         for p, payload_kg in enumerate(stream.payload_kg)
-        for works in [alternatives_of(scenario, stream, payload_kg)]
+        for work, *rest in [alternatives_of(scenario, stream, payload_kg)]
+        for others in [tuple(rest)]
         for repetitions in range(stream.repetitions[0], stream.repetitions[1] + 1)
     ]  # fmt: skip
 

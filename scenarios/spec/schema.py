@@ -25,7 +25,7 @@ from fleet.job import (
 from fleet.observation import MOST_SLOTS
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
-SplitName = Literal["train", "validation", "test", "sizes"]
+SplitName = Literal["train", "validation", "test"]
 SPLITS: tuple[SplitName, ...] = get_args(SplitName)
 """Of the suite."""
 MOST_SAMPLES = 1_000_000

@@ -1,10 +1,15 @@
 """Instances of the suite: layouts of cells, tasks of real trades, cells, and the axes on which instances differ.
 
-A *group* of stations lies between two neighbouring arms. Its station `a` is nearer to one, `b` to the other, `c` to
-neither. The dimensions keep arms at home apart, and let each arm work in a group while its neighbour works in the next.
+Every arm has a group of stations in front of it: a and b near to it, c far. A job may be done at any group, each with
+the same stations, so every arm can do it; only in a control with one able arm a job names its group.
 
-A cell determines all that is prepared: plans, space and twins. Many instances share a cell; no two splits do. Instances
-of a cell differ in jobs, ambient temperature, faults and bus.
+- *Light* work, which every arm can do cool, is worth slightly more per time, and comes in waves.
+- *Heavy* work heats, is worth less, and expires if no arm begins it soon. Only some arms can do it without overheating:
+  those with a fan, on a wall, or without wear.
+
+So arms that each take what is best for them leave the heavy work undone, or overheat. A cell determines all that is
+prepared: plans, space and twins. Many instances share a cell; no two splits do. Instances of a cell differ in heat,
+jobs, faults and bus. The ambient temperature of each level of heat is calibrated by outcome: see `Level`.
 """
 
 import json
@@ -13,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache
 from importlib import resources
-from itertools import pairwise
 from math import ceil, cos, degrees, pi, sin
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
@@ -50,11 +54,11 @@ SIDE_M = 0.15
 
 @dataclass(frozen=True)
 class CellLayout:
-    """Mounted arms and groups of stations."""
+    """Mounted arms, and the group of stations in front of each."""
 
     arms: tuple[ArmSpec, ...]
     groups: tuple[tuple[Place, ...], ...]
-    """Stations of each group: a, b, and c if there are three."""
+    """Stations of each group: a, b, c."""
 
     @property
     def places(self) -> tuple[Place, ...]:
@@ -62,77 +66,78 @@ class CellLayout:
         return tuple(place for group in self.groups for place in group)
 
 
-def layout_of(
-    name: LayoutName, arms: int, stations: int = 2, *, pitch_m: float = 0.8, front_m: float = 0.4
-) -> CellLayout:
+@dataclass(frozen=True)
+class _Front:
+    """Where the stations of an arm are: distances from its base on the floor, and heights, m."""
+
+    near_m: float
+    far_m: float
+    near_z_m: float
+    far_z_m: float
+
+
+_FLOOR, _CEILING, _WALL = _Front(0.55, 0.66, 0.25, 0.35), _Front(0.45, 0.70, 0.5, 0.75), _Front(0.5, 0.68, 0.45, 0.5)
+_Mounted = tuple[tuple[float, float, float], tuple[float, float, float], float, _Front]
+"""Position of a base, tilt, direction in which the stations are, deg, and their distances."""
+
+
+def layout_of(name: LayoutName, arms: int, *, pitch_m: float = 0.85) -> CellLayout:
     """The layout of this name.
 
     Args:
-        arms: At least 2; a bench and a ring have at least 4, and a bench an even number.
-        stations: In each group, 2 or 3.
+        arms: At least 2; a bench has an even number.
         pitch_m: Distance between neighbours.
-        front_m: Distance of the stations in front of the line between two neighbours.
     """
-    return _LAYOUTS[name](arms, stations, pitch_m, front_m)
+    mounted = _LAYOUTS[name](arms, pitch_m)
+    specs = [
+        ArmSpec(name=f"arm_{i:02d}", position_m=_rounded(*at), tilt_deg=_rounded(*tilt), home=HOME)
+        for i, (at, tilt, _, _) in enumerate(mounted)
+    ]
+    groups = [_group(i, at, outwards, front) for i, (at, _, outwards, front) in enumerate(mounted)]
+    return CellLayout(tuple(specs), tuple(groups))
 
 
-def _line(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
-    """Arms on the floor in rows; the stations are in front of them."""
+def _line(arms: int, pitch_m: float) -> list[_Mounted]:
+    """Arms on the floor in rows."""
     rows = ceil(arms / MOST_IN_ROW)
     lengths = [arms // rows + (row < arms % rows) for row in range(rows)]
     spots = [(x, APART_M * (row - (rows - 1) / 2)) for row, n in enumerate(lengths) for x in _along(n, pitch_m)]
-    mounted = tuple(_arm(i, (x, y, 0.0), (0.0, 0.0, 90.0)) for i, (x, y) in enumerate(spots))
-    middles = [((x + next_x) / 2, y + front_m) for (x, y), (next_x, next_y) in pairwise(spots) if y == next_y]
-    return CellLayout(mounted, tuple(_group(i, at, 0.0, 0.25, stations) for i, at in enumerate(middles)))
+    return [((x, y, 0.0), (0.0, 0.0, 90.0), 90.0, _FLOOR) for x, y in spots]
 
 
-def _bench(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
-    """Two rows of arms facing each other across a bench; each group has stations on both sides of its middle."""
-    across_m, columns = front_m + 0.15, arms // 2
-    mounted = [
-        _arm(2 * i + row, (x, side * across_m, 0.0), (0.0, 0.0, -90.0 * side))
-        for i, x in enumerate(_along(columns, pitch_m))
-        for row, side in enumerate((-1.0, 1.0))
+def _bench(arms: int, pitch_m: float) -> list[_Mounted]:
+    """Two rows of arms facing each other across a bench."""
+    across_m = _FLOOR.far_m + 0.25
+    return [
+        ((x, side * across_m, 0.0), (0.0, 0.0, -90.0 * side), -90.0 * side, _FLOOR)
+        for x in _along(arms // 2, pitch_m)
+        for side in (-1.0, 1.0)
     ]
-    groups = [
-        _group(2 * i + row, ((x + next_x) / 2, side * 0.15), 0.0, 0.25, stations)
-        for i, (x, next_x) in enumerate(pairwise(_along(columns, pitch_m)))
-        for row, side in enumerate((-1.0, 1.0))
-    ]
-    return CellLayout(tuple(mounted), tuple(groups))
 
 
-def _ring(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
-    """Arms in a circle, facing outwards; the stations are around it."""
+def _ring(arms: int, pitch_m: float) -> list[_Mounted]:
+    """Arms in a circle, facing outwards."""
     radius_m = pitch_m / 2 / sin(pi / arms)
     around = [2 * pi * i / arms for i in range(arms)]
-    bases = [(radius_m * cos(a), radius_m * sin(a), 0.0) for a in around]
-    mounted = [_arm(i, base, (0.0, 0.0, degrees(a))) for i, (base, a) in enumerate(zip(bases, around, strict=True))]
-    out_m = radius_m * cos(pi / arms) + front_m
-    between = [a + pi / arms for a in around]
-    groups = [_group(i, (out_m * cos(a), out_m * sin(a)), a - pi / 2, 0.25, stations) for i, a in enumerate(between)]
-    return CellLayout(tuple(mounted), tuple(groups))
+    return [((radius_m * cos(a), radius_m * sin(a), 0.0), (0.0, 0.0, degrees(a)), degrees(a), _FLOOR) for a in around]
 
 
-def _gantry(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
-    """Arms hanging from a beam in a row; the stations are below, in front of it."""
-    along = _along(arms, pitch_m)
-    mounted = tuple(_arm(i, (x, 0.0, 1.2), (180.0, 0.0, 90.0)) for i, x in enumerate(along))
-    middles = [((x + next_x) / 2, front_m - 0.08) for x, next_x in pairwise(along)]
-    return CellLayout(mounted, tuple(_group(i, at, 0.0, 0.45, stations) for i, at in enumerate(middles)))
+def _gantry(arms: int, pitch_m: float) -> list[_Mounted]:
+    """Arms hanging from a beam in a row."""
+    return [((x, 0.0, 1.2), (180.0, 0.0, 90.0), 90.0, _CEILING) for x in _along(arms, pitch_m)]
 
 
-def _wall_ceiling(arms: int, stations: int, pitch_m: float, front_m: float) -> CellLayout:
-    """Arms alternately on a wall and on the ceiling; the stations are between wall and beam."""
-    wall, ceiling = ((1.0, 0.5), (90.0, 0.0, 0.0)), ((0.1, 1.2), (180.0, 0.0, 90.0))
-    along = _along(arms, pitch_m)
-    mounts = [(x, *(wall, ceiling)[i % 2]) for i, x in enumerate(along)]
-    mounted = tuple(_arm(i, (x, y, z), tilt) for i, (x, (y, z), tilt) in enumerate(mounts))
-    middles = [((x + next_x) / 2, front_m) for x, next_x in pairwise(along)]
-    return CellLayout(mounted, tuple(_group(i, at, 0.0, 0.45, stations) for i, at in enumerate(middles)))
+def _wall_ceiling(arms: int, pitch_m: float) -> list[_Mounted]:
+    """Arms alternately on a wall and on the ceiling."""
+    return [
+        ((x, 0.1, 1.2), (180.0, 0.0, 90.0), 90.0, _CEILING)
+        if i % 2
+        else ((x, 1.0, 0.5), (90.0, 0.0, 0.0), -90.0, _WALL)
+        for i, x in enumerate(_along(arms, pitch_m))
+    ]
 
 
-_LAYOUTS: dict[LayoutName, Callable[[int, int, float, float], CellLayout]] = {
+_LAYOUTS: dict[LayoutName, Callable[[int, float], list[_Mounted]]] = {
     "bench": _bench,
     "line": _line,
     "ring": _ring,
@@ -146,18 +151,17 @@ def _along(arms: int, pitch_m: float) -> list[float]:
     return [(i - (arms - 1) / 2) * pitch_m for i in range(arms)]
 
 
-def _arm(number: int, at: tuple[float, float, float], tilt: tuple[float, float, float]) -> ArmSpec:
-    return ArmSpec(name=f"arm_{number:02d}", position_m=_rounded(*at), tilt_deg=_rounded(*tilt), home=HOME)
-
-
-def _group(number: int, middle: tuple[float, float], turn: float, height_m: float, stations: int) -> tuple[Place, ...]:
-    """The stations around a middle; `turn` is the direction from a to b, rad."""
-    turned = rotation((0.0, 0.0, degrees(turn)))
-    spots = ((-SIDE_M, 0.0, 0.0), (SIDE_M, 0.0, 0.0), (0.0, 0.06, 0.1))[:stations]
-    ends = [(middle[0], middle[1], height_m) + turned @ spot for spot in spots]
+def _group(number: int, base: tuple[float, float, float], outwards_deg: float, front: _Front) -> tuple[Place, ...]:
+    """The stations in front of an arm."""
+    spots = (
+        (front.near_m, -SIDE_M, front.near_z_m),
+        (front.near_m, SIDE_M, front.near_z_m),
+        (front.far_m, 0.0, front.far_z_m),
+    )
+    ends = [(base[0], base[1], 0.0) + rotation((0.0, 0.0, outwards_deg)) @ spot for spot in spots]
     return tuple(
         Place(name=f"{letter}_{number:02d}", position_m=_rounded(*map(float, end)))
-        for letter, end in zip("abc", ends, strict=False)
+        for letter, end in zip("abc", ends, strict=True)
     )
 
 
@@ -167,29 +171,23 @@ def _rounded(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteTask:
-    """One task type at a group of stations."""
+    """One task type, at any group of stations."""
 
     name: str
     kind: Kind
     at: tuple[Literal["a", "b", "c"], ...]
-    """Stations of the group; c stands for b in a group of two."""
-    payload_kg: tuple[float, ...] = (0.0,)
+    """Stations of the group."""
+    payload_kg: tuple[float, ...]
     repetitions: tuple[int, int]
     dwell_s: float = DWELL_S
-    force_n: float = 0.0
-    value: float
-    due_s: float
-    heats: bool = False
-    """Whether the task loads a few joints for long; the share of such tasks grows with the heat severity."""
-    after: str = ""
-    """With precedence: the task whose job of the same number must be finished first."""
+    heavy: bool = False
 
 
 JUDGED = SPLITS[1:]
 """Splits whose results are reported."""
-Unlike = Literal["alike", "usual", "mixed"]
-SPREAD: dict[Unlike, float] = {"alike": 0.2, "usual": 0.7, "mixed": 0.7}
-"""`spread.scale` of the arms."""
+Asks = Literal["advantage", "equal_arms", "overload", "one_able_arm", "light_work"]
+"""advantage: who does what matters. Controls, in which sharing cannot pay: arms that are all alike; more jobs than
+anybody could do; jobs that one arm alone can do; no heavy work."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,23 +199,13 @@ class SuiteCell:
     layout: LayoutName
     arms: int
     trade: str
-    stations: int = 2
-    """Number of stations in each group."""
-    unlike: Unlike = "usual"
-    """alike and usual: deviations by chance, small or as among Gen3 arms. mixed: besides, some arms are worn, some cool
-    badly, one has a fan, and some carry less."""
-    pitch_m: float = 0.8
-    front_m: float = 0.4
+    asks: Asks = "advantage"
+    pitch_m: float = 0.85
     hours: float = 2.0
     slots: int = 24
-    instances: int = 17
+    instances: int = 16
     seed: int = 0
     """Seed of the arms' deviations."""
-
-    @property
-    def stations_per_arm(self) -> float:
-        """Number of stations divided by that of arms."""
-        return len(layout(self).places) / self.arms
 
 
 def _read_suite() -> tuple[dict[str, tuple[SuiteTask, ...]], tuple[SuiteCell, ...]]:
@@ -233,72 +221,73 @@ def _read_suite() -> tuple[dict[str, tuple[SuiteTask, ...]], tuple[SuiteCell, ..
 
 
 TRADES, CELLS = _read_suite()
+SPREAD = 0.3
+"""`spread.scale`: every parameter of an arm deviates 0.3 times as much as among real Gen3 arms."""
+_PLAIN: dict[str, Any] = {}
+ARMS: tuple[dict[str, Any], ...] = (
+    _PLAIN,
+    {"cooling": "forced_air"},
+    {"wear": 0.5},
+    _PLAIN,
+    {"cooling": "forced_air"},
+    {"cooling_factor": 0.9},
+    _PLAIN,
+    {"payload_limit_kg": 1.5},
+)
+"""What is particular to each arm of a fleet, in turn: of eight, two have a fan, one is worn, one cools badly, and one
+carries less (Any: fields of several types)."""
 
 
 @lru_cache(maxsize=64)
 def layout(cell: SuiteCell) -> CellLayout:
     """Arms and stations of a cell."""
-    plain = layout_of(cell.layout, cell.arms, cell.stations, pitch_m=cell.pitch_m, front_m=cell.front_m)
-    if cell.unlike != "mixed":
+    plain = layout_of(cell.layout, cell.arms, pitch_m=cell.pitch_m)
+    if cell.asks == "equal_arms":
         return plain
-    return replace(plain, arms=tuple(_altered(arm, i) for i, arm in enumerate(plain.arms)))
+    return replace(plain, arms=tuple(replace(arm, **ARMS[i % len(ARMS)]) for i, arm in enumerate(plain.arms)))
 
 
-def _altered(arm: ArmSpec, number: int) -> ArmSpec:
-    """The arm with the properties of its index in a mixed fleet: every eighth has a fan, and so on."""
-    match number % 8:
-        case 1 | 6:
-            return replace(arm, wear=0.6)
-        case 2 | 5:
-            return replace(arm, cooling_factor=0.8)
-        case 3:
-            return replace(arm, cooling="forced_air")
-        case 4:
-            return replace(arm, payload_limit_kg=1.5)
-        case _:
-            return arm
+def tasks_of(cell: SuiteCell) -> tuple[SuiteTask, ...]:
+    """The tasks of a cell."""
+    return tuple(task for task in TRADES[cell.trade] if not (task.heavy and cell.asks == "light_work"))
 
 
-Heat = Literal["mild", "warm", "hot", "severe"]
-Due = Literal["loose", "usual", "tight", "hard"]
-Arriving = Literal["poisson", "batch", "trace", "rush"]
-Precedence = Literal["none", "chain"]
-Air = Literal["cool", "warm", "hot", "rising"]
+Level = Literal["cool", "warm", "hot", "severe"]
+FAULTS: dict[Level, float] = {"cool": 0.0, "warm": 0.5, "hot": 1.5, "severe": 4.0}
+"""Expected faults of the policy `wspt`, which ignores heat, in a shift: the ambient temperature of each level and cell
+is set so. `benchmarks/freeze_suite.py` does it, and checks it on other seeds. Cells with one-hour shifts of many arms
+have as many faults for every four arms."""
+Arriving = Literal["waves", "poisson", "trace", "rush"]
+Due = Literal["usual", "tight"]
 Faults = Literal["attended", "unattended", "noisy"]
 Bus = Literal["perfect", "late", "lossy", "ring", "cut"]
 
-
-SEVERITY: dict[Heat, tuple[float, float]] = {
-    "mild": (0.4, 0.55),
-    "warm": (0.55, 0.55),
-    "hot": (0.75, 0.55),
-    "severe": (1.0, 0.55),
-}
-"""Time loads (`scenarios.prepare.load_factor`) of the expected jobs that heat, and of the others. The resulting thermal
-load factor depends on cell and ambient temperature; `thermofleet show` prints it."""
+LIGHT_LOAD = 0.55
+HEAVY_LOAD: dict[Level, float] = {"cool": 0.3, "warm": 0.3, "hot": 0.35, "severe": 0.5}
+"""Shares of the time of all arms that light and heavy work take, if all is done."""
+OVERLOAD = 1.8
+"""Factor on both in an overloaded cell."""
+LIGHT_WORTH, HEAVY_WORTH = 0.45, 0.42
+"""Value of a minute of work."""
+LIGHT_DUE_S: dict[Due, float] = {"usual": 2400.0, "tight": 1200.0}
+HEAVY_DUE_S: dict[Due, float] = {"usual": 150.0, "tight": 90.0}
+"""Time in which an arm must begin a heavy job; then it expires."""
 LEAST_JOBS = 0.25
-"""Fewest expected jobs of a stream and payload, so that every task occurs."""
-DUE: dict[Due, float] = {"loose": 2.0, "usual": 1.0, "tight": 0.5, "hard": 0.75}
-"""Factor on the due times of the tasks; with `hard`, jobs that still wait at their due date expire."""
-AIR_C: dict[Air, tuple[float, float]] = {
-    "cool": (22.0, 22.0),
-    "warm": (26.0, 26.0),
-    "hot": (30.0, 30.0),
-    "rising": (22.0, 31.0),
-}
-"""Ambient temperature at the beginning and, after two thirds of the shift, at the end, °C."""
-PAST_AIR_C = (22.0, 31.0)
-"""Range of the past jobs of the arms, the same for all instances of a cell."""
+"""Fewest expected jobs of a stream, so that every task occurs."""
+PAST_AIR_C = (15.0, 35.0)
+"""Range of the ambient temperature of the past jobs of the arms, the same for all instances of a cell."""
+COOL_C = 12.0
+"""Ambient temperature of the level cool."""
 LIMITS = ThermalLimits(warning_c=52.0, error_c=59.0, restart_c=43.0)
 """Lower than the defaults, as for arms beside people, so that heat matters within an hour."""
 UNATTENDED_S = 2400.0
 """unattended: time until a person clears the fault of a cooled arm and moves it home."""
 NOISE_K = 2.0
 """noisy: standard deviation of the temperature readings of every second arm."""
-BATCHES_S = 1500.0
-"""batch: approximate time between two batches."""
+WAVES_S = 1200.0
+"""waves: approximate time between two waves of light jobs."""
 RUSH, RUSH_SHARE = (0.35, 0.55), 0.5
-"""rush: a share of all jobs arrives in this part of the shift."""
+"""rush: a share of all light jobs arrives in this part of the shift."""
 BUSES: dict[Bus, BusSpec] = {
     "perfect": BusSpec(),
     "late": BusSpec(delay_s=20.0, jitter_s=20.0),
@@ -313,62 +302,58 @@ BUSES: dict[Bus, BusSpec] = {
 class Axes:
     """Values of an instance on the axes of its cell."""
 
-    heat: Heat
-    due: Due
+    heat: Level
     arrivals: Arriving
-    precedence: Precedence
-    air: Air
+    due: Due
     faults: Faults
     bus: Bus
 
 
-OFTEN = {"faults": "attended", "bus": "perfect"}
+OFTEN = {"arrivals": "waves", "faults": "attended", "bus": "perfect"}
 """Values that half of all instances have; all others are equally frequent."""
 
 
-def draw_axes(rng: np.random.Generator) -> Axes:
-    """Values sampled independently."""
+def draw_axes(rng: np.random.Generator, turn: int) -> Axes:
+    """Values sampled independently; the levels of heat take turns."""
     values: dict[str, Any] = {}  # literals of several types
     for name, kind in get_type_hints(Axes).items():
         choices = list(get_args(kind))
         weights = np.array([len(choices) - 1.0 if choice == OFTEN.get(name) else 1.0 for choice in choices])
         values[name] = choices[int(rng.choice(len(choices), p=weights / weights.sum()))]
-    return Axes(**values)
+    levels = get_args(Level)
+    return Axes(**{**values, "heat": levels[turn % len(levels)]})
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was measured in a cell, for all of its instances."""
+
+    minutes: dict[str, float]
+    """Mean duration of a job of each task, min, over payloads, repetitions and able arms."""
+    ambient_c: dict[Level, float]
+    """Ambient temperature of each level."""
 
 
 @cache
-def time_loads() -> dict[str, tuple[float, float]]:
-    """By cell, time load of one job of each stream and payload in a shift: of the tasks that heat, and of the others.
-
-    As `benchmarks/freeze_suite.py` computed them.
-    """
-    text = resources.files("scenarios").joinpath("suite/time_loads.json").read_text(encoding="utf-8")
-    return json.loads(text)
+def calibrations() -> dict[str, Calibration]:
+    """By cell, as `benchmarks/freeze_suite.py` computed them."""
+    text = resources.files("scenarios").joinpath("suite/calibration.json").read_text(encoding="utf-8")
+    return msgspec.convert(json.loads(text), dict[str, Calibration])
 
 
-def expected_jobs(cell: SuiteCell, heat: Heat) -> tuple[float, float]:
-    """Expected number of jobs of each stream and payload in a shift: of tasks that heat, of the others."""
-    heating, rest = (wanted / one for wanted, one in zip(SEVERITY[heat], time_loads()[cell.name], strict=True))
-    return max(LEAST_JOBS, heating), max(LEAST_JOBS, rest)
-
-
-def scenario_of(name: str, cell: SuiteCell, axes: Axes, seed: int, jobs: tuple[float, float] | None = None) -> Scenario:
+def scenario_of(name: str, cell: SuiteCell, axes: Axes, seed: int, known: Calibration | None = None) -> Scenario:
     """Scenario of a cell at these values, checked like a file.
 
     Args:
         seed: Of the sampled times of a trace.
-        jobs: Expected jobs of each stream and payload, see `expected_jobs`; default: those.
+        known: Calibration of the cell; default: the stored one.
     """
     horizon_s = 3600.0 * cell.hours
-    hot, rest = jobs or expected_jobs(cell, axes.heat)
+    known = known or calibrations()[cell.name]
     rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
     streams: list[JobStream] = []
-    for group in range(len(layout(cell).groups)):
-        for task in TRADES[cell.trade]:
-            expected = (hot if task.heats else rest) * len(task.payload_kg)
-            streams += _streams(cell, axes, group, task, expected, rng)
-    first_c, last_c = AIR_C[axes.air]
-    points = ((0.0, first_c),) if first_c == last_c else ((0.0, first_c), (horizon_s * 2 / 3, last_c))
+    for task in tasks_of(cell):
+        streams += _streams(cell, axes, task, known.minutes[task.name], rng)
     limits = LIMITS
     if axes.faults == "unattended":
         limits = replace(limits, clear_s=UNATTENDED_S, move_home_s=UNATTENDED_S)
@@ -383,10 +368,10 @@ def scenario_of(name: str, cell: SuiteCell, axes: Axes, seed: int, jobs: tuple[f
         places=layout(cell).places,
         jobs=tuple(streams),
         slots=cell.slots,
-        ambient=Ambient(points=points),
+        ambient=Ambient(points=((0.0, known.ambient_c[axes.heat]),)),
         limits=limits,
         twin=TwinSpec(size="quick", exploration=32, air_c=PAST_AIR_C),
-        spread=Spread(scale=SPREAD[cell.unlike], seed=cell.seed),
+        spread=Spread(scale=SPREAD, seed=cell.seed),
         bus=_bus(axes.bus, [arm.name for arm in arms], horizon_s),
     )  # fmt: skip
     return parse_scenario(msgspec.to_builtins(scenario), Path(f"{name}.toml"))
@@ -395,7 +380,8 @@ def scenario_of(name: str, cell: SuiteCell, axes: Axes, seed: int, jobs: tuple[f
 def describe(cell: SuiteCell, axes: Axes) -> str:
     """Description of an instance in a sentence."""
     values = ", ".join(f"{name} {value}" for name, value in asdict(axes).items())
-    return f"{cell.trade.replace('_', ' ')} by {cell.arms} {cell.unlike} arms ({cell.layout}): {values}."
+    trade, asks = (text.replace("_", " ") for text in (cell.trade, cell.asks))
+    return f"{trade} by {cell.arms} arms ({cell.layout}; {asks}): {values}."
 
 
 def _bus(quality: Bus, arms: list[str], horizon_s: float) -> BusSpec:
@@ -406,44 +392,45 @@ def _bus(quality: Bus, arms: list[str], horizon_s: float) -> BusSpec:
     return replace(spec, partitions=(Partition(horizon_s / 3, horizon_s * 2 / 3, (half,)),))
 
 
-def _streams(
-    cell: SuiteCell, axes: Axes, group: int, task: SuiteTask, expected: float, rng: np.random.Generator
-) -> list[JobStream]:
-    """The stream of a task at a group of stations; with a rush, a second one for it."""
-    spots = {place.name[0]: place.name for place in layout(cell).groups[group]}
-    horizon_s = 3600.0 * cell.hours
+def _streams(cell: SuiteCell, axes: Axes, task: SuiteTask, minutes: float, rng: np.random.Generator) -> list[JobStream]:
+    """The streams of a task: one for each group if one arm alone can do it; with a rush, a second one for it."""
+    places = [tuple(f"{letter}_{group:02d}" for letter in task.at) for group in range(cell.arms)]
+    horizon_s, due = 3600.0 * cell.hours, HEAVY_DUE_S if task.heavy else LIGHT_DUE_S
+    load = (HEAVY_LOAD[axes.heat] if task.heavy else LIGHT_LOAD) * (OVERLOAD if cell.asks == "overload" else 1.0)
+    expected = max(LEAST_JOBS, load * cell.arms * horizon_s / 60.0 / minutes)
+    arrivals = "poisson" if task.heavy else axes.arrivals
     stream = JobStream(
-        name=f"{task.name}_{group:02d}",
+        name=task.name,
         kind=task.kind,
-        places=tuple(spots.get(letter, spots["b"]) for letter in task.at),
+        places=tuple(places),
         payload_kg=task.payload_kg,
         repetitions=task.repetitions,
         dwell_s=task.dwell_s,
-        force_n=task.force_n,
-        value=task.value,
-        due_s=task.due_s * DUE[axes.due],
-        due="hard" if axes.due == "hard" else "soft",
-        after=(f"{task.after}_{group:02d}",) if task.after and axes.precedence == "chain" else (),
-        arrivals=_arrivals(axes.arrivals, expected, horizon_s, rng),
+        value=round((HEAVY_WORTH if task.heavy else LIGHT_WORTH) * minutes, 2),
+        due_s=due[axes.due],
+        due="hard" if task.heavy else "soft",
+        arrivals=Arrivals(kind="poisson", every_s=horizon_s),
     )
-    if axes.arrivals != "rush":
-        return [stream]
-    begin_s, end_s = (share * horizon_s for share in RUSH)
-    every_s = round((end_s - begin_s) / (RUSH_SHARE * expected), 3)
-    window = Arrivals(kind="poisson", every_s=every_s, start_s=begin_s, stop_s=end_s)
-    after = tuple(f"rush_{name}" for name in stream.after)
-    return [stream, replace(stream, name=f"rush_{stream.name}", arrivals=window, after=after)]
+    alone = [replace(stream, name=f"{task.name}_{i:02d}", places=(each,)) for i, each in enumerate(places)]
+    own = alone if cell.asks == "one_able_arm" else [stream]
+    made: list[JobStream] = []
+    for each in own:
+        made.append(replace(each, arrivals=_arrivals(arrivals, expected / len(own), horizon_s, rng)))
+        if arrivals == "rush":
+            begin_s, end_s = (share * horizon_s for share in RUSH)
+            every_s = round((end_s - begin_s) / (RUSH_SHARE * expected / len(own)), 3)
+            window = Arrivals(kind="poisson", every_s=every_s, start_s=begin_s, stop_s=end_s)
+            made.append(replace(each, name=f"rush_{each.name}", arrivals=window))
+    return made
 
 
 def _arrivals(kind: Arriving, expected: float, horizon_s: float, rng: np.random.Generator) -> Arrivals:
     """Arrivals of about `expected` jobs in a shift, or of what is not in the rush."""
     match kind:
-        case "batch":
-            count = max(1, round(expected * BATCHES_S / horizon_s))
+        case "waves":
+            count = max(1, round(expected * WAVES_S / horizon_s))
             every_s = round(horizon_s * count / expected, 3)
-            return Arrivals(
-                kind="batch", count=count, every_s=every_s, start_s=round(every_s * float(rng.random()) ** 2, 3)
-            )
+            return Arrivals(kind="batch", count=count, every_s=every_s, start_s=round(0.1 * every_s * rng.random(), 3))
         case "trace":
             return Arrivals(kind="trace", times_s=_trace(int(rng.poisson(expected)), horizon_s, rng))
         case "poisson" | "rush":

@@ -16,7 +16,7 @@ from scenarios.spec.parse import choose, hash_of, scenario_hash
 from scenarios.spec.schema import SPLITS, Scenario, SplitName
 from scenarios.suite.instances import CELLS, Axes, SuiteCell, draw_axes, scenario_of
 
-SUITE = 17
+SUITE = 37
 """Seed of all draws of the suite."""
 DIGITS = 3
 """Decimals of times in a hash of jobs, s: the last bits of a logarithm differ between platforms."""
@@ -51,7 +51,7 @@ class ManifestLine:
 
 @lru_cache(maxsize=len(SPLITS))
 def split(name: str) -> tuple[Instance, ...]:
-    """The instances of a split: train, validation, test or sizes.
+    """The instances of a split: train, validation or test.
 
     Cells that several instances share have equal plans, space and twins. The first instances are of different cells.
 
@@ -103,11 +103,11 @@ def drawn_rows(name: SplitName) -> Iterator[ManifestLine]:
     """Sample the lines of a split again, in turns from each of its cells."""
     cells = [cell for cell in CELLS if cell.split == name]
     turns = range(max(cell.instances for cell in cells))
-    chosen = [cell for turn in turns for cell in cells if turn < cell.instances]
-    for number, cell in enumerate(chosen):
+    chosen = [(turn, cell) for turn in turns for cell in cells if turn < cell.instances]
+    for number, (turn, cell) in enumerate(chosen):
         entropy = np.random.SeedSequence([SUITE, SPLITS.index(name), number])
         seed = int(entropy.generate_state(1)[0])
-        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]))
+        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]), 0 if cell.asks == "light_work" else turn)
         row = ManifestLine(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
         made = instance_of(row)
         jobs = jobs_content(made)
@@ -123,8 +123,8 @@ def jobs_content(made: Instance) -> list[Any]:
     """The jobs of an instance's shift as JSON values, in order of release."""
     jobs = draw_jobs(made.scenario, shift_seeds(np.random.SeedSequence(made.seed))[0])
     return [
-        [job.name, job.work.kind, job.work.stations, job.work.payload_kg, job.repetitions, round(job.release_s, DIGITS),
-         round(job.due_s, DIGITS), job.value, job.after, job.expires]
+        [job.name, job.work.kind, [work.stations for work in job.works], job.work.payload_kg, job.repetitions,
+         round(job.release_s, DIGITS), round(job.due_s, DIGITS), job.value, job.after, job.expires]
         for job in jobs
     ]  # fmt: skip
 
