@@ -169,7 +169,7 @@ def compare_command(
         shown="",
     ),
     suite: str | None = option(
-        "Instances for one joint table: a split (train, validation, test or sizes); or instances (test/0017), "
+        "Instances for one joint table: a split (train, validation or test); or instances (test/0017), "
         "library names and .toml files, separated by commas.",
         None,
     ),
@@ -265,7 +265,7 @@ def bounds_command(
         None,
     ),
     *,
-    suite: str | None = option("All instances of a split: train, validation, test or sizes.", None),
+    suite: str | None = option("All instances of a split: train, validation or test.", None),
     seeds: int = option("Number of seeds of each scenario.", 5, low=1, high=10_000),
     first_seed: int = option("First seed.", 0, low=0, high=MAX_SEED),
     budget: Annotated[Given, From(Budget)],
@@ -317,7 +317,7 @@ def bounds_command(
 
 def leaderboard_command(
     folder: Path = argument("Folder of results, one file for each policy.", FOLDER),
-    split: str = option("Split of the suite: test, sizes or validation.", "test"),
+    split: str = option("Split of the suite: test or validation.", "test"),
     as_json: bool = options.JSON,
     submit: Path | None = option("Folder of `thermofleet compare --suite test --out`.", None, panel=_SUBMIT),
     author: str = option("--submit: name of the author.", "", panel=_SUBMIT),

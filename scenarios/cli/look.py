@@ -55,8 +55,8 @@ def show_command(
         "Mass of the gripper at the flange, kg.", 0.0, low=0, high=RATING.temporary_kg, panel=_HOLD
     ),
     beyond_rating: bool = option("Accept a load beyond the rating of the arm.", False, panel=_HOLD),
-    suite: Literal["cells", "train", "validation", "test", "sizes"] | None = option(
-        "List the benchmark's suite: its cells, or the instances of a split: train, validation, test or sizes.", None
+    suite: Literal["cells", "train", "validation", "test"] | None = option(
+        "List the benchmark's suite: its cells, or the instances of a split: train, validation or test.", None
     ),
     as_json: bool = options.JSON,
 ) -> None:
@@ -104,13 +104,10 @@ def _list_cells(as_json: bool) -> None:
     from scenarios.suite.instances import CELLS
 
     if as_json:
-        print_json({cell.name: {**asdict(cell), "stations_per_arm": cell.stations_per_arm} for cell in CELLS})
+        print_json({cell.name: asdict(cell) for cell in CELLS})
         return
-    head = ("split", "cell", "arms are", "stations per arm", "hours", "instances")
-    lines = tuple(
-        (cell.split, cell.name, cell.unlike, f"{cell.stations_per_arm:.2g}", f"{cell.hours:g}", str(cell.instances))
-        for cell in CELLS
-    )
+    head = ("split", "cell", "asks", "hours", "instances")
+    lines = tuple((cell.split, cell.name, cell.asks, f"{cell.hours:g}", str(cell.instances)) for cell in CELLS)
     out_console.print(Table(head=head, rows=lines, numbers=False))
 
 

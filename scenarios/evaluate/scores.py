@@ -13,7 +13,7 @@ from scenarios.evaluate.statistics import Interval, aggregates, by_group, holm, 
 from scenarios.evaluate.study import Case, Row
 from scenarios.policy_loader import has_trainings
 from scenarios.spec.parse import scenario_hash
-from scenarios.suite.splits import cell_name
+from scenarios.suite.splits import cell_name, heat_binds
 
 if TYPE_CHECKING:
     from scenarios.evaluate.references import ShiftReference
@@ -36,16 +36,20 @@ class Normalised:
     """Cell of each instance; instances of one cell have the same arms, stations and tasks."""
     score: Mapping[str, Array]
     """By policy, [training of the policy, instance]; a single training counts as given, not as a sample."""
-    to_bound: Mapping[str, Array]
-    """(upper bound − reward) / (upper bound − random), in the same shape."""
     missing: int = 0
     """Shifts of each policy that have no reference."""
 
     def only(self, chosen: Array) -> "Normalised":
         """Some of the instances, bool [instance]."""
         names, cells = (tuple(np.array(each)[chosen].tolist()) for each in (self.instances, self.cells))
-        score, to_bound = ({name: x[:, chosen] for name, x in each.items()} for each in (self.score, self.to_bound))
-        return replace(self, instances=names, cells=cells, score=score, to_bound=to_bound)
+        return replace(self, instances=names, cells=cells, score={name: x[:, chosen] for name, x in self.score.items()})
+
+    @cached_property
+    def hot(self) -> Array | None:
+        """Whether heat binds in each instance, bool [instance]; None if some are no instances of the suite, or if it is
+        the same in all."""
+        hot = [heat_binds(name) for name in self.instances]
+        return np.array(hot, dtype=bool) if None not in hot and len(set(hot)) > 1 else None
 
     @cached_property
     def groups(self) -> Array | None:
@@ -91,8 +95,10 @@ class Score:
     """By how much scores are below 1 in the mean; those above count as 1."""
     improvement: Interval
     """Probability of a better score than the baseline's on an instance; an equal score counts one half."""
-    bound_gap: Interval
-    """Distance to the upper bound as a share of that from random to the bound, in the mean."""
+    hot: Interval | None = None
+    """Mean score in the instances in which heat binds; None as in `Normalised.hot`."""
+    cool: Interval | None = None
+    """Mean score in the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +153,7 @@ def scores_of(values: Normalised, baseline: str) -> SuiteScores:
                 iqm=suite[name].iqm,
                 optimality_gap=suite[name].optimality_gap,
                 improvement=improvement(values.score[name], base, groups=groups),
-                bound_gap=values.interval(values.to_bound[name]),
+                **_parts(values, name),
             )
             for name, difference, p_holm in zip(names, differences, adjusted, strict=True)
         },
@@ -164,7 +170,15 @@ def ranked(scores: SuiteScores) -> list[str]:
     return sorted(scores.policies, key=lambda name: -scores.policies[name].mean.mean)
 
 
-HEADS = ("policy", "mean", "difference", "", "IQM", "short of 1", "better in", "to bound")
+def _parts(values: Normalised, name: str) -> dict[str, Interval]:
+    """Mean scores of a policy where heat binds and where it does not, by the fields of `Score`."""
+    if values.hot is None:
+        return {}
+    parts = {"hot": values.only(values.hot), "cool": values.only(~values.hot)}
+    return {field: own.interval(own.score[name]) for field, own in parts.items()}
+
+
+HEADS = ("policy", "mean", "difference", "", "heat binds", "it does not", "IQM", "better in")
 
 
 def score_cells(scores: SuiteScores, name: str, digits: int = 2) -> tuple[str, ...]:
@@ -174,10 +188,10 @@ def score_cells(scores: SuiteScores, name: str, digits: int = 2) -> tuple[str, .
         each.mean.text(digits),
         "" if base else each.difference.text(digits),
         "" if base else each.difference.stars(each.p_holm),
+        each.hot.text(digits) if each.hot else "",
+        each.cool.text(digits) if each.cool else "",
         each.iqm.text(digits),
-        each.optimality_gap.text(digits),
         "" if base else each.improvement.text(digits),
-        f"{each.bound_gap.mean:.{digits}f}",
     )
 
 
@@ -235,8 +249,8 @@ def normalised(
     if len(scored) < FEWEST:
         return None
     known = [references[shift] for shift in scored]
-    random, unit, upper = (np.array([getattr(each, name) for each in known]) for name in ("random", "unit", "upper"))
-    score, to_bound = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    random, unit = (np.array([getattr(each, name) for each in known]) for name in ("random", "unit"))
+    score = dict[str, np.ndarray]()
     for policy, rows in by_policy.items():
         rewards: dict[int, dict[Shift, list[float]]] = {}
         for row in rows:
@@ -247,11 +261,9 @@ def normalised(
                 own.setdefault(shift, []).append(row.outcome.reward if row.outcome else references[shift].random)
         reward = np.array([[np.mean(own[shift]) for shift in scored] for own in rewards.values()])
         score[policy] = (reward - random) / unit
-        to_bound[policy] = (upper - reward) / (upper - random)
     return Normalised(
         instances=tuple(each.instance for each in known),
         cells=tuple(cell_name(each.instance) for each in known),
         score=score,
-        to_bound=to_bound,
         missing=len({(row.key.fleet, row.key.instance, row.key.seed) for row in first}) - len(scored),
     )

@@ -203,7 +203,7 @@ class SuiteCell:
     pitch_m: float = 0.85
     hours: float = 2.0
     slots: int = 24
-    instances: int = 16
+    instances: int = 24
     seed: int = 0
     """Seed of the arms' deviations."""
 

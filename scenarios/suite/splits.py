@@ -99,6 +99,14 @@ def cell_name(instance: str) -> str:
     return name or number
 
 
+def heat_binds(instance: str) -> bool | None:
+    """Whether a policy that ignores heat is expected to fault in an instance of a split; None for another name."""
+    split = instance.rpartition("/")[0]
+    if split not in SPLITS:
+        return None
+    return next((row.axes.heat != "cool" for row in manifest(split) if row.name == instance), None)
+
+
 def drawn_rows(name: SplitName) -> Iterator[ManifestLine]:
     """Sample the lines of a split again, in turns from each of its cells."""
     cells = [cell for cell in CELLS if cell.split == name]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fleet.difficulty import KNOWN, Blind, Difficulty, Forecast
-from fleet.engine.shift import initial
+from fleet.engine.shift import initial, open_jobs, step
+from fleet.engine.state import DONE
 from fleet.engine.world import warm_start
 from fleet.heat.motor import gen3_motors
 from fleet.motion import Plan
@@ -141,3 +142,44 @@ def test_offers_index_rows_of_the_risk_table(small) -> None:
     assert offers.forecasts.offset.tolist() == [[-2.0, -2.0, -np.inf], [-3.0] * 3]
     assert np.isnan(offers.p_saturation[:, 0]).all()
     assert small.shop([jobs], arms=[arms[1]])[0].offers.forecasts is None
+
+
+def alternatives(small, count: int, stations: int = 3):
+    """Jobs that serve alike at any of some stations."""
+    works = [small.work(f"station_{i}") for i in range(stations)]
+    return [small.job(f"j{i}", works[0], alternatives=tuple(works[1:])) for i in range(count)], works
+
+
+def test_the_second_plan_of_a_job_with_alternatives_is_at_another_station(small) -> None:
+    (job,), works = alternatives(small, 1)
+    arm = small.arm(0, works)
+    fast = replace(arm.plans[works[1]][0], approach=small.phase(2.5, arm.plans[works[1]][0].approach.profile[0, 2]))
+    arm = replace(arm, plans={**arm.plans, works[1]: (fast,)})
+    (first, _), (second, _) = arm.offers(*job.works)[3]
+    assert first is fast
+    assert second.work in (works[0], works[2])
+    world, _ = small.shop([[job]], arms=[arm], plans_per_job=2)
+    assert world.stations == ()  # no station that every alternative needs
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_arms_with_alternatives_never_share_a_station(small, seed) -> None:
+    """Random legal claims: at every moment the arms at work are at different stations, and all jobs are done."""
+    jobs, works = alternatives(small, 6)
+    rng, arms = np.random.default_rng(seed), [small.arm(i, works) for i in range(4)]
+    world, plant = small.shop([jobs], arms=arms, slots=6, plans_per_job=2)
+    state, most = initial(world), 0
+    station = {
+        world.offers.plan[0, a, 0, n]: plan.work.stations
+        for a, arm in enumerate(arms)
+        for n, (plan, _) in enumerate(arm.offers(*jobs[0].works)[3])
+    }
+    for _ in range(world.ticks):
+        mask = open_jobs(world, state)[1][0]
+        actions = np.array([[rng.choice(np.flatnonzero(row[:-1])) for row in mask]])
+        state = step(world, state, actions, plant).state
+        busy = [station[row] for row in state.plan[0].tolist() if row >= 0]
+        assert len(set(busy)) == len(busy)
+        most = max(most, len(busy))
+    assert most == 2  # an arm offers the fastest plan, at the first station, and one at another
+    assert (state.status[0] == DONE).all()

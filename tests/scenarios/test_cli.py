@@ -216,7 +216,7 @@ WRONG_WORDS = {
     "suite --split test": "`thermofleet suite` is now `thermofleet show --suite`.",
     "arm resume arm_0": "`thermofleet arm resume` is now `thermofleet arm pause --end`.",
     "show quickstart --suite test": "--suite takes no scenario; leave 'quickstart' out.",
-    "show --suite tst": "No suite 'tst'; did you mean 'test'? Allowed: cells, sizes, test, train, validation.",
+    "show --suite tst": "No suite 'tst'; did you mean 'test'? Allowed: cells, test, train, validation.",
     "arm quickstart arm_0": "`thermofleet arm SCENARIO NAME` is now `thermofleet arm run SCENARIO NAME`.",
     "show quickstart --hold 1": "--hold takes no scenario; leave 'quickstart' out.",
     "compare quickstart --policies random,rnd": "No policy 'rnd'; did you mean 'random'?",

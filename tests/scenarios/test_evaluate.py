@@ -33,6 +33,7 @@ from scenarios.spec.load import load
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import parse_scenario
 from scenarios.spec.schema import Ambient, RewardSpec
+from scenarios.suite.splits import manifest
 
 SEEDS = (0, 3, 12)
 LATE = Channel(delay_s=25.0, loss=0.3)
@@ -214,6 +215,7 @@ class Known:
 
     def __init__(self, instance: str, random: float, hindsight: float, upper: float) -> None:
         self.instance, self.random, self.hindsight, self.upper = instance, random, hindsight, upper
+        self.unit = max(hindsight - random, 0.1 * hindsight)
 
 
 REFERENCES = {
@@ -241,17 +243,33 @@ def test_scores_are_shares_of_the_way_from_random_to_hindsight():
     by_policy = {"a": rows_of("a", {0: 15.0, 1: 50.0, 2: 5.0}), "b": rows_of("b", {0: 7.0, 1: 24.0, 2: 0.0}, 3)}
     values = scored(by_policy, REFERENCES)
     assert values is not None
-    assert values.instances == ("test/0000", "test/0001")
-    assert values.flat == ("test/0002",)
-    assert values.score["a"].tolist() == [[0.5, 1.0]]
-    assert values.score["b"].tolist() == [pytest.approx([-0.2, 0.5])]  # means of trainings of twins: 8 and 25
-    assert values.to_bound["a"].tolist() == [[0.75, 0.0]]
+    assert values.instances == ("test/0000", "test/0001", "test/0002")
+    assert values.score["a"].tolist() == [pytest.approx([0.5, 1.0, 0.0])]
+    assert values.score["b"].tolist() == [pytest.approx([-0.2, 0.5, -8.0])]  # means of trainings of twins: 8, 25, 1
     scores = scores_of(values, "b")
-    assert scores.policies["a"].mean.mean == 0.75
-    assert scores.policies["a"].difference.mean == pytest.approx(0.6)
-    assert scores.policies["a"].optimality_gap.mean == 0.25
+    assert scores.policies["a"].mean.mean == 0.5
+    assert scores.policies["a"].difference.mean == pytest.approx(0.5 + 7.7 / 3)
+    assert scores.policies["a"].optimality_gap.mean == 0.5
     assert scores.policies["a"].improvement.mean == 1.0
-    assert scores.policies["b"].bound_gap.mean == pytest.approx((22 / 20 + 0.5) / 2)
+
+
+def test_where_heat_binds_has_a_mean_of_its_own():
+    levels = {row.axes.heat: (row.name, row.seed) for row in manifest("test")}
+    shifts = [levels["cool"], levels["warm"], levels["severe"]]
+    known = {shift: Known(shift[0], 0.0, 10.0, 10.0) for shift in shifts}
+    blank = Outcome(**dict.fromkeys(FIGURES, 0.0))
+    rows = [
+        Row(RowKey("a", name, 0, 0, "oracle", seed), replace(blank, reward=reward))
+        for (name, seed), reward in zip(shifts, (9.0, 6.0, 2.0), strict=True)
+    ]
+    values = scored({"a": rows}, known)
+    assert values is not None
+    (found,) = scores_of(values, "a").policies.values()
+    assert found.hot is not None
+    assert found.cool is not None
+    assert (found.hot.mean, found.cool.mean) == pytest.approx((0.4, 0.9))
+    other = replace(values, instances=("quickstart/1", *values.instances[1:]))
+    assert scores_of(other, "a").policies["a"].hot is None
 
 
 def test_trainings_of_a_policy_are_a_sample_and_those_of_twins_are_not():
@@ -259,15 +277,15 @@ def test_trainings_of_a_policy_are_a_sample_and_those_of_twins_are_not():
     by_policy = {"pairs-*": rows_of("pairs-*", rewards, 3), "a": rows_of("a", {0: 12.0, 1: 30.0, 2: 5.0})}
     values = scored(by_policy, REFERENCES)
     assert values is not None
-    each = np.array([[0.5, 0.8], [0.6, 0.82], [0.7, 0.84]])  # instances in columns
+    each = np.array([[0.5, 0.8, 0.0], [0.6, 0.82, 2.0], [0.7, 0.84, 4.0]])  # instances in columns
     assert values.score["pairs-*"].tolist() == [pytest.approx(row.tolist()) for row in each]
     learned = scores_of(values, "a").policies["pairs-*"]
     assert learned.mean == interval(values.score["pairs-*"][:, None])
     assert learned.mean.mean == pytest.approx(each.mean())
-    # Two instances: with trainings as a sample the interval is wider than that of the means over trainings.
+    # Three instances: with trainings as a sample the interval is wider than that of the means over trainings.
     given = interval(each.mean(axis=0))
     assert learned.mean.high - learned.mean.low > given.high - given.low
-    assert scores_of(values, "a").remarks[0].startswith("Unit: 2 instances × 3 trainings of a policy.")
+    assert scores_of(values, "a").remarks[0].startswith("Unit: 3 instances × 3 trainings of a policy.")
 
 
 def test_shifts_without_a_reference_are_counted_and_failures_can_count_as_random():

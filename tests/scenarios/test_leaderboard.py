@@ -97,7 +97,7 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     (first,) = re.findall(r"\| 1 \|.*", text)
     assert [cell.strip() for cell in first.split("|")][2:5] == ["`wsept`", "oracle", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text
-    assert board_text(sent, "sizes") == "No results on the split sizes."
+    assert board_text(sent, "validation") == "No results on the split validation."
     assert run("leaderboard", tmp_path / "absent") == 2
 
 
@@ -188,7 +188,7 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: BoardResult,
     with pytest.raises(FleetError, match="must have the name of its policy and split, test-mine-oracle"):
         read_all(tmp_path, "test")
     (tmp_path / "banana.jsonl").touch()
-    with pytest.raises(FleetError, match=r"banana.jsonl' must have the name .* with SPLIT validation, test, sizes"):
+    with pytest.raises(FleetError, match=r"banana.jsonl' must have the name .* with SPLIT validation, test"):
         read_all(tmp_path, "test")
     (tmp_path / "study.json").touch()
     with pytest.raises(
