@@ -1,5 +1,7 @@
 """Estimates of an arm: best variant, reason of an infeasible job, and a peak that scipy confirms."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -149,3 +151,43 @@ def test_an_estimate_says_whether_a_load_is_too_heavy(arm):
     for job in jobs:
         estimator.prepare(job)
     assert [each.too_heavy for each in estimator.estimate(jobs, KNOWN_C, 0.0)] == [False, True]
+
+
+def test_a_job_with_alternatives_is_planned_at_each_and_its_stations_are_those_that_all_need(small):
+    places = {name: Place(name=name, position_m=(0.5, 0.0, 0.2)) for name in ("feeder", "left", "right")}
+    works = [small.work("feeder", 4.0, to=name) for name in ("left", "right")]
+    arm, asked = small.arm(0, works), []
+
+    def plan(work):
+        asked.append(tuple(place.name for place in work.places))
+        if work.places[1].name == "left":
+            raise InfeasibleJob("arm_0", "left", "out of reach")
+        return next(plans for each, plans in arm.plans.items() if each.places == work.places)
+
+    estimator = Estimator(arm.model, plan, places, NominalPeaks())
+    job = spec(kind="pick_place", places=("feeder", "left"), alternatives=(("feeder", "right"),), payload_kg=4.0)
+    assert job.stations == ("feeder",)
+    estimator.prepare(job)
+    assert asked == [("feeder", "left"), ("feeder", "right")]
+    (estimate,) = estimator.estimate([job], KNOWN_C, 0.0)
+    assert estimate.feasible
+    (scored,) = estimator.plans(job)
+    assert scored.plan.work.places[1].name == "right"
+    assert [work.places[1].name for work in estimator.job(job).works] == ["left", "right"]
+    unknown = spec(places=("left",), alternatives=(("shelf",),))
+    (refused,) = estimator.estimate([unknown], KNOWN_C, 0.0)
+    assert "there is no place 'shelf' in this cell" in refused.reason
+
+
+@pytest.mark.parametrize(
+    ("alternatives", "message"),
+    [
+        ((("bench",),), "JobSpec.places must name each alternative once"),
+        ((("a", "b"),), "JobSpec.places must be one place for a hold"),
+        ((("a/b",),), "JobSpec.alternatives must have"),
+        (tuple((f"p{i}",) for i in range(64)), "JobSpec.places must have 1 to 64 alternatives (got 65)"),
+    ],
+)
+def test_impossible_alternatives_are_named(alternatives, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        spec(alternatives=alternatives)
