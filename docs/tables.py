@@ -172,6 +172,7 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
     return {
         "bounds": lambda: reference_table(load_references(results / "bounds_library.jsonl")).markdown(),
         "references": references_text,
+        "leaderboard_top": partial(board_top, results / "leaderboard"),
         **{f"leaderboard_{split}": partial(board_text, results / "leaderboard", split) for split in JUDGED},
     }
 
@@ -193,6 +194,24 @@ def board_text(folder: Path, split: str) -> str:
         more = (f"{mean_of(entry, 'faults'):.2f}", str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
         rows.append((str(place), *cells, *more))
     return "\n\n".join([board.summary, table(BOARD, rows), board.remark])
+
+
+SHOWN = 8
+"""Rows of the leaderboard in README."""
+
+
+def board_top(folder: Path) -> str:
+    """The best policies of the test split and the two that all scores refer to, as README shows them."""
+    board = board_of("test", read_all(folder, "test"))
+    assert board is not None
+    rows: list[tuple[str, ...]] = []
+    for place, name in enumerate(board.order, start=1):
+        entry, score = board.entries[name], board.scores.policies[name]
+        if place <= SHOWN or entry.card.policy in ("wspt", "random"):
+            hot, cool = (f"{each.mean:.2f}" if each else "" for each in (score.hot, score.cool))
+            cells = (title(entry), entry.card.scope, score.mean.text(), hot, cool, f"{mean_of(entry, 'faults'):.2f}")
+            rows.append((str(place), *cells))
+    return table(("", "policy", "scope", "mean score", "heat binds", "it does not", "faults"), rows)
 
 
 def title(entry: BoardResult) -> str:
@@ -475,7 +494,8 @@ def documents(docs: Path) -> dict[Path, str]:
         docs / "contract" / name: json.dumps(each, indent=1, ensure_ascii=False) + "\n"
         for name, each in contract.items()
     }
-    pages = {page: page.read_text(encoding="utf-8") for page in sorted(docs.rglob("*.md"))}
+    paths = [*([docs.parent / "README.md"] if docs == DOCS else []), *sorted(docs.rglob("*.md"))]
+    pages = {page: page.read_text(encoding="utf-8") for page in paths}
     return made | {page: fill_tables(text, tables) for page, text in pages.items() if MARK.search(text)}
 
 

@@ -1,13 +1,16 @@
 """A hall of any number of arms: rows of up to 16 on the floor, with two stations between every two neighbours."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import pairwise
 
 import numpy as np
 
 from fleet.arrivals import Arrivals
 from fleet.env.vector import Library
-from scenarios.spec.schema import JobStream, Scenario, Spread, TwinSpec
+from fleet.job import Place
+from scenarios.spec.schema import ArmSpec, JobStream, Scenario, Spread, TwinSpec
 from scenarios.suite.instances import layout_of
 
 SHOWN = ("name", "position_m", "tilt_deg", "home")
@@ -22,8 +25,9 @@ def hall(
         jobs: Expected number; default: eight per arm and hour.
         cycles: Fewest and most of a job, of 10 s or so each.
     """
-    layout, horizon_s = layout_of("line", arms), 3600.0 * hours
-    every_s = horizon_s * len(layout.groups) / (8.0 * arms * hours if jobs is None else jobs)
+    mounted, horizon_s = layout_of("line", arms, pitch_m=0.8).arms, 3600.0 * hours
+    groups = _stations(mounted)
+    every_s = horizon_s * len(groups) / (8.0 * arms * hours if jobs is None else jobs)
     streams = [
         JobStream(
             name=f"sort_{i:03d}",
@@ -34,19 +38,33 @@ def hall(
             repetitions=cycles,
             due_s=1800.0,
         )
-        for i, group in enumerate(layout.groups)
+        for i, group in enumerate(groups)
     ]
     return Scenario(
         name=f"hall_{arms}",
         description=f"{arms} arms sort parts.",
         horizon_s=horizon_s,
-        arms=layout.arms,
-        places=layout.places,
+        arms=mounted,
+        places=tuple(place for group in groups for place in group),
         jobs=tuple(streams),
         slots=slots,
         spread=Spread(scale=0.5, seed=17),
         twin=TwinSpec(size="quick", exploration=32),
     )
+
+
+def _stations(arms: Sequence[ArmSpec]) -> list[tuple[Place, Place]]:
+    """Two stations before the middle of every two neighbours of a row, each nearer to one of them."""
+    middles = [
+        ((one.position_m[0] + other.position_m[0]) / 2, one.position_m[1] + 0.4)
+        for one, other in pairwise(arms)
+        if one.position_m[1] == other.position_m[1]
+    ]
+    return [
+        (Place(name=f"a_{i:02d}", position_m=(round(x - 0.15, 4), y, 0.25)),
+         Place(name=f"b_{i:02d}", position_m=(round(x + 0.15, 4), y, 0.25)))
+        for i, (x, y) in enumerate(middles)
+    ]  # fmt: skip
 
 
 def toml_of(scenario: Scenario) -> str:

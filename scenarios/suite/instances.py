@@ -277,7 +277,7 @@ LEAST_JOBS = 0.25
 PAST_AIR_C = (15.0, 35.0)
 """Range of the ambient temperature of the past jobs of the arms, the same for all instances of a cell."""
 COOL_C = 12.0
-"""Ambient temperature of the level cool."""
+"""Highest ambient temperature of the level cool."""
 LIMITS = ThermalLimits(warning_c=52.0, error_c=59.0, restart_c=43.0)
 """Lower than the defaults, as for arms beside people, so that heat matters within an hour."""
 UNATTENDED_S = 2400.0
