@@ -250,45 +250,83 @@ LARGE = 4
 class Wsept(Matched, CentralRule):
     """Matching by expected worth per time: weighted shortest expected processing time, with the cost of heat.
 
-    The worth of a claim is the expected value of the job, less the expected cost of heat. The true peak is assumed to
-    be normally distributed around the predicted one. The probability of a fault is that of a true peak above the error
-    limit. A fault costs the value of the job and `fault_price`, each minute above the warning limit `minute_price`. An
-    arm takes the plan of a job with the most worth per time, and makes no claim without a positive worth.
+    The worth of a claim is the expected value of the job, less the expected cost of heat and of tardiness. The true
+    peak is assumed to be normally distributed around `margin_k` below the predicted one. The probability of a fault is
+    that of a true peak above the error limit. A fault costs the value of the job and `fault_price`, each minute above
+    the warning limit `minute_price`. A job that cannot end before the shift does is worth nothing. Jobs that expire
+    soon come first. An arm takes the plan of a job with the most worth per time, and makes no claim without a positive
+    worth.
 
     Without a predicted peak, P(saturation) gives one; with neither, heat costs almost nothing.
 
-    Source: Rothkopf, Management Science 12, 1966 (weighted expected processing times).
+    Source: Rothkopf, Management Science 12, 1966 (weighted expected processing times); the urgency follows Vepsalainen
+    & Morton, Management Science 33, 1987.
     """
 
     only_choices = True
     fault_price: ClassVar = 20.0
     """In units of value; `thermofleet show` prints 14 to 27 for the scenarios of the library."""
-    peak_sd_k: ClassVar = 2.5
-    """Standard deviation of true peaks around predicted ones near the error limit: chosen on the validation split of
-    the suite among 1, 1.5, 2.5 and 5."""
+    peak_sd_k: ClassVar = 4.0
+    """Standard deviation of true peaks around their mean near the error limit."""
+    margin_k: ClassVar = 3.0
+    """Predicted peak less the mean of true peaks near the error limit."""
     minute_price: ClassVar = 0.05
     """Price of a minute above the warning limit, as in the default reward."""
     tardiness_price: ClassVar = 0.01
-    """Price of a minute of tardiness for each unit of a job's value, as in the default reward: for others, as the worth
-    of `wsept` has no tardiness."""
+    """Price of a minute of tardiness for each unit of a job's value, as in the default reward."""
+    urgent_s: ClassVar = 1200.0
+    """Time until a job expires in which its urgency falls to 1/e; a job that expires now counts twice."""
 
     def index(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [env, arm, option]; −inf for those that must not be claimed."""
-        value, hottest_c = per_option(seen, seen.value), seen.temp_c.max(axis=-1)[..., None]
-        warning_c, error_c = warning_of(seen)[..., None], error_of(seen)[..., None]
-        peak_c = self.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
-        worth = self.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c)
-        return np.where(worth > 0, worth / np.maximum(seen.duration_s, 1.0), -np.inf)
+        worth = self.later_worth(seen, self.worth(seen), np.zeros(()))
+        return np.where(worth > 0, worth * self.urgency(seen) / np.maximum(seen.duration_s, 1.0), -np.inf)
 
     @classmethod
-    def predicted_peak_c(cls, peak_c: Array, p_saturation: Array, warning_c: Floats) -> Array:
-        """Predicted peaks, or those that P(saturation) gives where they are unknown (0), °C, [n]."""
+    def worth(cls, seen: Observation) -> Array:
+        """Expected value less the expected cost of heat of every option, begun now, [env, arm, option]."""
+        value, hottest_c = per_option(seen, seen.value), seen.temp_c.max(axis=-1)[..., None]
+        warning_c, error_c = warning_of(seen)[..., None], error_of(seen)[..., None]
+        peak_c = cls.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
+        return cls.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c + cls.margin_k)
+
+    @classmethod
+    def later_worth(cls, seen: Observation, worth: Array, delay_s: Array) -> Array:
+        """Worth after the cost of tardiness, [env, arm, option]; 0 if the job expires before the start or the shift
+        before the end.
+
+        Args:
+            worth: Without tardiness, [env, arm, option].
+            delay_s: Time until the start, in the same shape or one for all.
+        """
+        late_s = np.maximum(delay_s - seen.slack_s, 0.0)
+        worth = worth - cls.tardiness_price / 60.0 * per_option(seen, seen.value) * late_s
+        expires_s = np.where(seen.expires > 0, seen.due_in_s, np.inf)
+        lost = (delay_s > 0) & (delay_s > per_option(seen, expires_s))
+        return np.where(lost | (delay_s + seen.duration_s > seen.left_s[..., None]), 0.0, worth)
+
+    @classmethod
+    def urgency(cls, seen: Observation) -> Array:
+        """Factor on the worth of every option: 1 for jobs that do not expire, up to 2, [env, arm, option]."""
+        until_s = np.maximum(seen.due_in_s, 0.0)
+        return per_option(seen, 1.0 + np.where(seen.expires > 0, np.exp(-until_s / cls.urgent_s), 0.0))
+
+    @classmethod
+    def predicted_peak_c(
+        cls, peak_c: Array, p_saturation: Array, warning_c: Floats, peak_sd_k: float | None = None
+    ) -> Array:
+        """Predicted peaks, or those that P(saturation) gives where they are unknown (0), °C, [n].
+
+        Args:
+            peak_sd_k: Instead of that of the class.
+        """
         if (peak_c > 0).all():
             return peak_c
         from scipy.special import logit  # slow import that few processes need
 
         # An unknown peak is placed so far from the limit that its error gives P(saturation).
-        margin_k = cls.peak_sd_k * logit(np.clip(p_saturation, LEAST_P, 1.0 - LEAST_P))
+        sd_k = cls.peak_sd_k if peak_sd_k is None else peak_sd_k
+        margin_k = sd_k * logit(np.clip(p_saturation, LEAST_P, 1.0 - LEAST_P))
         return np.where(peak_c > 0, peak_c, warning_c + margin_k)
 
     @classmethod
@@ -300,7 +338,8 @@ class Wsept(Matched, CentralRule):
         hottest_c: Floats,
         warning_c: Floats,
         error_c: Floats,
-        factors: Sequence[Floats] = (1.0, 1.0, 1.0),
+        factors: Sequence[Floats] = (1.0, 1.0),
+        peak_sd_k: Floats | None = None,
     ) -> Array:
         """Expected value of jobs less the expected cost of heat, [n].
 
@@ -308,12 +347,13 @@ class Wsept(Matched, CentralRule):
             value, duration_s, peak_c: Of each job, [n], with the predicted peak.
             hottest_c: Hottest motor at the beginning, [n] or one for all.
             warning_c, error_c: The limits.
-            factors: On `peak_sd_k`, `fault_price` and `minute_price`.
+            factors: On `fault_price` and `minute_price`.
+            peak_sd_k: Instead of that of the class.
         """
         from scipy.special import ndtr  # slow import that few processes need
 
-        spread, fault, minute = factors
-        p_fault = ndtr((peak_c - error_c) / (cls.peak_sd_k * spread))
+        fault, minute = factors
+        p_fault = ndtr((peak_c - error_c) / (cls.peak_sd_k if peak_sd_k is None else peak_sd_k))
         # Approximation: the temperature rises linearly to its peak.
         above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
         heat = p_fault * cls.fault_price * fault + cls.minute_price * minute * above_share * duration_s / 60.0

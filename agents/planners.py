@@ -331,7 +331,7 @@ class RollingHorizon(Wsept):
         warmer_k = np.maximum(start_c - hottest_c, 0.0)
         later_c = np.maximum(peak_c[options] + warmer_k * np.exp(-d / self.tau_s), start_c)
         warning_c, error_c = float(seen.headroom_k) + hottest_c, float(seen.error_headroom_k) + hottest_c
-        worth = self.worth_of(value, d, later_c, start_c, warning_c, error_c)
+        worth = self.worth_of(value, d, later_c, start_c, warning_c, error_c + self.margin_k)
         late_s = np.maximum(self.horizon_s + d - due_s, 0.0) - np.maximum(begin_s + d - due_s, 0.0)
         late = self.tardiness_share * self.tardiness_price * value * late_s / 60.0
         earned = worth * np.exp(-(begin_s + d) / self.discount_s) + late

@@ -70,6 +70,11 @@ RULES: dict[str, BuiltInPolicy] = {
         "Salimans et al. 2017",
         scope="arm",
     ),
+    "bid_price": BuiltInPolicy(
+        "prices:BidPrice",
+        "time per expected worth less the price of the arm's time, over the next two jobs of each arm",
+        "Talluri & van Ryzin 1998",
+    ),
     "auction": BuiltInPolicy("auction:Auction", "time per expected worth, within n · ε", "Bertsekas 1988"),
     "rolling_horizon": BuiltInPolicy(
         "planners:RollingHorizon", "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"

@@ -1,0 +1,221 @@
+"""Bid-price control: arms bid for jobs, and the time of an arm that others cannot replace has a price.
+
+1. `bids_of`: the expected worth and the duration of each job for each arm, free or not.
+2. `price_of`: what an arm's time costs, from the bids for the jobs of the last hour. The advantage of an arm in a job
+   is its worth for this arm less the mean of the others. While an arm works, it misses jobs that expire before it is
+   free. An option costs the advantage that the arm is expected to miss during it.
+3. `best_pairs`: one matching of jobs with each arm's next job and the one after it. Only a free arm's next job is
+   claimed. So an arm that is good for what others cannot do stays free for it while others can do the rest.
+
+The three are functions of bids, wherever these come from.
+
+Source of the prices: Talluri & van Ryzin, An Analysis of Bid-Price Controls for Network Revenue Management, Management
+Science 44, 1998.
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from agents.heat import Wsept
+from agents.policy import WAIT, CentralArrayPolicy, legal_options, plans_of
+from fleet.observation import LONG_S, Observation
+
+Array = np.ndarray
+
+
+class Bids(NamedTuple):
+    """Bids of arms for jobs, one bid of each arm for each job."""
+
+    worth: Array
+    """Expected worth without tardiness, [..., arm, job]; 0 for a job that the arm cannot or should not do."""
+    duration_s: Array
+    """[..., arm, job]."""
+
+
+def bids_of(worth: Array, duration_s: Array, plans: int) -> Bids:
+    """The bids by the plan with the most worth.
+
+    Args:
+        worth, duration_s: Of every option, [..., arm, option].
+        plans: Number of options of a job.
+    """
+    shape = (*worth.shape[:-1], -1, plans)
+    by_job = worth.reshape(shape)
+    best = by_job.argmax(axis=-1)[..., None]
+    worth, duration_s = (
+        np.take_along_axis(each, best, axis=-1)[..., 0] for each in (by_job, duration_s.reshape(shape))
+    )
+    return Bids(np.maximum(worth, 0.0), np.maximum(duration_s, 1.0))
+
+
+class TimePrice(NamedTuple):
+    """Price of the time of each arm."""
+
+    patience_s: Array
+    """Time until recent jobs expired, ascending, [job]."""
+    advantage: Array
+    """Advantage per second in the first k of these jobs, [job + 1, arm]."""
+    spared: Array
+    """The same, each job times its patience, [job + 1, arm]."""
+    most: Array
+    """Highest price per second, [arm]."""
+    busy: float
+    """Worth per second of the least of the jobs that fill the arms' time, 0 if there is time for all."""
+
+    def of(self, duration_s: Array) -> Array:
+        """Advantage that each arm misses in work of some durations, in the shape of the durations, [arm, option]."""
+        count = np.searchsorted(self.patience_s, duration_s)
+        arm = np.arange(duration_s.shape[0])[:, None]
+        missed = self.advantage[count, arm] * duration_s - self.spared[count, arm]
+        return np.minimum(missed, self.most[:, None] * duration_s)
+
+
+LEAST_ADVANTAGE = 0.05
+"""Smaller advantages do not count; as a share of the best bid for the job."""
+MOST_OF_RATE = 0.8
+"""Highest price, as a share of the worth per time of the arm's advantages: it still does the jobs it stays free for."""
+FULL = 0.8
+"""Share of the arms' time that can be filled."""
+
+
+def price_of(bids: Bids, patience_s: Array, over_s: float) -> TimePrice:
+    """Prices by the bids for recent jobs.
+
+    Args:
+        bids: [job, arm] each.
+        patience_s: Time from the arrival of each job until it expires, inf for others, [job].
+        over_s: Time in which the jobs arrived.
+    """
+    worth, duration_s = bids
+    arms = worth.shape[1]
+    others = (worth.sum(axis=1, keepdims=True) - worth) / max(arms - 1, 1)
+    advantage = worth - others
+    counts = (advantage > LEAST_ADVANTAGE * worth.max(axis=1, keepdims=True)) & np.isfinite(patience_s)[:, None]
+    advantage = np.where(counts, advantage, 0.0)
+    most = MOST_OF_RATE * advantage.sum(axis=0) / np.maximum(np.where(counts, duration_s, 0.0).sum(axis=0), 1.0)
+    order = np.argsort(patience_s, kind="stable")
+    # One of the arms with an advantage gets the job.
+    share = (advantage / np.maximum(counts.sum(axis=1, keepdims=True), 1) / over_s)[order]
+    patience_s = patience_s[order]
+    spared = share * np.where(np.isfinite(patience_s), patience_s, 0.0)[:, None]
+    return TimePrice(patience_s, _sums(share), _sums(spared), most, _busy(bids, FULL * arms * over_s))
+
+
+def _sums(rows: Array) -> Array:
+    """Sums of the first 0, 1, … rows, [row + 1, …]."""
+    return np.concatenate([np.zeros((1, *rows.shape[1:])), rows.cumsum(axis=0)])
+
+
+def _busy(bids: Bids, room_s: float) -> float:
+    """Worth per second of the job at which the jobs with the most of it, by the mean of able arms, fill a time."""
+    able = bids.worth > 0
+    some = able.any(axis=1)
+    count = able[some].sum(axis=1)
+    mean_s = np.where(able, bids.duration_s, 0.0)[some].sum(axis=1) / count
+    rate = bids.worth[some].sum(axis=1) / count / mean_s
+    order = np.argsort(-rate, kind="stable")
+    first = int(np.searchsorted(mean_s[order].cumsum(), room_s))
+    return float(rate[order[first]]) if first < len(order) else 0.0
+
+
+def best_pairs(gain: Array) -> list[tuple[int, int]]:
+    """The next jobs of the arms in a matching with the largest total gain, as pairs (arm, job).
+
+    Args:
+        gain: Gain of each job as an arm's first, second, … from now, [place, arm, job]; 0 is never paired.
+    """
+    from scipy.optimize import linear_sum_assignment  # slow import that few processes need
+
+    arms = gain.shape[1]
+    rows = gain.reshape(-1, gain.shape[2])
+    pairs = zip(*(each.tolist() for each in linear_sum_assignment(rows, maximize=True)), strict=True)
+    return [(row, job) for row, job in pairs if row < arms and rows[row, job] > 0]
+
+
+class BidPrice(CentralArrayPolicy):
+    """Matching by expected worth per time, less what the arm's time costs, over the next two jobs of each arm.
+
+    See the module. It differs from `wsept` in three ways: arms at work take part, a job may wait for an arm that will
+    be free, and an arm stays free for jobs that others can hardly do. Worths and urgency are those of `wsept`.
+    """
+
+    only_choices = True
+    window_s: ClassVar = 3600.0
+    """Jobs that arrived earlier do not count."""
+    prior_s: ClassVar = 600.0
+    """Time without jobs before the shift that is assumed."""
+    patience_s: ClassVar = 7200.0
+    """Time in which the worth of a later start falls to 1/e."""
+    busy_share: ClassVar = 0.5
+    """Share of `TimePrice.busy` that a later start costs for each second of work."""
+
+    def __init__(self) -> None:
+        self.reset(np.random.default_rng(0))
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift: no job has been seen."""
+        self._arms: tuple[str, ...] = ()
+        self._left_s = self._first_s = 0.0
+        self._jobs: list[tuple[float, Array, Array, float]] = []
+        self._price: TimePrice | None = None
+
+    @classmethod
+    def decide(cls, policies: Sequence[Any], seen: Observation, arms: Sequence[str]) -> Array:
+        """The claims of the best pairs."""
+        plans, duration_s = plans_of(seen), np.maximum(seen.duration_s, 1.0).astype(float)
+        worth = np.where(seen.feasible, Wsept.worth(seen), 0.0)
+        bids = bids_of(worth, duration_s, plans)
+        cost, busy = np.zeros(worth.shape), np.zeros((len(policies), 1, 1))
+        for env, policy in enumerate(policies):
+            price = policy._observe(seen, env, Bids(bids.worth[env], bids.duration_s[env]), tuple(arms))
+            cost[env], busy[env] = price.of(duration_s[env]), price.busy
+        delay_s = np.where(seen.faulted > 0, LONG_S, np.where(seen.working > 0, seen.busy_s, 0.0))[..., None]
+        able = worth > 0
+        mean_s = np.where(able, duration_s, 0.0).sum(axis=-1) / np.maximum(able.sum(axis=-1), 1)
+        # With more jobs than arms a later start costs time as well as patience.
+        crowd = np.clip(seen.offered[:, 0].sum(axis=-1) / len(arms) - 1.0, 0.0, 1.0)[:, None, None]
+        urgency, legal = Wsept.urgency(seen), legal_options(seen)
+
+        def gain(start_s: Array) -> Array:
+            later = Wsept.later_worth(seen, worth * np.exp(-start_s / cls.patience_s), start_s)
+            rate = (later - cost) / (duration_s + crowd * start_s) * urgency
+            return np.where(able & (later > 0), np.maximum(rate - (start_s > 0) * cls.busy_share * busy, 0.0), 0.0)
+
+        now = np.where((delay_s > 0) | legal, gain(delay_s), 0.0)
+        gains = np.stack([now, gain(delay_s + mean_s[..., None])], axis=1)
+        gains = gains.reshape(*gains.shape[:-1], -1, plans)
+        best, option = gains.max(axis=-1), gains[:, 0].argmax(axis=-1)
+        actions = np.full(seen.action_mask.shape[:2], WAIT)
+        for env in range(len(policies)):
+            for arm, job in best_pairs(best[env]):
+                if delay_s[env, arm, 0] <= 0:
+                    actions[env, arm] = 1 + job * plans + option[env, arm, job]
+        return actions
+
+    def _observe(self, seen: Observation, env: int, bids: Bids, arms: tuple[str, ...]) -> TimePrice:
+        """The prices with the jobs that have arrived since the last decision."""
+        left_s, age_s = float(seen.left_s[env, 0]), seen.age_s[env, 0]
+        offered, endless = seen.offered[env, 0], left_s >= LONG_S
+        begins = arms != self._arms or endless  # without an end there is no clock: only the open jobs count
+        if begins:
+            self._arms, self._jobs, self._first_s, self._price = arms, [], left_s, None
+        new = offered & (begins | (age_s < self._left_s - left_s - ROUNDING_S)) & (seen.returns[env, 0] == 0)
+        self._left_s = left_s
+        if self._price is not None and not new.any():
+            return self._price
+        lasts_s = np.where(seen.expires[env, 0] > 0, seen.due_in_s[env, 0] + age_s, np.inf)
+        rows = zip(bids.worth.T[new], bids.duration_s.T[new], lasts_s[new].tolist(), strict=True)
+        self._jobs = [job for job in self._jobs if job[0] < left_s + self.window_s]
+        self._jobs += [(left_s, *row) for row in rows]
+        past_s = float(np.max(age_s, where=offered, initial=0.0)) if endless else self._first_s - left_s
+        _, worth, duration_s, patience_s = zip(*self._jobs, strict=True) if self._jobs else ((),) * 4
+        shape = (len(self._jobs), len(arms))
+        recent = Bids(np.reshape(worth, shape), np.reshape(duration_s, shape))
+        self._price = price_of(recent, np.array(patience_s, float), min(self.window_s, past_s + self.prior_s))
+        return self._price
+
+
+ROUNDING_S = 0.01
+"""Ages of jobs that are equal up to rounding."""
