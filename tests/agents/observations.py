@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.observation import FIELDS, Layout, Observation
+from fleet.observation import FIELDS, LONG_S, Layout, Observation
 
 NAMES = (*(field.name for field in FIELDS), "peers", "action_mask")
 """Names of the fields of an observation."""
@@ -24,8 +24,8 @@ def observation(
 ) -> Observation:
     """An observation of one arm with these fields, also `peer_…` [peer, …].
 
-    Without them all slots hold jobs, the arm has a plan of 1 s for each option, difficulties are unknown, and all else
-    is 0.
+    Without them all slots hold jobs, the arm has a plan of 1 s for each option, difficulties are unknown, the shift has
+    no end, and all else is 0.
 
     Args:
         place: Index of the arm in the fleet.
@@ -37,6 +37,7 @@ def observation(
     blank = layout.read(np.zeros((peers + 1, layout.size), np.float32), np.tile(mask, (peers + 1, 1)))
     first = Observation(**{name: getattr(blank, name)[place] for name in NAMES})
     base = {
+        "left_s": np.array(LONG_S),
         "group": np.arange(1.0, slots + 1.0),
         "duration_s": np.ones(slots * plans),
         "difficulty": np.full(slots * plans, -1.0),
@@ -57,3 +58,46 @@ def with_peers(seen: Observation, **fields: Any) -> Observation:
         changed[own] = getattr(seen, own).astype(float)
         changed[own][seen.peers] = values
     return replace(seen, **changed)
+
+
+DRAWN = Layout(5, 6, plans=2)
+"""Layout of `drawn`."""
+
+
+def drawn(rng: np.random.Generator) -> Observation:
+    """What five arms might know: three free, one at work, one stopped; the jobs of all slots are offered."""
+    blank = DRAWN.read(np.zeros((5, DRAWN.size), np.float32), np.zeros((5, DRAWN.actions), np.int8))
+    jobs = {
+        "group": np.tile(np.arange(1.0, 7.0), (5, 1)),
+        "due_in_s": np.tile(rng.uniform(-240.0, 1500.0, 6), (5, 1)),
+        "value": np.tile(rng.uniform(0.5, 4.0, 6), (5, 1)),
+        "age_s": np.tile(rng.uniform(0.0, 900.0, 6), (5, 1)),
+        "payload_kg": np.tile(rng.uniform(0.0, 4.0, 6), (5, 1)),
+        "expires": np.tile(rng.integers(2, size=6), (5, 1)),
+    }
+    options = {
+        "duration_s": rng.uniform(60.0, 900.0, (5, 12)),
+        "peak_c": rng.uniform(40.0, 80.0, (5, 12)) * (rng.random((5, 12)) < 0.8),
+        "difficulty": rng.uniform(0.0, 1.0, (5, 12)),
+        "p_saturation": rng.random((5, 12)),
+    }
+    temp_c = rng.uniform(30.0, 50.0, (5, 7))
+    free, working = np.array([1, 1, 1, 0, 0]), np.array([0, 0, 0, 1, 0])
+    mask = (rng.random((5, DRAWN.actions)) < 0.8) & (free[:, None] > 0)
+    mask[:, 0], mask[:, -1] = True, False
+    arms = {
+        "temp_c": temp_c,
+        "headroom_k": 60.0 - temp_c.max(axis=1),
+        "error_headroom_k": 67.0 - temp_c.max(axis=1),
+        "working": working,
+        "faulted": 1 - free - working,
+        "busy_s": 60.0 * working,
+        "left_s": np.full(5, rng.uniform(100.0, 5000.0)),
+    }
+    return replace(blank, **jobs, **options, **arms, action_mask=mask.astype(np.int8))
+
+
+def of_arms(seen: Observation) -> dict[str, Observation]:
+    """The observation of each arm."""
+    names = [*(field.name for field in FIELDS), "peers", "action_mask"]
+    return {f"arm{a}": Observation(**{name: getattr(seen, name)[a] for name in names}) for a in range(5)}

@@ -8,52 +8,13 @@ import pytest
 
 from agents.heat import Wsept
 from agents.learned.evolution import Evolution, EvolutionConfig
-from agents.pairs import PAIRS, PAIRS_CARD, PARAMETERS, PairPolicy, Worth, load_pairs, save_pairs, scores
+from agents.pairs import PAIRS, PAIRS_CARD, PARAMETERS, PEAK_SD_K, PairPolicy, Worth, load_pairs, save_pairs, scores
 from fleet.errors import CheckpointError
-from fleet.observation import FIELDS, LONG_S, Layout, LazyObservation, Observation
+from fleet.observation import FIELDS, LONG_S, LazyObservation, Observation
 from scenarios.policy_loader import policy_of, scope_of
+from tests.agents.observations import drawn, of_arms
 
-LAYOUT = Layout(5, 6, plans=2)
 ROOT = Path(__file__).parents[2]
-
-
-def drawn(rng: np.random.Generator) -> Observation:
-    """What five arms might know: three free, one at work, one stopped; the jobs of all slots are offered."""
-    blank = LAYOUT.read(np.zeros((5, LAYOUT.size), np.float32), np.zeros((5, LAYOUT.actions), np.int8))
-    jobs = {
-        "group": np.tile(np.arange(1.0, 7.0), (5, 1)),
-        "due_in_s": np.tile(rng.uniform(-240.0, 1500.0, 6), (5, 1)),
-        "value": np.tile(rng.uniform(0.5, 4.0, 6), (5, 1)),
-        "age_s": np.tile(rng.uniform(0.0, 900.0, 6), (5, 1)),
-        "payload_kg": np.tile(rng.uniform(0.0, 4.0, 6), (5, 1)),
-        "expires": np.tile(rng.integers(2, size=6), (5, 1)),
-    }
-    options = {
-        "duration_s": rng.uniform(60.0, 900.0, (5, 12)),
-        "peak_c": rng.uniform(40.0, 80.0, (5, 12)) * (rng.random((5, 12)) < 0.8),
-        "difficulty": rng.uniform(0.0, 1.0, (5, 12)),
-        "p_saturation": rng.random((5, 12)),
-    }
-    temp_c = rng.uniform(30.0, 50.0, (5, 7))
-    free, working = np.array([1, 1, 1, 0, 0]), np.array([0, 0, 0, 1, 0])
-    mask = (rng.random((5, LAYOUT.actions)) < 0.8) & (free[:, None] > 0)
-    mask[:, 0], mask[:, -1] = True, False
-    arms = {
-        "temp_c": temp_c,
-        "headroom_k": 60.0 - temp_c.max(axis=1),
-        "error_headroom_k": 67.0 - temp_c.max(axis=1),
-        "working": working,
-        "faulted": 1 - free - working,
-        "busy_s": 60.0 * working,
-        "left_s": np.full(5, rng.uniform(100.0, 5000.0)),
-    }
-    return replace(blank, **jobs, **options, **arms, action_mask=mask.astype(np.int8))
-
-
-def of_arms(seen: Observation) -> dict[str, Observation]:
-    """The observation of each arm."""
-    names = [*(field.name for field in FIELDS), "peers", "action_mask"]
-    return {f"arm{a}": Observation(**{name: getattr(seen, name)[a] for name in names}) for a in range(5)}
 
 
 def batched(seen: Observation) -> Observation:
@@ -65,13 +26,24 @@ def trained(rng: np.random.Generator) -> np.ndarray:
     return 0.1 * rng.standard_normal(PARAMETERS)
 
 
-def test_before_any_training_it_is_wsept() -> None:
+class WithoutDueDates(Wsept):
+    """`wsept` with the deviation of peaks that learned parameters are relative to, and without due dates."""
+
+    peak_sd_k = PEAK_SD_K
+    margin_k = 0.0
+
+    def index(self, seen: Observation) -> np.ndarray:
+        worth = self.worth(seen)
+        return np.where(worth > 0, worth / np.maximum(seen.duration_s, 1.0), -np.inf)
+
+
+def test_before_any_training_it_is_wsept_without_due_dates() -> None:
     rng = np.random.default_rng(0)
     claims = 0
     for _ in range(30):
         observations = of_arms(drawn(rng))
         actions = PairPolicy(np.zeros(PARAMETERS)).act(observations)
-        assert actions == Wsept().act(observations)
+        assert actions == WithoutDueDates().act(observations)
         claims += sum(action > 0 for action in actions.values())
     assert claims > 30
 

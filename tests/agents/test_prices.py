@@ -1,0 +1,192 @@
+"""Prices of arms' time: closed forms of few jobs, the largest total gain, and who stays free for what."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents.policy import Policy, on_arrays
+from agents.prices import Bids, best_pairs, bids_of, price_of
+from agents.registry import make_policy
+from fleet.observation import LazyObservation, Observation
+from tests.agents.observations import NAMES, drawn, observation, of_arms
+from tests.profiles import examples
+
+SCARCE_S, COMMON_S = 400.0, 300.0
+
+
+def recent(worth: list[float], count: int, duration_s: float = SCARCE_S) -> Bids:
+    """Bids for some equal jobs with these worths for the arms."""
+    rows = np.tile(np.array(worth), (count, 1))
+    return Bids(rows, np.full(rows.shape, duration_s))
+
+
+def test_the_price_of_a_time_is_the_advantage_that_the_arm_misses_in_it() -> None:
+    """Four jobs in 2400 s are worth 10 to the first arm only: 1/60 a second, without those that wait for 60 s."""
+    price = price_of(recent([10.0, 0.0], 4), np.full(4, 60.0), 2400.0)
+    np.testing.assert_allclose(price.of(np.full((2, 1), 300.0)), [[4.0], [0.0]])
+    assert (price.of(np.full((2, 1), 60.0)) == 0).all()
+    assert (price_of(recent([10.0, 0.0], 4), np.full(4, np.inf), 2400.0).of(np.full((2, 1), 300.0)) == 0).all()
+
+
+def test_the_price_is_lower_than_the_worth_of_the_jobs_that_the_arm_stays_free_for() -> None:
+    """Ten times as many jobs: 0.8 · 10 / 400 s."""
+    price = price_of(recent([10.0, 0.0], 40), np.full(40, 60.0), 2400.0)
+    np.testing.assert_allclose(price.of(np.full((2, 1), 300.0)), [[6.0], [0.0]])
+
+
+def test_the_advantage_is_that_over_the_mean_of_the_others_and_shared_by_those_that_have_it() -> None:
+    """Worth 10 to two arms of three, whose others have 5 on average; one of them gets the job."""
+    price = price_of(recent([10.0, 10.0, 0.0], 1), np.zeros(1), 1000.0)
+    np.testing.assert_allclose(price.of(np.full((3, 1), 100.0)), [[0.25], [0.25], [0.0]])
+
+
+@given(st.integers(1, 6), st.floats(0.1, 100.0), st.integers(0, 5))
+def test_the_time_of_equal_arms_has_no_price(arms, worth, count) -> None:
+    price = price_of(recent([worth] * max(arms, 2), count), np.full(count, 60.0), 600.0)
+    assert (price.of(np.full((max(arms, 2), 3), 900.0)) == 0).all()
+
+
+@pytest.mark.parametrize(("jobs", "rate"), [(3, 0.0), (4, 0.1), (5, 0.1)])
+def test_the_least_job_that_fills_the_time_is_the_measure_of_a_busy_fleet(jobs, rate) -> None:
+    """Two arms have 0.8 · 2000 s; each job takes 400 s."""
+    worth = 400.0 * np.array([0.4, 0.3, 0.2, 0.1, 0.05])[:jobs, None].repeat(2, axis=1)
+    price = price_of(Bids(worth, np.full((jobs, 2), 400.0)), np.full(jobs, np.inf), 1000.0)
+    assert price.busy == pytest.approx(rate)
+
+
+@examples(60)
+@given(st.integers(0, 2**32))
+def test_other_labels_of_arms_give_other_labels_of_prices(seed) -> None:
+    rng = np.random.default_rng(seed)
+    bids = Bids(rng.uniform(0.0, 5.0, (6, 4)) * (rng.random((6, 4)) < 0.7), rng.uniform(60.0, 900.0, (6, 4)))
+    patience_s, order = rng.uniform(0.0, 600.0, 6), rng.permutation(4)
+    duration_s = rng.uniform(60.0, 900.0, (4, 3))
+    price = price_of(bids, patience_s, 1800.0)
+    moved = price_of(Bids(*(each[:, order] for each in bids)), patience_s, 1800.0)
+    np.testing.assert_allclose(moved.of(duration_s[order]), price.of(duration_s)[order], rtol=1e-9, atol=1e-12)
+    assert moved.busy == pytest.approx(price.busy)
+
+
+@examples(60)
+@given(st.integers(0, 2**32))
+def test_the_pairs_have_the_largest_total_gain(seed) -> None:
+    """By all assignments of three jobs to two places of two arms."""
+    gain = np.random.default_rng(seed).uniform(-0.5, 1.0, (2, 2, 3)).clip(0.0)
+    rows = gain.reshape(4, 3)
+    every = [
+        row for row in product(range(-1, 4), repeat=3) if len({r for r in row if r >= 0}) == sum(r >= 0 for r in row)
+    ]
+    best = max(every, key=lambda row: sum(rows[r, j] for j, r in enumerate(row) if r >= 0))
+    assert set(best_pairs(gain)) == {(r, j) for j, r in enumerate(best) if 0 <= r < 2 and rows[r, j] > 0}
+
+
+def test_a_bid_is_that_of_the_plan_with_the_most_worth() -> None:
+    bids = bids_of(np.array([[1.0, 3.0, -2.0, -1.0]]), np.array([[60.0, 90.0, 60.0, 90.0]]), plans=2)
+    np.testing.assert_array_equal(bids.worth, [[3.0, 0.0]])
+    np.testing.assert_array_equal(bids.duration_s, [[90.0, 90.0]])
+
+
+def know(time_s: float, jobs: str, *, busy_s=(0.0, 0.0)) -> dict[str, Observation]:
+    """What a cool arm that can do all and one that can do common jobs only know of new jobs, s(carce) or c(ommon)."""
+    scarce = np.array([job == "s" for job in jobs])
+
+    def seen(able: np.ndarray, busy_s: float) -> Observation:
+        duration_s = np.where(able, np.where(scarce, SCARCE_S, COMMON_S), 0.0)
+        return observation(
+            len(jobs),
+            legal=(duration_s > 0) & (busy_s == 0),
+            left_s=np.array(10_000.0 - time_s),
+            value=np.where(scarce, 10.0, 5.0),
+            due_in_s=np.where(scarce, 60.0, 5000.0),
+            expires=scarce,
+            duration_s=duration_s,
+            peak_c=np.full(len(jobs), 21.0),
+            temp_c=np.full(7, 20.0),
+            headroom_k=np.array(40.0),
+            error_headroom_k=np.array(47.0),
+            working=float(busy_s > 0),
+            busy_s=np.array(busy_s),
+        )
+
+    return {"able": seen(np.ones(len(jobs), bool), busy_s[0]), "other": seen(~scarce, busy_s[1])}
+
+
+def after_scarce_jobs(*, count: int = 4) -> Policy:
+    """The policy after one scarce job every 600 s, the first at the beginning."""
+    policy = make_policy("bid_price")
+    for k in range(count):
+        assert policy.act(know(600.0 * k, "s")) == {"able": 1, "other": 0}
+    return policy
+
+
+def test_an_arm_stays_free_for_what_only_it_can_do_while_another_can_do_the_rest() -> None:
+    """It would miss 4 of a common job's 5 (see above), and the other arm is free in 60 s."""
+    soon, late = (0.0, 60.0), (0.0, 9000.0)
+    assert after_scarce_jobs().act(know(1800.0, "c")) == {"able": 0, "other": 1}
+    assert after_scarce_jobs().act(know(1800.0, "c", busy_s=soon)) == {"able": 0, "other": 0}
+    assert after_scarce_jobs().act(know(1800.0, "c", busy_s=late)) == {"able": 1, "other": 0}
+    assert make_policy("wsept").act(know(1800.0, "c", busy_s=soon)) == {"able": 1, "other": 0}
+
+
+def test_without_scarce_jobs_no_arm_stays_free() -> None:
+    policy = make_policy("bid_price")
+    assert sorted(policy.act(know(0.0, "cc")).values()) == [1, 2]
+    assert policy.act(know(1800.0, "c", busy_s=(0.0, 200.0))) == {"able": 1, "other": 0}
+
+
+def test_no_arm_stays_free_in_a_crowd() -> None:
+    """There is work for both arms however it is shared."""
+    claims = after_scarce_jobs().act(know(1800.0, "cccccccc", busy_s=(0.0, 60.0)))
+    assert claims["able"] > 0
+
+
+def test_a_job_counts_once_and_for_an_hour() -> None:
+    """Seen again it has an age; an hour later its price is gone."""
+    again, once = after_scarce_jobs(count=1), after_scarce_jobs(count=1)
+    waiting = {name: LazyObservation(lambda field, seen=seen: getattr(seen, field), age_s=np.array([5.0]))
+               for name, seen in know(5.0, "s", busy_s=(0.0, 0.0)).items()}  # fmt: skip
+    again.act(waiting)
+    for policy in (again, once):
+        assert policy.act(know(300.0, "c", busy_s=(0.0, 400.0))) == {"able": 0, "other": 0}
+    later = after_scarce_jobs().act(know(1800.0 + 3601.0, "c", busy_s=(0.0, 60.0)))
+    assert later == {"able": 1, "other": 0}
+
+
+def shift(rng: np.random.Generator, decisions: int = 6) -> list[dict[str, Observation]]:
+    """Random instants of a shift, 200 s apart."""
+    return [
+        {
+            name: LazyObservation(lambda field, seen=seen: getattr(seen, field), left_s=np.array(5000.0 - 200.0 * k))
+            for name, seen in of_arms(drawn(rng)).items()
+        }
+        for k in range(decisions)
+    ]
+
+
+def test_other_labels_of_arms_give_other_labels_of_claims() -> None:
+    rng = np.random.default_rng(4)
+    claims = 0
+    for _ in range(20):
+        policy, other, order = make_policy("bid_price"), make_policy("bid_price"), rng.permutation(5)
+        for seen in shift(rng):
+            names = list(seen)
+            expected = policy.act(seen)
+            moved = other.act({names[a]: seen[names[a]] for a in order})
+            assert moved == {names[a]: expected[names[a]] for a in order}
+            claims += sum(action > 0 for action in expected.values())
+    assert claims > 100
+
+
+def test_shifts_side_by_side_get_the_claims_of_each_alone() -> None:
+    shifts = [shift(np.random.default_rng(seed)) for seed in range(3)]
+    together = on_arrays({e: make_policy("bid_price") for e in range(3)}, tuple(shifts[0][0]))
+    assert together is not None
+    alone = [make_policy("bid_price") for _ in shifts]
+    for each in zip(*shifts, strict=True):
+        names = (name for name in NAMES if name != "peers")
+        stacked = {name: np.stack([[getattr(a, name) for a in seen.values()] for seen in each]) for name in names}
+        found = together(np.arange(3), LazyObservation(stacked.__getitem__))
+        assert found.tolist() == [list(policy.act(seen).values()) for policy, seen in zip(alone, each, strict=True)]
