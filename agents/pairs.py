@@ -1,7 +1,8 @@
 """A learned score of pairs of arm and option: `wsept` with learned weights, matched as `wsept` matches.
 
 score = rate · exp(f) + g · mean rate, where `rate` is the expected worth per time with learned prices (`Worth`), and f
-and g are weighted sums of the pair's numbers. All parameters are one vector; zeros give `wsept` exactly.
+and g are weighted sums of the pair's numbers. All parameters are one vector; zeros give `wsept` without due dates and
+with the deviation `PEAK_SD_K`.
 
 Numbers of one option come from one arm's observation; numbers of the set (alternatives of the job, other jobs of the
 arm, arms that are home soon) come from the observations of all arms. They do not depend on the order or number of arms
@@ -18,11 +19,11 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.heat import Wsept
-from agents.policy import Local, plans_of
+from agents.policy import Local, plans_of, without_empty
 from agents.rules import CentralRule, Matched
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
-from fleet.observation import FIELDS, LazyObservation, Observation
+from fleet.observation import Observation
 
 Array = np.ndarray
 
@@ -37,7 +38,7 @@ PEAK_SD_K = 2.5
 
 
 class Worth(NamedTuple):
-    """Learned parameters of the worth per time, [env] each; zeros give `wsept`."""
+    """Learned parameters of the worth per time, [env] each."""
 
     margin: Array
     """Predicted peaks may be this much higher, in units of 10 K."""
@@ -48,7 +49,7 @@ class Worth(NamedTuple):
     minute: Array
     """Logarithm of the factor on the price of a minute above the warning limit."""
     tardiness: Array
-    """Factor on the price of tardiness, which `wsept` leaves out."""
+    """Factor on the price of tardiness."""
     end: Array
     """Share of the value that a claim loses if it cannot end before the shift does."""
     overhead: Array
@@ -197,7 +198,7 @@ PARAMETERS = len(Worth._fields) + PAIR_FEATURES * OUTPUTS
 
 
 def first_parameters() -> Array:
-    """Initial parameters of a training, float [PARAMETERS]: `wsept`, except for the end of the shift and faults.
+    """Initial parameters of a training, float [PARAMETERS]: zeros, except for the end of the shift and faults.
 
     A job that cannot end before the shift does has no value, and one that just can has twice the score. A predicted
     peak may be 4 K above the error limit, and deviates twice as much.
@@ -217,7 +218,7 @@ def scores(seen: Observation, parameters: Array) -> Array:
         parameters: [env, PARAMETERS].
     """
     worth, weights = np.split(parameters, [len(Worth._fields)], axis=-1)
-    pairs = pairs_of(_without_empty(seen), Worth(*worth.T))
+    pairs = pairs_of(without_empty(seen), Worth(*worth.T))
     each = weights.reshape(-1, PAIR_FEATURES, OUTPUTS)[pairs.at[0]]
     f, g = np.clip(np.einsum("pk,pko->op", pairs.features, each), -3.0, 3.0)
     score = pairs.rate * np.exp(f) + g * pairs.scale
@@ -314,17 +315,3 @@ class WseptLearnedLocal(Local):
 
     central = WseptLearned
     only_choices = True
-
-
-def _without_empty(seen: Observation) -> Observation:
-    """The observation without trailing slots that are empty in all envs."""
-    plans = plans_of(seen)
-    legal = seen.action_mask[..., 1:-1].any(axis=(0, 1)).reshape(-1, plans).any(axis=-1)
-    used = np.flatnonzero(legal | seen.offered.any(axis=(0, 1)))
-    slots = int(used[-1]) + 1 if len(used) else 1
-    if slots == seen.offered.shape[-1]:
-        return seen
-    ends: dict[tuple[str, ...], int] = {("slot",): slots, ("member", "slot"): slots, ("option",): slots * plans}
-    short = {field.name: ends[field.axes] for field in FIELDS if field.axes in ends}
-    mask = seen.action_mask[..., [*range(1 + slots * plans), -1]]
-    return LazyObservation(lambda name: getattr(seen, name)[..., : short.get(name)], action_mask=mask)

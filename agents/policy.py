@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from fleet.errors import FleetError
-from fleet.observation import LazyObservation, Observation
+from fleet.observation import FIELDS, LazyObservation, Observation
 
 Array = np.ndarray
 
@@ -280,3 +280,17 @@ def plans_of(observation: Observation) -> int:
 def per_option(observation: Observation, per_slot: Array) -> Array:
     """Values of slots, [..., slot], for each option, [..., option]."""
     return np.repeat(per_slot, plans_of(observation), axis=-1)
+
+
+def without_empty(seen: Observation) -> Observation:
+    """The observation without trailing slots that are empty in all envs."""
+    plans = plans_of(seen)
+    legal = seen.action_mask[..., 1:-1].any(axis=(0, 1)).reshape(-1, plans).any(axis=-1)
+    used = np.flatnonzero(legal | seen.offered.any(axis=(0, 1)))
+    slots = int(used[-1]) + 1 if len(used) else 1
+    if slots == seen.offered.shape[-1]:
+        return seen
+    ends: dict[tuple[str, ...], int] = {("slot",): slots, ("member", "slot"): slots, ("option",): slots * plans}
+    short = {field.name: ends[field.axes] for field in FIELDS if field.axes in ends}
+    mask = seen.action_mask[..., [*range(1 + slots * plans), -1]]
+    return LazyObservation(lambda name: getattr(seen, name)[..., : short.get(name)], action_mask=mask)

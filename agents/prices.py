@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from agents.heat import Wsept
-from agents.policy import WAIT, CentralArrayPolicy, legal_options, plans_of
+from agents.policy import WAIT, CentralArrayPolicy, legal_options, plans_of, without_empty
 from fleet.observation import LONG_S, Observation
 
 Array = np.ndarray
@@ -144,6 +144,8 @@ class BidPrice(CentralArrayPolicy):
     only_choices = True
     window_s: ClassVar = 3600.0
     """Jobs that arrived earlier do not count."""
+    renew_s: ClassVar = 300.0
+    """Time for which prices hold."""
     prior_s: ClassVar = 600.0
     """Time without jobs before the shift that is assumed."""
     patience_s: ClassVar = 7200.0
@@ -157,25 +159,36 @@ class BidPrice(CentralArrayPolicy):
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift: no job has been seen."""
         self._arms: tuple[str, ...] = ()
-        self._left_s = self._first_s = 0.0
+        self._left_s = self._first_s = self._priced_s = 0.0
         self._jobs: list[tuple[float, Array, Array, float]] = []
         self._price: TimePrice | None = None
 
     @classmethod
     def decide(cls, policies: Sequence[Any], seen: Observation, arms: Sequence[str]) -> Array:
         """The claims of the best pairs."""
-        plans, duration_s = plans_of(seen), np.maximum(seen.duration_s, 1.0).astype(float)
+        seen, plans = without_empty(seen), plans_of(seen)
+        duration_s = np.maximum(seen.duration_s, 1.0).astype(float)
         worth = np.where(seen.feasible, Wsept.worth(seen), 0.0)
         bids = bids_of(worth, duration_s, plans)
         cost, busy = np.zeros(worth.shape), np.zeros((len(policies), 1, 1))
+        offered, left_s, age_s = seen.offered[:, 0], seen.left_s[:, 0].tolist(), seen.age_s[:, 0]
+        lasts_s = np.where(seen.expires[:, 0] > 0, seen.due_in_s[:, 0] + age_s, np.inf)
+        first, names = offered & (seen.returns[:, 0] == 0), tuple(arms)
         for env, policy in enumerate(policies):
-            price = policy._observe(seen, env, Bids(bids.worth[env], bids.duration_s[env]), tuple(arms))
-            cost[env], busy[env] = price.of(duration_s[env]), price.busy
+            since_s = policy._since(left_s[env], names)
+            new = first[env] & (age_s[env] < since_s)
+            if new.any():
+                rows = zip(bids.worth[env].T[new], bids.duration_s[env].T[new], lasts_s[env, new], strict=True)
+                policy._jobs += [(left_s[env], *row) for row in rows]
+            price = policy._current(left_s[env], float(age_s[env].max()))
+            if price.most.any():
+                cost[env] = price.of(duration_s[env])
+            busy[env] = price.busy
         delay_s = np.where(seen.faulted > 0, LONG_S, np.where(seen.working > 0, seen.busy_s, 0.0))[..., None]
         able = worth > 0
         mean_s = np.where(able, duration_s, 0.0).sum(axis=-1) / np.maximum(able.sum(axis=-1), 1)
         # With more jobs than arms a later start costs time as well as patience.
-        crowd = np.clip(seen.offered[:, 0].sum(axis=-1) / len(arms) - 1.0, 0.0, 1.0)[:, None, None]
+        crowd = np.clip(offered.sum(axis=-1) / len(arms) - 1.0, 0.0, 1.0)[:, None, None]
         urgency, legal = Wsept.urgency(seen), legal_options(seen)
 
         def gain(start_s: Array) -> Array:
@@ -194,24 +207,24 @@ class BidPrice(CentralArrayPolicy):
                     actions[env, arm] = 1 + job * plans + option[env, arm, job]
         return actions
 
-    def _observe(self, seen: Observation, env: int, bids: Bids, arms: tuple[str, ...]) -> TimePrice:
-        """The prices with the jobs that have arrived since the last decision."""
-        left_s, age_s = float(seen.left_s[env, 0]), seen.age_s[env, 0]
-        offered, endless = seen.offered[env, 0], left_s >= LONG_S
-        begins = arms != self._arms or endless  # without an end there is no clock: only the open jobs count
-        if begins:
-            self._arms, self._jobs, self._first_s, self._price = arms, [], left_s, None
-        new = offered & (begins | (age_s < self._left_s - left_s - ROUNDING_S)) & (seen.returns[env, 0] == 0)
-        self._left_s = left_s
-        if self._price is not None and not new.any():
+    def _since(self, left_s: float, arms: tuple[str, ...]) -> float:
+        """Greatest age of a job that has arrived since the last decision."""
+        since_s, self._left_s = self._left_s - left_s - ROUNDING_S, left_s
+        if arms == self._arms and left_s < LONG_S:
+            return since_s
+        # Other arms begin anew. Without an end of the shift there is no clock: only the open jobs count.
+        self._arms, self._jobs, self._first_s, self._price = arms, [], left_s, None
+        return np.inf
+
+    def _current(self, left_s: float, oldest_s: float) -> TimePrice:
+        """The prices, renewed if they are old."""
+        if self._price is not None and self._priced_s - left_s < self.renew_s:
             return self._price
-        lasts_s = np.where(seen.expires[env, 0] > 0, seen.due_in_s[env, 0] + age_s, np.inf)
-        rows = zip(bids.worth.T[new], bids.duration_s.T[new], lasts_s[new].tolist(), strict=True)
+        self._priced_s = left_s
         self._jobs = [job for job in self._jobs if job[0] < left_s + self.window_s]
-        self._jobs += [(left_s, *row) for row in rows]
-        past_s = float(np.max(age_s, where=offered, initial=0.0)) if endless else self._first_s - left_s
+        past_s = oldest_s if left_s >= LONG_S else self._first_s - left_s
         _, worth, duration_s, patience_s = zip(*self._jobs, strict=True) if self._jobs else ((),) * 4
-        shape = (len(self._jobs), len(arms))
+        shape = (len(self._jobs), len(self._arms))
         recent = Bids(np.reshape(worth, shape), np.reshape(duration_s, shape))
         self._price = price_of(recent, np.array(patience_s, float), min(self.window_s, past_s + self.prior_s))
         return self._price
