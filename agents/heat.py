@@ -10,7 +10,7 @@ error limit follow from the observed headrooms.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -247,6 +247,23 @@ LARGE = 4
 """Joints 1 to 4 have the large motors, which carry payloads."""
 
 
+class Dues(NamedTuple):
+    """What the worth of jobs that begin later depends on, [n] each."""
+
+    value: Array
+    due_in_s: Array
+    expires: Array
+    """Whether the job expires if it still waits at its due date, bool."""
+    left_s: Array
+    """Time until the end of the shift, [n] or one for all."""
+
+
+def dues_of(seen: Observation) -> Dues:
+    """Of every option, [env, arm, option]."""
+    value, due_in_s, expires = (per_option(seen, each) for each in (seen.value, seen.due_in_s, seen.expires > 0))
+    return Dues(value, due_in_s, expires, seen.left_s[..., None])
+
+
 class Wsept(Matched, CentralRule):
     """Matching by expected worth per time: weighted shortest expected processing time, with the cost of heat.
 
@@ -279,8 +296,9 @@ class Wsept(Matched, CentralRule):
 
     def index(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [env, arm, option]; −inf for those that must not be claimed."""
-        worth = self.later_worth(seen, self.worth(seen), np.zeros(()))
-        return np.where(worth > 0, worth * self.urgency(seen) / np.maximum(seen.duration_s, 1.0), -np.inf)
+        dues, duration_s = dues_of(seen), np.maximum(seen.duration_s, 1.0)
+        worth = self.later_worth(self.worth(seen), duration_s, np.zeros(()), dues)
+        return np.where(worth > 0, worth * self.urgency(dues) / duration_s, -np.inf)
 
     @classmethod
     def worth(cls, seen: Observation) -> Array:
@@ -291,25 +309,22 @@ class Wsept(Matched, CentralRule):
         return cls.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c + cls.margin_k)
 
     @classmethod
-    def later_worth(cls, seen: Observation, worth: Array, delay_s: Array) -> Array:
-        """Worth after the cost of tardiness, [env, arm, option]; 0 if the job expires before the start or the shift
-        before the end.
+    def later_worth(cls, worth: Array, duration_s: Array, start_s: Array, dues: Dues) -> Array:
+        """Worth less the cost of tardiness, [n]; 0 if the job expires before the start or the shift before the end.
 
         Args:
-            worth: Without tardiness, [env, arm, option].
-            delay_s: Time until the start, in the same shape or one for all.
+            worth: Without tardiness, [n].
+            start_s: Time until the start, [n] or one for all.
         """
-        late_s = np.maximum(delay_s - seen.slack_s, 0.0)
-        worth = worth - cls.tardiness_price / 60.0 * per_option(seen, seen.value) * late_s
-        expires_s = np.where(seen.expires > 0, seen.due_in_s, np.inf)
-        lost = (delay_s > 0) & (delay_s > per_option(seen, expires_s))
-        return np.where(lost | (delay_s + seen.duration_s > seen.left_s[..., None]), 0.0, worth)
+        late_s = np.maximum(start_s + duration_s - dues.due_in_s, 0.0)
+        worth = worth - cls.tardiness_price / 60.0 * dues.value * late_s
+        lost = (start_s > 0) & dues.expires & (start_s > dues.due_in_s)
+        return np.where(lost | (start_s + duration_s > dues.left_s), 0.0, worth)
 
     @classmethod
-    def urgency(cls, seen: Observation) -> Array:
-        """Factor on the worth of every option: 1 for jobs that do not expire, up to 2, [env, arm, option]."""
-        until_s = np.maximum(seen.due_in_s, 0.0)
-        return per_option(seen, 1.0 + np.where(seen.expires > 0, np.exp(-until_s / cls.urgent_s), 0.0))
+    def urgency(cls, dues: Dues) -> Array:
+        """Factor on the worth of jobs: 1 for those that do not expire, up to 2, [n]."""
+        return 1.0 + np.where(dues.expires, np.exp(-np.maximum(dues.due_in_s, 0.0) / cls.urgent_s), 0.0)
 
     @classmethod
     def predicted_peak_c(

@@ -4,10 +4,10 @@
 2. `price_of`: what an arm's time costs, from the bids for the jobs of the last hour. The advantage of an arm in a job
    is its worth for this arm less the mean of the others. While an arm works, it misses jobs that expire before it is
    free. An option costs the advantage that the arm is expected to miss during it.
-3. `best_pairs`: one matching of jobs with each arm's next job and the one after it. Only a free arm's next job is
-   claimed. So an arm that is good for what others cannot do stays free for it while others can do the rest.
+3. `gain_of` and `best_pairs`: one matching of jobs with each arm's next job and the one after it. Only a free arm's
+   next job is claimed. So an arm that is good for what others cannot do stays free for it while others can do the rest.
 
-The three are functions of bids, wherever these come from.
+All are functions of bids, wherever these come from.
 
 Source of the prices: Talluri & van Ryzin, An Analysis of Bid-Price Controls for Network Revenue Management, Management
 Science 44, 1998.
@@ -18,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from agents.heat import Wsept
+from agents.heat import Dues, Wsept, dues_of
 from agents.policy import WAIT, CentralArrayPolicy, legal_options, plans_of, without_empty
 from fleet.observation import LONG_S, Observation
 
@@ -120,6 +120,25 @@ def _busy(bids: Bids, room_s: float) -> float:
     return float(rate[order[first]]) if first < len(order) else 0.0
 
 
+PATIENCE_S = 7200.0
+"""Time in which the worth of a later start falls to 1/e."""
+
+
+def gain_of(bids: Bids, dues: Dues, start_s: Array, cost: Array, crowd: Array, busy: Array) -> Array:
+    """Worth per second of jobs less the price of the arms' time, at least 0, in the shape of the bids.
+
+    Args:
+        start_s: Time until the start; like the others in a shape that fits that of the bids.
+        cost: Price of the arm's time for the job, as of `TimePrice.of`.
+        crowd: Share of the time until the start that counts as time of the arm.
+        busy: Cost of each second of work.
+    """
+    worth, duration_s = bids
+    later = Wsept.later_worth(worth * np.exp(-start_s / PATIENCE_S), duration_s, start_s, dues)
+    rate = (later - cost) / (duration_s + crowd * start_s) * Wsept.urgency(dues)
+    return np.where((worth > 0) & (later > 0), np.maximum(rate - busy, 0.0), 0.0)
+
+
 def best_pairs(gain: Array) -> list[tuple[int, int]]:
     """The next jobs of the arms in a matching with the largest total gain, as pairs (arm, job).
 
@@ -148,8 +167,6 @@ class BidPrice(CentralArrayPolicy):
     """Time for which prices hold."""
     prior_s: ClassVar = 600.0
     """Time without jobs before the shift that is assumed."""
-    patience_s: ClassVar = 7200.0
-    """Time in which the worth of a later start falls to 1/e."""
     busy_share: ClassVar = 0.5
     """Share of `TimePrice.busy` that a later start costs for each second of work."""
 
@@ -170,31 +187,17 @@ class BidPrice(CentralArrayPolicy):
         duration_s = np.maximum(seen.duration_s, 1.0).astype(float)
         worth = np.where(seen.feasible, Wsept.worth(seen), 0.0)
         bids = bids_of(worth, duration_s, plans)
-        cost, busy = np.zeros(worth.shape), np.zeros((len(policies), 1, 1))
-        offered, left_s, age_s = seen.offered[:, 0], seen.left_s[:, 0].tolist(), seen.age_s[:, 0]
-        lasts_s = np.where(seen.expires[:, 0] > 0, seen.due_in_s[:, 0] + age_s, np.inf)
-        first, names = offered & (seen.returns[:, 0] == 0), tuple(arms)
-        for env, policy in enumerate(policies):
-            since_s = policy._since(left_s[env], names)
-            new = first[env] & (age_s[env] < since_s)
-            if new.any():
-                rows = zip(bids.worth[env].T[new], bids.duration_s[env].T[new], lasts_s[env, new], strict=True)
-                policy._jobs += [(left_s[env], *row) for row in rows]
-            price = policy._current(left_s[env], float(age_s[env].max()))
-            if price.most.any():
-                cost[env] = price.of(duration_s[env])
-            busy[env] = price.busy
+        cost, busy = cls._prices(policies, seen, bids, duration_s, tuple(arms))
         delay_s = np.where(seen.faulted > 0, LONG_S, np.where(seen.working > 0, seen.busy_s, 0.0))[..., None]
         able = worth > 0
         mean_s = np.where(able, duration_s, 0.0).sum(axis=-1) / np.maximum(able.sum(axis=-1), 1)
         # With more jobs than arms a later start costs time as well as patience.
-        crowd = np.clip(offered.sum(axis=-1) / len(arms) - 1.0, 0.0, 1.0)[:, None, None]
-        urgency, legal = Wsept.urgency(seen), legal_options(seen)
+        crowd = np.clip(seen.offered[:, 0].sum(axis=-1) / len(arms) - 1.0, 0.0, 1.0)[:, None, None]
+        dues, legal = dues_of(seen), legal_options(seen)
 
         def gain(start_s: Array) -> Array:
-            later = Wsept.later_worth(seen, worth * np.exp(-start_s / cls.patience_s), start_s)
-            rate = (later - cost) / (duration_s + crowd * start_s) * urgency
-            return np.where(able & (later > 0), np.maximum(rate - (start_s > 0) * cls.busy_share * busy, 0.0), 0.0)
+            later_busy = np.where(start_s > 0, cls.busy_share * busy, 0.0)
+            return gain_of(Bids(worth, duration_s), dues, start_s, cost, crowd, later_busy)
 
         now = np.where((delay_s > 0) | legal, gain(delay_s), 0.0)
         gains = np.stack([now, gain(delay_s + mean_s[..., None])], axis=1)
@@ -206,6 +209,27 @@ class BidPrice(CentralArrayPolicy):
                 if delay_s[env, arm, 0] <= 0:
                     actions[env, arm] = 1 + job * plans + option[env, arm, job]
         return actions
+
+    @classmethod
+    def _prices(
+        cls, policies: Sequence[Any], seen: Observation, bids: Bids, duration_s: Array, arms: tuple[str, ...]
+    ) -> tuple[Array, Array]:
+        """Price of every option, [env, arm, option], and `TimePrice.busy`, [env, 1, 1], with the jobs that are new."""
+        cost, busy = np.zeros(duration_s.shape), np.zeros((len(policies), 1, 1))
+        left_s, age_s = seen.left_s[:, 0].tolist(), seen.age_s[:, 0]
+        lasts_s = np.where(seen.expires[:, 0] > 0, seen.due_in_s[:, 0] + age_s, np.inf)
+        first = seen.offered[:, 0] & (seen.returns[:, 0] == 0)
+        for env, policy in enumerate(policies):
+            since_s = policy._since(left_s[env], arms)
+            new = first[env] & (age_s[env] < since_s)
+            if new.any():
+                rows = zip(bids.worth[env].T[new], bids.duration_s[env].T[new], lasts_s[env, new], strict=True)
+                policy._jobs += [(left_s[env], *row) for row in rows]
+            price = policy._current(left_s[env], float(age_s[env].max()))
+            if price.most.any():
+                cost[env] = price.of(duration_s[env])
+            busy[env] = price.busy
+        return cost, busy
 
     def _since(self, left_s: float, arms: tuple[str, ...]) -> float:
         """Greatest age of a job that has arrived since the last decision."""
