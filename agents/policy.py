@@ -150,6 +150,7 @@ class Local(ArrayPolicy):
     """
 
     scope: ClassVar = "arm"
+    reads_messages: ClassVar = False
     central: ClassVar[type[Policy]]
     """The central policy."""
 
@@ -265,6 +266,16 @@ def only_choices(policy: Policy) -> bool:
     """
     kind = policy.kind if isinstance(policy, EveryArm) else type(policy)
     return vars(kind).get("only_choices") is True
+
+
+def reads_messages(policy: Policy) -> bool:
+    """Whether the decisions of a policy depend on messages between arms: the bus affects no other.
+
+    A central policy sees the observations of all arms. A class of scope `arm` declares `reads_messages = False` if it
+    reads no field of the fleet.
+    """
+    kind = policy.kind if isinstance(policy, EveryArm) else type(policy)
+    return policy.scope == "arm" and getattr(kind, "reads_messages", True)
 
 
 def legal_options(observation: Observation) -> Array:

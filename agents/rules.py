@@ -28,6 +28,7 @@ class RandomLegal(ArrayPolicy):
     """Every free arm claims a random legal job. Scope arm: it reads the arm's own mask."""
 
     scope: ClassVar = "arm"
+    reads_messages: ClassVar = False
     only_choices = True
 
     def __init__(self) -> None:

@@ -28,7 +28,7 @@ from scenarios.evaluate.hindsight import (
     without_scores,
 )
 from scenarios.evaluate.rollout import DecisionLimit
-from scenarios.evaluate.sources import Fleets, plan_content
+from scenarios.evaluate.sources import Fleets, plan_content, prepared_content
 from scenarios.evaluate.study import suite_of
 from scenarios.evaluate.upper_bound import Relaxation, upper_bound
 from scenarios.json_rows import Row, Rows
@@ -210,6 +210,8 @@ def references(
     first: dict[object, Instance] = {}
     cells = [first.setdefault(plan_content(task.scenario), task) for task in left]
     order = [task for cell in first.values() for task, own in zip(left, cells, strict=True) if own is cell]
+    contents = [prepared_content(task.scenario, difficulty) for task in order]
+    order = [order[i] for i in sorted(range(len(order)), key=lambda i: contents.index(contents[i]))]
     if workers > 1:
         for task in first.values():
             _fleet_of(task, difficulty, folder, progress)  # so that no two processes plan the same motions

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from agents.policy import WAIT, PlanningPolicy, Policy, on_arrays, only_choices
+from agents.policy import WAIT, PlanningPolicy, Policy, on_arrays, only_choices, reads_messages
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.env.lookahead import CellSimulator
@@ -21,7 +21,7 @@ from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Obs
 from fleet.observation import Observation
 from scenarios.evaluate.statistics import FigureKind
-from scenarios.policy_loader import OnBus, failure, policy_at, scope_of
+from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.batch import library_of
 from scenarios.prepare.fleet import Fleet, as_known, simulator_of
 from scenarios.run.metrics import HeatUse, common_figures
@@ -113,8 +113,6 @@ def play(
         limit_s: Most time for a decision, s of real time.
     """
     library, channel = _library(fleet), fleet.scenario.channel(channel)
-    if scope_of(policy) == "central":
-        channel = PERFECT  # it reads the arms' own observations, and no message
     running, time_s = np.ones(len(seeds), dtype=bool), np.zeros(len(seeds))
     results: dict[int, ShiftResult] = {}
     policies: dict[int, Policy] = {}
@@ -155,6 +153,8 @@ def play(
         for e, seed in enumerate(seeds):
             with guarded([e]):
                 policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
+        if not any(reads_messages(each) for each in policies.values()):
+            channel = PERFECT
         waits = channel.perfect and all(only_choices(each) for each in policies.values())
         env = BatchEnv(
             library,
