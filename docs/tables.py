@@ -62,8 +62,8 @@ from scenarios.evaluate.statistics import Interval, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
 from scenarios.spec.schema import SPLITS
-from scenarios.suite.instances import CELLS, JUDGED
-from scenarios.suite.splits import instance, manifest
+from scenarios.suite.instances import CELLS, FAULTS, JUDGED
+from scenarios.suite.splits import cell_of_instance, instance, manifest
 from scenarios.table import markdown_table as table
 
 Array = np.ndarray
@@ -136,6 +136,8 @@ def references_text() -> str:
     rows: list[tuple[str, ...]] = []
     for split in SPLITS:
         found = list(split_references(split).values())
+        if not found:
+            continue
         rows.append(
             (
                 split,
@@ -172,6 +174,7 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
     return {
         "bounds": lambda: reference_table(load_references(results / "bounds_library.jsonl")).markdown(),
         "references": references_text,
+        "leaderboard_questions": partial(by_question, results / "leaderboard"),
         "leaderboard_top": partial(board_top, results / "leaderboard"),
         **{f"leaderboard_{split}": partial(board_text, results / "leaderboard", split) for split in JUDGED},
     }
@@ -212,6 +215,31 @@ def board_top(folder: Path) -> str:
             cells = (title(entry), entry.card.scope, score.mean.text(), hot, cool, f"{mean_of(entry, 'faults'):.2f}")
             rows.append((str(place), *cells))
     return table(("", "policy", "scope", "mean score", "heat binds", "it does not", "faults"), rows)
+
+
+CENTRAL, ALONE, BLIND = "bid_price", "wsept_local", "wspt"
+"""The best central rule, the best with which each arm decides alone, and one that ignores heat."""
+
+
+def by_question(folder: Path) -> str:
+    """What knowledge of heat and a central decision are worth, by what a cell asks and by level of heat."""
+    found, values = scored(folder, "test")
+    lines = {line.name: line for line in manifest("test")}
+    level = np.array([lines[name].axes.heat for name in values.instances])
+    asks = np.array([cell_of_instance(lines[name]).asks for name in values.instances])
+    parts = {f"advantage, {each}": (asks == "advantage") & (level == each) for each in FAULTS}
+    parts["advantage, heat binds"] = (asks == "advantage") & (level != "cool")
+    parts |= {f"control: {each}": asks == each for each in dict.fromkeys(asks.tolist()) if each != "advantage"}
+    faults = {row.instance: row.figures[FIGURES.index("faults")] for row in found[BLIND].rows if row.figures}
+    rows: list[tuple[str, ...]] = []
+    for name, chosen in parts.items():
+        own = values.only(chosen)
+        means = (f"{own.score[policy].mean():.2f}" for policy in (CENTRAL, ALONE, BLIND))
+        gains = (shown(own.difference(*pair)) for pair in ((ALONE, BLIND), (CENTRAL, ALONE)))
+        count = f"{np.mean([faults[each] for each in own.instances]):.2f}"
+        rows.append((name, str(len(own.instances)), count, *means, *gains))
+    heads = ("cells, heat", "instances", f"faults of `{BLIND}`", *(f"`{each}`" for each in (CENTRAL, ALONE, BLIND)))
+    return table((*heads, "knowing the heat", "deciding together"), rows)
 
 
 def title(entry: BoardResult) -> str:
@@ -302,8 +330,6 @@ def ablation_table(folders: Mapping[str, Path], columns: Mapping[str, str]) -> s
 
 TRAINED = {cell.arms for cell in CELLS if cell.split == "train"}
 """Numbers of arms of the fleets of the training split."""
-UNTRAINED = "wsept_untrained"
-LEARNED = ("wsept_learned", "wsept_learned_local")
 TEST_SIZES: Mapping[str, Callable[[Array], Array]] = {
     "trained sizes": lambda arms: arms <= max(TRAINED),
     "larger": lambda arms: arms > max(TRAINED),
@@ -332,18 +358,6 @@ def scored(folder: Path, split: str) -> tuple[dict[str, BoardResult], Normalised
     )
     assert values is not None
     return found, values
-
-
-def gain(folder: Path) -> str:
-    """Scores of learned policies less those of the best rule, and of the parameters that training began with."""
-    bases = (BASELINE, UNTRAINED)
-    rows: list[tuple[str, ...]] = []
-    found, values = scored(folder, "test")
-    for name in LEARNED:
-        if name in found:
-            cells = [shown(values.difference(name, base)) for base in bases]
-            rows.append((title(found[name]), f"{mean_of(found[name], 'faults'):.3f}", *cells))
-    return table(("policy", "faults per shift", *(f"score less that of `{base}`" for base in bases)), rows)
 
 
 def shown(difference: Interval) -> str:
@@ -457,7 +471,6 @@ def tables_of(results: Path) -> Tables:
         **benchmark_tables(results),
         "sample_efficiency": lambda: efficiency_table(trainings(results / "sample_efficiency/heat_wave.jsonl")),
         "trainings": of(trainings_table, results / "learned"),
-        "learned_gain": of(gain, board),
         "learned_test": of(by_size, board, "test", TEST_SIZES),
         "workers": of(workers_table, scaling / "workers.jsonl"),
         "growing_halls": of(halls_table, scaling / "arms.jsonl"),
