@@ -153,7 +153,9 @@ def build_world(
     """
     motors, thermal, rest, phi, gamma, observer = _laws(tuple(arms), dt_s)
     plans, offers = _offers(arms, shifts, plans_per_job)
-    volume, conflicts = (space or station_space)(plans) if plans else (np.zeros(1, int), np.zeros((1, 1), bool))
+    if space is None and any(job.alternatives for jobs in shifts for job in jobs):
+        space = station_space  # the stations of these jobs depend on the plan
+    volume, conflicts = space(plans) if space and plans else (np.zeros(max(1, len(plans)), int), np.zeros((1, 1), bool))
     start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
     housing_c = np.repeat(ambient_c[0][:, None], len(GEN3.velocity), axis=1)
     if start_warm:

@@ -138,7 +138,8 @@ BY_HAND = {
     ("docs/scaling.md", "what fails first"): "calculated from the table above it",
     ("docs/several_machines.md", "fault"): "`make mesh` prints it: 256 arms",
     ("docs/suite.md", "split"): "the definition of the suite",
-    ("docs/suite.md", "axis of a cell"): "the definition of the suite",
+    ("docs/suite.md", "control"): "the definition of the suite",
+    ("docs/suite.md", "axis of an instance"): "the definition of the suite",
     ("docs/trainers.md", "trainer"): "versions",
 }
 """Hand-made tables by page and first heading, with the reason."""

@@ -240,7 +240,7 @@ def test_a_long_hold_costs_no_more_than_a_short_one_and_has_its_peak(participant
     assert one.duration_s == pytest.approx(many.duration_s)
     assert one.peak_c == pytest.approx(many.peak_c, abs=1e-6)
     assert one.joint_difficulty == pytest.approx(many.joint_difficulty)
-    plans: tuple[Plan, ...] = estimator._variants(estimator._work(long))
+    plans: tuple[Plan, ...] = estimator._variants(estimator._works(long)[0])
     assert _size(plans) < 2e6
 
 

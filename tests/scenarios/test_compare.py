@@ -177,7 +177,7 @@ REWARD = {"wspt": 10.0, "wsept": 14.0, "fifo": 6.0}
 class Known:
     """What scores read of a reference: random 0, hindsight 20, bound 40."""
 
-    random, hindsight, upper = 0.0, 20.0, 40.0
+    random, hindsight, upper, unit = 0.0, 20.0, 40.0, 20.0
 
     def __init__(self, instance: str) -> None:
         self.instance = instance

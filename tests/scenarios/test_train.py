@@ -113,8 +113,8 @@ def ground():
 def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
     """In the same shift, decision by decision, with perfect messages; and other parameters give another reward."""
     fleet = prepare(override(load("quickstart"), horizon_s=1200.0), difficulty="oracle")
-    expected = [outcome.reward for outcome in outcomes(fleet, "wsept", [3, 4])]
-    found = rewards(ground, np.zeros((2, PARAMETERS)), [3, 4])
+    expected = [outcome.reward for outcome in outcomes(fleet, "wsept_untrained", [3, 4])]
+    found = rewards(ground, np.tile(first_parameters(), (2, 1)), [3, 4])
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     refuses_all = first_parameters()
     refuses_all[Worth._fields.index("spread")] = (
