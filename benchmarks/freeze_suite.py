@@ -118,7 +118,7 @@ def calibrated(cell: SuiteCell) -> Calibration:
 def check(cells: Sequence[SuiteCell]) -> bool:
     """Print the faults of every cell and level on other seeds; whether all are as expected."""
     right = True
-    print(f"{'cell':28s}{'asks':14s}" + "".join(f"{level:>22s}" for level in FAULTS))
+    print(f"{'cell':32s}{'asks':14s}" + "".join(f"{level:>22s}" for level in FAULTS))
     for cell in cells:
         _, fleet = minutes_of(cell)
         texts: list[str] = []
@@ -130,7 +130,7 @@ def check(cells: Sequence[SuiteCell]) -> bool:
             right &= fits
             ambient_c = calibrations()[cell.name].ambient_c[level]
             texts.append(f"{mean:.2f} ± {error:.2f}{' ' if fits else '!'}({ambient_c:.1f} °C)")
-        print(f"{cell.name:28s}{cell.asks:14s}" + "".join(f"{text:>22s}" for text in texts), flush=True)
+        print(f"{cell.name:32s}{cell.asks:14s}" + "".join(f"{text:>22s}" for text in texts), flush=True)
     return right
 
 
