@@ -75,7 +75,8 @@ class TimePrice(NamedTuple):
 LEAST_ADVANTAGE = 0.05
 """Smaller advantages do not count; as a share of the best bid for the job."""
 MOST_OF_RATE = 0.8
-"""Highest price, as a share of the worth per time of the arm's advantages: it still does the jobs it stays free for."""
+"""Highest price, as a share of the worth per time of the arm's advantages: it does not refuse the jobs that it is kept
+free for."""
 FULL = 0.8
 """Share of the arms' time that can be filled."""
 
@@ -109,7 +110,7 @@ def _sums(rows: Array) -> Array:
 
 
 def _busy(bids: Bids, room_s: float) -> float:
-    """Worth per second of the job at which the jobs with the most of it, by the mean of able arms, fill a time."""
+    """Worth per second (mean of able arms) of the job at which all jobs, the highest first, fill a time; 0 if none."""
     able = bids.worth > 0
     some = able.any(axis=1)
     count = able[some].sum(axis=1)

@@ -72,7 +72,7 @@ RULES: dict[str, BuiltInPolicy] = {
     ),
     "bid_price": BuiltInPolicy(
         "prices:BidPrice",
-        "time per expected worth less the price of the arm's time, over the next two jobs of each arm",
+        "(expected worth less price of the arm's time) per second, over the next two jobs of each arm",
         "Talluri & van Ryzin 1998",
     ),
     "auction": BuiltInPolicy("auction:Auction", "time per expected worth, within n · ε", "Bertsekas 1988"),

@@ -1,4 +1,6 @@
-"""Compute the suite anew: python -m benchmarks.freeze_suite [CELL …] [--check]. Frozen files must not change any more.
+"""Calibrate cells and write the manifests: python -m benchmarks.freeze_suite [CELL …] [--check].
+
+Existing files are frozen: the output must equal them.
 
 The named cells, and those without any calibration, are calibrated; then all manifests are written. It plans every cell
 and needs no twins. With --check it calibrates nothing, and plays `wspt` on other seeds of each cell and level.

@@ -222,7 +222,7 @@ CENTRAL, ALONE, BLIND = "bid_price", "wsept_local", "wspt"
 
 
 def by_question(folder: Path) -> str:
-    """What knowledge of heat and a central decision are worth, by what a cell asks and by level of heat."""
+    """Worth of knowing the heat, of one decision for all arms, and of prices, by what a cell asks and by level of heat."""
     found, values = scored(folder, "test")
     lines = {line.name: line for line in manifest("test")}
     level = np.array([lines[name].axes.heat for name in values.instances])
@@ -235,11 +235,12 @@ def by_question(folder: Path) -> str:
     for name, chosen in parts.items():
         own = values.only(chosen)
         means = (f"{own.score[policy].mean():.2f}" for policy in (CENTRAL, ALONE, BLIND))
-        gains = (shown(own.difference(*pair)) for pair in ((ALONE, BLIND), (CENTRAL, ALONE)))
+        pairs = (ALONE, BLIND), (BASELINE, ALONE), (CENTRAL, ALONE)
+        gains = (shown(own.difference(*pair)) for pair in pairs)
         count = f"{np.mean([faults[each] for each in own.instances]):.2f}"
         rows.append((name, str(len(own.instances)), count, *means, *gains))
     heads = ("cells, heat", "instances", f"faults of `{BLIND}`", *(f"`{each}`" for each in (CENTRAL, ALONE, BLIND)))
-    return table((*heads, "knowing the heat", "deciding together"), rows)
+    return table((*heads, "knowing the heat", "one decision", "prices"), rows)
 
 
 def title(entry: BoardResult) -> str:

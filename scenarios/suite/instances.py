@@ -1,15 +1,15 @@
 """Instances of the suite: layouts of cells, tasks of real trades, cells, and the axes on which instances differ.
 
 Every arm has a group of stations in front of it: a and b near to it, c far. A job may be done at any group, each with
-the same stations, so every arm can do it; only in a control with one able arm a job names its group.
+the same stations, so an arm does it at its own; only in a control with one able arm a job names its group.
 
-- *Light* work, which every arm can do cool, is worth slightly more per time, and comes in waves.
-- *Heavy* work heats, is worth less, and expires if no arm begins it soon. Only some arms can do it without overheating:
-  those with a fan, on a wall, or without wear.
+- *Light* work, which every arm can do cool, is worth slightly more per time, and often comes in waves.
+- *Heavy* work heats, is worth less, and expires if no arm begins it soon. Arms with a fan or on a wall stay coolest.
 
-So arms that each take what is best for them leave the heavy work undone, or overheat. A cell determines all that is
-prepared: plans, space and twins. Many instances share a cell; no two splits do. Instances of a cell differ in heat,
-jobs, faults and bus. The ambient temperature of each level of heat is calibrated by outcome: see `Level`.
+A greedy arm chooses light work. When heavy work arrives, it is busy: another arm overheats, or the job expires. A cell
+determines all that is prepared: plans, space and twins. Many instances share a cell; no two splits do. Instances of a
+cell differ in heat, jobs, faults and bus. The ambient temperature of each level of heat is calibrated by outcome: see
+`FAULTS`.
 """
 
 import json
@@ -186,8 +186,8 @@ class SuiteTask:
 JUDGED = SPLITS[1:]
 """Splits whose results are reported."""
 Asks = Literal["advantage", "equal_arms", "overload", "one_able_arm", "light_work"]
-"""advantage: who does what matters. Controls, in which sharing cannot pay: arms that are all alike; more jobs than
-anybody could do; jobs that one arm alone can do; no heavy work."""
+"""advantage: who does what matters. Controls, in which sharing cannot pay: arms that differ by chance only; more jobs
+than anybody could do; jobs that one arm alone can do; no heavy work."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,8 +255,7 @@ def tasks_of(cell: SuiteCell) -> tuple[SuiteTask, ...]:
 Level = Literal["cool", "warm", "hot", "severe"]
 FAULTS: dict[Level, float] = {"cool": 0.0, "warm": 0.5, "hot": 1.5, "severe": 4.0}
 """Expected faults of the policy `wspt`, which ignores heat, in a shift: the ambient temperature of each level and cell
-is set so. `benchmarks/freeze_suite.py` does it, and checks it on other seeds. Cells with one-hour shifts of many arms
-have as many faults for every four arms."""
+is set so, whatever the number of arms. `benchmarks/freeze_suite.py` does it, and checks it on other seeds."""
 Arriving = Literal["waves", "poisson", "trace", "rush"]
 Due = Literal["usual", "tight"]
 Faults = Literal["attended", "unattended", "noisy"]
@@ -287,7 +286,7 @@ NOISE_K = 2.0
 WAVES_S = 1200.0
 """waves: approximate time between two waves of light jobs."""
 RUSH, RUSH_SHARE = (0.35, 0.55), 0.5
-"""rush: a share of all light jobs arrives in this part of the shift."""
+"""rush: this share of the light jobs arrives in this part of the shift, besides those that arrive all the time."""
 BUSES: dict[Bus, BusSpec] = {
     "perfect": BusSpec(),
     "late": BusSpec(delay_s=20.0, jitter_s=20.0),
