@@ -222,7 +222,7 @@ CENTRAL, ALONE, BLIND = "bid_price", "wsept_local", "wspt"
 
 
 def by_question(folder: Path) -> str:
-    """Worth of knowing the heat, of one decision for all arms, and of prices, by what cells ask and by level of heat."""
+    """Worth of knowing the heat, of one decision for all arms, and of prices, by what cells ask and level of heat."""
     found, values = scored(folder, "test")
     lines = {line.name: line for line in manifest("test")}
     level = np.array([lines[name].axes.heat for name in values.instances])
