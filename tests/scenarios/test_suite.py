@@ -161,4 +161,4 @@ def test_stored_results_of_built_in_policies_repeat():
         for row in run_study(study, workers=1):
             (before,) = [own.figures for own in stored[row.key.policy].rows if own.instance == "test/0000"]
             assert row.outcome is not None
-            assert list(asdict(row.outcome).values()) == pytest.approx(before, rel=1e-6, abs=1e-9), row.key
+            assert list(asdict(row.outcome).values()) == pytest.approx(before, rel=1e-4, abs=1e-6), row.key
