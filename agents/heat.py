@@ -327,21 +327,14 @@ class Wsept(Matched, CentralRule):
         return 1.0 + np.where(dues.expires, np.exp(-np.maximum(dues.due_in_s, 0.0) / cls.urgent_s), 0.0)
 
     @classmethod
-    def predicted_peak_c(
-        cls, peak_c: Array, p_saturation: Array, warning_c: Floats, peak_sd_k: float | None = None
-    ) -> Array:
-        """Predicted peaks, or those that P(saturation) gives where they are unknown (0), °C, [n].
-
-        Args:
-            peak_sd_k: Instead of that of the class.
-        """
+    def predicted_peak_c(cls, peak_c: Array, p_saturation: Array, warning_c: Floats) -> Array:
+        """Predicted peaks, or those that P(saturation) gives where they are unknown (0), °C, [n]."""
         if (peak_c > 0).all():
             return peak_c
         from scipy.special import logit  # slow import that few processes need
 
         # An unknown peak is placed so far from the limit that its error gives P(saturation).
-        sd_k = cls.peak_sd_k if peak_sd_k is None else peak_sd_k
-        margin_k = sd_k * logit(np.clip(p_saturation, LEAST_P, 1.0 - LEAST_P))
+        margin_k = cls.peak_sd_k * logit(np.clip(p_saturation, LEAST_P, 1.0 - LEAST_P))
         return np.where(peak_c > 0, peak_c, warning_c + margin_k)
 
     @classmethod
@@ -353,8 +346,7 @@ class Wsept(Matched, CentralRule):
         hottest_c: Floats,
         warning_c: Floats,
         error_c: Floats,
-        factors: Sequence[Floats] = (1.0, 1.0),
-        peak_sd_k: Floats | None = None,
+        factors: Sequence[Floats] = (1.0, 1.0, 1.0),
     ) -> Array:
         """Expected value of jobs less the expected cost of heat, [n].
 
@@ -362,13 +354,12 @@ class Wsept(Matched, CentralRule):
             value, duration_s, peak_c: Of each job, [n], with the predicted peak.
             hottest_c: Hottest motor at the beginning, [n] or one for all.
             warning_c, error_c: The limits.
-            factors: On `fault_price` and `minute_price`.
-            peak_sd_k: Instead of that of the class.
+            factors: On `peak_sd_k`, `fault_price` and `minute_price`.
         """
         from scipy.special import ndtr  # slow import that few processes need
 
-        fault, minute = factors
-        p_fault = ndtr((peak_c - error_c) / (cls.peak_sd_k if peak_sd_k is None else peak_sd_k))
+        spread, fault, minute = factors
+        p_fault = ndtr((peak_c - error_c) / (cls.peak_sd_k * spread))
         # Approximation: the temperature rises linearly to its peak.
         above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
         heat = p_fault * cls.fault_price * fault + cls.minute_price * minute * above_share * duration_s / 60.0

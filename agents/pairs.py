@@ -37,6 +37,12 @@ PEAK_SD_K = 2.5
 """Standard deviation of true peaks around predicted ones, if `Worth.spread` is 0."""
 
 
+class _Trained(Wsept):
+    """`wsept` with the deviation of true peaks that trainings begin with."""
+
+    peak_sd_k = PEAK_SD_K
+
+
 class Worth(NamedTuple):
     """Learned parameters of the worth per time, [env] each."""
 
@@ -83,13 +89,12 @@ def worth_per_second(seen: Observation, at: Places, learned: Worth) -> Array:
     value, duration_s = seen.value[env, arm, option // plans_of(seen)], seen.duration_s[at].astype(float)
     hottest_c = seen.temp_c.max(axis=-1)[env, arm]
     warning_c = seen.headroom_k[env, arm] + hottest_c
-    peak_c = Wsept.predicted_peak_c(seen.peak_c[at], seen.p_saturation[at], warning_c, PEAK_SD_K)
+    peak_c = _Trained.predicted_peak_c(seen.peak_c[at], seen.p_saturation[at], warning_c)
     error_c = seen.error_headroom_k[env, arm] + hottest_c + 10.0 * learned.margin[env]
     ends = _step((seen.left_s[env, arm] - duration_s) / 20.0)
     value_left = value * (1.0 - np.clip(learned.end[env], 0.0, 1.0) * (1.0 - ends))
-    spread, *factors = (np.exp(each[env]) for each in (learned.spread, learned.fault, learned.minute))
-    peak_sd_k = PEAK_SD_K * spread
-    worth = Wsept.worth_of(value_left, duration_s, peak_c, hottest_c, warning_c, error_c, factors, peak_sd_k)
+    factors = [np.exp(each[env]) for each in (learned.spread, learned.fault, learned.minute)]
+    worth = _Trained.worth_of(value_left, duration_s, peak_c, hottest_c, warning_c, error_c, factors)
     late = Wsept.tardiness_price * value * np.maximum(-seen.slack_s[at], 0.0) / 60.0
     duration_s = duration_s + 120.0 * np.maximum(learned.overhead[env], -0.2)
     return (worth - learned.tardiness[env] * late) / np.maximum(duration_s, 1.0)
