@@ -237,7 +237,7 @@ def on_arrays(policies: Mapping[int, Policy], arms: Sequence[str]) -> Callable[[
         None if the policies do not decide on arrays: then call `act` of each.
     """
     first = next(iter(policies.values()), None)
-    kind: Any = first.kind if isinstance(first, EveryArm) else type(first)
+    kind = _kind_of(first)
     if not _decides(kind):
         return None
     each = {e: policy.of(arms[0]) if isinstance(policy, EveryArm) else policy for e, policy in policies.items()}
@@ -264,8 +264,7 @@ def only_choices(policy: Policy) -> bool:
     A class declares `only_choices = True` if it then returns WAIT for all arms, draws no random number and changes no
     state. A subclass must declare it again.
     """
-    kind = policy.kind if isinstance(policy, EveryArm) else type(policy)
-    return vars(kind).get("only_choices") is True
+    return vars(_kind_of(policy)).get("only_choices") is True
 
 
 def reads_messages(policy: Policy) -> bool:
@@ -274,8 +273,12 @@ def reads_messages(policy: Policy) -> bool:
     A central policy sees the observations of all arms. A class of scope `arm` declares `reads_messages = False` if it
     reads no field of the fleet.
     """
-    kind = policy.kind if isinstance(policy, EveryArm) else type(policy)
-    return policy.scope == "arm" and getattr(kind, "reads_messages", True)
+    return policy.scope == "arm" and getattr(_kind_of(policy), "reads_messages", True)
+
+
+def _kind_of(policy: Policy | None) -> Any:
+    """The class of a policy, or of the arm policies that `EveryArm` runs (Any: callers read what it declares)."""
+    return policy.kind if isinstance(policy, EveryArm) else type(policy)
 
 
 def legal_options(observation: Observation) -> Array:
