@@ -28,7 +28,7 @@ from scenarios.evaluate.hindsight import (
     without_scores,
 )
 from scenarios.evaluate.rollout import DecisionLimit
-from scenarios.evaluate.sources import Fleets, plan_content, prepared_content
+from scenarios.evaluate.sources import Fleets, preparations
 from scenarios.evaluate.study import suite_of
 from scenarios.evaluate.upper_bound import Relaxation, upper_bound
 from scenarios.json_rows import Row, Rows
@@ -207,17 +207,14 @@ def references(
     keys = [_key(task.name, scenario_hash(task.scenario), task.seed, difficulty) for task in tasks]
     known = {(each.instance, each.seed): each for each in _references_in(rows, keys)}
     left = [task for task in tasks if not _enough(known.get((task.name, task.seed)), budget)]
-    first: dict[object, Instance] = {}
-    cells = [first.setdefault(plan_content(task.scenario), task) for task in left]
-    order = [task for cell in first.values() for task, own in zip(left, cells, strict=True) if own is cell]
-    contents = [prepared_content(task.scenario, difficulty) for task in order]
-    order = [order[i] for i in sorted(range(len(order)), key=lambda i: contents.index(contents[i]))]
+    groups = preparations([task.scenario for task in left], difficulty)
+    order = sorted(zip(groups, left, strict=True), key=lambda each: each[0])
     if workers > 1:
-        for task in first.values():
+        for task in {cell: task for (cell, _), task in order}.values():
             _fleet_of(task, difficulty, folder, progress)  # so that no two processes plan the same motions
     work = (
         delayed(_bounded)(task, budget, difficulty, known.get((task.name, task.seed)), folder, policies)
-        for task in order
+        for _, task in order
     )
     done = len(tasks) - len(left)
     progress("bounding", Count(done, max(1, len(tasks))))

@@ -326,6 +326,22 @@ def plan_content(scenario: Scenario) -> tuple[object, ...]:
     return (all_works(scenario), *(getattr(scenario, name) for name in kept))
 
 
+def preparations(scenarios: Sequence[Scenario], source: str) -> list[tuple[int, int]]:
+    """Numbers of the cell (`plan_content`) and of the `prepared_content` of each scenario, in order of appearance.
+
+    Scenarios in this order find what is prepared among the last `MOST_FLEETS`.
+    """
+    cells: dict[object, int] = {}
+    contents: dict[object, int] = {}
+    return [
+        (
+            cells.setdefault(plan_content(each), len(cells)),
+            contents.setdefault(prepared_content(each, source), len(contents)),
+        )
+        for each in scenarios
+    ]
+
+
 class Fleets:
     """Prepared fleets, the last few of them kept: one for all scenarios that share a cell."""
 

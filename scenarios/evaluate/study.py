@@ -13,7 +13,7 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError, nearest
 from fleet.seeding import child
 from scenarios.evaluate.rollout import FIGURES, DecisionLimit, Outcome, TooSlow
-from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, plan_content, prepared_content
+from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, preparations
 from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.run.log import code_hash, versions_of
@@ -158,14 +158,8 @@ class Study(StudySpec):
     def units(self, done: Collection[RowKey]) -> Iterator[Unit]:
         """What is left to run, by cells, then by what is prepared, then in the order of the instances."""
         together = TOGETHER if self.channel.perfect else 1
-        cells: dict[object, int] = {}
-        prepared: dict[object, int] = {}
-        cases: list[tuple[int, int, Case]] = []
-        for case in self.cases:
-            cell = cells.setdefault(plan_content(case.scenario), len(cells))
-            content = prepared_content(case.scenario, self.sources[0])
-            cases.append((cell, prepared.setdefault(content, len(prepared)), case))
-        for cell, _, case in sorted(cases, key=lambda each: each[:2]):
+        groups = preparations([case.scenario for case in self.cases], self.sources[0])
+        for (cell, _), case in sorted(zip(groups, self.cases, strict=True), key=lambda each: each[0]):
             for difficulty, policies in self._policies_with.items():
                 most = max(self.trainings_of(policy, difficulty) for policy in policies)
                 for fleet, training, policy in product(range(self.fleets), range(most), policies):
