@@ -55,7 +55,7 @@ def minutes_of(cell: SuiteCell) -> tuple[dict[str, float], Fleet]:
     some = Calibration(
         dict.fromkeys([task.name for task in tasks_of(cell)], 10.0), dict.fromkeys(get_args(Level), 25.0)
     )
-    axes = replace(draw_axes(np.random.default_rng(0), 0), arrivals="poisson")
+    axes = replace(draw_axes(np.random.default_rng(0), "cool"), arrivals="poisson")
     fleet = prepare(scenario_of(cell.name, cell, axes, 0, some), difficulty="blind")
     minutes: dict[str, list[float]] = {}
     for stream in fleet.scenario.jobs:
@@ -76,7 +76,7 @@ def faults_of(
     draws = draws // 2 if cell.arms > 8 else draws
     counts: list[float] = []
     for draw in range(draws):
-        axes = replace(draw_axes(np.random.default_rng([first_seed, draw]), 0), heat=level)
+        axes = draw_axes(np.random.default_rng([first_seed, draw]), level)
         scenario = scenario_of(cell.name, cell, axes, first_seed + draw, known)
         own = prepare(scenario, difficulty="blind", like=fleet)
         seeds = range(first_seed + SHIFTS * draw, first_seed + SHIFTS * (draw + 1))

@@ -312,15 +312,14 @@ OFTEN = {"arrivals": "waves", "faults": "attended", "bus": "perfect"}
 """Values that half of all instances have; all others are equally frequent."""
 
 
-def draw_axes(rng: np.random.Generator, turn: int) -> Axes:
-    """Values sampled independently; the levels of heat take turns."""
+def draw_axes(rng: np.random.Generator, heat: Level) -> Axes:
+    """Values sampled independently, but for the level of heat."""
     values: dict[str, Any] = {}  # literals of several types
     for name, kind in get_type_hints(Axes).items():
         choices = list(get_args(kind))
         weights = np.array([len(choices) - 1.0 if choice == OFTEN.get(name) else 1.0 for choice in choices])
         values[name] = choices[int(rng.choice(len(choices), p=weights / weights.sum()))]
-    levels = get_args(Level)
-    return Axes(**{**values, "heat": levels[turn % len(levels)]})
+    return Axes(**{**values, "heat": heat})
 
 
 @dataclass(frozen=True)

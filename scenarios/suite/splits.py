@@ -14,7 +14,7 @@ from fleet.seeding import shift_seeds
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.parse import choose, hash_of, scenario_hash
 from scenarios.spec.schema import SPLITS, Scenario, SplitName
-from scenarios.suite.instances import CELLS, Axes, SuiteCell, draw_axes, scenario_of
+from scenarios.suite.instances import CELLS, FAULTS, Axes, SuiteCell, draw_axes, scenario_of
 
 SUITE = 37
 """Seed of all draws of the suite."""
@@ -91,31 +91,35 @@ def cell_of_instance(row: ManifestLine) -> SuiteCell:
     return next(cell for cell in CELLS if cell.name == row.cell)
 
 
+def _line_of_instance(instance: str) -> ManifestLine | None:
+    """The line of an instance by its name, as `test/0017`; None for another name."""
+    split = instance.rpartition("/")[0]
+    return next((row for row in (manifest(split) if split in SPLITS else ()) if row.name == instance), None)
+
+
 def cell_name(instance: str) -> str:
     """The cell of an instance of a split by its name; of `SCENARIO/SEED`, the scenario."""
-    name, _, number = instance.rpartition("/")
-    if name in SPLITS:
-        return next((row.cell for row in manifest(name) if row.name == instance), name)
-    return name or number
+    row, (name, _, number) = _line_of_instance(instance), instance.rpartition("/")
+    return row.cell if row else name or number
 
 
 def heat_binds(instance: str) -> bool | None:
     """Whether a policy that ignores heat is expected to fault in an instance of a split; None for another name."""
-    split = instance.rpartition("/")[0]
-    if split not in SPLITS:
-        return None
-    return next((row.axes.heat != "cool" for row in manifest(split) if row.name == instance), None)
+    row = _line_of_instance(instance)
+    return None if row is None else row.axes.heat != "cool"
 
 
 def drawn_rows(name: SplitName) -> Iterator[ManifestLine]:
     """Sample the lines of a split again, in turns from each of its cells."""
     cells = [cell for cell in CELLS if cell.split == name]
     turns = range(max(cell.instances for cell in cells))
+    levels = list(FAULTS)
     chosen = [(turn, cell) for turn in turns for cell in cells if turn < cell.instances]
     for number, (turn, cell) in enumerate(chosen):
         entropy = np.random.SeedSequence([SUITE, SPLITS.index(name), number])
         seed = int(entropy.generate_state(1)[0])
-        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]), 0 if cell.asks == "light_work" else turn)
+        heat = levels[0 if cell.asks == "light_work" else turn % len(levels)]
+        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]), heat)
         row = ManifestLine(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
         made = instance_of(row)
         jobs = jobs_content(made)
