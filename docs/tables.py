@@ -136,8 +136,6 @@ def references_text() -> str:
     rows: list[tuple[str, ...]] = []
     for split in SPLITS:
         found = list(split_references(split).values())
-        if not found:
-            continue
         rows.append(
             (
                 split,

@@ -34,7 +34,7 @@ def works_of(scenario: Scenario, stream: JobStream, payload_kg: Sequence[float] 
 
 
 def alternatives_of(scenario: Scenario, stream: JobStream, payload_kg: float) -> tuple[Work, ...]:
-    """The works of a stream with a payload, of which one must be done."""
+    """The task of a stream with a payload at each of its alternative places."""
     place = {p.name: p for p in scenario.places}
     return tuple(
         Work(

@@ -255,7 +255,7 @@ class Estimator:
         return self._offers.get((works, job.repetitions, done), NoPlan(NOT_PLANNED))
 
     def _works(self, job: JobSpec) -> tuple[Work, ...] | NoPlan:
-        """Return the works of which one must be done, or why one is not possible."""
+        """Return the task at each alternative place, or why one is not possible."""
         unknown = [name for names in job.every_places for name in names if name not in self._places]
         if unknown:
             return NoPlan(f"there is no place '{unknown[0]}' in this cell; places: {', '.join(self._places)}")
