@@ -122,8 +122,9 @@ def measure(sim: Simulation, e: int, measured_c: Array, hottest_c: Array, busy_s
     fleet, key, count = nonnegative(env["fleet"]), env["noise_key"], np.uint64(env["tick"] * arms * JOINTS)
     for a in range(arms):
         arm, noise_k = s.arms[e, a], t.law[fleet, a]["sensor_noise_k"]
+        drift_k = t.law[fleet, a]["drift_k_per_s"] * np.float32(env["tick"] * t.dt_s)
         for k in range(JOINTS):
-            measured_c[a, k] = arm["temp_c"][k] + noise_k[k] * random_normal(key, count + np.uint64(k + 1))
+            measured_c[a, k] = arm["temp_c"][k] + drift_k + noise_k[k] * random_normal(key, count + np.uint64(k + 1))
         count += np.uint64(JOINTS)
         hottest_c[a] = hottest(measured_c[a])
         busy_s[a] = _ZERO

@@ -146,15 +146,18 @@ def telemetry_of(world: World, record: StepRecord, offsets_s: Array, motion: Arr
     amps = np.where(faulted[..., None], 0.0, current(tau, qd, temp_c[..., HOUSING], world.motors))
     working = (record.mode[:, None] == WORKING) & (moments < home_s)
 
+    time_s = record.tick[:, None] * world.dt_s + offsets_s  # [step, sample]
+    drift_k = (time_s[..., None] * world.drift_k_per_s)[..., None]
+
     def flat(values: Array) -> Array:
         return values.reshape(-1, *values.shape[2:])
 
     return Telemetry(
-        time_s=(record.tick[:, None] * world.dt_s + offsets_s).ravel(),
+        time_s=time_s.ravel(),
         mode=flat(np.where(faulted, FAULTED, np.where(working, WORKING, IDLE))),
         q=flat(q),
         qd=flat(qd),
         tau=flat(tau),
         current_a=flat(amps),
-        temp_c=flat(temp_c[..., WINDING] + noise * world.motors.sensor_noise_k),
+        temp_c=flat(temp_c[..., WINDING] + drift_k + noise * world.motors.sensor_noise_k),
     )

@@ -113,6 +113,8 @@ class World:
     phi: Array
     gamma: Array
     """Step matrices for `dt_s`, [arm, node, node]."""
+    drift_k_per_s: Array
+    """Drift of the readings of motor temperatures from the start of the shift, [arm]."""
 
     @property
     def horizon_s(self) -> float:

@@ -102,7 +102,8 @@ def step_arms(sim: Simulation, terms: Array, rows: Array) -> None:
                 env["alarm"] = env["alarm"] or (mode == WORKING and not hot and hottest(end) >= t.warning_c)
             for n in range(NODES):
                 arm["temp_c"][n] = end[n]
-            follow_housings(law, arm, begin, end, friction_w, powered, ambient_c, load_w)
+            drift_k = law["drift_k_per_s"] * np.float32(env["tick"] * dt_s)
+            follow_housings(law, arm, begin, end, friction_w, powered, ambient_c, drift_k, load_w)
             arm["energy_j"] += crossed.energy_j
             arm["above_warning_s"] += crossed.above_s
             arm["peak_c"] = max(arm["peak_c"], np.float32(crossed.peak_c))
@@ -200,7 +201,15 @@ def advance(law: Array, begin: Array, end: Array) -> None:
 
 @jit_inline
 def follow_housings(
-    law: Array, arm: Array, begin: Array, end: Array, friction_w: Array, powered: bool, ambient_c: Real, load_w: Array
+    law: Array,
+    arm: Array,
+    begin: Array,
+    end: Array,
+    friction_w: Array,
+    powered: bool,
+    ambient_c: Real,
+    drift_k: Real,
+    load_w: Array,
 ) -> None:
     """Step the arm's own estimate of its housings, from its motor temperatures; see `HousingObserver`.
 
@@ -208,10 +217,13 @@ def follow_housings(
 
     Args:
         begin, end: Temperatures of the network, which are overwritten.
+        drift_k: By which readings of the motors have drifted.
         load_w: Room for the loads of the housings, [lane].
     """
     for k in range(JOINTS):
-        warmed_w = _HALF * (begin[k] + end[k]) * law["housing_winding"][k] + law["housing_ambient"][k] * ambient_c
+        warmed_w = (_HALF * (begin[k] + end[k]) + drift_k) * law["housing_winding"][k] + law["housing_ambient"][
+            k
+        ] * ambient_c
         load_w[k] = warmed_w + (friction_w[k] + (law["housing_idle_w"][k] if powered else _ZERO))
         begin[k] = arm["housing_c"][k]
     for m in range(len(load_w)):  # a number that the compiler does not know, so that it does not unroll

@@ -148,6 +148,7 @@ LAW = np.dtype(
         ("copper_w_per_a2", "f4", LANES),
         ("idle_w", "f4", LANES),
         ("sensor_noise_k", "f4", LANES),
+        ("drift_k_per_s", "f4"),
     ],
     align=True,
 )
@@ -435,6 +436,7 @@ def tables_of(world: World) -> tuple[Tables, State]:
         copper_w_per_a2=motors.copper_w_per_a2,
         idle_w=motors.idle_w,
         sensor_noise_k=motors.sensor_noise_k,
+        drift_k_per_s=world.drift_k_per_s,
     )
     modal = records(
         MODAL,

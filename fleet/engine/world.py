@@ -1,7 +1,7 @@
 """From nouns to arrays: the plan table, the offers of every arm for every job, and the world of a shift."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -47,6 +47,12 @@ class Arm:
     """Works whose load exceeds its rating."""
     known: tuple[ThermalModel, Motors] | None = None
     """What the arm knows of its own heat, for its estimate of the housings; None: a nominal arm with its cooling."""
+    before: "Arm | None" = None
+    """The arm until the shift, if something of it has changed since."""
+    executed: Mapping[Plan, Plan] = field(default_factory=dict)
+    """Plans that need other torques than planned, with these torques."""
+    drift_k_per_s: float = 0.0
+    """Drift of its readings of motor temperatures."""
 
     @cached_property
     def _offered(self) -> dict[tuple[Work, ...], "ScoredPlans"]:
@@ -72,9 +78,10 @@ class Arm:
         """Of one of its plans: durations, s, [phase], mean squared current and friction heat, [phase, joint], and
         largest torques, [joint]."""
         if id(plan) not in self._driven:  # with the plan itself, so that its id stays its own
-            times_s = np.array([phase.duration_s for phase in plan.phases])
-            drives = [drive(phase.profile, self.motors) for phase in plan.phases]
-            peak = np.abs(np.concatenate([phase.profile[:, 2] for phase in plan.phases])).max(axis=0).astype(float)
+            phases = self.executed.get(plan, plan).phases
+            times_s = np.array([phase.duration_s for phase in phases])
+            drives = [drive(phase.profile, self.motors) for phase in phases]
+            peak = np.abs(np.concatenate([phase.profile[:, 2] for phase in phases])).max(axis=0).astype(float)
             current_sq, friction_w = (np.array([getattr(d, n) for d in drives]) for n in ("current_sq", "friction_w"))
             self._driven[id(plan)] = plan, (times_s, current_sq, friction_w, peak)
         return self._driven[id(plan)][1]
@@ -112,11 +119,12 @@ class ScoredPlans(dict[int, list[tuple[Plan, Difficulty | None]]]):
 
 
 def warm_start(arm: Arm, ambient_c: float) -> Array:
-    """Temperatures of an arm that has stood powered at home for hours, °C, [node].
+    """Temperatures of an arm that has stood powered at home for hours until the shift, °C, [node].
 
     Raises:
         ValueError: standing at home alone overheats it.
     """
+    arm = arm.before or arm
     known = arm.warm_c.get(ambient_c)
     if known is None:
         rest = arm.rest_drive()
@@ -183,6 +191,7 @@ def build_world(
         start_housing_c=housing_c,
         phi=phi,
         gamma=gamma,
+        drift_k_per_s=np.array([arm.drift_k_per_s for arm in arms]),
     )
     return world, plans
 

@@ -21,7 +21,7 @@ from fleet.motion import Plan
 from fleet.robot import JOINTS
 from scenarios.extras import require_extra
 from scenarios.prepare.arms import PlannedArm, plan_arms
-from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.prepare.fleet import Fleet, prepare, with_surprises
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import all_works, rehearsal_works, works_of
@@ -41,7 +41,7 @@ MOST_FLEETS = 4
 """Prepared fleets that a process keeps; one has some 10 MB per arm."""
 _UNREAD = ("name", "description", "jobs", "reward", "people", "slots", "decisions", "telemetry_interval_s", "bus")
 """Fields of a scenario that `prepare` does not read, and its jobs."""
-_WEATHER = ("horizon_s", "decision_interval_s", "ambient", "start", "limits")
+_WEATHER = ("surprises", "horizon_s", "decision_interval_s", "ambient", "start", "limits")
 """Fields that plans and trained networks do not depend on; what does is quickly made."""
 
 
@@ -313,10 +313,10 @@ def drawn(scenario: Scenario, fleet: int) -> Scenario:
 def prepared_content(scenario: Scenario, source: str) -> tuple[object, ...]:
     """What the preparation of a fleet reads of a scenario: two with the same content have the same prepared fleet.
 
-    Past jobs of a twin are drawn from the scenario's streams, so these are kept whole, but for `blind` and `oracle`.
+    Past jobs of a twin are drawn from the works and repetitions of the scenario's streams.
     """
     without_past = source in ("blind", "oracle")
-    jobs = tuple(works_of(scenario, stream) for stream in scenario.jobs) if without_past else scenario.jobs
+    jobs = tuple((None if without_past else stream.repetitions, works_of(scenario, stream)) for stream in scenario.jobs)
     return (jobs, *(getattr(scenario, field.name) for field in fields(scenario) if field.name not in _UNREAD))
 
 
@@ -376,18 +376,20 @@ class Fleets:
         asked = (scenario, training, source, risk, randomise, folder)
         if self._last and self._last[0] == asked:
             return self._last[1]
-        cell = (prepared_content(scenario, source), *asked[1:])
+        # What only the simulator knows is added to what is prepared; the true state is prepared with it.
+        bare = scenario if source == "oracle" else replace(scenario, surprises=())
+        cell = (prepared_content(bare, source), *asked[1:])
         if cell not in self._cells:
-            plans = (plan_content(scenario), source, risk, randomise, folder)
+            plans = (plan_content(bare), source, risk, randomise, folder)
             like = next((fleet for key, fleet in self._cells.values() if key == plans), None)
             randomise_ = randomisation_of(randomise)
             made = (
                 prepare(
-                    scenario, difficulty=source, risk=risk, randomise=randomise, training=training, cache=folder,
+                    bare, difficulty=source, risk=risk, randomise=randomise, training=training, cache=folder,
                     progress=progress, like=like,
                 )
                 if source in PREPARED
-                else self._scored(scenario, source, training, randomise_, folder, progress)
+                else self._scored(bare, source, training, randomise_, folder, progress)
             )  # fmt: skip
             self._cells[cell] = plans, made
             while len(self._cells) > MOST_FLEETS:
@@ -397,6 +399,7 @@ class Fleets:
         _, *specs = (randomise or Randomisation()).scenarios_of(scenario)
         variants = [replace(each, scenario=spec) for each, spec in zip(fleet.variants, specs, strict=True)]
         found = replace(fleet, scenario=scenario, variants=tuple(variants))
+        found = found if source == "oracle" else with_surprises(found)
         self._last = asked, found
         return found
 

@@ -32,6 +32,7 @@ from scenarios.extras import require_extra
 from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms, problems_of
 from scenarios.prepare.randomisation import Randomisation, ShiftConditions, randomisation_of
 from scenarios.prepare.shipped import is_shipped
+from scenarios.prepare.surprise import surprised
 from scenarios.progress import Count, Progress, check_progress, quiet
 from scenarios.spec.jobs import JobSampler, all_works, rehearsal_works, weights_of
 from scenarios.spec.load import scenario_with
@@ -180,7 +181,7 @@ def _arms(
     planned = like.planned if like else plan_arms(scenario, indices, works, folder, progress)
     if problems := problems_of(scenario, planned if every_work else (), folder):
         raise ScenarioError("\n".join(problems))
-    arms = list(like.arms) if like else [_blind_arm(arm, asked, folder) for arm in planned]
+    arms = [arm.before or arm for arm in like.arms] if like else [_blind_arm(arm, asked, folder) for arm in planned]
     if difficulty == "twin":
         from scenarios.prepare.calibrate import calibrate_networks
         from scenarios.prepare.twins import train_twins, training_seed
@@ -195,8 +196,8 @@ def _arms(
             for arm, twin, heat in zip(arms, twins, heats, strict=True)
         ]
     elif difficulty == "oracle":
-        arms = [_with_oracle(scenario, arm) for arm in arms]
-    return arms, planned
+        return [_with_oracle(scenario, arm) for arm in surprised(scenario, arms)], planned
+    return list(surprised(scenario, arms)), planned
 
 
 def _blind_arm(planned: PlannedArm, works: Sequence[Work], folder: Path) -> Arm:
@@ -246,8 +247,10 @@ def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
 
     cell_c = float(np.mean(scenario.ambient.at(np.linspace(0, scenario.horizon_s, 100))))
     ambient_c = cell_c + arm.robot.ambient_offset_k
-    model = Oracle(arm.motors, arm.thermal, warm_start(arm, ambient_c), ambient_c, scenario.limits.warning_c)
-    return replace(arm, model=model, known=(arm.thermal, arm.motors))
+    model = Oracle(
+        arm.motors, arm.thermal, warm_start(arm, ambient_c), ambient_c, scenario.limits.warning_c, arm.executed
+    )
+    return replace(arm, model=model, known=(arm.thermal, arm.motors), drift_k_per_s=0.0)
 
 
 def world_of(fleet: Fleet, jobs: Sequence[Job], warmer_k: float = 0.0) -> tuple[World, tuple[Plan, ...]]:
@@ -296,25 +299,37 @@ class ShiftFactory:
         jobs_seed, sensor_seed = shift_seeds(seed)
         world, plans = world_of(fleet, self._samplers[chosen].jobs(jobs_seed, rate), warmer_k)
         robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
+        others = {plan: other for arm in arms for plan, other in arm.executed.items()}
+        executed = tuple(others.get(plan, plan) for plan in plans)
         plant: Plant
         if self.plant == "mujoco":
             from fleet.arm.plant import MujocoPlant
 
-            plant = MujocoPlant(robots, plans, rest_tau, scenario.places, scenario.fixtures)
+            plant = MujocoPlant(robots, executed, rest_tau, scenario.places, scenario.fixtures)
         else:
-            plant = ProfilePlant(plans, np.stack([robot.home_q() for robot in robots]), rest_tau)
+            plant = ProfilePlant(executed, np.stack([robot.home_q() for robot in robots]), rest_tau)
         twins = tuple(arm.model.version for arm in arms)
         return Episode(world=world, plant=plant, twins=twins, sensors=sensor_seed)
+
+
+def with_surprises(fleet: Fleet) -> Fleet:
+    """The fleet in the shifts of its scenario, whose surprises its arms are not told."""
+    variants = tuple(with_surprises(each) for each in fleet.variants)
+    return replace(fleet, arms=surprised(fleet.scenario, fleet.arms), variants=variants)
 
 
 def as_known(fleet: Fleet) -> Fleet:
     """The fleet with the thermal networks and motors that its arms know, and without scores."""
     variants = tuple(as_known(each) for each in fleet.variants)
-    arms = tuple(
-        replace(arm, thermal=arm.beliefs[0], motors=arm.beliefs[1], model=Blind(), known=arm.beliefs)
-        for arm in fleet.arms
-    )
-    return replace(fleet, arms=arms, variants=variants)
+    return replace(fleet, arms=tuple(_as_known(arm) for arm in fleet.arms), variants=variants)
+
+
+def _as_known(arm: Arm) -> Arm:
+    from scenarios.prepare.oracle import Oracle
+
+    thermal, motors = arm.beliefs
+    known = replace(arm, thermal=thermal, motors=motors, model=Blind(), known=arm.beliefs, drift_k_per_s=0.0)
+    return known if isinstance(arm.model, Oracle) else replace(known, before=None, executed={})
 
 
 def simulator_of(fleet: Fleet, tables: Tables) -> CellSimulator:

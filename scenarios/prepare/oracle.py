@@ -1,7 +1,7 @@
 """The true models of an arm, which only the simulator knows."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -54,10 +54,13 @@ class Oracle:
     ambient_c: float
     """Ambient temperature of the idle equilibrium; the peak uses the present one."""
     warning_c: float
+    executed: Mapping[Plan, Plan] = field(default_factory=dict)
+    """Plans that need other torques than planned, with these torques."""
     version: str = "oracle"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
         """Difficulty of the repeated plan from idle equilibrium, and its peak as a function of known temperatures."""
+        plan = self.executed.get(plan, plan)
         peak = peaks(
             [plan],
             [plan.duration_s(repetitions)],

@@ -252,6 +252,16 @@ def _check(scenario: Scenario, path: Path) -> None:
         scenario.bus.channel().check([arm.name for arm in scenario.arms])
     except ValueError as error:
         raise ScenarioError(f"{file}: bus.partitions: {error}") from error
+    names = {"arm": {arm.name: arm for arm in scenario.arms}, "jobs": dict.fromkeys(streams)}
+    for i, surprise in enumerate(scenario.surprises):
+        for field, known in names.items():
+            name = getattr(surprise, field)
+            if name and name not in known:
+                raise ScenarioError(f"{file}: surprises[{i}].{field}: there is no '{name}'{nearest(name, known)}")
+        if surprise.kind == "fan" and names["arm"][surprise.arm].cooling != "forced_air":
+            raise ScenarioError(
+                f"{file}: surprises[{i}].arm: '{surprise.arm}' has no fan; its cooling must be forced_air."
+            )
     total = sum(stream.arrivals.expected(scenario.horizon_s) for stream in scenario.jobs)
     if total > MOST_JOBS:
         raise ScenarioError(

@@ -232,6 +232,40 @@ class Spread:
         check_nonnegative(self, "seed")
 
 
+SurpriseKind = Literal["payload", "friction", "fan", "sensor"]
+_SIZES: dict[SurpriseKind, tuple[float, float]] = {
+    "payload": (0.1, 5.0),
+    "friction": (0.0, 10.0),
+    "fan": (0.0, 0.0),
+    "sensor": (-50.0, 50.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surprise:
+    """Something that has changed since the arms were prepared, and that they are not told.
+
+    payload: the load of some jobs is heavier than declared. friction: the joints of an arm have more friction than when
+    its network was identified. fan: the fan of an arm stops when the shift begins. sensor: the motor temperatures that
+    an arm reads drift. The true temperatures still decide about warnings and faults.
+    """
+
+    kind: SurpriseKind
+    arm: str = ""
+    """The arm; "" for a payload."""
+    jobs: str = ""
+    """Of a payload: the stream of jobs."""
+    size: float = 0.0
+    """payload: factor on the mass, 0.1 to 5. friction: share of the friction of a new arm that is added, 0 to 10.
+    sensor: drift of the readings, K/h, -50 to 50. fan: 0."""
+
+    def __post_init__(self) -> None:
+        subject, other = ("jobs", "arm") if self.kind == "payload" else ("arm", "jobs")
+        if not getattr(self, subject) or getattr(self, other):
+            raise ValueError(f"Surprise of kind {self.kind} needs `{subject}` and no `{other}`")
+        check_between(self, *_SIZES[self.kind], "size")
+
+
 @dataclass(frozen=True, kw_only=True)
 class RewardSpec:
     """Weights of the reward terms; `fleet.engine.batch.RewardWeights` defines the fields."""
@@ -275,6 +309,7 @@ class Scenario:
     twin: TwinSpec = field(default_factory=TwinSpec)
     spread: Spread = field(default_factory=Spread)
     bus: BusSpec = field(default_factory=BusSpec)
+    surprises: tuple[Surprise, ...] = ()
 
     def __post_init__(self) -> None:
         check_positive(self, "horizon_s", "decision_interval_s", "telemetry_interval_s")

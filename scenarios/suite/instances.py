@@ -14,7 +14,7 @@ cell differ in heat, jobs, faults and bus. The ambient temperature of each level
 
 import json
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache
 from importlib import resources
@@ -39,6 +39,7 @@ from scenarios.spec.schema import (
     Scenario,
     SplitName,
     Spread,
+    Surprise,
     TwinSpec,
 )
 
@@ -260,6 +261,7 @@ Arriving = Literal["waves", "poisson", "trace", "rush"]
 Due = Literal["usual", "tight"]
 Faults = Literal["attended", "unattended", "noisy"]
 Bus = Literal["perfect", "late", "lossy", "ring", "cut"]
+Surprising = Literal["nothing", "payload", "friction", "fan", "sensor"]
 
 LIGHT_LOAD = 0.55
 HEAVY_LOAD: dict[Level, float] = {"cool": 0.3, "warm": 0.3, "hot": 0.35, "severe": 0.5}
@@ -306,20 +308,65 @@ class Axes:
     due: Due
     faults: Faults
     bus: Bus
+    surprise: Surprising = "nothing"
+    """What the arms believe is wrong: see `scenarios.spec.schema.Surprise`."""
 
 
+SURPRISE_EVERY = 3
+"""In one of three instances something surprises the arms."""
+PAYLOAD_FACTORS, FRICTION_SHARES, DRIFTS_K_PER_H = (1.15, 1.3), (1.5, 3.0), (6.0, 12.0)
+"""Ranges of the sizes of surprises; a sensor reads too much or, three times as often, too little."""
+READS_LESS = 0.75
+SURPRISED_ARMS = 1 / 3
+"""Share of the arms whose friction has grown, or whose sensors drift, at least one."""
 OFTEN = {"arrivals": "waves", "faults": "attended", "bus": "perfect"}
 """Values that half of all instances have; all others are equally frequent."""
 
 
-def draw_axes(rng: np.random.Generator, heat: Level) -> Axes:
-    """Values sampled independently, but for the level of heat."""
+def draw_axes(rng: np.random.Generator, heat: Level, surprises: Sequence[Surprising] = ("nothing",)) -> Axes:
+    """Values sampled independently, but for the level of heat.
+
+    Args:
+        surprises: One of these surprises the arms.
+    """
     values: dict[str, Any] = {}  # literals of several types
     for name, kind in get_type_hints(Axes).items():
+        if name == "surprise":
+            break
         choices = list(get_args(kind))
         weights = np.array([len(choices) - 1.0 if choice == OFTEN.get(name) else 1.0 for choice in choices])
         values[name] = choices[int(rng.choice(len(choices), p=weights / weights.sum()))]
-    return Axes(**{**values, "heat": heat})
+    return Axes(**{**values, "heat": heat}, surprise=surprises[int(rng.integers(len(surprises)))])
+
+
+def surprises_in(cell: SuiteCell) -> tuple[Surprising, ...]:
+    """Kinds of surprises that a cell can have: without a fan none stops."""
+    fans = any(arm.cooling == "forced_air" for arm in layout(cell).arms)
+    return ("payload", "friction", "fan", "sensor") if fans else ("payload", "friction", "sensor")
+
+
+def _surprises(cell: SuiteCell, kind: Surprising, streams: Sequence[JobStream], seed: int) -> tuple[Surprise, ...]:
+    """What surprises the arms in an instance."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
+    arms = layout(cell).arms
+    few = np.sort(rng.choice(len(arms), max(1, round(SURPRISED_ARMS * len(arms))), replace=False))
+    match kind:
+        case "nothing":
+            return ()
+        case "payload":
+            heavy = tuple(task.name for task in tasks_of(cell) if task.heavy)
+            factor = round(rng.uniform(*PAYLOAD_FACTORS), 3)
+            chosen = [each.name for each in streams if each.name.startswith(heavy)] if heavy else [streams[0].name]
+            return tuple(Surprise(kind="payload", jobs=name, size=factor) for name in chosen)
+        case "friction":
+            sizes = rng.uniform(*FRICTION_SHARES, len(few)).round(3).tolist()
+            return tuple(Surprise(kind=kind, arm=arms[i].name, size=size) for i, size in zip(few, sizes, strict=True))
+        case "fan":
+            return tuple(Surprise(kind=kind, arm=arm.name) for arm in arms if arm.cooling == "forced_air")
+        case "sensor":
+            sign = np.where(rng.random(len(few)) < READS_LESS, -1.0, 1.0)
+            sizes = (sign * rng.uniform(*DRIFTS_K_PER_H, len(few))).round(3).tolist()
+            return tuple(Surprise(kind=kind, arm=arms[i].name, size=size) for i, size in zip(few, sizes, strict=True))
 
 
 @dataclass(frozen=True)
@@ -371,13 +418,14 @@ def scenario_of(name: str, cell: SuiteCell, axes: Axes, seed: int, known: Calibr
         twin=TwinSpec(size="quick", exploration=32, air_c=PAST_AIR_C),
         spread=Spread(scale=SPREAD, seed=cell.seed),
         bus=_bus(axes.bus, [arm.name for arm in arms], horizon_s),
+        surprises=_surprises(cell, axes.surprise, streams, seed),
     )  # fmt: skip
     return parse_scenario(msgspec.to_builtins(scenario), Path(f"{name}.toml"))
 
 
 def describe(cell: SuiteCell, axes: Axes) -> str:
     """Description of an instance in a sentence."""
-    values = ", ".join(f"{name} {value}" for name, value in asdict(axes).items())
+    values = ", ".join(f"{name} {value}" for name, value in asdict(axes).items() if value != "nothing")
     trade, asks = (text.replace("_", " ") for text in (cell.trade, cell.asks))
     return f"{trade} by {cell.arms} arms ({cell.layout}; {asks}): {values}."
 

@@ -14,7 +14,16 @@ from fleet.seeding import shift_seeds
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.parse import choose, hash_of, scenario_hash
 from scenarios.spec.schema import SPLITS, Scenario, SplitName
-from scenarios.suite.instances import CELLS, FAULTS, Axes, SuiteCell, draw_axes, scenario_of
+from scenarios.suite.instances import (
+    CELLS,
+    FAULTS,
+    SURPRISE_EVERY,
+    Axes,
+    SuiteCell,
+    draw_axes,
+    scenario_of,
+    surprises_in,
+)
 
 SUITE = 37
 """Seed of all draws of the suite."""
@@ -119,7 +128,9 @@ def drawn_rows(name: SplitName) -> Iterator[ManifestLine]:
         entropy = np.random.SeedSequence([SUITE, SPLITS.index(name), number])
         seed = int(entropy.generate_state(1)[0])
         heat = levels[0 if cell.asks == "light_work" else turn % len(levels)]
-        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]), heat)
+        surprised = (turn + cells.index(cell)) % SURPRISE_EVERY == 0
+        surprises = surprises_in(cell) if surprised else ("nothing",)
+        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]), heat, surprises)
         row = ManifestLine(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
         made = instance_of(row)
         jobs = jobs_content(made)

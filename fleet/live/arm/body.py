@@ -346,7 +346,8 @@ class SimulatedBody:
         if self._last is None:
             still = np.zeros_like(self._arm.rest_tau)
             temp_c, motors, tau = self._state.temp_c[0, 0], self._arm.motors, self._arm.rest_tau
-            noisy_c = temp_c[WINDING] + motors.sensor_noise_k * self._rng.standard_normal(still.shape)
+            drift_k = self._arm.drift_k_per_s * self.time_s
+            noisy_c = temp_c[WINDING] + drift_k + motors.sensor_noise_k * self._rng.standard_normal(still.shape)
             values = (noisy_c, self._arm.robot.home_q(), still, tau, current(tau, still, temp_c[HOUSING], motors))
             return SensorReading("idle", *(tuple(v.tolist()) for v in values))
         world, record = self._last
@@ -493,7 +494,8 @@ class SimulatedBody:
             ambient_c=np.array([[self._ambient_c(self._start_s)]]),
             start_warm=warm,
         )
-        return world, ProfilePlant(rows, self._arm.robot.home_q()[None], self._arm.rest_tau[None])
+        executed = [self._arm.executed.get(plan, plan) for plan in rows]
+        return world, ProfilePlant(executed, self._arm.robot.home_q()[None], self._arm.rest_tau[None])
 
     def _carried(self, world: World) -> State:
         """State at home before a stint, with temperatures and counters of the present state."""
