@@ -11,7 +11,7 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -401,19 +401,27 @@ def commands_table(folder: Path) -> str:
 
 def coverage_by_law(path: Path) -> str:
     measured = json.loads(path.read_text(encoding="utf-8"))
-    rows = [(law, *share_cells(shares)) for law, shares in measured["laws"].items()]
+    rows = [(law, *map(coverage_cell, cells)) for law, cells in measured["laws"].items()]
     return table(("values", *(f"n = {n}" for n in measured["seeds"])), rows)
+
+
+def coverage_by_limit(path: Path) -> str:
+    measured = json.loads(path.read_text(encoding="utf-8"))
+    rows = [(law, *map(coverage_cell, cells)) for law, cells in measured["limited"].items()]
+    return table(
+        ("values", *("no limit" if limit == "none" else f"limit {limit}" for limit in measured["limits"])), rows
+    )
+
+
+def coverage_cell(measured: Mapping[str, float]) -> str:
+    return f"{measured['share']:.3f} ({measured['width']:.2f})"
 
 
 def coverage_by_clusters(path: Path) -> str:
     measured = json.loads(path.read_text(encoding="utf-8"))
-    rows = [(size, *share_cells(shares)) for size, shares in measured["sizes"].items()]
-    rows.append(("200 instances of 9 unequal cells", *share_cells(measured["cells"])))
+    samples = measured["sizes"] | measured["cells"]
+    rows = [(sample, *(f"{share:.3f}" for share in shares)) for sample, shares in samples.items()]
     return table(("fleets × trainings × seeds", "normal effects", "exponential effects"), rows)
-
-
-def share_cells(shares: Iterable[float]) -> Iterable[str]:
-    return (f"{share:.3f}" for share in shares)
 
 
 PAPER = {
@@ -466,6 +474,7 @@ def tables_of(results: Path) -> Tables:
             for path in results.glob("channels/*.json")
         },
         "coverage": of(coverage_by_law, results / "coverage.json"),
+        "coverage_limits": of(coverage_by_limit, results / "coverage.json"),
         "coverage_clusters": of(coverage_by_clusters, results / "coverage.json"),
         **benchmark_tables(results),
         "sample_efficiency": lambda: efficiency_table(trainings(results / "sample_efficiency/heat_wave.jsonl")),

@@ -1,18 +1,19 @@
-"""Share of 95 % intervals that contain the true mean, by simulation: the tables of docs/results.md.
+"""Share of 95 % intervals that contain the true mean, and their width, by simulation: the tables of docs/results.md.
 
-python -m benchmarks.statistics.interval_coverage [--out docs/results/coverage.json]   # a minute of one core
+python -m benchmarks.statistics.interval_coverage [--out docs/results/coverage.json]   # two minutes of one core
 """
 
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 
 from benchmarks.harness import options, write_text
-from scenarios.evaluate.statistics import aggregates, by_group, mean_bounds
+from scenarios.evaluate.statistics import FARTHEST, aggregates, by_group, mean_bounds
+from scenarios.suite.instances import CELLS
 
 Array = np.ndarray
 Law = tuple[Callable[[np.random.Generator, tuple[int, ...]], Array], float]
@@ -31,21 +32,37 @@ SEEDS = (3, 5, 10, 20, 40)
 SIZES = ((4, 2, 10), (8, 2, 20), (10, 1, 10))
 """Fleets, trainings and seeds."""
 MORE_SIZES = ((2, 2, 20), (3, 2, 20), (200, 1, 5))
-CELLS = (30, 30, 30, 30, 30, 24, 12, 8, 6)
-"""Instances of each cell, about as in the test split."""
+LIMITS = (1.0, 1.5, FARTHEST, 2.5, 3.0, np.inf)
+"""Largest distances of a bound from the mean, as multiples of Student's."""
+LIMITED_SEEDS = 10
+"""Seeds with which the limits are compared."""
+INSTANCES = tuple(cell.instances for cell in CELLS if cell.split == "test")
+"""Instances of each cell of the test split."""
 
 
-def coverage(values: Array, mean: float) -> float:
+class Measured(NamedTuple):
+    """Intervals of one kind of values."""
+
+    share: float
+    """That contain the mean."""
+    width: float
+    """Mean width, as a multiple of the mean width of Student's intervals of the same values."""
+
+
+def measured(values: Array, mean: float, farthest: float = FARTHEST) -> Measured:
     """Of [trial, fleet, training, seed]; trials without variation have no interval and do not count."""
-    bounds = mean_bounds(values)
-    some = np.isfinite(bounds.low)
-    return float(((bounds.low <= mean) & (mean <= bounds.high))[some].mean())
+    bounds, student = mean_bounds(values, farthest=farthest), mean_bounds(values, farthest=1.0)
+    contains = (bounds.low <= mean) & (mean <= bounds.high)
+    width = np.nanmean(bounds.high - bounds.low) / np.nanmean(student.high - student.low)
+    return Measured(float(contains[np.isfinite(bounds.low)].mean()), float(width))
 
 
-def law_coverage(rng: np.random.Generator, law: Law, seeds: int, trials: int = 200_000) -> float:
+def measured_law(
+    rng: np.random.Generator, law: Law, seeds: int, trials: int = 200_000, farthest: float = FARTHEST
+) -> Measured:
     """Of the mean over seeds."""
     draw, mean = law
-    return coverage(draw(rng, (trials, 1, 1, seeds)), mean)
+    return measured(draw(rng, (trials, 1, 1, seeds)), mean, farthest)
 
 
 def effects(rng: np.random.Generator, size: tuple[int, ...], skewed: bool) -> Array:
@@ -66,9 +83,9 @@ def shifts(rng: np.random.Generator, trials: int, size: tuple[int, int, int], sk
 
 def cells_coverage(rng: np.random.Generator, skewed: bool, trials: int = 20_000) -> float:
     """Of the mean over instances of several cells: cells and instances differ alike."""
-    groups = np.repeat(np.arange(len(CELLS)), CELLS)
-    values = effects(rng, (trials, len(CELLS)), skewed)[:, groups] + effects(rng, (trials, len(groups)), skewed)
-    return coverage(np.stack([by_group(each[None], groups) for each in values]), 0.0)
+    groups = np.repeat(np.arange(len(INSTANCES)), INSTANCES)
+    values = effects(rng, (trials, len(INSTANCES)), skewed)[:, groups] + effects(rng, (trials, len(groups)), skewed)
+    return measured(np.stack([by_group(each[None], groups) for each in values]), 0.0).share
 
 
 def iqm_coverage(rng: np.random.Generator, instances: int, trials: int = 500) -> float:
@@ -79,21 +96,33 @@ def iqm_coverage(rng: np.random.Generator, instances: int, trials: int = 500) ->
 
 
 def measure() -> dict[str, Any]:
-    """Shares by law and number of seeds, by fleets × trainings × seeds, of IQMs by instances, and over cells.
+    """Intervals by law and number of seeds, by fleets × trainings × seeds, of IQMs by instances, over cells, by limit.
 
-    The pairs are of normal and of exponential effects.
+    Over laws and limits with their widths, else shares only; those of fleets and of cells are pairs, of normal and of
+    exponential effects.
     """
     rng = np.random.default_rng(2)
     laws = {**LAWS, "lognormal, σ = 1": VERY_SKEWED}
     return {
         "seeds": list(SEEDS),
-        "laws": {name: [law_coverage(rng, law, n) for n in SEEDS] for name, law in laws.items()},
+        "laws": {name: [measured_law(rng, law, n)._asdict() for n in SEEDS] for name, law in laws.items()},
         "sizes": {
-            " × ".join(map(str, size)): [coverage(shifts(rng, 20_000, size, skewed), 0.0) for skewed in (False, True)]
+            " × ".join(map(str, size)): [
+                measured(shifts(rng, 20_000, size, skewed), 0.0).share for skewed in (False, True)
+            ]
             for size in (*SIZES, *MORE_SIZES)
         },
         "iqm": {str(n): iqm_coverage(rng, n) for n in (10, 50, 200)},
-        "cells": [cells_coverage(rng, skewed) for skewed in (False, True)],
+        "cells": {
+            f"{sum(INSTANCES)} instances of {len(INSTANCES)} cells": [
+                cells_coverage(rng, skewed) for skewed in (False, True)
+            ]
+        },
+        "limits": ["none" if np.isinf(limit) else f"{limit:g}" for limit in LIMITS],
+        "limited": {
+            name: [measured_law(rng, law, LIMITED_SEEDS, farthest=limit)._asdict() for limit in LIMITS]
+            for name, law in laws.items()
+        },
     }
 
 

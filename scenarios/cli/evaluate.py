@@ -109,7 +109,7 @@ def train_command(
         name = f"{suite}-pairs"
         chosen = [split(suite)[:instances], split("validation")[:validation_instances]]
         cases = [*suite_of(suite, 1)[:instances], *suite_of("validation", 1)[:validation_instances]]
-        known = {shift: (each.random, each.hindsight) for shift, each in references_of(cases).items()}
+        known = references_of(cases)
         with progress_bar() as progress:
             training, validation = (
                 training_instances(each, **sources, known=known, progress=progress) for each in chosen

@@ -12,7 +12,7 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Normalised, Shift, SuiteScores, and_trainings, normalised, scores_of
-from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, fewest, figure_rows, figures_of, remarks, unit
+from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, Interval, fewest, figure_rows, figures_of, remarks, unit
 from scenarios.evaluate.study import Case, Row, Study, suite_label
 from scenarios.policy_loader import check_name, has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
@@ -64,6 +64,8 @@ class Comparison:
     """By policy: illegal actions in all its shifts."""
     failures: tuple[Failed, ...] = ()
     """Shifts in which a policy failed. A policy with one has no figures."""
+    lead: Interval | None = None
+    """Paired difference in reward of the first to the second of `by_reward`; None with fewer than two."""
     scores: SuiteScores | None = None
     """Normalised scores; None without references of the shifts."""
     randomise: Randomisation = field(default_factory=Randomisation)
@@ -184,6 +186,11 @@ def figures_of_shifts(
     return figures_of(values, baseline, KINDS)
 
 
+def by_reward(figures: Mapping[str, Mapping[str, Figure]]) -> list[str]:
+    """The policies, the one with the highest mean reward first."""
+    return sorted(figures, key=lambda name: -figures[name]["reward"].mean)
+
+
 def check_baseline(study: Study, baseline: str) -> None:
     """Raise a FleetError, which names what is compared, if the baseline is not."""
     names = study.competitors.values()
@@ -232,10 +239,14 @@ def comparison_of(
         if row.error is not None
     ]
     failed, count = {each.policy for each in failures}, len({row.key.instance for row in rows})
-    figures, scores = {}, None
+    figures, lead, scores = {}, None, None
     if baseline not in failed:
         whole = {each: _repeated(study, own) for each, own in shifts.items() if each not in failed}
         figures = figures_of_shifts(whole, baseline, (count, *study.shape))
+        best, *others = by_reward(figures)
+        if others:
+            pair = {name: whole[name] for name in (best, others[0])}
+            lead = figures_of_shifts(pair, others[0], (count, *study.shape))[best]["reward"].to_base
         values = scores_over_all(study, rows, references or {})
         scores = scores_of(values, baseline) if values else None
     fleets, trainings, per_fleet = study.shape
@@ -252,6 +263,7 @@ def comparison_of(
         channel_text=study.channel_text,
         illegal={each: sum(row.illegal for row in own) for each, own in shifts.items()},
         failures=tuple(failures),
+        lead=lead,
         scores=scores,
         randomise=study.randomise or Randomisation(),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from scenarios.evaluate.comparison import Comparison, Failed
+from scenarios.evaluate.comparison import Comparison, Failed, by_reward
 from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, SuiteScores, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
@@ -165,7 +165,7 @@ def comparison_page(judged: Judged) -> str:
 
 
 def verdict(judged: Judged) -> list[str]:
-    """The best policy against the baseline and against the next one, in sentences.
+    """The best policy against the baseline and against the second best, in sentences.
 
     The best one is chosen by its figures, so p-values count as many differences as there are other policies
     (Bonferroni).
@@ -178,9 +178,9 @@ def verdict(judged: Judged) -> list[str]:
     if values is None or scores is None:
         return [*_reward_verdict(judged.results), *last]
     best, *rest = ranked(scores)
-    others = {base: "the baseline "} if best != base else {}
-    others |= {name: "the next one, " for name in [name for name in rest if name != base][:1]}
-    compared = [_against(other, values.difference(best, other), role, len(rest)) for other, role in others.items()]
+    compared = [
+        _against(other, values.difference(best, other), role, len(rest)) for other, role in _rivals(best, rest, base)
+    ]
     sentences = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     sentences.append(
@@ -190,13 +190,21 @@ def verdict(judged: Judged) -> list[str]:
     return [*sentences, *last]
 
 
+def _rivals(best: str, others: Sequence[str], base: str) -> Iterator[tuple[str, str]]:
+    """What the best policy is compared with, each with its role: the baseline, and the first of the others."""
+    if base not in (best, *others[:1]):
+        yield base, "the baseline"
+    for second in others[:1]:
+        yield second, "the baseline and next policy" if second == base else "the next policy"
+
+
 def _against(other: str, difference: Interval, role: str, tests: int) -> str:
     """`beats the baseline wspt by 0.12 [0.08, 0.16] of the way from random to the best known`."""
     by = f"{difference.text()} of the way from random to the best known"
     if difference.low > 0 and _significant(difference.p, tests):
-        return f"beats {role}{label(other)} by {by}"
+        return f"beats {role} {label(other)} by {by}"
     among = f", not significant among {tests} policies" if difference.low > 0 else ""
-    return f"is not shown to beat {role}{label(other)}: the difference is {by}{among}"
+    return f"is not shown to beat {role} {label(other)}: the difference is {by}{among}"
 
 
 def _significant(p: float, tests: int) -> bool:
@@ -211,23 +219,16 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
             yield f"{where}no differences, as the baseline {label(result.baseline)} failed."
             continue
         base = result.baseline
-        best, *others = sorted(result.figures, key=lambda name: -result.figures[name]["reward"].mean)
+        best, *others = by_reward(result.figures)
         reward = f"{result.figures[best]['reward'].mean:.1f}"
-        if not others:
-            yield f"{where}no policy has more reward than the baseline {label(base)} ({reward})."
-            continue
-        compared = best if best != base else others[0]
-        figure = result.figures[compared]["reward"]
-        span = figure.to_base.text(1)
-        significant = figure.to_base.excludes_zero and _significant(figure.p, len(others))
-        doubt = "" if significant else ", which is not significant"
-        if best == base:
-            yield (
-                f"{where}no policy has more reward than the baseline {label(base)} ({reward}); "
-                f"the difference of {label(compared)} to it is {span}{doubt}."
-            )
-        else:
-            yield f"{where}{label(best)} has the most reward, {reward}; {span} more reward than {label(base)}{doubt}."
+        more: list[str] = []
+        for other, role in _rivals(best, others, base):
+            difference = result.lead if other == others[0] else result.figures[best]["reward"].to_base
+            assert difference is not None
+            significant = difference.excludes_zero and _significant(difference.p, len(others))
+            doubt = "" if significant else " (not significant)"
+            more.append(f"{difference.text(1)} more than {role} {label(other)}{doubt}")
+        yield f"{where}{'; '.join([f'{label(best)} has the most reward, {reward}', *more])}."
 
 
 def _score_charts(judged: Judged) -> list[Chart]:

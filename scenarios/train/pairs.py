@@ -15,6 +15,7 @@ from agents.policy import WAIT
 from agents.rules import matched_options
 from fleet.engine.batch import RewardWeights
 from fleet.env.vector import BatchEnv, Library, Obs
+from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import rollout
 from scenarios.prepare.batch import library_of
 from scenarios.prepare.fleet import prepare
@@ -26,8 +27,6 @@ from scenarios.train.training import PAIRS_STATE, Trained, check_folder, run_tra
 
 Array = np.ndarray
 
-LEAST_SPAN = 0.04
-"""Shortest span of an instance in training, as a share of the value of its jobs."""
 MOST_LOSS = 1.0
 """A sample loses at most this much to the best one in a shift, so that one shift does not decide an iteration."""
 
@@ -41,10 +40,8 @@ class TrainingInstance:
     """Of the instance itself."""
     library: Library
     weights: RewardWeights
-    random: float = 0.0
-    """Mean reward of the policy `random` in the shift of its own seed; 0 without a reference."""
-    span: float | None = None
-    """Reward of the hindsight of that shift less `random`; None without a reference."""
+    reference: ShiftReference | None = None
+    """Of the shift of its own seed."""
 
     @property
     def arms(self) -> int:
@@ -58,8 +55,13 @@ class TrainingInstance:
 
     @property
     def unit(self) -> float:
-        """What rewards of its shifts are divided by: the span, or the value of all jobs without a reference."""
-        return self.value if self.span is None else self.span
+        """What rewards of its shifts are divided by: the unit of the reference; without one, the value of all jobs."""
+        return self.reference.unit if self.reference else self.value
+
+    @property
+    def random(self) -> float:
+        """Mean reward of the policy `random` in the shift of its own seed; 0 without a reference."""
+        return self.reference.random if self.reference else 0.0
 
 
 def training_instances(
@@ -67,22 +69,21 @@ def training_instances(
     *,
     difficulty: DifficultyName = "oracle",
     risk: RiskName = RISK,
-    known: Mapping[tuple[str, int], tuple[float, float]] | None = None,
+    known: Mapping[tuple[str, int], ShiftReference] | None = None,
     progress: Progress = quiet,
 ) -> list[TrainingInstance]:
     """Prepare instances; a cell is planned once.
 
     Args:
-        known: Rewards of random and of the hindsight, by instance and seed, as far as there are references.
+        known: References by instance and seed, as far as there are some.
     """
     prepared: list[TrainingInstance] = []
     for instance in instances:
         progress(f"preparing {instance.name}", Count(len(prepared), len(instances)))
         fleet = prepare(instance.scenario, difficulty=difficulty, risk=risk)
-        random, hindsight = (known or {}).get((instance.name, instance.seed), (0.0, None))
-        span = None if hindsight is None else hindsight - random
+        reference = (known or {}).get((instance.name, instance.seed))
         library, weights = library_of(fleet), weights_of(instance.scenario)
-        prepared.append(TrainingInstance(instance.name, instance.seed, library, weights, random, span))
+        prepared.append(TrainingInstance(instance.name, instance.seed, library, weights, reference))
     return prepared
 
 
@@ -185,7 +186,7 @@ class PairLearner:
             yield row | {"seconds": time.monotonic() - began_s}
 
     def fitness(self) -> Array:
-        """Mean reward of every sample over the span of the instance, on shifts that all samples share, [sample].
+        """Mean reward of every sample in units of the instance, on shifts that all samples share, [sample].
 
         Large fleets are drawn less often, as their shifts take longer.
         """
@@ -197,8 +198,7 @@ class PairLearner:
         samples, total = search.ask(), np.zeros(search.config.samples)
         for index in chosen.tolist():
             instance, seed = self.training[index], int(rng.integers(2**31))
-            unit = max(instance.unit, LEAST_SPAN * instance.value)
-            scores = rewards(instance, samples, [seed] * len(samples)) / unit
+            scores = rewards(instance, samples, [seed] * len(samples)) / instance.unit
             total += np.maximum(scores, scores.max() - MOST_LOSS)
         return total / len(chosen)
 

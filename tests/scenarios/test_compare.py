@@ -206,10 +206,10 @@ def rows_of(study: Study, error: str | None = None, failing: str = "random") -> 
     return rows
 
 
-def judged(study: Study, rows: list[Row], known: dict[Shift, Known]) -> Judged:
+def judged(study: Study, rows: list[Row], known: dict[Shift, Known], baseline: str = "wspt") -> Judged:
     return Judged(
         title="Comparison <here>",
-        results=comparisons(study, rows, "wspt", references=known),  # pyright: ignore[reportArgumentType]  # a stand-in
+        results=comparisons(study, rows, baseline, references=known),  # pyright: ignore[reportArgumentType]  # a stand-in
         values=scores_over_all(study, rows, known),  # pyright: ignore[reportArgumentType]
         card=study.card,
         command="thermofleet compare quickstart",
@@ -232,8 +232,7 @@ def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
     first, second, failed = verdict(about)
     mean = np.mean([row.outcome.reward for row in rows[6:12] if row.outcome]) / 20
     better = mean - np.mean([row.outcome.reward for row in rows[:6] if row.outcome]) / 20
-    assert first.startswith(f"wsept beats the baseline wspt by {better:.2f} [")
-    assert "; it beats the next one, fifo by " in first
+    assert first.startswith(f"wsept beats the baseline and next policy wspt by {better:.2f} [")
     assert second.startswith(f"Its mean score is {mean:.2f} [")
     assert failed.startswith("Failed: random;")
     page = comparison_page(about)
@@ -261,21 +260,40 @@ def test_a_baseline_that_failed_has_no_differences(study: Study):
 def test_the_best_of_several_must_be_significant_among_them(study: Study):
     about = judged(study, rows_of(study), {})
     (result,) = about.results
-    for p, said in (
-        (0.016, "more reward than wspt."),
-        (0.02, "more reward than wspt, which is not significant."),
-    ):  # of three
-        reward = replace(result.figures["wsept"]["reward"], p=p)
-        figures = result.figures | {"wsept": result.figures["wsept"] | {"reward": reward}}
-        (only,) = verdict(replace(about, results=[replace(result, figures=figures)]))
-        assert said in only
+    assert result.lead is not None
+    for p, said in ((0.016, "wspt."), (0.02, "wspt (not significant).")):  # of three
+        (only,) = verdict(replace(about, results=[replace(result, lead=replace(result.lead, p=p))]))
+        assert only.endswith(said)
+
+
+@pytest.mark.parametrize(
+    ("baseline", "others"),
+    [
+        ("wspt", ["the baseline and next policy wspt"]),
+        ("fifo", ["the baseline fifo", "the next policy wspt"]),
+        ("wsept", ["the next policy wspt"]),
+    ],
+)
+@pytest.mark.parametrize("known", [KNOWN_SHIFTS, {}], ids=["scores", "rewards"])
+def test_the_verdict_names_the_baseline_and_the_policy_that_is_second(study: Study, baseline, others, known):
+    """Of wsept 14, wspt 10, fifo 6 and random 0; the differences are those of the means."""
+    rows = rows_of(study)
+    means = {p: np.mean([r.outcome.reward for r in rows if r.key.policy == p and r.outcome]) for p in study.policies}
+    first, *_ = verdict(judged(study, rows, known, baseline))
+    for other in others:
+        more = means["wsept"] - means[other.split()[-1]]
+        number = rf"{more / 20:.2f}" if known else rf"{more:.1f}"
+        by = rf"beats {other} by {number} \[" if known else rf"{number} \[[^]]*\] more than {other}[;.]"
+        assert re.search(by, first), (by, first)
+    assert ("baseline" in first) == (baseline != "wsept")
+    assert len(re.findall("wspt|fifo|random", first.partition("wsept")[2].replace("from random", ""))) == len(others)
 
 
 def test_without_references_the_verdict_is_of_rewards(study: Study):
     (only,) = verdict(judged(study, rows_of(study), {}))
     assert re.fullmatch(
         r"quickstart, 6 seeds, this fleet only: wsept has the most reward, 14\.\d; "
-        r"[34]\.\d \[[234]\.\d, [45]\.\d\] more reward than wspt\.",
+        r"[34]\.\d \[[234]\.\d, [45]\.\d\] more than the baseline and next policy wspt\.",
         only,
     )
 

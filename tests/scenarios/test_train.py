@@ -14,7 +14,9 @@ from agents.learned.ppo import PpoConfig
 from agents.pairs import PAIRS_CARD, PARAMETERS, Worth, first_parameters
 from fleet.errors import FleetError
 from scenarios.cli.main import main
+from scenarios.evaluate.references import load_references
 from scenarios.evaluate.rollout import outcomes
+from scenarios.evaluate.scores import split_file
 from scenarios.policy_loader import label, policy_of, scope_of
 from scenarios.prepare.fleet import prepare
 from scenarios.spec.load import load
@@ -125,12 +127,17 @@ def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
 
 def test_validation_is_the_normalised_score_of_the_shift_of_the_benchmark(ground) -> None:
     (reward,) = rewards(ground, np.zeros((1, PARAMETERS)), [ground.seed])
-    half = replace(ground, random=reward - 5.0, span=10.0)
-    none = replace(ground, random=reward, span=20.0)
+    some = load_references(split_file("train"))[0]
+    half = replace(ground, reference=replace(some, random=reward - 5.0, hindsight=reward + 5.0))
+    none = replace(ground, reference=replace(some, random=reward, hindsight=reward + 20.0))
     assert validation_score([half, none], np.zeros(PARAMETERS)) == pytest.approx(0.25)
+    # Where random is as good as the hindsight, the unit is a tenth of the reward of the hindsight.
+    equal = replace(ground, reference=replace(some, random=0.5 * reward, hindsight=0.5 * reward))
+    assert validation_score([equal], np.zeros(PARAMETERS)) == pytest.approx(10.0)
     assert validation_score([ground], np.zeros(PARAMETERS)) == pytest.approx(reward / ground.value)
     own = replace(instance("train/0005"), name="x", seed=3)
-    (made,) = training_instances([own], known={("x", 3): (40.0, 60.0), ("x", 4): (0.0, 1.0)})
+    known = {("x", 3): replace(some, random=40.0, hindsight=60.0), ("x", 4): some}
+    (made,) = training_instances([own], known=known)
     assert (made.random, made.unit) == (40.0, 20.0)
 
 

@@ -1,6 +1,7 @@
 """Statistics against SciPy, arch, closed forms and simulated coverage."""
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from benchmarks.statistics.interval_coverage import LAWS, SIZES, VERY_SKEWED, coverage, law_coverage, measure, shifts
+from benchmarks.statistics.interval_coverage import (
+    INSTANCES,
+    LAWS,
+    SIZES,
+    VERY_SKEWED,
+    measure,
+    measured,
+    measured_law,
+    shifts,
+)
 from scenarios.evaluate.statistics import (
     EQUAL,
     FARTHEST,
@@ -32,6 +42,7 @@ from scenarios.evaluate.statistics import (
     share_bounds,
     unit,
 )
+from scenarios.suite.splits import manifest
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 10), (3, 10), (10, 10), (1, 1)])
@@ -199,21 +210,41 @@ FILE = Path(__file__).parents[2] / "docs/results/coverage.json"
 
 @pytest.mark.parametrize("name", LAWS)
 def test_ten_seeds_cover(name):
-    assert law_coverage(np.random.default_rng(0), LAWS[name], 10, trials=20_000) >= 0.94
+    assert measured_law(np.random.default_rng(0), LAWS[name], 10, trials=20_000).share >= 0.94
 
 
 def test_ten_very_skewed_values_cover_less():
     """Lognormal, σ = 1, skewness 6.2: .927, where Student's t has .84. Twenty values cover .94."""
     rng = np.random.default_rng(0)
-    assert 0.92 <= law_coverage(rng, VERY_SKEWED, 10, trials=20_000) <= 0.94
-    assert law_coverage(rng, VERY_SKEWED, 20, trials=20_000) >= 0.94
+    assert 0.92 <= measured_law(rng, VERY_SKEWED, 10, trials=20_000).share <= 0.94
+    assert measured_law(rng, VERY_SKEWED, 20, trials=20_000).share >= 0.94
+
+
+def test_the_limit_1_gives_student_s_intervals_and_a_limit_bounds_the_width() -> None:
+    """Student's cover normal values with .95 exactly; their bounds are those of SciPy."""
+    rng = np.random.default_rng(0)
+    share, width = measured_law(rng, LAWS["normal"], 10, trials=40_000, farthest=1.0)
+    assert (share, width) == (pytest.approx(0.95, abs=0.005), 1.0)
+    x = rng.lognormal(size=(5, 10))
+    found = mean_bounds(x[:, None, None], farthest=1.0)
+    low, high = stats.ttest_1samp(x, 0.0, axis=1).confidence_interval(0.95)
+    np.testing.assert_allclose((found.low, found.high), (low, high))
+    np.testing.assert_allclose(found.p, stats.ttest_1samp(x, 0.0, axis=1).pvalue)
+    widths = [measured(x[:, None, None], 1.0, limit).width for limit in (1.5, FARTHEST, np.inf)]
+    assert widths == sorted(widths)
+    assert widths[0] <= 1.25  # one bound is Student's, the other is at most 1.5 times as far
+    assert widths[1] <= 1.5
+
+
+def test_the_cells_of_the_simulation_are_those_of_the_test_split() -> None:
+    assert sorted(INSTANCES) == sorted(Counter(row.cell for row in manifest("test")).values())
 
 
 @pytest.mark.parametrize("skewed", [False, True])
 @pytest.mark.parametrize("size", SIZES)
 def test_fleets_trainings_and_seeds_cover(size, skewed):
     values = shifts(np.random.default_rng(1), 2000, size, skewed)
-    assert coverage(values, 0.0) >= 0.94
+    assert measured(values, 0.0).share >= 0.94
     flat = values.reshape(len(values), -1)
     naive = np.abs(flat.mean(axis=1)) < 1.96 * flat.std(axis=1, ddof=1) / np.sqrt(flat.shape[1])
     assert naive.mean() < 0.75  # one over shifts, as if they were independent
@@ -221,19 +252,24 @@ def test_fleets_trainings_and_seeds_cover(size, skewed):
 
 @pytest.mark.slow
 def test_coverage_of_every_law_and_size():
-    """The shares of docs/results.md repeat, and none is much too small."""
-    measured, stored = measure(), json.loads(FILE.read_text(encoding="utf-8"))
-    assert list(measured) == list(stored)
-    for name in ("laws", "sizes"):
-        assert list(measured[name]) == list(stored[name])
-        for key, shares in measured[name].items():
+    """The shares and widths of docs/results.md repeat, and no share is much too small."""
+    found, stored = measure(), json.loads(FILE.read_text(encoding="utf-8"))
+    assert list(found) == list(stored)
+    for name in ("laws", "limited"):
+        assert list(found[name]) == list(stored[name])
+        for key, cells in found[name].items():
+            for cell, kept in zip(cells, stored[name][key], strict=True):
+                assert cell == pytest.approx(kept, abs=0.001), key
+    for name in ("sizes", "cells"):
+        assert list(found[name]) == list(stored[name])
+        for key, shares in found[name].items():
             assert shares == pytest.approx(stored[name][key], abs=0.001), key
-    assert measured["iqm"] == pytest.approx(stored["iqm"], abs=0.005)
-    assert measured["cells"] == pytest.approx(stored["cells"], abs=0.001)
-    assert min(measured["iqm"].values()) >= 0.92
-    assert min(measured["cells"]) >= 0.92
-    assert all(shares[measured["seeds"].index(10)] >= 0.94 for name, shares in measured["laws"].items() if name in LAWS)
-    assert min(measured["sizes"]["10 × 1 × 10"]) >= 0.94
+    assert found["iqm"] == pytest.approx(stored["iqm"], abs=0.005)
+    assert min(found["iqm"].values()) >= 0.92
+    assert min(min(shares) for shares in found["cells"].values()) >= 0.92
+    ten = found["seeds"].index(10)
+    assert all(cells[ten]["share"] >= 0.94 for name, cells in found["laws"].items() if name in LAWS)
+    assert min(found["sizes"]["10 × 1 × 10"]) >= 0.94
 
 
 KINDS = {"faults": FigureKind("faults", is_count=True)}
