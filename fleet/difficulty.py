@@ -74,6 +74,8 @@ class Forecast:
     beyond. None, or NaN as first value: the logistic function."""
     time_s: Array | None = None
     """Moment of each piece after the start, s, [..., piece]; 0: it counts at any time. None: all 0."""
+    gain: Array | None = None
+    """By how much each piece rises if the load makes twice the heat that was assumed, [..., piece]; None: all 0."""
 
     def __post_init__(self) -> None:
         if self.offset.shape[-1:] in ((), (0,)) or self.weight.shape != (*self.offset.shape, KNOWN):
@@ -89,40 +91,50 @@ class Forecast:
             raise ValueError(f"Forecast.curve must be [..., knot, 2] (got {self.curve.shape}).")
         if self.time_s is not None and (self.time_s.shape != self.offset.shape or not (self.time_s >= 0).all()):
             raise ValueError(f"Forecast.time_s must be >= 0, one per piece (got shape {np.shape(self.time_s)}).")
+        if self.gain is not None and (self.gain.shape != self.offset.shape or not np.isfinite(self.gain).all()):
+            raise ValueError(f"Forecast.gain must be finite, one per piece (got shape {np.shape(self.gain)}).")
 
-    def value(self, known_c: Array, left_s: float = np.inf) -> Array:
-        """The value [...] from known temperatures [..., KNOWN], without the pieces of moments later than `left_s`."""
-        values = self.offset + (self.weight @ np.asarray(known_c, dtype=float)[..., None])[..., 0]
+    def value(self, known_c: Array, left_s: float = np.inf, excess: float = 0.0) -> Array:
+        """The value [...] from known temperatures [..., KNOWN], without the pieces of moments later than `left_s`.
+
+        Args:
+            excess: Heat of the load over the assumed heat, less 1.
+        """
+        offset = self.offset if self.gain is None else self.offset + excess * self.gain
+        values = offset + (self.weight @ np.asarray(known_c, dtype=float)[..., None])[..., 0]
         if self.time_s is not None:
             values = np.where(self.time_s <= left_s, values, -np.inf)
         return values.max(axis=-1)
 
-    def at(self, known_c: Array, left_s: float = np.inf) -> Array:
+    def at(self, known_c: Array, left_s: float = np.inf, excess: float = 0.0) -> Array:
         """The probability [...]; arguments as in `value`."""
         curve = np.zeros((0, 2)) if self.curve is None else self.curve
-        return _LINKS(self.value(known_c, left_s), curve)
+        return _LINKS(self.value(known_c, left_s, excess), curve)
 
     def __getitem__(self, row: Array | int) -> "Forecast":
         """Rows of the first axis."""
-        curve, time_s = (None if part is None else part[row] for part in (self.curve, self.time_s))
-        return Forecast(self.offset[row], self.weight[row], curve, time_s)
+        curve, time_s, gain = (None if part is None else part[row] for part in (self.curve, self.time_s, self.gain))
+        return Forecast(self.offset[row], self.weight[row], curve, time_s, gain)
 
 
 def stack_forecasts(forecasts: Sequence[Forecast]) -> Forecast:
     """Stack forecasts of single plans along a leading axis; their numbers of pieces and knots may differ."""
     pieces = max(len(each.offset) for each in forecasts)
     knots = max(0 if each.curve is None else len(each.curve) for each in forecasts)
-    offset, time_s = np.full((len(forecasts), pieces), -np.inf), np.zeros((len(forecasts), pieces))
+    offset = np.full((len(forecasts), pieces), -np.inf)
+    time_s, gain = np.zeros((2, len(forecasts), pieces))
     weight = np.zeros((len(forecasts), pieces, KNOWN))
     for row, each in enumerate(forecasts):
         count = len(each.offset)
         offset[row, :count], weight[row, :count] = each.offset, each.weight
         if each.time_s is not None:
             time_s[row, :count] = each.time_s
+        if each.gain is not None:
+            gain[row, :count] = each.gain
     if not knots:
-        return Forecast(offset, weight, None, time_s)
+        return Forecast(offset, weight, None, time_s, gain)
     curves = [np.zeros((1, 0, 2)) if each.curve is None else each.curve[None] for each in forecasts]
-    return Forecast(offset, weight, np.concatenate([extend_curve(curve, knots) for curve in curves]), time_s)
+    return Forecast(offset, weight, np.concatenate([extend_curve(curve, knots) for curve in curves]), time_s, gain)
 
 
 def forecast_arrays(forecasts: Forecast | None, lanes: int) -> dict[str, Array]:
@@ -130,21 +142,23 @@ def forecast_arrays(forecasts: Forecast | None, lanes: int) -> dict[str, Array]:
 
     Returns:
         forecast_first, first block of each forecast, and the number of all blocks, int [forecast + 1];
-        forecast_block [block, 2 + KNOWN, lane], offset, moment and slopes of each piece, padded with offsets of −inf;
-        and forecast_curve [forecast, knot, 2].
+        forecast_block [block, 3 + KNOWN, lane], offset, moment, gain and slopes of each piece, padded with offsets of
+        −inf; and forecast_curve [forecast, knot, 2].
     """
     if forecasts is None:
-        empty = np.zeros((0, 2 + KNOWN, lanes)), np.zeros((0, 0, 2))
+        empty = np.zeros((0, 3 + KNOWN, lanes)), np.zeros((0, 0, 2))
         return dict(zip(_FORECAST_TABLES, (np.zeros(1, int), *empty), strict=True))
     count = len(forecasts.offset)
     size = -(-forecasts.offset.shape[1] // lanes)
-    pieces = np.zeros((count, 2 + KNOWN, size * lanes))
+    pieces = np.zeros((count, 3 + KNOWN, size * lanes))
     pieces[:, 0] = -np.inf
     used = slice(0, forecasts.offset.shape[1])
-    pieces[:, 0, used], pieces[:, 2:, used] = forecasts.offset, forecasts.weight.swapaxes(1, 2)
+    pieces[:, 0, used], pieces[:, 3:, used] = forecasts.offset, forecasts.weight.swapaxes(1, 2)
     if forecasts.time_s is not None:
         pieces[:, 1, used] = forecasts.time_s
-    blocks = pieces.reshape(count, 2 + KNOWN, size, lanes).swapaxes(1, 2)
+    if forecasts.gain is not None:
+        pieces[:, 2, used] = forecasts.gain
+    blocks = pieces.reshape(count, 3 + KNOWN, size, lanes).swapaxes(1, 2)
     counts = (blocks[:, :, 0] > -np.inf).any(axis=-1)
     curve = np.zeros((count, 0, 2)) if forecasts.curve is None else forecasts.curve
     first = np.cumsum([0, *counts.sum(axis=1)])
@@ -221,26 +235,27 @@ class Difficulty:
         """d = Σ_k w_k d_k, in [0, joints)."""
         return float(np.sum(self.per_joint if self.weight is None else self.weight * self.per_joint))
 
-    def p_at(self, known_c: Array, left_s: float = np.inf) -> float | None:
+    def p_at(self, known_c: Array, left_s: float = np.inf, excess: float = 0.0) -> float | None:
         """P(saturation) from known temperatures [KNOWN]; None if unknown.
 
         Args:
             left_s: Time until the plan ends, if it has begun.
+            excess: As in `Forecast.value`.
         """
         if self.risk is not None:
-            return float(self.risk.at(known_c, left_s))
+            return float(self.risk.at(known_c, left_s, excess))
         if self.p_saturation is None and self.peak is not None and self.peak.curve is not None:
-            return float(self.peak.at(known_c, left_s))
+            return float(self.peak.at(known_c, left_s, excess))
         return self.p_saturation
 
-    def peak_at(self, known_c: Array, left_s: float = np.inf) -> float | None:
+    def peak_at(self, known_c: Array, left_s: float = np.inf, excess: float = 0.0) -> float | None:
         """Predicted hottest motor temperature during the plan, °C; None if unknown; arguments as in `p_at`.
 
         Of a plan that has begun, it is at least the hottest motor now.
         """
         if self.peak is None:
             return None
-        peak_c = float(self.peak.value(known_c, left_s))
+        peak_c = float(self.peak.value(known_c, left_s, excess))
         return peak_c if left_s == np.inf else max(peak_c, float(known_c[:JOINTS].max()))
 
 

@@ -117,6 +117,8 @@ def reset_rows(
             for k in range(JOINTS):
                 arm["housing_c"][k] = net["start_housing_c"][k] + ambient_offset_k[n]
             arm["peak_c"] = hottest(arm["temp_c"])
+            for work in range(sim.excess.shape[2]):
+                sim.excess[e, a, work] = np.nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,6 +238,7 @@ class Engine:
             closed=np.zeros((envs, tables.excluded.shape[1]), np.uint64),
         )
         offers.mask[:, :, 0] = 1
+        works = int(tables.alike.max()) + 1 if tables.plans["excess"].any() else 0
         self._simulation = Simulation(
             tables,
             empty_state(envs, arms, jobs, 0),
@@ -245,8 +248,9 @@ class Engine:
             np.zeros((0, arms), DRIVE),
             np.zeros((envs, arms), INFO),
             np.zeros((envs if path else 0, tables.ticks, arms, NODES), np.float32),
+            np.full((envs, arms, works), np.nan, np.float32),
             form_of(layout),
-            room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK)),
+            room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK), works),
             weights_per_unit(weights),
             NO_SCRIPT,
         )

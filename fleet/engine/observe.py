@@ -10,7 +10,7 @@ from fleet.difficulty import KNOWN, probability_of
 from fleet.engine.claims import is_closed
 from fleet.engine.crossings import hottest
 from fleet.engine.state import LANES
-from fleet.engine.tables import Form, Simulation, Tables
+from fleet.engine.tables import Simulation, Tables
 from fleet.jit import Real, jit_inline, nonnegative
 from fleet.observation import FIELDS, LONG_S
 from fleet.robot import JOINTS
@@ -47,8 +47,9 @@ def observe(sim: Simulation, rows: Array, shared: Array, own: Array) -> None:
     alike, forecasts = form.alike[0] != 0, len(t.forecast_curve) > 0
     for row in rows:
         e = nonnegative(row)
-        fleet, filled = nonnegative(s.env[e]["fleet"]), show_jobs(sim, e, shared[e], slot_kind, left)
+        filled = show_jobs(sim, e, shared[e], slot_kind, left)
         measure(sim, e, measured_c, hottest_c, busy_s)
+        average_excess(sim, e, room.excess)
         if alike:
             show_members(sim, e, 0, shared[e], slot_kind, filled, hottest_c, busy_s)
         for a in range(arms):
@@ -67,7 +68,7 @@ def observe(sim: Simulation, rows: Array, shared: Array, own: Array) -> None:
             if shown:
                 show_options(sim, e, a, mine, slot_kind, left, filled)
                 if forecasts:
-                    show_forecasts(t, form, fleet, a, mine, slot_kind, filled, known_c, values_c)
+                    show_forecasts(sim, e, a, mine, slot_kind, filled, known_c, values_c)
 
 
 @jit_inline
@@ -135,6 +136,34 @@ def measure(sim: Simulation, e: int, measured_c: Array, hottest_c: Array, busy_s
 
 
 @jit_inline
+def average_excess(sim: Simulation, e: int, mean: Array) -> None:
+    """Average the excess of heat over the arms of an env that have measured it.
+
+    Args:
+        mean: Receives it, NaN where none has, float32 [work].
+    """
+    for work in range(len(mean)):
+        total, count = _ZERO, 0
+        for a in range(nonnegative(sim.excess.shape[1])):
+            if sim.excess[e, a, work] == sim.excess[e, a, work]:
+                total += sim.excess[e, a, work]
+                count += 1
+        mean[work] = total / np.float32(count) if count > 0 else np.float32(np.nan)
+
+
+@jit_inline
+def excess_of(sim: Simulation, e: int, a: int, kind: int) -> Real:
+    """Excess of heat of a kind of job that an arm assumes: its own, that of its peers if they tell at once, or 0."""
+    if sim.excess.shape[2] == 0:
+        return _ZERO
+    work = nonnegative(sim.tables.alike[nonnegative(sim.state.env[e]["fleet"]), nonnegative(kind)])
+    own, mean = sim.excess[e, a, work], sim.room.excess[work]
+    if own == own:
+        return own
+    return mean if sim.form.alike[0] != 0 and mean == mean else _ZERO
+
+
+@jit_inline
 def show_members(
     sim: Simulation, e: int, a: int, to: Array, slot_kind: Array, filled: int, hottest_c: Array, busy_s: Array
 ) -> None:
@@ -190,7 +219,7 @@ def show_job(
             if work["risk"] >= 0 or work["peak"] >= 0:
                 p, peak_c = predict(
                     p, work["risk"], work["peak"], t.forecast_first, t.forecast_block, t.forecast_curve, known_c,
-                    busy_s, room,
+                    busy_s, excess_of(sim, e, a, kind), room,
                 )  # fmt: skip
                 if work["peak"] >= 0:
                     peak_c = max(peak_c, min(max(hottest_c, LOW_C), HIGH_C))
@@ -217,20 +246,21 @@ def show_options(sim: Simulation, e: int, a: int, mine: Array, slot_kind: Array,
 
 @jit_inline
 def show_forecasts(
-    t: Tables, form: Form, fleet: int, a: int, mine: Array, slot_kind: Array, filled: int, known_c: Array, room: Array
+    sim: Simulation, e: int, a: int, mine: Array, slot_kind: Array, filled: int, known_c: Array, room: Array
 ) -> None:
     """Put the predictions of an arm's plans from its present temperatures into its part."""
+    t, form, fleet = sim.tables, sim.form, nonnegative(sim.state.env[e]["fleet"])
     at, options = form.offsets, nonnegative(t.work.shape[3])
     first, block, curve = t.forecast_first, t.forecast_block, t.forecast_curve
     for k in range(filled):
-        works = t.work[fleet, nonnegative(slot_kind[k]), a]
+        works, excess = t.work[fleet, nonnegative(slot_kind[k]), a], excess_of(sim, e, a, slot_kind[k])
         for n in range(options):
             work, option = works[n], k * options + n
             if work["risk"] >= 0 or work["peak"] >= 0:
                 # All cycles, also of a job that came back: moments in between are not predicted.
                 p, peak_c = predict(
                     work["p_saturation"], work["risk"], work["peak"], first, block, curve, known_c, np.float32(np.inf),
-                    room,
+                    excess, room,
                 )  # fmt: skip
                 mine[at.peak_c + option] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C) * form.inverse.peak_c
                 if p == p:
@@ -239,7 +269,16 @@ def show_forecasts(
 
 @jit_inline
 def predict(
-    p: Real, risk: int, peak: int, first: Array, block: Array, curve: Array, known_c: Array, left_s: Real, room: Array
+    p: Real,
+    risk: int,
+    peak: int,
+    first: Array,
+    block: Array,
+    curve: Array,
+    known_c: Array,
+    left_s: Real,
+    excess: Real,
+    room: Array,
 ) -> tuple[Real, Real]:
     """P(saturation), NaN if unknown, and predicted peak temperature, °C, 0 if unknown, of a plan.
 
@@ -252,27 +291,31 @@ def predict(
         first, block, curve: Forecasts; see `fleet.engine.tables.Tables`.
         known_c: [KNOWN].
         left_s: Pieces of later moments do not count.
+        excess: Heat of the load over that which the forecasts assume, less 1.
         room: For the values of some pieces, [lane].
     """
     chance, peak_c = np.float32(p), _ZERO
     if peak >= 0:
-        peak_c = np.float32(largest_piece(first, block, peak, known_c, left_s, room))
+        peak_c = np.float32(largest_piece(first, block, peak, known_c, left_s, excess, room))
         if curve.shape[1] > 0 and risk < 0 and np.isnan(p) and not np.isnan(curve[peak, 0, 0]):
             chance = np.float32(probability_of(peak_c, curve[peak]))
     if risk >= 0:
-        chance = np.float32(probability_of(largest_piece(first, block, risk, known_c, left_s, room), curve[risk]))
+        value = largest_piece(first, block, risk, known_c, left_s, excess, room)
+        chance = np.float32(probability_of(value, curve[risk]))
     return chance, peak_c
 
 
 @jit_inline
-def largest_piece(first: Array, block: Array, row: int, known_c: Array, left_s: Real, room: Array) -> Real:
+def largest_piece(
+    first: Array, block: Array, row: int, known_c: Array, left_s: Real, excess: Real, room: Array
+) -> Real:
     """Value of a forecast without the pieces of moments later than `left_s`, −inf if none is left."""
     most = NEVER
     for b in range(nonnegative(first[row]), nonnegative(first[row + 1])):
         for lane in range(len(room)):  # a number that the compiler does not know, so that it does not unroll
-            total = block[b, 0, lane]
+            total = block[b, 0, lane] + excess * block[b, 2, lane]
             for i in range(KNOWN):
-                total += block[b, 2 + i, lane] * known_c[i]
+                total += block[b, 3 + i, lane] * known_c[i]
             room[lane] = total if block[b, 1, lane] <= left_s else NEVER
         for half in (4, 2, 1):
             for lane in range(half):

@@ -38,6 +38,8 @@ class JobTable:
     """Indices of the jobs that must be done first, int [env, job, n], −1 for none."""
     expires: Array
     """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
+    alike: Array
+    """Jobs of one work have the same number: what is measured in one holds for all, int [env, job]."""
     stations: Array
     """Indices of the stations it occupies, int [env, job, n], −1 for none."""
 
@@ -56,6 +58,8 @@ class PlanTable:
     """Largest torque magnitude, N·m, [plan, joint]."""
     volume: Array
     """Index of the space that the arm takes, int [plan]."""
+    excess: Array
+    """Heat of a cycle that the arm measures over that which it expects, less 1, [plan]."""
 
 
 @dataclass(frozen=True, eq=False)

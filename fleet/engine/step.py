@@ -269,6 +269,9 @@ def settle(sim: Simulation, terms: Array, e: int, a: int, spent: Spent, crossed:
         if spent.done_s <= cut_s:
             end_job(sim, terms, e, a, spent.done_s)
         arm["progress_s"] += cut_s
+        if sim.excess.shape[2] > 0 and arm["progress_s"] >= t.plans[nonnegative(arm["plan"])]["times_s"][0]:
+            work = t.alike[nonnegative(s.env[e]["fleet"]), nonnegative(arm["kind"])]
+            sim.excess[e, a, nonnegative(work)] = t.plans[nonnegative(arm["plan"])]["excess"]
         if spent.home_s <= cut_s:
             if recording:
                 record_event(events, HOME, e, a, arm["job"], -1, spent.home_s, 0.0)
@@ -474,7 +477,19 @@ def step_rows(
     """
     s = sim
     whole = Simulation(
-        s.tables, s.state, s.offers, s.events, s.trace, s.drive, s.infos, s.path_c, s.form, s.room, s.weights, s.script
+        s.tables,
+        s.state,
+        s.offers,
+        s.events,
+        s.trace,
+        s.drive,
+        s.infos,
+        s.path_c,
+        s.excess,
+        s.form,
+        s.room,
+        s.weights,
+        s.script,
     )
     take_steps(whole, parts, actions, terms, until, rows, shared, own)
 

@@ -173,10 +173,11 @@ capacities, inverse time constants, 1/s, conductances to ambient, W/K, and idle 
 start of a shift, and what the arm estimates those of its housings to be, without the shift's offset of the ambient."""
 
 PLAN = np.dtype(
-    [("times_s", "f8", 3), ("current_sq", "f4", (3, LANES)), ("friction_w", "f4", (3, LANES))],
+    [("times_s", "f8", 3), ("current_sq", "f4", (3, LANES)), ("friction_w", "f4", (3, LANES)), ("excess", "f4")],
     align=True,
 )
-"""Durations and mean heat drives of the phases of a plan: approach, one cycle, retreat."""
+"""Durations and mean heat drives of the phases of a plan: approach, one cycle, retreat; then the excess of heat that
+its arm measures; see `PlanTable`."""
 
 WORK = np.dtype(
     [(name, "f4") for name in ("travel_s", "cycle_s", "difficulty", "p_saturation")]
@@ -219,7 +220,7 @@ class Tables(NamedTuple):
     forecast_first: Array
     """Where the blocks of each forecast begin, int [forecast + 1]; see `fleet.difficulty.forecast_arrays`."""
     forecast_block: Array
-    """Pieces, float32 [block, 2 + known, lane]."""
+    """Pieces, float32 [block, 3 + known, lane]."""
     forecast_curve: Array
     """float32 [forecast, knot, 2]; no knots where no forecast has a curve."""
     least: Array
@@ -229,6 +230,8 @@ class Tables(NamedTuple):
     payload_kg: Array
     value: Array
     """[fleet, kind], as is the one before."""
+    alike: Array
+    """Kinds of one work have the same number, int [fleet, kind]."""
 
 
 class OpenJobs(NamedTuple):
@@ -355,10 +358,12 @@ class Room(NamedTuple):
     """float32 [wide]."""
     modal: Array
     """See `fleet.engine.crossings`, [6, node]."""
+    excess: Array
+    """Mean excess of heat that arms have measured, NaN for none yet, float32 [number]."""
 
 
-def room_for(arms: int, slots: int, words: int, rows: int) -> Room:
-    """Room for some arms, slots, words of stations, and rows at a time."""
+def room_for(arms: int, slots: int, words: int, rows: int, works: int) -> Room:
+    """Room for some arms, slots, words of stations, rows at a time, and numbers of works."""
     return Room(
         rows=np.zeros(rows, int),
         busy=np.zeros(words, np.uint64),
@@ -374,6 +379,7 @@ def room_for(arms: int, slots: int, words: int, rows: int) -> Room:
         begin=np.zeros(2 * NODES + LANES, np.float32),
         end=np.zeros(WIDE, np.float32),
         modal=np.zeros((6, NODES)),
+        excess=np.zeros(works, np.float32),
     )
 
 
@@ -392,6 +398,9 @@ class Simulation(NamedTuple):
     """`INFO` [env, arm]."""
     path_c: Array
     """Temperatures at the end of each interval of a shift, float32 [env, tick, arm, node]; without rows none."""
+    excess: Array
+    """Excess of heat that each arm has measured in works of each number, NaN for none yet, float32 [env, arm, number];
+    without columns none is measured."""
     form: Form
     room: Room
     weights: Array
@@ -471,6 +480,7 @@ def tables_of(world: World) -> tuple[Tables, State]:
         times_s=world.plans.times_s,
         current_sq=world.plans.current_sq,
         friction_w=world.plans.friction_w,
+        excess=world.plans.excess,
     )
 
     def per_fleet(values: Array) -> Array:
@@ -503,6 +513,7 @@ def tables_of(world: World) -> tuple[Tables, State]:
         stations=bits(_one_hot(jobs.stations, len(world.stations))),
         payload_kg=jobs.payload_kg,
         value=jobs.value,
+        alike=jobs.alike,
     )
     state = empty_state(envs, arms, jobs.exists.shape[1], jobs.after.shape[2])
     state.env["fleet"], state.env["number"] = np.arange(envs), count

@@ -53,6 +53,8 @@ class Arm:
     """Plans that need other torques than planned, with these torques."""
     drift_k_per_s: float = 0.0
     """Drift of its readings of motor temperatures."""
+    learns: bool = False
+    """Whether it corrects its predictions by the heat that it measures at work."""
 
     @cached_property
     def _offered(self) -> dict[tuple[Work, ...], "ScoredPlans"]:
@@ -64,7 +66,7 @@ class Arm:
         return {}
 
     @cached_property
-    def _driven(self) -> dict[int, tuple[Plan, tuple[Array, Array, Array, Array]]]:
+    def _driven(self) -> dict[int, tuple[Plan, tuple[Array, Array, Array, Array, float]]]:
         return {}
 
     def offers(self, *works: Work) -> "ScoredPlans":
@@ -74,17 +76,30 @@ class Arm:
             self._offered[works] = ScoredPlans(self.model, variants)
         return self._offered[works]
 
-    def driven(self, plan: Plan) -> tuple[Array, Array, Array, Array]:
-        """Of one of its plans: durations, s, [phase], mean squared current and friction heat, [phase, joint], and
-        largest torques, [joint]."""
+    def driven(self, plan: Plan) -> tuple[Array, Array, Array, Array, float]:
+        """Of one of its plans: durations, s, [phase], mean squared current and friction heat, [phase, joint], largest
+        torques, [joint], and what it measures of `excess`."""
         if id(plan) not in self._driven:  # with the plan itself, so that its id stays its own
             phases = self.executed.get(plan, plan).phases
             times_s = np.array([phase.duration_s for phase in phases])
             drives = [drive(phase.profile, self.motors) for phase in phases]
             peak = np.abs(np.concatenate([phase.profile[:, 2] for phase in phases])).max(axis=0).astype(float)
             current_sq, friction_w = (np.array([getattr(d, n) for d in drives]) for n in ("current_sq", "friction_w"))
-            self._driven[id(plan)] = plan, (times_s, current_sq, friction_w, peak)
+            excess = self._excess(plan, drives[1]) if self.learns else 0.0
+            self._driven[id(plan)] = plan, (times_s, current_sq, friction_w, peak, excess)
         return self._driven[id(plan)][1]
+
+    def _excess(self, plan: Plan, measured: Drive) -> float:
+        """Heat of a cycle, by measured currents and joint torques, over that which the arm expects of the plan, less 1.
+
+        Both by the copper losses that it knows; of the joint that differs most, over the heat of the most loaded one.
+        """
+        _, motors = self.beliefs
+        expected = drive(plan.cycle.profile, motors)
+        more_sq, more_friction_w = measured.current_sq - expected.current_sq, measured.friction_w - expected.friction_w
+        more_w = motors.copper_w_per_a2 * more_sq + more_friction_w
+        most_w = float((motors.copper_w_per_a2 * expected.current_sq + expected.friction_w).max())
+        return float(more_w[np.abs(more_w).argmax()]) / most_w if most_w > 0 else 0.0
 
     def rest_drive(self, motors: Motors | None = None) -> Drive:
         """Mean heat drive of standing at home, each [joint]; of other motors if given."""
@@ -264,10 +279,10 @@ def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm], volume: Array) -
     if not plans:
         joints = len(GEN3.velocity)
         empty = np.zeros((1, 3, joints))
-        return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)), volume)
+        return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)), volume, np.zeros(1))
     driven = zip(*(arms[plan.arm].driven(plan) for plan in plans), strict=True)
-    times_s, current_sq, friction_w, peak_tau = map(np.array, driven)
-    return PlanTable(times_s, current_sq, friction_w, peak_tau, volume)
+    times_s, current_sq, friction_w, peak_tau, excess = map(np.array, driven)
+    return PlanTable(times_s, current_sq, friction_w, peak_tau, volume, excess)
 
 
 def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobTable:
@@ -278,6 +293,7 @@ def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobT
         index = {job.name: j for j, job in enumerate(jobs)}
         after.append([[index[name] for name in job.after] for job in jobs])
     most = max(1, *map(len, shifts))
+    alike: dict[tuple[Work, ...], int] = {}
 
     def table(of: Callable[[Job], float], missing: float, dtype: type = float) -> Array:
         rows = [[of(job) for job in jobs] + [missing] * (most - len(jobs)) for jobs in shifts]
@@ -298,5 +314,6 @@ def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobT
         repetitions=table(lambda job: job.repetitions, 1, int),
         after=lists(after),
         expires=table(lambda job: job.expires, False, bool),
+        alike=table(lambda job: alike.setdefault(job.works, len(alike)), 0, int),
         stations=lists([[[station[name] for name in job.stations] for job in jobs] for jobs in shifts]),
     )

@@ -192,7 +192,7 @@ def _arms(
         twins = train_twins(scenario, planned, folder, progress, seed=training_seed(scenario, training))
         heats = calibrate_networks(scenario, planned, folder, progress, risk=risk)
         arms = [
-            replace(arm, model=CalibratedTwin(twin, heat), known=(heat.thermal, heat.motors))
+            replace(arm, model=CalibratedTwin(twin, heat), known=(heat.thermal, heat.motors), learns=True)
             for arm, twin, heat in zip(arms, twins, heats, strict=True)
         ]
     elif difficulty == "oracle":
@@ -328,7 +328,9 @@ def _as_known(arm: Arm) -> Arm:
     from scenarios.prepare.oracle import Oracle
 
     thermal, motors = arm.beliefs
-    known = replace(arm, thermal=thermal, motors=motors, model=Blind(), known=arm.beliefs, drift_k_per_s=0.0)
+    known = replace(
+        arm, thermal=thermal, motors=motors, model=Blind(), known=arm.beliefs, drift_k_per_s=0.0, learns=False
+    )
     return known if isinstance(arm.model, Oracle) else replace(known, before=None, executed={})
 
 

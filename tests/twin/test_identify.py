@@ -24,7 +24,7 @@ from fleet.heat.thermal import (
     steady_state,
     thermal_model,
 )
-from fleet.motion import RATE_HZ, drive, drives
+from fleet.motion import RATE_HZ, Drive, drive, drives
 from fleet.robot import JOINTS
 from scenarios.prepare.oracle import peaks
 from twin.logs.recording import READINGS, Recording, heat_logs
@@ -41,7 +41,15 @@ from twin.thermal.identify import (
     noise_of,
     nominal_heat_model,
 )
-from twin.thermal.thermal_twin import CalibratedTwin, NotEnoughExperience, PeakCurve, RcTwin, fit_curve
+from twin.thermal.thermal_twin import (
+    CalibratedTwin,
+    LinearHeat,
+    NotEnoughExperience,
+    PeakCurve,
+    RcTwin,
+    fit_curve,
+    peak_forecast,
+)
 
 AIR_C = 22.0
 FULL_REACH_NM = np.array([0.0, 50.1, 0.0, 21.3, 0.0, 1.0, 0.0])
@@ -524,3 +532,17 @@ def test_an_arm_with_values_of_its_own_gives_them_back(rng, cooling):
     np.testing.assert_allclose(again.thermal().laplacian, body.thermal().laplacian)
     np.testing.assert_allclose(again.thermal().capacity, body.thermal().capacity)
     np.testing.assert_allclose(again.motors.copper_w_per_a2, body.motors.copper_w_per_a2)
+
+
+@pytest.mark.parametrize("excess", [-0.2, 0.15, 0.3])
+def test_a_forecast_with_more_heat_is_that_of_the_heavier_load(holds, excess) -> None:
+    """Second method: the forecast of the drives with that much more heat; to first order in the excess."""
+    twin, plan = RcTwin.nominal(), holds(FULL_REACH_NM, 60.0)
+    load = drives([phase.profile for phase in plan.phases], twin.motors)
+    known_c = known_temperatures(np.full(JOINTS, 38.0), np.full(JOINTS, 36.0), 24.0)
+    lasts_s = plan.duration_s(10) * plan.weights(10)
+    more = Drive(load.current_sq * (1 + excess), load.friction_w * (1 + excess))
+    found = peak_forecast(LinearHeat.of(load, twin.motors, twin.thermal), lasts_s).value(known_c, excess=excess)
+    exact = peak_forecast(LinearHeat.of(more, twin.motors, twin.thermal), lasts_s).value(known_c)
+    plain = peak_forecast(LinearHeat.of(load, twin.motors, twin.thermal), lasts_s).value(known_c)
+    assert abs(found - exact) < 0.15 * abs(exact - plain) + 0.05

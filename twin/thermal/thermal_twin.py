@@ -51,7 +51,10 @@ class NotEnoughExperience(FleetError):
 
 @dataclass(frozen=True, eq=False)
 class LinearHeat:
-    """Temperatures under constant drives as T' = V diag(rates) V⁻¹ T + B [ambient, 1], arrays [phase, ...]."""
+    """Temperatures under constant drives as T' = V diag(rates) V⁻¹ T + B [ambient, 1, excess], arrays [phase, ...].
+
+    excess is the heat of the load over that of these drives, less 1, to first order.
+    """
 
     rates: Array
     """1/s, [phase, mode]; positive beyond thermal runaway."""
@@ -60,7 +63,7 @@ class LinearHeat:
     inverse: Array
     """[phase, mode, node]."""
     forcing: Array
-    """By 1 °C of ambient temperature, and by the heat at 0 °C, K/s, [phase, node, 2]."""
+    """By 1 °C of ambient temperature, by the heat at 0 °C, and by the heat of the load, K/s, [phase, node, 3]."""
 
     @classmethod
     def of(cls, load: Drive, motors: Motors, thermal: ThermalModel) -> "LinearHeat":
@@ -76,18 +79,19 @@ class LinearHeat:
         slope[:, joints, joints], slope[:, joints, joints + JOINTS] = by_winding, by_housing
         rates, modes = np.linalg.eig((slope - thermal.laplacian) / thermal.capacity[:, None])
         heat = node_heat(at_zero, motors.idle_w + load.friction_w)
-        forcing = np.stack(np.broadcast_arrays(thermal.to_ambient, heat), axis=-1) / thermal.capacity[:, None]
+        of_load = node_heat(loss_w, load.friction_w)
+        forcing = np.stack(np.broadcast_arrays(thermal.to_ambient, heat, of_load), axis=-1) / thermal.capacity[:, None]
         # A tree of nodes: the matrix is similar to a symmetric one, so its modes are real.
         rates, modes = np.real(rates), np.real(modes)
         return cls(rates, modes, np.linalg.inv(modes), forcing)
 
     def courses(self, elapsed_s: Array) -> Array:
-        """Temperatures as affine functions of the start: [moment, node, NODES + 2] for nodes, ambient and 1.
+        """Temperatures as affine functions of the start: [moment, node, NODES + 3] for nodes, ambient, 1 and excess.
 
         Args:
             elapsed_s: Time spent in each phase until each moment, [moment, phase].
         """
-        course = np.broadcast_to(np.eye(NODES, NODES + 2), (len(elapsed_s), NODES, NODES + 2))
+        course = np.broadcast_to(np.eye(NODES, NODES + 3), (len(elapsed_s), NODES, NODES + 3))
         for phase, rates in enumerate(self.rates):
             exponent = np.multiply.outer(elapsed_s[:, phase], rates)  # [moment, mode]
             safe = np.where(np.abs(rates) > 1e-12, rates, 1.0)
@@ -112,7 +116,7 @@ def peak_forecast(heat: LinearHeat, lasts_s: Array, curve: Array | None = None) 
     until = np.cumsum(lasts_s)
     elapsed_s = np.clip(moments_s[:, None] - (until - lasts_s), 0.0, lasts_s)
     pieces = heat.courses(elapsed_s)[:, WINDING]  # [moment, joint, ...]
-    values = pieces @ _starts().T  # [moment, joint, start]
+    values = pieces[..., : KNOWN + 1] @ _starts().T  # [moment, joint, start]
     # A piece stays if it decides somewhere, by more than rounding against earlier moments: later ones may not come.
     of_moment = values.max(axis=1)
     before = np.maximum.accumulate(np.vstack([np.full_like(of_moment[:1], -np.inf), of_moment[:-1]]))
@@ -120,7 +124,9 @@ def peak_forecast(heat: LinearHeat, lasts_s: Array, curve: Array | None = None) 
     stays = ((values == of_moment[:, None]) & decides).any(axis=-1)
     time_s = np.broadcast_to(np.append(0.0, moments_s[1:])[:, None], stays.shape)
     kept = pieces[stays]
-    return Forecast(kept[:, KNOWN].copy(), kept[:, :KNOWN].copy(), curve, time_s[stays])
+    # Of the joint that rises most, since more heat may also make another joint the hottest.
+    gain = np.broadcast_to(pieces[..., KNOWN + 1].max(axis=1, keepdims=True), stays.shape)
+    return Forecast(kept[:, KNOWN].copy(), kept[:, :KNOWN].copy(), curve, time_s[stays], gain[stays])
 
 
 @cache

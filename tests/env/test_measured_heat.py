@@ -1,0 +1,106 @@
+"""Arms correct their predictions by the heat that they measure at work, and tell each other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.bus.exchange.channel import Channel
+from fleet.bus.exchange.memory import Exchange
+from fleet.difficulty import KNOWN, Difficulty, Forecast
+from fleet.engine.shift import shifts_of
+from fleet.engine.tables import tables_of
+from fleet.env.vector import BatchEnv, Library
+from fleet.heat.motor import gen3_motors
+from fleet.robot import JOINTS
+
+GAIN_K = 20.0
+
+
+class Expects:
+    """A peak of 30 °C for every plan; with twice the assumed heat it is 20 K higher."""
+
+    version = "expects"
+
+    def score(self, plan, repetitions: int) -> Difficulty:
+        peak = Forecast(np.array([30.0]), np.zeros((1, KNOWN)), gain=np.array([GAIN_K]))
+        return Difficulty(np.full(JOINTS, 0.1), peak=peak)
+
+
+def env_of(small, *, learns: bool = True, copper: float = 1.3, channel: Channel | None = None) -> BatchEnv:
+    """Three arms; holds at the bench make `copper` times the heat in arm 0 that it expects."""
+    bench, rack = small.work("bench", small.WARM), small.work("rack", small.WARM)
+    arms = []
+    for i in range(3):
+        own = small.arm(i, [bench, rack], model=Expects(), times=small.Times(approach=10.0, cycle=50.0, retreat=10.0))
+        expected = own.plans[bench][0]
+        harder = replace(expected, cycle=small.phase(50.0, np.sqrt(copper) * small.torque(small.WARM)))
+        arms.append(
+            replace(
+                own, executed={expected: harder} if i == 0 else {}, learns=learns, known=(own.thermal, gen3_motors())
+            )
+        )
+    jobs = [small.job(f"j{j}", (bench, rack)[j % 2], repetitions=2) for j in range(6)]
+    world, _ = small.shop([jobs], arms=arms, ticks=60, slots=6)
+    tables, drawn = tables_of(world)
+    shift = shifts_of(drawn, [7])[0]
+    names = tuple(f"arm_{i}" for i in range(3))
+    exchanges = None if channel is None else [Exchange(names, channel)]
+    return BatchEnv(
+        Library(names, 6, tables, lambda _: shift), 1, seed=0, scaled=False, exchanges=exchanges, ahead_s=np.inf
+    )
+
+
+def peaks(env: BatchEnv, obs) -> np.ndarray:
+    """Predicted peaks of arms 0 to 2 for the jobs in the slots, °C, [arm, slot], and their stations' parity."""
+    return env.layout.read_parts(obs["shared"], obs["own"], obs["action_mask"]).peak_c[0]
+
+
+def test_a_measured_excess_raises_the_predictions_for_that_work_of_all_arms(small) -> None:
+    env = env_of(small)
+    obs, _ = env.reset()
+    assert peaks(env, obs) == pytest.approx(np.full((3, 6), 30.0))
+    obs, *_ = env.step(np.array([[1, 0, 0]]))  # the bench: its approach ends in this step
+    job_c = env.layout.read_parts(obs["shared"], obs["own"], obs["action_mask"]).job_peak_c[0, 0]
+    hotter = 30.0 + 0.3 * GAIN_K
+    assert job_c == pytest.approx(hotter, abs=0.01)
+    # Five jobs are left: rack, bench, rack, bench, rack.
+    assert peaks(env, obs)[:, :5] == pytest.approx(np.tile([30.0, hotter, 30.0, hotter, 30.0], (3, 1)), abs=0.01)
+
+
+def test_an_arm_believes_its_own_measurement_and_the_others_their_mean(small) -> None:
+    env = env_of(small)
+    env.reset()
+    obs, *_ = env.step(np.array([[1, 0, 0]]))
+    while env.state.mode[0, 0] == 1:
+        obs, *_ = env.step(np.zeros((1, 3), int))
+    seen = env.layout.read_parts(obs["shared"], obs["own"], obs["action_mask"])
+    bench = int(np.flatnonzero(peaks(env, obs)[1, :5] > 31.0)[0])
+    assert seen.action_mask[0, 1, 1 + bench]
+    obs, *_ = env.step(np.array([[0, 1 + bench, 0]]))
+    found = peaks(env, obs)
+    left = int(np.flatnonzero(found[0, :4] > 31.0)[0])
+    assert found[:, left] == pytest.approx([36.0, 30.0, 33.0], abs=0.02)  # .3, 0, and their mean
+
+
+def test_arms_whose_messages_take_time_know_what_they_measured_themselves(small) -> None:
+    env = env_of(small, channel=Channel(delay_s=30.0))
+    env.reset()
+    obs, *_ = env.step(np.array([[1, 0, 0]]))
+    assert peaks(env, obs)[:, 1] == pytest.approx([36.0, 30.0, 30.0], abs=0.01)
+
+
+@pytest.mark.parametrize(("learns", "copper"), [(False, 1.3), (True, 1.0)])
+def test_without_a_difference_or_without_learning_nothing_changes(small, learns, copper) -> None:
+    env = env_of(small, learns=learns, copper=copper)
+    env.reset()
+    obs, *_ = env.step(np.array([[1, 0, 0]]))
+    assert peaks(env, obs)[:, :5] == pytest.approx(np.full((3, 5), 30.0), abs=1e-4)
+
+
+def test_a_new_shift_begins_without_measurements(small) -> None:
+    env = env_of(small)
+    env.reset()
+    env.step(np.array([[1, 0, 0]]))
+    obs, _ = env.reset()
+    assert peaks(env, obs) == pytest.approx(np.full((3, 6), 30.0))
