@@ -119,6 +119,11 @@ def reset_rows(
             arm["peak_c"] = hottest(arm["temp_c"])
             for work in range(sim.excess.shape[2]):
                 sim.excess[e, a, work] = np.nan
+            sim.warmer[e, a] = 1.0
+            if t.learns:
+                for k in range(JOINTS):
+                    sim.assumed_c[e, a, k] = arm["temp_c"][k]
+                    sim.assumed_c[e, a, JOINTS + k] = arm["housing_c"][k]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +243,7 @@ class Engine:
             closed=np.zeros((envs, tables.excluded.shape[1]), np.uint64),
         )
         offers.mask[:, :, 0] = 1
-        works = int(tables.alike.max()) + 1 if tables.plans["excess"].any() else 0
+        works, nodes = (int(tables.alike.max()) + 1, NODES) if tables.learns else (0, 0)
         self._simulation = Simulation(
             tables,
             empty_state(envs, arms, jobs, 0),
@@ -249,6 +254,8 @@ class Engine:
             np.zeros((envs, arms), INFO),
             np.zeros((envs if path else 0, tables.ticks, arms, NODES), np.float32),
             np.full((envs, arms, works), np.nan, np.float32),
+            np.zeros((envs, arms, nodes), np.float32),
+            np.ones((envs, arms), np.float32),
             form_of(layout),
             room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK), works),
             weights_per_unit(weights),

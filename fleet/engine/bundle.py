@@ -32,8 +32,26 @@ class Bundle(structref.StructRefProxy):
 structref.define_proxy(Bundle, BundleType, list(Simulation._fields))
 
 
-def _make(tables, state, offers, events, trace, drive, infos, path_c, excess, form, room, weights, script):  # pyright: ignore
-    return Bundle(tables, state, offers, events, trace, drive, infos, path_c, excess, form, room, weights, script)
+def _make(
+    tables, state, offers, events, trace, drive, infos, path_c, excess, assumed_c, warmer, form, room, weights, script
+):  # pyright: ignore
+    return Bundle(
+        tables,
+        state,
+        offers,
+        events,
+        trace,
+        drive,
+        infos,
+        path_c,
+        excess,
+        assumed_c,
+        warmer,
+        form,
+        room,
+        weights,
+        script,
+    )
 
 
 _compiled_make = compile_cached(_make)

@@ -11,6 +11,7 @@ from fleet.engine.claims import is_closed
 from fleet.engine.crossings import hottest
 from fleet.engine.state import LANES
 from fleet.engine.tables import Simulation, Tables
+from fleet.heat.thermal import NODES
 from fleet.jit import Real, jit_inline, nonnegative
 from fleet.observation import FIELDS, LONG_S
 from fleet.robot import JOINTS
@@ -27,6 +28,9 @@ PEAK_LOW_C, PEAK_HIGH_C = _LOW["peak_c"], _HIGH["peak_c"]
 MOST_KG, MOST_VALUE, MOST_RETURNS = _HIGH["payload_kg"], _HIGH["value"], _HIGH["returns"]
 _LONG_S, _ZERO, _ONE, _HALF = np.float32(LONG_S), np.float32(0.0), np.float32(1.0), np.float32(0.5)
 NEVER = np.float32(-np.inf)
+COOLER_K, MOST_WARMER = np.float32(3.0), np.float32(2.0)
+"""Readings lower than the assumed temperatures by more than this are not believed; and the most that counts of warmer
+motors."""
 
 assert LANES == 8, "the largest of the lanes is found by halves"
 
@@ -62,6 +66,9 @@ def observe(sim: Simulation, rows: Array, shared: Array, own: Array) -> None:
             shown = busy_s[a] <= form.ahead_s[0]
             for k in range(JOINTS):
                 known_c[k], known_c[JOINTS + k] = measured_c[a, k], arm["housing_c"][k]
+            if t.learns:
+                for n in range(NODES):
+                    known_c[n] = max(known_c[n], sim.assumed_c[e, a, n] - COOLER_K)
             known_c[2 * JOINTS] = air_at(t, s.env[e], a)
             if arm["mode"] == WORKING and arm["pending"]:
                 show_job(sim, e, a, mine, hottest_c[a], busy_s[a], known_c, values_c)
@@ -153,14 +160,19 @@ def average_excess(sim: Simulation, e: int, mean: Array) -> None:
 
 @jit_inline
 def excess_of(sim: Simulation, e: int, a: int, kind: int) -> Real:
-    """Excess of heat of a kind of job that an arm assumes: its own, that of its peers if they tell at once, or 0."""
-    if sim.excess.shape[2] == 0:
+    """Excess of heat of a kind of job that an arm assumes.
+
+    It is what the arm measured itself, or what its peers did if they tell at once. If its motors are warmer than they
+    should be, so it will be again.
+    """
+    if not sim.tables.learns:
         return _ZERO
+    warmer = min(max(sim.warmer[e, a], _ONE), MOST_WARMER)
     work = nonnegative(sim.tables.alike[nonnegative(sim.state.env[e]["fleet"]), nonnegative(kind)])
     own, mean = sim.excess[e, a, work], sim.room.excess[work]
-    if own == own:
-        return own
-    return mean if sim.form.alike[0] != 0 and mean == mean else _ZERO
+    if own != own:
+        own = mean if sim.form.alike[0] != 0 and mean == mean else _ZERO
+    return (_ONE + own) * warmer - _ONE
 
 
 @jit_inline

@@ -81,6 +81,17 @@ class Offers:
 
 
 @dataclass(frozen=True, eq=False)
+class Law:
+    """How arms heat up in a decision interval, arrays [arm, ...]."""
+
+    motors: Motors
+    thermal: ThermalModel
+    phi: Array
+    gamma: Array
+    """Step matrices, [arm, node, node]."""
+
+
+@dataclass(frozen=True, eq=False)
 class World:
     """Everything that does not change during a shift."""
 
@@ -119,6 +130,8 @@ class World:
     """Step matrices for `dt_s`, [arm, node, node]."""
     drift_k_per_s: Array
     """Drift of the readings of motor temperatures from the start of the shift, [arm]."""
+    believed: Law | None
+    """What the arms believe of their heat, if they learn: see `fleet.engine.world.Arm.learns`."""
 
     @property
     def horizon_s(self) -> float:

@@ -89,7 +89,7 @@ def step_arms(sim: Simulation, terms: Array, rows: Array) -> None:
             if measured:
                 for k in range(LANES):
                     current_sq[k], friction_w[k] = sim.drive[e, a]["current_sq"][k], sim.drive[e, a]["friction_w"][k]
-            heat_w = load_nodes(t, law, arm, current_sq, friction_w, powered, ambient_c, begin)
+            heat_w = load_nodes(t, law, arm["temp_c"], current_sq, friction_w, powered, ambient_c, begin)
             advance(law, begin, end)
             first_c, last_c = hottest(begin), hottest(end)
             hot = first_c >= t.warning_c
@@ -104,6 +104,8 @@ def step_arms(sim: Simulation, terms: Array, rows: Array) -> None:
                 arm["temp_c"][n] = end[n]
             drift_k = law["drift_k_per_s"] * np.float32(env["tick"] * dt_s)
             follow_housings(law, arm, begin, end, friction_w, powered, ambient_c, drift_k, load_w)
+            if t.learns:
+                compare_temperatures(sim, e, a, current_sq, friction_w, powered, ambient_c, drift_k, begin, end)
             arm["energy_j"] += crossed.energy_j
             arm["above_warning_s"] += crossed.above_s
             arm["peak_c"] = max(arm["peak_c"], np.float32(crossed.peak_c))
@@ -154,21 +156,21 @@ def mix_phases(plans: Array, home: Array, arm: Array, dt_s: float, current_sq: A
 def load_nodes(
     t: Tables,
     law: Array,
-    arm: Array,
+    temp_c: Array,
     current_sq: Array,
     friction_w: Array,
     powered: bool,
     ambient_c: Real,
     begin: Array,
 ) -> float:
-    """Put an arm's temperatures and the loads of its nodes into `begin`; return its heat, W.
+    """Put temperatures of nodes and the loads at them into `begin`; return the heat, W.
 
     The load of a node is its heat plus its conductance to ambient times the ambient temperature.
     """
     heat_w = 0.0
     for k in range(JOINTS):
-        copper_w, housing_w = heat_of(t, law, arm, k, current_sq[k], friction_w[k], powered)
-        begin[k], begin[JOINTS + k] = arm["temp_c"][k], arm["temp_c"][JOINTS + k]
+        copper_w, housing_w = heat_of(t, law, temp_c, k, current_sq[k], friction_w[k], powered)
+        begin[k], begin[JOINTS + k] = temp_c[k], temp_c[JOINTS + k]
         begin[NODES + k] = np.float32(copper_w) + law["to_ambient"][k] * ambient_c
         begin[NODES + JOINTS + k] = np.float32(housing_w) + law["to_ambient"][JOINTS + k] * ambient_c
         heat_w += copper_w + housing_w
@@ -177,11 +179,11 @@ def load_nodes(
 
 @jit_inline
 def heat_of(
-    t: Tables, law: Array, arm: Array, k: int, current_sq: float, friction_w: float, powered: bool
+    t: Tables, law: Array, temp_c: Array, k: int, current_sq: float, friction_w: float, powered: bool
 ) -> tuple[float, float]:
     """Heat in the winding and in the housing of a joint, W; see `fleet.heat.thermal.drive_heat`."""
-    factor = magnet_factor(np.float64(arm["temp_c"][JOINTS + k]), t)
-    warm_sq, winding_c = np.float64(current_sq) / (factor * factor), np.float64(arm["temp_c"][k])
+    factor = magnet_factor(np.float64(temp_c[JOINTS + k]), t)
+    warm_sq, winding_c = np.float64(current_sq) / (factor * factor), np.float64(temp_c[k])
     copper_w = winding_heat(np.float64(law["copper_w_per_a2"][k]), warm_sq, winding_c, t)
     return copper_w, np.float64(friction_w) + (np.float64(law["idle_w"][k]) if powered else 0.0)
 
@@ -235,6 +237,46 @@ def follow_housings(
         arm["housing_c"][m] = end[m]
 
 
+SMOOTH_S = 100.0
+"""Time constant with which measured temperatures are compared with assumed ones."""
+LEAST_RISE_K = 1.0
+"""Mean rise of the motors above the air that is compared, at least."""
+
+
+@jit
+def compare_temperatures(
+    sim: Simulation,
+    e: int,
+    a: int,
+    current_sq: Array,
+    friction_w: Array,
+    powered: bool,
+    ambient_c: Real,
+    drift_k: Real,
+    begin: Array,
+    end: Array,
+) -> None:
+    """Step the temperatures that an arm assumes, and compare those of its motors with what it measures.
+
+    The noise of the sensors is left out, as in `follow_housings`.
+
+    Args:
+        begin, end: Room for temperatures and loads of the network.
+    """
+    t, assumed_c, temp_c = sim.tables, sim.assumed_c[e, a], sim.state.arms[e, a]["temp_c"]
+    law = t.believed[nonnegative(sim.state.env[e]["fleet"]), a]
+    load_nodes(t, law, assumed_c, current_sq, friction_w, powered, ambient_c, begin)
+    advance(law, begin, end)
+    measured_k = assumed_k = _ZERO
+    for n in range(NODES):
+        assumed_c[n] = end[n]
+    for k in range(JOINTS):
+        measured_k += temp_c[k] + drift_k - ambient_c
+        assumed_k += end[k] - ambient_c
+    ratio = measured_k / max(assumed_k, np.float32(JOINTS * LEAST_RISE_K))
+    sim.warmer[e, a] += np.float32(min(t.dt_s / SMOOTH_S, 1.0)) * (ratio - sim.warmer[e, a])
+
+
 @jit
 def trace_arm(
     t: Tables,
@@ -252,7 +294,7 @@ def trace_arm(
     for n in range(NODES):
         trace["start_c"][n] = arm["temp_c"][n]
     for k in range(JOINTS):
-        heat_w = heat_of(t, law, arm, k, current_sq[k], friction_w[k], powered)
+        heat_w = heat_of(t, law, arm["temp_c"], k, current_sq[k], friction_w[k], powered)
         trace["heat_w"][k], trace["heat_w"][JOINTS + k] = heat_w
 
 
@@ -486,6 +528,8 @@ def step_rows(
         s.infos,
         s.path_c,
         s.excess,
+        s.assumed_c,
+        s.warmer,
         s.form,
         s.room,
         s.weights,

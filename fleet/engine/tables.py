@@ -15,6 +15,7 @@ import numpy as np
 from fleet.difficulty import KNOWN, extend_curve, forecast_arrays
 from fleet.engine.state import ARM, ENV, JOB, LANES, State, World
 from fleet.events import Event, EventKind
+from fleet.heat.motor import Motors
 from fleet.heat.thermal import NODES
 from fleet.jit import jit
 from fleet.job import MOST_FAULTS
@@ -203,10 +204,14 @@ class Tables(NamedTuple):
     alpha_cu_per_k: float
     alpha_kt_per_k: float
     reference_c: float
+    learns: bool
+    """Whether the arms correct their predictions by what they measure."""
     ambient_c: Array
     """[fleet, tick, arm]."""
     law: Array
     """`LAW` [fleet, arm]."""
+    believed: Array
+    """What the arms believe it to be, where they learn, `LAW` [fleet, arm]."""
     modal: Array
     """`MODAL` [fleet, arm]."""
     start: Array
@@ -400,7 +405,13 @@ class Simulation(NamedTuple):
     """Temperatures at the end of each interval of a shift, float32 [env, tick, arm, node]; without rows none."""
     excess: Array
     """Excess of heat that each arm has measured in works of each number, NaN for none yet, float32 [env, arm, number];
-    without columns none is measured."""
+    without columns no arm learns."""
+    assumed_c: Array
+    """Temperatures that each arm should have by what it believes and by the currents that it measures, from the start
+    of the shift, float32 [env, arm, node]; without columns no arm learns."""
+    warmer: Array
+    """Rise of the measured motor temperatures above the air over that of the assumed ones, smoothed, float32
+    [env, arm]."""
     form: Form
     room: Room
     weights: Array
@@ -432,21 +443,26 @@ def tables_of(world: World) -> tuple[Tables, State]:
 
     limits, motors, offers, rest = world.limits, world.motors, world.offers, world.rest
     observer, thermal, arms = world.observer, world.thermal, len(world.arms)
+
+    def heating(phi: Array, gamma: Array, to_ambient: Array, of: Motors) -> dict[str, Array]:
+        step = np.concatenate([phi - np.eye(NODES), gamma], axis=-1).swapaxes(-1, -2)
+        return {"step": step, "to_ambient": to_ambient, "copper_w_per_a2": of.copper_w_per_a2, "idle_w": of.idle_w}
+
     law = records(
         LAW,
         (arms,),
-        step=np.concatenate([world.phi - np.eye(NODES), world.gamma], axis=-1).swapaxes(-1, -2),
-        to_ambient=thermal.to_ambient,
+        **heating(world.phi, world.gamma, thermal.to_ambient, motors),
         housing_keep=observer.keep.swapaxes(-1, -2),
         housing_gain=observer.gain.swapaxes(-1, -2),
         housing_winding=observer.from_winding,
         housing_ambient=observer.from_ambient,
         housing_idle_w=observer.idle_w,
-        copper_w_per_a2=motors.copper_w_per_a2,
-        idle_w=motors.idle_w,
         sensor_noise_k=motors.sensor_noise_k,
         drift_k_per_s=world.drift_k_per_s,
     )
+    believed = np.zeros(arms, LAW)
+    if known := world.believed:
+        believed = records(LAW, (arms,), **heating(known.phi, known.gamma, known.thermal.to_ambient, known.motors))
     modal = records(
         MODAL,
         (arms,),
@@ -500,7 +516,9 @@ def tables_of(world: World) -> tuple[Tables, State]:
         alpha_kt_per_k=float(motors.alpha_kt_per_k),
         reference_c=float(motors.reference_c),
         ambient_c=per_fleet(world.ambient_c),
+        learns=world.believed is not None,
         law=per_fleet(law),
+        believed=per_fleet(believed),
         modal=per_fleet(modal),
         start=per_fleet(start),
         plans=plans,

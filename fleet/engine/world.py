@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from fleet.difficulty import Difficulty, DifficultyModel, Forecast, stack_forecasts
-from fleet.engine.state import JobTable, Offers, PlanTable, World
+from fleet.engine.state import JobTable, Law, Offers, PlanTable, World
 from fleet.heat.motor import Motors, gen3_motors, stack_motors
 from fleet.heat.thermal import (
     HOUSING,
@@ -54,7 +54,8 @@ class Arm:
     drift_k_per_s: float = 0.0
     """Drift of its readings of motor temperatures."""
     learns: bool = False
-    """Whether it corrects its predictions by the heat that it measures at work."""
+    """Whether it corrects its predictions by the heat and the temperatures that it measures; all arms of a fleet do, or
+    none."""
 
     @cached_property
     def _offered(self) -> dict[tuple[Work, ...], "ScoredPlans"]:
@@ -174,7 +175,7 @@ def build_world(
         space: Which plans of two arms would touch; none if not given.
         plans_per_job: Most plans that an arm offers for a job.
     """
-    motors, thermal, rest, phi, gamma, observer = _laws(tuple(arms), dt_s)
+    motors, thermal, rest, phi, gamma, observer, believed = _laws(tuple(arms), dt_s)
     plans, offers = _offers(arms, shifts, plans_per_job)
     if space is None and any(job.alternatives for jobs in shifts for job in jobs):
         space = station_space  # the stations of these jobs depend on the plan
@@ -207,6 +208,7 @@ def build_world(
         phi=phi,
         gamma=gamma,
         drift_k_per_s=np.array([arm.drift_k_per_s for arm in arms]),
+        believed=believed,
     )
     return world, plans
 
@@ -221,14 +223,20 @@ def station_space(plans: Sequence[Plan]) -> tuple[Array, Array]:
 
 
 @lru_cache(maxsize=8)
-def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Drive, Array, Array, HousingObserver]:
-    """Motors, thermal models and rest of a fleet, [arm, ...], the matrices of a step, and the observers of the arms'
-    housings: the same in every shift."""
+def _laws(
+    arms: tuple[Arm, ...], dt_s: float
+) -> tuple[Motors, ThermalModel, Drive, Array, Array, HousingObserver, Law | None]:
+    """What is the same in every shift: motors, thermal models and rest of a fleet, [arm, ...], the matrices of a step,
+    the observers of the arms' housings, and what the arms believe."""
     thermal, drives = stack_models([arm.thermal for arm in arms]), [arm.rest_drive() for arm in arms]
     rest = Drive(np.stack([d.current_sq for d in drives]), np.stack([d.friction_w for d in drives]))
     observers = [housing_observer(*arm.beliefs, dt_s) for arm in arms]
     observer = HousingObserver(*(np.stack(parts) for parts in zip(*observers, strict=True)))
-    return stack_motors([arm.motors for arm in arms]), thermal, rest, *thermal.step_matrices(dt_s), observer
+    believed = None
+    if all(arm.learns for arm in arms):
+        known, motors = stack_models([arm.beliefs[0] for arm in arms]), stack_motors([arm.beliefs[1] for arm in arms])
+        believed = Law(motors, known, *known.step_matrices(dt_s))
+    return stack_motors([arm.motors for arm in arms]), thermal, rest, *thermal.step_matrices(dt_s), observer, believed
 
 
 def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> tuple[tuple[Plan, ...], Offers]:

@@ -12,6 +12,8 @@ from fleet.engine.shift import shifts_of
 from fleet.engine.tables import tables_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import ThermalModel, gen3_network, temperature_steps, thermal_model
+from fleet.motion import static_drive
 from fleet.robot import JOINTS
 
 GAIN_K = 20.0
@@ -104,3 +106,80 @@ def test_a_new_shift_begins_without_measurements(small) -> None:
     env.step(np.array([[1, 0, 0]]))
     obs, _ = env.reset()
     assert peaks(env, obs) == pytest.approx(np.full((3, 6), 30.0))
+
+
+class Continues:
+    """A peak at the present temperature of the hottest motor; with twice the assumed heat it is 20 K higher."""
+
+    version = "continues"
+
+    def score(self, plan, repetitions: int) -> Difficulty:
+        weight = np.eye(JOINTS, KNOWN)
+        peak = Forecast(np.zeros(JOINTS), weight, gain=np.full(JOINTS, GAIN_K))
+        return Difficulty(np.full(JOINTS, 0.1), peak=peak)
+
+
+def idle_env(small, *, true: ThermalModel, believed: ThermalModel, drift_k_per_s: float = 0.0) -> BatchEnv:
+    """One arm that never works, as its jobs come after the shift."""
+    bench = small.work("bench", small.WARM)
+    arm = replace(
+        small.arm(0, [bench], model=Continues(), thermal=true),
+        learns=True,
+        known=(believed, gen3_motors()),
+        drift_k_per_s=drift_k_per_s,
+        motors=replace(gen3_motors(), sensor_noise_k=np.zeros(JOINTS)),
+    )
+    world, _ = small.shop([[small.job("later", bench, release_s=10.0)]], arms=[arm], ticks=400, slots=1)
+    tables, drawn = tables_of(world)
+    shift = shifts_of(drawn, [7])[0]
+    return BatchEnv(Library(("arm_0",), 1, tables, lambda _: shift), 1, seed=0, scaled=False, ahead_s=np.inf)
+
+
+def course(small, thermal: ThermalModel, ticks: int) -> np.ndarray:
+    """Motor temperatures of the idle arm at the end of each tick, by the ODE, °C, [tick, joint]."""
+    motors, rest_tau = gen3_motors(), small.torque(0.0) / 3.0
+    load = static_drive(rest_tau, motors)
+    cold_c = np.full(2 * JOINTS, 25.0)
+    steps = temperature_steps([load] * ticks, 10.0, motors=motors, thermal=thermal, start_c=cold_c, ambient_c=25.0)
+    return np.stack(list(steps))[1:, :JOINTS]
+
+
+def test_motors_that_are_warmer_than_assumed_count_as_more_heat(small) -> None:
+    """Second method: both networks by themselves, their ratio smoothed with the time constant of 100 s."""
+    still, fan = thermal_model(gen3_network()), thermal_model(gen3_network(cooling="forced_air"))
+    env = idle_env(small, true=still, believed=fan)
+    obs, _ = env.reset()
+    for _ in range(300):
+        obs, *_ = env.step(np.zeros((1, 1), int))
+    true_c, assumed_c = course(small, still, 300), course(small, fan, 300)
+    ratio = (true_c - 25.0).sum(axis=1) / np.maximum((assumed_c - 25.0).sum(axis=1), float(JOINTS))
+    warmer = 1.0
+    for each in ratio:
+        warmer += 0.1 * (each - warmer)
+    assert 1.3 < warmer < 2.0
+    expected = true_c[-1].max() + (warmer - 1.0) * GAIN_K
+    assert peaks(env, obs)[0, 0] == pytest.approx(expected, abs=0.05)
+
+
+def test_motors_that_are_cooler_than_assumed_change_nothing(small) -> None:
+    still, fan = thermal_model(gen3_network()), thermal_model(gen3_network(cooling="forced_air"))
+    env = idle_env(small, true=fan, believed=fan)
+    other = idle_env(small, true=still, believed=still)
+    for each, network in ((env, fan), (other, still)):
+        obs, _ = each.reset()
+        for _ in range(100):
+            obs, *_ = each.step(np.zeros((1, 1), int))
+        assert peaks(each, obs)[0, 0] == pytest.approx(course(small, network, 100)[-1].max(), abs=0.05)
+
+
+def test_readings_far_below_the_assumed_temperatures_are_not_believed(small) -> None:
+    still = thermal_model(gen3_network())
+    env = idle_env(small, true=still, believed=still, drift_k_per_s=-0.01)
+    obs, _ = env.reset()
+    for tick in range(1, 101):
+        obs, *_ = env.step(np.zeros((1, 1), int))
+        true_c = float(course(small, still, tick)[-1].max()) if tick in (20, 100) else 0.0
+        if tick == 20:  # 2 K too low: believed
+            assert peaks(env, obs)[0, 0] == pytest.approx(true_c - 2.0, abs=0.05)
+        if tick == 100:  # 10 K too low: 3 K are
+            assert peaks(env, obs)[0, 0] == pytest.approx(true_c - 3.0, abs=0.05)

@@ -485,7 +485,7 @@ class SimulatedBody:
         plans = {} if task is None else {task.job.work: (task.plan,)}
         jobs = [] if task is None else [replace(task.job, release_s=0.0, due_s=np.inf, after=())]
         world, rows = build_world(
-            [replace(self._arm, model=Blind(), plans=plans)],
+            [replace(self._arm, model=Blind(), plans=plans, learns=False)],
             [jobs],
             limits=self._limits,
             dt_s=self._dt_s,
