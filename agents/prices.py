@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from agents.heat import Dues, Wsept, dues_of
-from agents.policy import WAIT, CentralArrayPolicy, legal_options, plans_of, without_empty
+from agents.policy import WAIT, CentralArrayPolicy, Shared, legal_options, plans_of, without_empty
 from fleet.observation import LONG_S, Observation
 
 Array = np.ndarray
@@ -205,7 +205,7 @@ class BidPrice(CentralArrayPolicy):
         gains = gains.reshape(*gains.shape[:-1], -1, plans)
         best, option = gains.max(axis=-1), gains[:, 0].argmax(axis=-1)
         actions = np.full(seen.action_mask.shape[:2], WAIT)
-        for env in range(len(policies)):
+        for env in np.flatnonzero(legal.any(axis=(1, 2))).tolist():
             for arm, job in best_pairs(best[env]):
                 if delay_s[env, arm, 0] <= 0:
                     actions[env, arm] = 1 + job * plans + option[env, arm, job]
@@ -219,10 +219,10 @@ class BidPrice(CentralArrayPolicy):
         cost, busy = np.zeros(duration_s.shape), np.zeros((len(policies), 1, 1))
         left_s, age_s = seen.left_s[:, 0].tolist(), seen.age_s[:, 0]
         lasts_s = np.where(seen.expires[:, 0] > 0, seen.due_in_s[:, 0] + age_s, np.inf)
-        first = seen.offered[:, 0] & (seen.returns[:, 0] == 0)
+        first, settled_s = seen.offered[:, 0] & (seen.returns[:, 0] == 0), cls.settled_s(seen).tolist()
         for env, policy in enumerate(policies):
-            since_s = policy._since(left_s[env], arms)
-            new = first[env] & (age_s[env] < since_s)
+            least_s, since_s = policy._ages_of_new(left_s[env], settled_s[env], arms)
+            new = first[env] & (age_s[env] >= least_s) & (age_s[env] < since_s)
             if new.any():
                 rows = zip(bids.worth[env].T[new], bids.duration_s[env].T[new], lasts_s[env, new], strict=True)
                 policy._jobs += [(left_s[env], *row) for row in rows]
@@ -232,14 +232,20 @@ class BidPrice(CentralArrayPolicy):
             busy[env] = price.busy
         return cost, busy
 
-    def _since(self, left_s: float, arms: tuple[str, ...]) -> float:
-        """Greatest age of a job that has arrived since the last decision."""
-        since_s, self._left_s = self._left_s - left_s - ROUNDING_S, left_s
-        if arms == self._arms and left_s < LONG_S:
-            return since_s
-        # Other arms begin anew. Without an end of the shift there is no clock: only the open jobs count.
-        self._arms, self._jobs, self._first_s, self._price = arms, [], left_s, None
-        return np.inf
+    @classmethod
+    def settled_s(cls, seen: Observation) -> Array:
+        """Age from which all bids for a job are known, [env]."""
+        return np.zeros(len(seen.left_s))
+
+    def _ages_of_new(self, left_s: float, settled_s: float, arms: tuple[str, ...]) -> tuple[float, float]:
+        """Least and greatest age of the jobs that count from this decision on."""
+        before_s = self._left_s - ROUNDING_S
+        self._left_s = min(self._left_s, left_s + settled_s)
+        if arms != self._arms or left_s >= LONG_S:
+            # Other arms begin anew. Without an end of the shift there is no clock: only the open jobs count.
+            self._arms, self._jobs, self._first_s, self._price = arms, [], left_s, None
+            before_s, self._left_s = np.inf, left_s + settled_s
+        return self._left_s - left_s - ROUNDING_S, before_s - left_s
 
     def _current(self, left_s: float, oldest_s: float) -> TimePrice:
         """The prices, renewed if they are old."""
@@ -253,6 +259,24 @@ class BidPrice(CentralArrayPolicy):
         recent = Bids(np.reshape(worth, shape), np.reshape(duration_s, shape))
         self._price = price_of(recent, np.array(patience_s, float), min(self.window_s, past_s + self.prior_s))
         return self._price
+
+
+class BidPriceByMessages(BidPrice):
+    """As `bid_price`, for bids that arrive by messages."""
+
+    only_choices = True
+
+    @classmethod
+    def settled_s(cls, seen: Observation) -> Array:
+        """The age of the oldest message, [env]: all bids for older jobs have arrived."""
+        return seen.fleet_age_s.max(axis=(1, 2))
+
+
+class BidPriceShared(Shared):
+    """As `bid_price`, decided by every arm for itself from what its peers share."""
+
+    central = BidPriceByMessages
+    only_choices = True
 
 
 ROUNDING_S = 0.01

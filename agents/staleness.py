@@ -2,12 +2,13 @@
 
 A difficulty describes a job and fades: at an age its weight is exp(−age / fading), both in the fleet's average and in
 the peer's distance from that average. So old scores have little influence on an assignment. A state describes a moment
-and expires: a peer whose last message is older than `EXPIRY_S` counts as busy, so no job is left to it.
+and expires: a peer whose last message is older than `EXPIRY_S` counts as busy, so no job is left to it. A bid
+describes a job at a moment: it counts as long as the state does.
 """
 
 import numpy as np
 
-from fleet.observation import Observation
+from fleet.observation import FIELDS, LazyObservation, Observation
 
 Array = np.ndarray
 
@@ -23,10 +24,14 @@ def fading_weights(observation: Observation) -> Array:
     return np.exp(-observation.peer_age_s.astype(float) / FADING_S)
 
 
+def current_peers(observation: Observation) -> Array:
+    """Peers with a message that is not too old, bool, [..., peer]."""
+    return (observation.peer_heard > 0) & (observation.peer_age_s < EXPIRY_S)
+
+
 def free_peers(observation: Observation) -> Array:
     """Peers that are free by their last messages, bool, [..., peer]."""
-    current = (observation.peer_heard > 0) & (observation.peer_age_s < EXPIRY_S)
-    return current & (observation.peer_working == 0) & (observation.peer_faulted == 0)
+    return current_peers(observation) & (observation.peer_working == 0) & (observation.peer_faulted == 0)
 
 
 def known_difficulty(observation: Observation) -> Array:
@@ -45,6 +50,64 @@ def in_fleet(peers: Array, place: Array | int, own: Array | float) -> Array:
     everyone = np.concatenate([peers, np.broadcast_to(own, peers.shape[:-1])[..., None]], axis=-1)
     order = np.where(arm == place, len(arm) - 1, arm - (arm > place))
     return np.take_along_axis(everyone, np.broadcast_to(order, everyone.shape), axis=-1)
+
+
+def fleet_as_shared(own: Observation, place: Array, arms: Array) -> Observation:
+    """What an arm knows of itself and of some of its peers, as if these were their observations, [n, arm].
+
+    A peer that should be home by now counts as free, and one that is free may claim what it has a plan for, if the
+    stations are free. All motors of a peer have the temperature of its hottest one. Unknown are: its space and its
+    current job.
+
+    Args:
+        own: Observations of arms, [n].
+        place: Indices of the arms in the fleet, int [n].
+        arms: Which arms of the fleet, int [arm]; its own is one of them.
+    """
+    mine = (place[:, None] == arms)[..., None]  # [n, arm, 1]
+    plans = own.duration_s.shape[-1] // own.group.shape[-1]
+
+    def together(peers: Array, value: Array | float) -> Array:
+        return in_fleet(peers, place, value)[:, arms]
+
+    def bids(peers: Array, value: Array) -> Array:
+        each = in_fleet(np.swapaxes(peers, -1, -2), place[:, None], value)  # [n, option, arm]
+        return np.swapaxes(each, -1, -2)[:, arms]
+
+    def per_joint(values: Array) -> Array:
+        of_own = values[:, None]
+        return np.where(mine, of_own, (of_own.max(axis=-1) + own.headroom_k[:, None] - headroom_k)[..., None])
+
+    left_s = np.where(own.peer_working > 0, np.maximum(own.peer_busy_s - own.peer_age_s, 0.0), 0.0)
+    working, faulted = together(left_s > 0, own.working > 0), together(own.peer_faulted > 0, own.faulted > 0)
+    headroom_k = together(own.peer_headroom_k, own.headroom_k)
+    duration_s = bids(own.peer_duration_s, own.duration_s)
+    can = (duration_s > 0) & ~(working | faulted)[..., None] & np.repeat(own.station_free > 0, plans, axis=-1)[:, None]
+    legal = np.where(mine, own.action_mask[:, None, 1:-1], can)
+    fields = {
+        "working": working,
+        "faulted": faulted,
+        "busy_s": together(left_s, own.busy_s),
+        "headroom_k": headroom_k,
+        "error_headroom_k": headroom_k + (own.error_headroom_k - own.headroom_k)[:, None],
+        "temp_c": per_joint(own.temp_c),
+        "housing_c": per_joint(own.housing_c),
+        "duration_s": duration_s,
+        "peak_c": bids(own.peer_peak_c, own.peak_c),
+        "p_saturation": bids(own.peer_p_saturation, own.p_saturation),
+        "difficulty": bids(np.repeat(own.peer_difficulty, plans, axis=-1), own.difficulty),
+        "fleet_age_s": np.repeat(together(own.peer_age_s, 0.0)[:, None], len(arms), axis=1),
+        "action_mask": np.pad(legal, ((0, 0), (0, 0), (1, 1)), constant_values=((0, 0), (0, 0), (1, 0))),
+    }
+    jobs = {field.name for field in FIELDS if field.part == "jobs"}
+
+    def read(name: str) -> Array:
+        if name not in jobs:
+            raise AttributeError(f"'{name}' of a peer is unknown: it is not shared.")
+        value = getattr(own, name)[:, None]
+        return np.broadcast_to(value, (len(value), len(arms), *value.shape[2:]))
+
+    return LazyObservation(read, **fields)
 
 
 def advantage(observation: Observation, place: Array | int, open_slots: Array) -> Array:

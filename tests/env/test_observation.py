@@ -261,6 +261,8 @@ def reference(world: World, state: State, slots: list[int], key: int, layout: La
             mine[f"fleet_{name}"] = [own[b][name] for b in members]
         mine["fleet_age_s"] = [0.0] * len(members)
         mine["fleet_difficulty"] = least[members]
+        for name in ("duration_s", "peak_c", "p_saturation"):
+            mine[f"fleet_{name}"] = np.array([own[b][name] for b in members if layout.bids])
     return {name: np.array([(shared | each)[name] for each in own], dtype=float) for name in shared | own[0]}
 
 
@@ -273,7 +275,7 @@ def reference_mask(world: World, state: State, slots: list[int], expected: dict[
 
 
 COMPARED = {"temp_c": 1e-4, "housing_c": 1e-4, "ambient_c": 1e-4, "headroom_k": 1e-4, "error_headroom_k": 1e-4,
-            "fleet_headroom_k": 1e-4, "peak_c": 1e-3, "job_peak_c": 1e-3}  # fmt: skip
+            "fleet_headroom_k": 1e-4, "peak_c": 1e-3, "fleet_peak_c": 1e-3, "job_peak_c": 1e-3}  # fmt: skip
 """Absolute tolerances of the fields in °C and K; of others it is 2e-5."""
 
 
@@ -317,6 +319,7 @@ def layouts(draw, arms: int):
         "scaled": draw(st.booleans()),
         "near": None if near is None else tuple(tuple(peers[:near]) for peers in order),
         "ahead_s": draw(st.sampled_from([np.inf, 0.0, 12.3, 40.3])),
+        "bids": draw(st.booleans()),
     }
 
 
@@ -361,7 +364,7 @@ def test_messages_that_arrive_at_once_give_what_the_arms_know_of_each_other(smal
     make = small.Shifts(arms=3, jobs=5, ticks=40, crowding=0.3)
     never = Channel(partitions=(Partition(1e8, 2e8, (("arm_0",),)),))
     compare_with_reference(
-        play, make(np.random.SeedSequence(4)), 4, Exchange(("arm_0", "arm_1", "arm_2"), never), near=near
+        play, make(np.random.SeedSequence(4)), 4, Exchange(("arm_0", "arm_1", "arm_2"), never), near=near, bids=True
     )
 
 
@@ -423,7 +426,7 @@ def received(arms: int, slots: int, **changes: np.ndarray) -> PeerView:
         "headroom_k": np.full((arms, arms), 30.0),
         "busy_s": np.zeros((arms, arms)),
         "difficulty": np.full((arms, arms, slots), np.nan),
-        "p_saturation": np.full((arms, arms, slots), np.nan),
+        **{name: np.full((arms, arms, slots, 1), np.nan) for name in ("duration_s", "peak_c", "p_saturation")},
         "age_s": np.zeros((arms, arms)),
     }
     return PeerView(**(base | changes))
@@ -590,7 +593,7 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     assert message.headroom_k.tolist() == [60.0 - 46.0, 60.0 - 53.0]
     assert message.temp_c.tolist() == measured[0].tolist()
     assert message.difficulty[:, 0] == pytest.approx(world.offers.difficulty[0, :, 0, 0])
-    assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0, 0])
+    assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0])
     assert np.isnan(message.difficulty[:, 1:]).all()
     assert np.isnan(message.p_saturation[:, 1:]).all()
 

@@ -114,7 +114,9 @@ def fresh(name: str) -> Policy:
 @pytest.mark.parametrize("name", [name for name, rule in RULES.items() if not rule.plans])
 def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, name) -> None:
     """Each step of a shift at which an arm may choose, converted to quotes and back."""
-    env = parallel_env(small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0, plans_per_job=PLANS), ahead_s=np.inf)
+    env = parallel_env(
+        small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0, plans_per_job=PLANS), ahead_s=np.inf, bids=True
+    )
     env.reset(seed=4)
     simulated, live, compared = fresh(name), fresh(name), 0
     while env.agents:
