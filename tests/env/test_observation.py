@@ -515,6 +515,19 @@ def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
     assert all(np.isfinite(getattr(observed, field.name)).all() for field in FIELDS)
 
 
+def test_bids_are_those_that_were_received() -> None:
+    """A plan with both predictions, one without, no plan, and a slot without a job."""
+    one = np.full((2, 2, 2, 2), np.nan)
+    duration_s, peak_c, p_saturation = one.copy(), one.copy(), one.copy()
+    duration_s[:, 1, 0], peak_c[:, 1, 0, 0], p_saturation[:, 1, 0, 0] = (60.0, 70.0), 55.0, 0.25
+    layout = Layout(2, 2, plans=2, delivered=True, bids=True)
+    view = received(2, 2, duration_s=duration_s, peak_c=peak_c, p_saturation=p_saturation)
+    observed = peers_of(layout, view)
+    assert observed.peer_duration_s[0].tolist() == [[60.0, 70.0, 0.0, 0.0]]
+    assert observed.peer_peak_c[0].tolist() == [[55.0, 0.0, 0.0, 0.0]]
+    assert observed.peer_p_saturation[0].tolist() == [[0.25, 0.5, 0.0, 0.0]]
+
+
 def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     bench, rack = small.work("bench", 4.0), small.work("rack", 1.0)
     arms = [small.arm(0, [bench, rack]), small.arm(1, [bench], times=small.Times(1.0, 20.0, 4.0))]

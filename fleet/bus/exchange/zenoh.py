@@ -200,7 +200,7 @@ def messages_of(broadcast: Broadcast, arms: tuple[str, ...], tick: int) -> list[
     slots, time_s = [slot for slot, job in enumerate(broadcast.jobs) if job], float(broadcast.time_s)
     jobs, p_saturation = tuple(broadcast.jobs[slot] for slot in slots), broadcast.p_saturation[:, slots]
     duration_s, peak_c = broadcast.duration_s[:, slots], broadcast.peak_c[:, slots]
-    lacks_peak = (~np.isnan(duration_s) & np.isnan(peak_c)).any(axis=(1, 2)).tolist()
+    lacks_peak = np.any(~np.isnan(duration_s) & np.isnan(peak_c), axis=(1, 2)).tolist()
     difficulty, least_p = _nullable(broadcast.difficulty[:, slots], 4), _nullable(np.fmin.reduce(p_saturation, -1), 3)
     bid_s, bid_c, bid_p = _nullable(duration_s, 1), _nullable(peak_c, 1), _nullable(p_saturation, 3)
     mode, temp_c = broadcast.mode.tolist(), broadcast.temp_c.tolist()
