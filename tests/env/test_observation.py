@@ -355,7 +355,7 @@ def test_risks_equal_the_reference(small, play, pieces, curve) -> None:
     ]
     jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]
     world, plant = small.shop([jobs], arms=arms, ticks=60)
-    compare_with_reference(play, Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), 3)
+    compare_with_reference(play, Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), 3, bids=True)
 
 
 @pytest.mark.parametrize("near", [None, ((2,), (0,), (1,))])

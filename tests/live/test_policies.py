@@ -210,6 +210,10 @@ def test_quotes_become_observations() -> None:
     assert one.peer_working.tolist() == [0, 0, 1]
     assert two.peer_known.tolist() == [[1, 0], [0, 0], [0, 0]]
     assert two.peer_difficulty.tolist() == [[1.25, -1], [-1, -1], [-1, -1]]
+    assert two.peer_duration_s.tolist() == [[60.0, 55.0, 0, 0], [0, 0, 0, 0], [50.0, 0, 0, 0]]  # one, four, three
+    assert two.peer_peak_c.tolist() == [[55.0, 50.0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+    assert two.peer_p_saturation.tolist() == [[0.25, 0.125, 0, 0], [0, 0, 0, 0], [0.5, 0, 0, 0]]
+    assert one.peer_peak_c[0].tolist() == two.peak_c.tolist()
     assert two.fleet_difficulty.tolist() == [[-1, -1], [1.25, -1], [-1, -1], [-1, -1]]
 
 
