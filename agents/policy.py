@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from agents.staleness import current_peers, fleet_as_shared, in_fleet
+from agents.staleness import fleet_as_shared
 from fleet.errors import FleetError
 from fleet.observation import FIELDS, LazyObservation, Observation
 
@@ -188,11 +188,10 @@ class Local(ArrayPolicy):
 
 
 class Shared(ArrayPolicy):
-    """Base of policies of scope `arm`: a central policy for the arms that an arm hears, by what they share.
+    """Base of policies of scope `arm`: a central policy for all arms, by what they share.
 
     Every arm decides for itself and for its peers, and makes its own claim. With the same messages all arms come to the
-    same decision. A peer without a message, or with none younger than `agents.staleness.EXPIRY_S`, does not count. An
-    arm without messages is a fleet of one.
+    same decision. A peer without a message, or with none younger than `agents.staleness.EXPIRY_S`, has no plan.
     """
 
     scope: ClassVar = "arm"
@@ -236,16 +235,9 @@ class Shared(ArrayPolicy):
             own: Observations of the arms, [n].
             place: Their indices in their fleets, int [n].
         """
-        actions = np.full(len(place), WAIT)
-        heard = in_fleet(current_peers(own), place, True)
-        patterns, pattern = np.unique(heard, axis=0, return_inverse=True)
-        for number, counts in enumerate(patterns):
-            rows, arms = np.flatnonzero(pattern.reshape(-1) == number), np.flatnonzero(counts)
-            here = LazyObservation(lambda name, rows=rows: getattr(own, name)[rows])
-            fleet = fleet_as_shared(here, place[rows], arms)
-            chosen = cls.central.decide([policies[row] for row in rows.tolist()], fleet, [str(arm) for arm in arms])
-            actions[rows] = chosen[np.arange(len(rows)), np.searchsorted(arms, place[rows])]
-        return actions
+        fleet = fleet_as_shared(own, place)
+        arms = [str(arm) for arm in range(fleet.working.shape[1])]
+        return cls.central.decide(policies, fleet, arms)[np.arange(len(place)), np.minimum(place, len(arms) - 1)]
 
 
 class EveryArm:

@@ -20,6 +20,7 @@ import numpy as np
 
 from agents.heat import Dues, Wsept, dues_of
 from agents.policy import WAIT, CentralArrayPolicy, Shared, legal_options, plans_of, without_empty
+from agents.staleness import EXPIRY_S
 from fleet.observation import LONG_S, Observation
 
 Array = np.ndarray
@@ -29,7 +30,8 @@ class Bids(NamedTuple):
     """Bids of arms for jobs, one bid of each arm for each job."""
 
     worth: Array
-    """Expected worth without tardiness, [..., arm, job]; 0 for a job that the arm cannot or should not do."""
+    """Expected worth without tardiness, [..., arm, job]; 0 for a job that the arm cannot or should not do, NaN where it
+    is unknown."""
     duration_s: Array
     """[..., arm, job]."""
 
@@ -84,15 +86,19 @@ FULL = 0.8
 def price_of(bids: Bids, patience_s: Array, over_s: float) -> TimePrice:
     """Prices by the bids for recent jobs.
 
+    An arm with an unknown bid counts as equal to each arm that it is compared with.
+
     Args:
         bids: [job, arm] each.
         patience_s: Time from the arrival of each job until it expires, inf for others, [job].
         over_s: Time in which the jobs arrived.
     """
     worth, duration_s = bids
-    arms = worth.shape[1]
-    others = (worth.sum(axis=1, keepdims=True) - worth) / max(arms - 1, 1)
-    advantage = worth - others
+    arms, known = worth.shape[1], ~np.isnan(worth)
+    worth = np.where(known, worth, 0.0)
+    # The worth less that of each other arm with a bid; 0 for the arms without one.
+    total = known.sum(axis=1, keepdims=True) * worth - worth.sum(axis=1, keepdims=True)
+    advantage = np.where(known, total, 0.0) / max(arms - 1, 1)
     counts = (advantage > LEAST_ADVANTAGE * worth.max(axis=1, keepdims=True)) & np.isfinite(patience_s)[:, None]
     advantage = np.where(counts, advantage, 0.0)
     most = MOST_OF_RATE * advantage.sum(axis=0) / np.maximum(np.where(counts, duration_s, 0.0).sum(axis=0), 1.0)
@@ -101,7 +107,9 @@ def price_of(bids: Bids, patience_s: Array, over_s: float) -> TimePrice:
     share = (advantage / np.maximum(counts.sum(axis=1, keepdims=True), 1) / over_s)[order]
     patience_s = patience_s[order]
     spared = share * np.where(np.isfinite(patience_s), patience_s, 0.0)[:, None]
-    return TimePrice(patience_s, _sums(share), _sums(spared), most, _busy(bids, FULL * arms * over_s))
+    return TimePrice(
+        patience_s, _sums(share), _sums(spared), most, _busy(Bids(worth, duration_s), FULL * arms * over_s)
+    )
 
 
 def _sums(rows: Array) -> Array:
@@ -219,12 +227,16 @@ class BidPrice(CentralArrayPolicy):
         cost, busy = np.zeros(duration_s.shape), np.zeros((len(policies), 1, 1))
         left_s, age_s = seen.left_s[:, 0].tolist(), seen.age_s[:, 0]
         lasts_s = np.where(seen.expires[:, 0] > 0, seen.due_in_s[:, 0] + age_s, np.inf)
-        first, settled_s = seen.offered[:, 0] & (seen.returns[:, 0] == 0), cls.settled_s(seen).tolist()
+        first = seen.offered[:, 0] & (seen.returns[:, 0] == 0)
+        messages_s = cls.ages_s(seen)
+        current = messages_s < EXPIRY_S
+        settled_s = np.where(current, messages_s, 0.0).max(axis=-1).tolist()
+        known = np.where(current[..., None], bids.worth, np.nan)
         for env, policy in enumerate(policies):
             least_s, since_s = policy._ages_of_new(left_s[env], settled_s[env], arms)
             new = first[env] & (age_s[env] >= least_s) & (age_s[env] < since_s)
             if new.any():
-                rows = zip(bids.worth[env].T[new], bids.duration_s[env].T[new], lasts_s[env, new], strict=True)
+                rows = zip(known[env].T[new], bids.duration_s[env].T[new], lasts_s[env, new], strict=True)
                 policy._jobs += [(left_s[env], *row) for row in rows]
             price = policy._current(left_s[env], float(age_s[env].max()))
             if price.most.any():
@@ -233,9 +245,9 @@ class BidPrice(CentralArrayPolicy):
         return cost, busy
 
     @classmethod
-    def settled_s(cls, seen: Observation) -> Array:
-        """Age from which all bids for a job are known, [env]."""
-        return np.zeros(len(seen.left_s))
+    def ages_s(cls, seen: Observation) -> Array:
+        """Age of what is known of each arm, [env, arm]."""
+        return np.zeros(seen.left_s.shape)
 
     def _ages_of_new(self, left_s: float, settled_s: float, arms: tuple[str, ...]) -> tuple[float, float]:
         """Least and greatest age of the jobs that count from this decision on."""
@@ -267,9 +279,9 @@ class BidPriceByMessages(BidPrice):
     only_choices = True
 
     @classmethod
-    def settled_s(cls, seen: Observation) -> Array:
-        """The age of the oldest message, [env]: all bids for older jobs have arrived."""
-        return seen.fleet_age_s.max(axis=(1, 2))
+    def ages_s(cls, seen: Observation) -> Array:
+        """Age of the last message of each arm, [env, arm]."""
+        return seen.fleet_age_s[:, 0]
 
 
 class BidPriceShared(Shared):

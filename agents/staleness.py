@@ -52,51 +52,45 @@ def in_fleet(peers: Array, place: Array | int, own: Array | float) -> Array:
     return np.take_along_axis(everyone, np.broadcast_to(order, everyone.shape), axis=-1)
 
 
-def fleet_as_shared(own: Observation, place: Array, arms: Array) -> Observation:
-    """What an arm knows of itself and of some of its peers, as if these were their observations, [n, arm].
+def fleet_as_shared(own: Observation, place: Array) -> Observation:
+    """What an arm knows of itself and of its peers, as if all these were observations of a fleet, [n, arm].
 
     A peer that should be home by now counts as free, and one that is free may claim what it has a plan for, if the
-    stations are free. All motors of a peer have the temperature of its hottest one. Unknown are: its space and its
-    current job.
+    stations are free. All motors of a peer have the temperature of its hottest one. Its space and its current job are
+    unknown. A peer whose last message is missing or too old has no plan. `fleet_age_s` is the age of the messages.
 
     Args:
         own: Observations of arms, [n].
         place: Indices of the arms in the fleet, int [n].
-        arms: Which arms of the fleet, int [arm]; its own is one of them.
     """
-    mine = (place[:, None] == arms)[..., None]  # [n, arm, 1]
-    plans = own.duration_s.shape[-1] // own.group.shape[-1]
+    arms, plans = own.peers.shape[-1] + 1, own.duration_s.shape[-1] // own.group.shape[-1]
+    mine = (np.arange(arms) == np.minimum(place, arms - 1)[:, None])[..., None]  # [n, arm, 1]
 
-    def together(peers: Array, value: Array | float) -> Array:
-        return in_fleet(peers, place, value)[:, arms]
+    def each_arm(peers: Array, value: Array | float) -> Array:
+        return in_fleet(peers, place, value)
 
     def bids(peers: Array, value: Array) -> Array:
-        each = in_fleet(np.swapaxes(peers, -1, -2), place[:, None], value)  # [n, option, arm]
-        return np.swapaxes(each, -1, -2)[:, arms]
-
-    def per_joint(values: Array) -> Array:
-        of_own = values[:, None]
-        return np.where(mine, of_own, (of_own.max(axis=-1) + own.headroom_k[:, None] - headroom_k)[..., None])
+        return np.swapaxes(in_fleet(np.swapaxes(peers, -1, -2), place[:, None], value), -1, -2)  # [n, arm, option]
 
     left_s = np.where(own.peer_working > 0, np.maximum(own.peer_busy_s - own.peer_age_s, 0.0), 0.0)
-    working, faulted = together(left_s > 0, own.working > 0), together(own.peer_faulted > 0, own.faulted > 0)
-    headroom_k = together(own.peer_headroom_k, own.headroom_k)
-    duration_s = bids(own.peer_duration_s, own.duration_s)
+    working, faulted = each_arm(left_s > 0, own.working > 0), each_arm(own.peer_faulted > 0, own.faulted > 0)
+    headroom_k = each_arm(own.peer_headroom_k, own.headroom_k)
+    limit_c = own.temp_c.max(axis=-1) + own.headroom_k
+    duration_s = bids(np.where(current_peers(own)[..., None], own.peer_duration_s, 0.0), own.duration_s)
     can = (duration_s > 0) & ~(working | faulted)[..., None] & np.repeat(own.station_free > 0, plans, axis=-1)[:, None]
     legal = np.where(mine, own.action_mask[:, None, 1:-1], can)
     fields = {
         "working": working,
         "faulted": faulted,
-        "busy_s": together(left_s, own.busy_s),
+        "busy_s": each_arm(left_s, own.busy_s),
         "headroom_k": headroom_k,
         "error_headroom_k": headroom_k + (own.error_headroom_k - own.headroom_k)[:, None],
-        "temp_c": per_joint(own.temp_c),
-        "housing_c": per_joint(own.housing_c),
+        "temp_c": np.where(mine, own.temp_c[:, None], (limit_c[:, None] - headroom_k)[..., None]),
         "duration_s": duration_s,
         "peak_c": bids(own.peer_peak_c, own.peak_c),
         "p_saturation": bids(own.peer_p_saturation, own.p_saturation),
         "difficulty": bids(np.repeat(own.peer_difficulty, plans, axis=-1), own.difficulty),
-        "fleet_age_s": np.repeat(together(own.peer_age_s, 0.0)[:, None], len(arms), axis=1),
+        "fleet_age_s": np.repeat(each_arm(own.peer_age_s, 0.0)[:, None], arms, axis=1),
         "action_mask": np.pad(legal, ((0, 0), (0, 0), (1, 1)), constant_values=((0, 0), (0, 0), (1, 0))),
     }
     jobs = {field.name for field in FIELDS if field.part == "jobs"}
@@ -105,7 +99,7 @@ def fleet_as_shared(own: Observation, place: Array, arms: Array) -> Observation:
         if name not in jobs:
             raise AttributeError(f"'{name}' of a peer is unknown: it is not shared.")
         value = getattr(own, name)[:, None]
-        return np.broadcast_to(value, (len(value), len(arms), *value.shape[2:]))
+        return np.broadcast_to(value, (len(value), arms, *value.shape[2:]))
 
     return LazyObservation(read, **fields)
 

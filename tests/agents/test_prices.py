@@ -44,6 +44,14 @@ def test_the_advantage_is_that_over_the_mean_of_the_others_and_shared_by_those_t
     np.testing.assert_allclose(price.of(np.full((3, 1), 100.0)), [[0.25], [0.25], [0.0]])
 
 
+@pytest.mark.parametrize(("worth", "price"), [([10, 0, 10], 0.25), ([10, 0, np.nan], 0.5), ([10, np.nan, np.nan], 0.0)])
+def test_an_arm_with_an_unknown_bid_counts_as_equal_to_each_other(worth, price) -> None:
+    """An advantage of 5 in one job of 1000 s, that the first arm shares with the third or not, or none."""
+    found = price_of(recent(worth, 1), np.zeros(1), 1000.0).of(np.full((3, 1), 100.0))
+    np.testing.assert_allclose(found[0], price)
+    assert found[1] == 0
+
+
 @given(st.integers(1, 6), st.floats(0.1, 100.0), st.integers(0, 5))
 def test_the_time_of_equal_arms_has_no_price(arms, worth, count) -> None:
     price = price_of(recent([worth] * max(arms, 2), count), np.full(count, 60.0), 600.0)
@@ -184,6 +192,14 @@ def test_an_arm_waits_for_a_peer_that_suits_better_while_its_messages_are_not_to
     )
     policy = make_policy("bid_price_shared")
     assert policy.act(shared({"able": slow, "other": busy}, age_s=age_s)) == {"able": claim, "other": WAIT}
+
+
+@pytest.mark.parametrize(("age_s", "claim"), [(0.0, WAIT), (LONG_S, 1)])
+def test_an_arm_that_hears_of_no_peer_does_not_stay_free_for_what_it_may_not_be_alone_with(age_s, claim) -> None:
+    policy = make_policy("bid_price_shared")
+    for k in range(4):
+        assert policy.act(shared(know(600.0 * k, "s"), age_s=age_s))["able"] == 1
+    assert policy.act(shared(know(1800.0, "c", busy_s=(0.0, 60.0)), age_s=age_s))["able"] == claim
 
 
 def test_a_job_counts_once_when_all_bids_for_it_have_arrived() -> None:
