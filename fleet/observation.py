@@ -376,7 +376,8 @@ class Layout:
     def pack(self, observation: Observation) -> Array:
         """An observation as vectors, float32 [..., size], clipped to `bounds`."""
         out = np.empty((*np.shape(observation.left_s), self.size), np.float32)
-        self.write(out, {field.name: np.asarray(getattr(observation, field.name)) for field in FIELDS})
+        names = (field.name for field in FIELDS if self.bids or field.name not in BIDS)
+        self.write(out, {name: np.asarray(getattr(observation, name)) for name in names})
         return out
 
     def write(self, vectors: Array, fields: Mapping[str, Array]) -> None:

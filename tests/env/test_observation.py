@@ -19,7 +19,7 @@ from fleet.engine.tables import tables_of
 from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import ScenarioError
 from fleet.heat.motor import gen3_motors
-from fleet.observation import FIELDS, LONG_S, Layout, Observation
+from fleet.observation import BIDS, FIELDS, LONG_S, Layout, Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 from scenarios.cell_layout import cell_of, near_of
@@ -526,6 +526,17 @@ def test_bids_are_those_that_were_received() -> None:
     assert observed.peer_duration_s[0].tolist() == [[60.0, 70.0, 0.0, 0.0]]
     assert observed.peer_peak_c[0].tolist() == [[55.0, 0.0, 0.0, 0.0]]
     assert observed.peer_p_saturation[0].tolist() == [[0.25, 0.5, 0.0, 0.0]]
+
+
+def test_a_layout_without_bids_packs_observations_that_have_them() -> None:
+    rich, plain = Layout(3, 2, plans=2, bids=True), Layout(3, 2, plans=2)
+    low, high = rich.bounds
+    vectors = np.random.default_rng(1).uniform(low, high, (4, rich.size)).astype(np.float32)
+    seen = rich.read(vectors, np.ones((4, rich.actions), np.int8))
+    np.testing.assert_array_equal(rich.pack(seen), vectors)
+    packed = plain.read(plain.pack(seen), seen.action_mask)
+    for name in (field.name for field in FIELDS if field.name not in BIDS):
+        np.testing.assert_array_equal(getattr(packed, name), getattr(seen, name))
 
 
 def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
