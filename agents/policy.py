@@ -5,11 +5,13 @@ auctioneer. An `arm` policy sees one observation: an arm's own state and what it
 in the process of each arm.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
+from agents.staleness import fleet_as_shared
 from fleet.errors import FleetError
 from fleet.observation import FIELDS, LazyObservation, Observation
 
@@ -185,6 +187,59 @@ class Local(ArrayPolicy):
         return self._policy.actions(alone).reshape(seen.action_mask.shape[:2])
 
 
+class Shared(ArrayPolicy):
+    """Base of policies of scope `arm`: a central policy for all arms, by what they share.
+
+    Every arm decides for itself and for its peers, and makes its own claim. With the same messages all arms come to the
+    same decision. A peer without a message, or with none younger than `agents.staleness.EXPIRY_S`, has no plan.
+    """
+
+    scope: ClassVar = "arm"
+    central: ClassVar[type[ArrayPolicy]]
+    """The central policy; it must decide on arrays."""
+
+    def __init__(self) -> None:
+        self.reset(np.random.default_rng(0))
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+        self._rng = rng
+        self._instances: dict[int, ArrayPolicy] = {}
+
+    def choose(self, observation: Observation, place: int) -> int:
+        """The arm's own claim."""
+        seen = LazyObservation(lambda name: np.asarray(getattr(observation, name))[None])
+        return int(self._claims([self.of(place)], seen, np.array([place]))[0])
+
+    @classmethod
+    def decide(cls, policies: Sequence[Any], seen: Observation, arms: Sequence[str]) -> Array:
+        """The claim of every arm by its own observation."""
+        shape = seen.action_mask.shape[:2]
+        each = LazyObservation(lambda name: (field := getattr(seen, name)).reshape(math.prod(shape), *field.shape[2:]))
+        central = [policy.of(place) for policy in policies for place in range(shape[1])]
+        return cls._claims(central, each, np.tile(np.arange(shape[1]), shape[0])).reshape(shape)
+
+    def of(self, place: int) -> ArrayPolicy:
+        """The instance of the central policy of the arm with this index."""
+        if place not in self._instances:
+            self._instances[place] = self.central()
+            self._instances[place].reset(self._rng)
+        return self._instances[place]
+
+    @classmethod
+    def _claims(cls, policies: Sequence[ArrayPolicy], own: Observation, place: Array) -> Array:
+        """The claims of some arms, int [n].
+
+        Args:
+            policies: Instances of the central policy, [n].
+            own: Observations of the arms, [n].
+            place: Their indices in their fleets, int [n].
+        """
+        fleet = fleet_as_shared(own, place)
+        arms = [str(arm) for arm in range(fleet.working.shape[1])]
+        return cls.central.decide(policies, fleet, arms)[np.arange(len(place)), np.minimum(place, len(arms) - 1)]
+
+
 class EveryArm:
     """Runs an arm policy for all arms: one instance per arm, which sees this arm's observation only."""
 
@@ -304,7 +359,7 @@ def without_empty(seen: Observation) -> Observation:
     slots = int(used[-1]) + 1 if len(used) else 1
     if slots == seen.offered.shape[-1]:
         return seen
-    ends: dict[tuple[str, ...], int] = {("slot",): slots, ("member", "slot"): slots, ("option",): slots * plans}
-    short = {field.name: ends[field.axes] for field in FIELDS if field.axes in ends}
+    ends = {"slot": slots, "option": slots * plans}
+    short = {field.name: ends[field.axes[-1]] for field in FIELDS if field.axes and field.axes[-1] in ends}
     mask = seen.action_mask[..., [*range(1 + slots * plans), -1]]
     return LazyObservation(lambda name: getattr(seen, name)[..., : short.get(name)], action_mask=mask)

@@ -19,7 +19,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from agents.heat import Dues, Wsept, dues_of
-from agents.policy import WAIT, CentralArrayPolicy, legal_options, plans_of, without_empty
+from agents.policy import WAIT, CentralArrayPolicy, Shared, legal_options, plans_of, without_empty
+from agents.staleness import EXPIRY_S
 from fleet.observation import LONG_S, Observation
 
 Array = np.ndarray
@@ -29,7 +30,8 @@ class Bids(NamedTuple):
     """Bids of arms for jobs, one bid of each arm for each job."""
 
     worth: Array
-    """Expected worth without tardiness, [..., arm, job]; 0 for a job that the arm cannot or should not do."""
+    """Expected worth without tardiness, [..., arm, job]; 0 for a job that the arm cannot or should not do, NaN where it
+    is unknown."""
     duration_s: Array
     """[..., arm, job]."""
 
@@ -84,15 +86,19 @@ FULL = 0.8
 def price_of(bids: Bids, patience_s: Array, over_s: float) -> TimePrice:
     """Prices by the bids for recent jobs.
 
+    An arm with an unknown bid counts as equal to each arm that it is compared with.
+
     Args:
         bids: [job, arm] each.
         patience_s: Time from the arrival of each job until it expires, inf for others, [job].
         over_s: Time in which the jobs arrived.
     """
     worth, duration_s = bids
-    arms = worth.shape[1]
-    others = (worth.sum(axis=1, keepdims=True) - worth) / max(arms - 1, 1)
-    advantage = worth - others
+    arms, known = worth.shape[1], ~np.isnan(worth)
+    worth = np.where(known, worth, 0.0)
+    # The worth less that of each other arm with a bid; 0 for the arms without one.
+    total = known.sum(axis=1, keepdims=True) * worth - worth.sum(axis=1, keepdims=True)
+    advantage = np.where(known, total, 0.0) / max(arms - 1, 1)
     counts = (advantage > LEAST_ADVANTAGE * worth.max(axis=1, keepdims=True)) & np.isfinite(patience_s)[:, None]
     advantage = np.where(counts, advantage, 0.0)
     most = MOST_OF_RATE * advantage.sum(axis=0) / np.maximum(np.where(counts, duration_s, 0.0).sum(axis=0), 1.0)
@@ -101,7 +107,9 @@ def price_of(bids: Bids, patience_s: Array, over_s: float) -> TimePrice:
     share = (advantage / np.maximum(counts.sum(axis=1, keepdims=True), 1) / over_s)[order]
     patience_s = patience_s[order]
     spared = share * np.where(np.isfinite(patience_s), patience_s, 0.0)[:, None]
-    return TimePrice(patience_s, _sums(share), _sums(spared), most, _busy(bids, FULL * arms * over_s))
+    return TimePrice(
+        patience_s, _sums(share), _sums(spared), most, _busy(Bids(worth, duration_s), FULL * arms * over_s)
+    )
 
 
 def _sums(rows: Array) -> Array:
@@ -205,7 +213,7 @@ class BidPrice(CentralArrayPolicy):
         gains = gains.reshape(*gains.shape[:-1], -1, plans)
         best, option = gains.max(axis=-1), gains[:, 0].argmax(axis=-1)
         actions = np.full(seen.action_mask.shape[:2], WAIT)
-        for env in range(len(policies)):
+        for env in np.flatnonzero(legal.any(axis=(1, 2))).tolist():
             for arm, job in best_pairs(best[env]):
                 if delay_s[env, arm, 0] <= 0:
                     actions[env, arm] = 1 + job * plans + option[env, arm, job]
@@ -220,11 +228,15 @@ class BidPrice(CentralArrayPolicy):
         left_s, age_s = seen.left_s[:, 0].tolist(), seen.age_s[:, 0]
         lasts_s = np.where(seen.expires[:, 0] > 0, seen.due_in_s[:, 0] + age_s, np.inf)
         first = seen.offered[:, 0] & (seen.returns[:, 0] == 0)
+        messages_s = cls.ages_s(seen)
+        current = messages_s < EXPIRY_S
+        settled_s = np.where(current, messages_s, 0.0).max(axis=-1).tolist()
+        known = np.where(current[..., None], bids.worth, np.nan)
         for env, policy in enumerate(policies):
-            since_s = policy._since(left_s[env], arms)
-            new = first[env] & (age_s[env] < since_s)
+            least_s, since_s = policy._ages_of_new(left_s[env], settled_s[env], arms)
+            new = first[env] & (age_s[env] >= least_s) & (age_s[env] < since_s)
             if new.any():
-                rows = zip(bids.worth[env].T[new], bids.duration_s[env].T[new], lasts_s[env, new], strict=True)
+                rows = zip(known[env].T[new], bids.duration_s[env].T[new], lasts_s[env, new], strict=True)
                 policy._jobs += [(left_s[env], *row) for row in rows]
             price = policy._current(left_s[env], float(age_s[env].max()))
             if price.most.any():
@@ -232,14 +244,20 @@ class BidPrice(CentralArrayPolicy):
             busy[env] = price.busy
         return cost, busy
 
-    def _since(self, left_s: float, arms: tuple[str, ...]) -> float:
-        """Greatest age of a job that has arrived since the last decision."""
-        since_s, self._left_s = self._left_s - left_s - ROUNDING_S, left_s
-        if arms == self._arms and left_s < LONG_S:
-            return since_s
-        # Other arms begin anew. Without an end of the shift there is no clock: only the open jobs count.
-        self._arms, self._jobs, self._first_s, self._price = arms, [], left_s, None
-        return np.inf
+    @classmethod
+    def ages_s(cls, seen: Observation) -> Array:
+        """Age of what is known of each arm, [env, arm]."""
+        return np.zeros(seen.left_s.shape)
+
+    def _ages_of_new(self, left_s: float, settled_s: float, arms: tuple[str, ...]) -> tuple[float, float]:
+        """Least and greatest age of the jobs that count from this decision on."""
+        before_s = self._left_s - ROUNDING_S
+        self._left_s = min(self._left_s, left_s + settled_s)
+        if arms != self._arms or left_s >= LONG_S:
+            # Other arms begin anew. Without an end of the shift there is no clock: only the open jobs count.
+            self._arms, self._jobs, self._first_s, self._price = arms, [], left_s, None
+            before_s, self._left_s = np.inf, left_s + settled_s
+        return self._left_s - left_s - ROUNDING_S, before_s - left_s
 
     def _current(self, left_s: float, oldest_s: float) -> TimePrice:
         """The prices, renewed if they are old."""
@@ -253,6 +271,24 @@ class BidPrice(CentralArrayPolicy):
         recent = Bids(np.reshape(worth, shape), np.reshape(duration_s, shape))
         self._price = price_of(recent, np.array(patience_s, float), min(self.window_s, past_s + self.prior_s))
         return self._price
+
+
+class BidPriceByMessages(BidPrice):
+    """As `bid_price`, for bids that arrive by messages."""
+
+    only_choices = True
+
+    @classmethod
+    def ages_s(cls, seen: Observation) -> Array:
+        """Age of the last message of each arm, [env, arm]."""
+        return seen.fleet_age_s[:, 0]
+
+
+class BidPriceShared(Shared):
+    """As `bid_price`, decided by every arm for itself from what its peers share."""
+
+    central = BidPriceByMessages
+    only_choices = True
 
 
 ROUNDING_S = 0.01

@@ -75,6 +75,12 @@ RULES: dict[str, BuiltInPolicy] = {
         "(expected worth less price of the arm's time) per second, over the next two jobs of each arm",
         "Talluri & van Ryzin 1998",
     ),
+    "bid_price_shared": BuiltInPolicy(
+        "prices:BidPriceShared",
+        "as bid_price, by each arm from what its peers share",
+        "Talluri & van Ryzin 1998",
+        scope="arm",
+    ),
     "auction": BuiltInPolicy("auction:Auction", "time per expected worth, within n · ε", "Bertsekas 1988"),
     "rolling_horizon": BuiltInPolicy(
         "planners:RollingHorizon", "tardiness less expected worth of the next hour", "Ovacik & Uzsoy 1994"

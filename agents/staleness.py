@@ -2,12 +2,13 @@
 
 A difficulty describes a job and fades: at an age its weight is exp(−age / fading), both in the fleet's average and in
 the peer's distance from that average. So old scores have little influence on an assignment. A state describes a moment
-and expires: a peer whose last message is older than `EXPIRY_S` counts as busy, so no job is left to it.
+and expires: a peer whose last message is older than `EXPIRY_S` counts as busy, so no job is left to it. A bid
+describes a job at a moment: it counts as long as the state does.
 """
 
 import numpy as np
 
-from fleet.observation import Observation
+from fleet.observation import FIELDS, LazyObservation, Observation
 
 Array = np.ndarray
 
@@ -23,10 +24,14 @@ def fading_weights(observation: Observation) -> Array:
     return np.exp(-observation.peer_age_s.astype(float) / FADING_S)
 
 
+def current_peers(observation: Observation) -> Array:
+    """Peers with a message that is not too old, bool, [..., peer]."""
+    return (observation.peer_heard > 0) & (observation.peer_age_s < EXPIRY_S)
+
+
 def free_peers(observation: Observation) -> Array:
     """Peers that are free by their last messages, bool, [..., peer]."""
-    current = (observation.peer_heard > 0) & (observation.peer_age_s < EXPIRY_S)
-    return current & (observation.peer_working == 0) & (observation.peer_faulted == 0)
+    return current_peers(observation) & (observation.peer_working == 0) & (observation.peer_faulted == 0)
 
 
 def known_difficulty(observation: Observation) -> Array:
@@ -45,6 +50,58 @@ def in_fleet(peers: Array, place: Array | int, own: Array | float) -> Array:
     everyone = np.concatenate([peers, np.broadcast_to(own, peers.shape[:-1])[..., None]], axis=-1)
     order = np.where(arm == place, len(arm) - 1, arm - (arm > place))
     return np.take_along_axis(everyone, np.broadcast_to(order, everyone.shape), axis=-1)
+
+
+def fleet_as_shared(own: Observation, place: Array) -> Observation:
+    """What an arm knows of itself and of its peers, as if all these were observations of a fleet, [n, arm].
+
+    A peer that should be home by now counts as free, and one that is free may claim what it has a plan for, if the
+    stations are free. All motors of a peer have the temperature of its hottest one. Its space and its current job are
+    unknown. A peer whose last message is missing or too old has no plan. `fleet_age_s` is the age of the messages.
+
+    Args:
+        own: Observations of arms, [n].
+        place: Indices of the arms in the fleet, int [n].
+    """
+    arms, plans = own.peers.shape[-1] + 1, own.duration_s.shape[-1] // own.group.shape[-1]
+    mine = (np.arange(arms) == np.minimum(place, arms - 1)[:, None])[..., None]  # [n, arm, 1]
+
+    def each_arm(peers: Array, value: Array | float) -> Array:
+        return in_fleet(peers, place, value)
+
+    def bids(peers: Array, value: Array) -> Array:
+        return np.swapaxes(in_fleet(np.swapaxes(peers, -1, -2), place[:, None], value), -1, -2)  # [n, arm, option]
+
+    left_s = np.where(own.peer_working > 0, np.maximum(own.peer_busy_s - own.peer_age_s, 0.0), 0.0)
+    working, faulted = each_arm(left_s > 0, own.working > 0), each_arm(own.peer_faulted > 0, own.faulted > 0)
+    headroom_k = each_arm(own.peer_headroom_k, own.headroom_k)
+    limit_c = own.temp_c.max(axis=-1) + own.headroom_k
+    duration_s = bids(np.where(current_peers(own)[..., None], own.peer_duration_s, 0.0), own.duration_s)
+    can = (duration_s > 0) & ~(working | faulted)[..., None] & np.repeat(own.station_free > 0, plans, axis=-1)[:, None]
+    legal = np.where(mine, own.action_mask[:, None, 1:-1], can)
+    fields = {
+        "working": working,
+        "faulted": faulted,
+        "busy_s": each_arm(left_s, own.busy_s),
+        "headroom_k": headroom_k,
+        "error_headroom_k": headroom_k + (own.error_headroom_k - own.headroom_k)[:, None],
+        "temp_c": np.where(mine, own.temp_c[:, None], (limit_c[:, None] - headroom_k)[..., None]),
+        "duration_s": duration_s,
+        "peak_c": bids(own.peer_peak_c, own.peak_c),
+        "p_saturation": bids(own.peer_p_saturation, own.p_saturation),
+        "difficulty": bids(np.repeat(own.peer_difficulty, plans, axis=-1), own.difficulty),
+        "fleet_age_s": np.repeat(each_arm(own.peer_age_s, 0.0)[:, None], arms, axis=1),
+        "action_mask": np.pad(legal, ((0, 0), (0, 0), (1, 1)), constant_values=((0, 0), (0, 0), (1, 0))),
+    }
+    jobs = {field.name for field in FIELDS if field.part == "jobs"}
+
+    def read(name: str) -> Array:
+        if name not in jobs:
+            raise AttributeError(f"'{name}' of a peer is unknown: it is not shared.")
+        value = getattr(own, name)[:, None]
+        return np.broadcast_to(value, (len(value), arms, *value.shape[2:]))
+
+    return LazyObservation(read, **fields)
 
 
 def advantage(observation: Observation, place: Array | int, open_slots: Array) -> Array:

@@ -27,12 +27,12 @@ import numpy as np
 
 from agents.auction import Consensus
 from agents.planners import Mpc, RollingHorizon
-from agents.policy import PlanningPolicy
+from agents.policy import PlanningPolicy, Shared
 from agents.registry import RULES
 from agents.rules import Ssi
 from benchmarks.harness import options, seconds, write_text
 from fleet.env.lookahead import Lookahead
-from fleet.observation import Layout, Observation
+from fleet.observation import BIDS, Layout, Observation
 from scenarios.evaluate.hindsight import ShiftSimulator
 from scenarios.evaluate.rollout import outcomes
 from scenarios.policy_loader import policy_at, scope_of
@@ -54,12 +54,12 @@ def limit_ms(name: str) -> float:
     kind = RULES[name].kind if name in RULES else None
     if kind is None or issubclass(kind, RollingHorizon | PlanningPolicy):
         return HORIZON_MS
-    return MATCHING_MS if issubclass(kind, Ssi | Consensus) else RULE_MS
+    return MATCHING_MS if issubclass(kind, Ssi | Consensus | Shared) else RULE_MS
 
 
 def draw(rng: np.random.Generator, arms: int, jobs: int) -> dict[str, Observation]:
     """What the arms of a fleet know at one moment."""
-    layout, options = Layout(arms, jobs, plans=PLANS), jobs * PLANS
+    layout, options = Layout(arms, jobs, plans=PLANS, bids=True), jobs * PLANS
     age_s, due_s = np.sort(rng.uniform(0, 1800, jobs))[::-1], rng.uniform(-600, 3600, jobs)
     value, payload_kg, station = rng.integers(1, 5, jobs), rng.uniform(0, 4, jobs), rng.random(jobs) < 0.7
     difficulty = rng.uniform(0, 3, (arms, options))
@@ -89,7 +89,8 @@ def draw(rng: np.random.Generator, arms: int, jobs: int) -> dict[str, Observatio
         blank = layout.read(np.zeros(layout.size, np.float32), mask)
         fields = {name: np.asarray(each, np.float32) for name, each in (shared | known).items()}
         seen[f"arm_{arm}"] = replace(blank, peers=layout.peers[arm], **fields)
-    return seen
+    bids = {name: np.stack([getattr(each, own) for each in seen.values()]) for name, own in BIDS.items()}
+    return {arm: replace(each, **bids) for arm, each in seen.items()}
 
 
 def measure(name: str, moments: list[dict[str, Observation]], clock: Callable[[], float]) -> dict[str, float | str]:

@@ -74,7 +74,7 @@ class Steps(NamedTuple):
 
 def steps_of(fleet: Fleet, policy: str, seed: int, decisions: Decisions) -> Steps:
     """Play a shift with one length of steps."""
-    env, chooser = env_of(fleet, decisions=decisions, ahead_s=np.inf), policy_at(policy, seed)
+    env, chooser = env_of(fleet, decisions=decisions, ahead_s=np.inf, bids=True), policy_at(policy, seed)
     env.reset(seed=seed)
     choices, full, reward = [], 0, 0.0
     while env.agents:

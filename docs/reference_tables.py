@@ -205,6 +205,7 @@ _SHAPES = {
     ("option",): "K P",
     ("member",): "n",
     ("member", "slot"): "n K",
+    ("member", "option"): "n K P",
 }
 _EXAMPLE = Layout(arms=4, slots=16, plans=2)
 
@@ -214,7 +215,7 @@ def _observation_table() -> str:
     start = 0
     for field in FIELDS:
         last = start + prod(_EXAMPLE.shape(field)) - 1
-        place = str(start) if last == start else f"{start}–{last}"
+        place = "with bids" if last < start else str(start) if last == start else f"{start}–{last}"
         span = f"{_number(field.low)} … {_number(field.high)}"
         row = (field.part, place, _SHAPES[field.axes], field.unit, span, _number(field.scale), field.text)
         rows.append((f"`{field.name}`", *row))

@@ -49,6 +49,7 @@ _SLOT: tuple[Axis, ...] = ("slot",)
 _OPTION: tuple[Axis, ...] = ("option",)
 _MEMBER: tuple[Axis, ...] = ("member",)
 _MEMBER_SLOT: tuple[Axis, ...] = ("member", "slot")
+_BID: tuple[Axis, ...] = ("member", "option")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,8 @@ class Observation:
     job, action option + 1 claims the option, and the last action gives the current job back after the present cycle.
     The first plan of a job is the fastest. Fields of empty slots and of options without a plan are 0.
 
-    A member is an arm of the fleet, this one included, or only the peers that the layout gives this arm.
+    A member is an arm of the fleet, this one included, or only the peers that the layout gives this arm. The bids of
+    members, [member, option], are part of layouts with `bids`; in others they have no member.
     """
 
     left_s: Annotated[
@@ -97,6 +99,15 @@ class Observation:
     ]
     fleet_difficulty: Annotated[
         Array, Field("fleet", _MEMBER_SLOT, "1", -1, JOINTS, 1, "least d of its plans for the job, -1 if not shared")
+    ]
+    fleet_duration_s: Annotated[
+        Array, Field("fleet", _BID, "s", 0, LONG_S, 1024, "time the member needs, 0: no plan, or not shared")
+    ]
+    fleet_peak_c: Annotated[
+        Array, Field("fleet", _BID, "°C", -60, 300, 64, "predicted peak of the member's plan, 0 if unknown")
+    ]
+    fleet_p_saturation: Annotated[
+        Array, Field("fleet", _BID, "1", 0, 1, 1, "P(saturation) of the member's plan, 0.5 if unknown")
     ]
     working: Annotated[Array, Field("own", (), "1", 0, 1, 1, "1 when this arm works or goes home")]
     faulted: Annotated[Array, Field("own", (), "1", 0, 1, 1, "1 from a fault until it recovers")]
@@ -190,7 +201,22 @@ class Observation:
     @property
     def peer_difficulty(self) -> Array:
         """Least d of its plans for a slot's job that the peer shared, −1 if none, [..., peer, slot]."""
-        return np.take_along_axis(self.fleet_difficulty, self.peers[..., None], axis=-2)
+        return self._rows_of_peers(self.fleet_difficulty)
+
+    @property
+    def peer_duration_s(self) -> Array:
+        """Time the peer needs by each plan, 0 without one, or if not shared, [..., peer, option]."""
+        return self._bids_of_peers(self.fleet_duration_s)
+
+    @property
+    def peer_peak_c(self) -> Array:
+        """Predicted peak of each plan of the peer, 0 if unknown, [..., peer, option]."""
+        return self._bids_of_peers(self.fleet_peak_c)
+
+    @property
+    def peer_p_saturation(self) -> Array:
+        """P(saturation) of each plan of the peer, 0.5 if unknown, [..., peer, option]."""
+        return self._bids_of_peers(self.fleet_p_saturation)
 
     @property
     def peer_known(self) -> Array:
@@ -199,6 +225,14 @@ class Observation:
 
     def _of_peers(self, values: Array) -> Array:
         return np.take_along_axis(values, self.peers, axis=-1)
+
+    def _rows_of_peers(self, values: Array) -> Array:
+        return np.take_along_axis(values, self.peers[..., None], axis=-2)
+
+    def _bids_of_peers(self, values: Array) -> Array:
+        if self.peers.shape[-1] and not values.shape[-2]:
+            raise ValueError("This observation has no bids of members: make the environment with bids=True.")
+        return self._rows_of_peers(values)
 
 
 class LazyObservation(Observation):
@@ -233,6 +267,9 @@ _BY_NAME = {field.name: field for field in FIELDS}
 
 Offsets = namedtuple("Offsets", [field.name for field in FIELDS])  # pyright: ignore[reportUntypedNamedTuple]
 """A number of each field, by name."""
+BIDS = {"fleet_duration_s": "duration_s", "fleet_peak_c": "peak_c", "fleet_p_saturation": "p_saturation"}
+"""Fields of the bids of members, each with the one that the member has itself, which has the same unit and scale."""
+assert all(_BY_NAME[bid].scale == _BY_NAME[own].scale for bid, own in BIDS.items())
 
 
 @dataclass(frozen=True)
@@ -251,6 +288,8 @@ class Layout:
     """Whether messages between arms take time or get lost, so that each arm knows its members otherwise."""
     ahead_s: float = np.inf
     """Options are given to arms that are home within this time; the options of others are 0."""
+    bids: bool = False
+    """Whether members share the predictions of their plans for the open jobs."""
 
     @cached_property
     def members(self) -> Array:
@@ -282,7 +321,7 @@ class Layout:
             "joint": JOINTS,
             "slot": self.slots,
             "option": self.slots * self.plans,
-            "member": self.members.shape[1],
+            "member": self.members.shape[1] if self.bids or field.axes != _BID else 0,
         }
         return tuple(sizes[axis] for axis in field.axes)
 
@@ -337,7 +376,8 @@ class Layout:
     def pack(self, observation: Observation) -> Array:
         """An observation as vectors, float32 [..., size], clipped to `bounds`."""
         out = np.empty((*np.shape(observation.left_s), self.size), np.float32)
-        self.write(out, {field.name: np.asarray(getattr(observation, field.name)) for field in FIELDS})
+        names = (field.name for field in FIELDS if self.bids or field.name not in BIDS)
+        self.write(out, {name: np.asarray(getattr(observation, name)) for name in names})
         return out
 
     def write(self, vectors: Array, fields: Mapping[str, Array]) -> None:

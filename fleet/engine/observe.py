@@ -76,6 +76,12 @@ def observe(sim: Simulation, rows: Array, shared: Array, own: Array) -> None:
                 show_options(sim, e, a, mine, slot_kind, left, filled)
                 if forecasts:
                     show_forecasts(sim, e, a, mine, slot_kind, filled, known_c, values_c)
+        if form.bids[0] != 0:
+            if alike:
+                show_bids(sim, 0, shared[e], own[e], filled)
+            else:
+                for a in range(arms):
+                    show_bids(sim, a, own[e, a], own[e], filled)
 
 
 @jit_inline
@@ -277,6 +283,23 @@ def show_forecasts(
                 mine[at.peak_c + option] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C) * form.inverse.peak_c
                 if p == p:
                     mine[at.p_saturation + option] = p
+
+
+@jit_inline
+def show_bids(sim: Simulation, a: int, to: Array, own: Array, filled: int) -> None:
+    """Copy what the members of an arm know of their plans into a part of the observation.
+
+    Args:
+        own: What each arm knows of itself, float32 [arm, own].
+    """
+    at, members, plans = sim.form.offsets, sim.form.members, nonnegative(sim.tables.work.shape[3])
+    options = nonnegative(sim.offers.slot_job.shape[1]) * plans
+    for m in range(members.shape[1]):
+        theirs, row = own[nonnegative(members[a, m])], m * options
+        for i in range(filled * plans):
+            to[at.fleet_duration_s + row + i] = theirs[at.duration_s + i]
+            to[at.fleet_peak_c + row + i] = theirs[at.peak_c + i]
+            to[at.fleet_p_saturation + row + i] = theirs[at.p_saturation + i]
 
 
 @jit_inline

@@ -43,10 +43,13 @@ def broadcast(engine: Engine, parts: Parts, names: Sequence[str], twins: tuple[s
     known = layout.read_parts(parts[0][env], parts[1][env], engine.mask[env])
     tables, fleet = engine.tables, engine.state.fleet[env]
     kinds = np.where(slots >= 0, engine.state.kind[env, slots], 0)
-    filled = slots[:, None] >= 0
+    filled = slots >= 0
     work = tables.work[fleet, kinds].swapaxes(0, 1)
     unknown = (work["risk"] < 0) & (work["peak"] < 0) & np.isnan(work["p_saturation"])  # [arm, slot, plan]
-    p_saturation = known.p_saturation.reshape(unknown.shape)
+    duration_s, peak_c, p_saturation = (
+        each.reshape(unknown.shape).astype(float) for each in (known.duration_s, known.peak_c, known.p_saturation)
+    )
+    has_plan = filled[..., None] & (duration_s > 0)
     return Broadcast(
         time_s=float(engine.state.tick[env] * tables.dt_s),
         mode=engine.state.mode[env].astype(int),
@@ -54,8 +57,10 @@ def broadcast(engine: Engine, parts: Parts, names: Sequence[str], twins: tuple[s
         temp_c=known.temp_c.astype(float),
         headroom_k=known.headroom_k.astype(float),
         jobs=tuple(names[j] if j >= 0 else "" for j in map(int, slots)),
-        difficulty=np.fmin.reduce(np.where(filled, work["difficulty"], np.nan), axis=-1),
-        p_saturation=np.fmin.reduce(np.where(filled & ~unknown, p_saturation, np.nan), axis=-1),
+        difficulty=np.fmin.reduce(np.where(filled[:, None], work["difficulty"], np.nan), axis=-1),
+        duration_s=np.where(has_plan, duration_s, np.nan),
+        peak_c=np.where(has_plan & (peak_c != 0), peak_c, np.nan),
+        p_saturation=np.where(has_plan & ~unknown, p_saturation, np.nan),
         twin=twins,
     )
 
@@ -81,6 +86,11 @@ def write_members(layout: Layout, view: PeerView, filled: Array, own: Array) -> 
         "fleet_headroom_k": np.nan_to_num(received(view.headroom_k)),
         "fleet_difficulty": np.where(filled, np.nan_to_num(received(view.difficulty), nan=-1.0), 0.0),
     }
+    if layout.bids:
+        duration_s, peak_c, p_saturation = map(received, (view.duration_s, view.peak_c, view.p_saturation))
+        p_saturation = np.where(np.isnan(p_saturation) & (duration_s > 0), 0.5, p_saturation)
+        bids = {"fleet_duration_s": duration_s, "fleet_peak_c": peak_c, "fleet_p_saturation": p_saturation}
+        fields |= {name: np.nan_to_num(values).reshape(*age_s.shape, -1) for name, values in bids.items()}
     layout.write(own, fields)
 
 

@@ -293,6 +293,8 @@ class Form(NamedTuple):
     """1 where what the arms share is the same for all of them, else 0, int [1]."""
     ahead_s: Array
     """Arms that are home later than this have no options, float32 [1]."""
+    bids: Array
+    """1 where members share their bids, else 0, int [1]."""
 
 
 class Script(NamedTuple):
@@ -424,7 +426,7 @@ def form_of(layout: Layout) -> Form:
     scales = Offsets(*(np.float32(1.0 / field.scale if layout.scaled else 1.0) for field in FIELDS))
     offsets = Offsets(*map(np.uint32, layout.offsets))
     alike, ahead_s = np.array([layout.is_shared], int), np.array([layout.ahead_s], np.float32)
-    return Form(offsets, scales, layout.members, alike, ahead_s)
+    return Form(offsets, scales, layout.members, alike, ahead_s, np.array([layout.bids], int))
 
 
 def tables_of(world: World) -> tuple[Tables, State]:

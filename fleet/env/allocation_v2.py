@@ -27,7 +27,7 @@ from fleet.engine.step import FINISHED, OUTCOME, TICK, TOTAL
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import CellMap
-from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, decisions_of, seed_of
+from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, decisions_of, seed_of, switch
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
 from fleet.observation import Layout, Observation
@@ -83,6 +83,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             warning limit ("events").
         scaled: Vectors hold values of order 1 (`Field.scale`); otherwise they have the units of the fields.
         ahead_s: Options of arms that are home later than this are 0: they cannot claim soon. inf for those of all.
+        bids: Vectors hold the bids of members; see `fleet.observation.Layout`.
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo's
@@ -108,6 +109,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         decisions: Decisions = "interval",
         scaled: bool = True,
         ahead_s: float = AHEAD_S,
+        bids: bool = False,
     ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             allowed = ", ".join(map(repr, RENDER_MODES))
@@ -138,6 +140,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             scaled=scaled,
             delivered=not self._exchange.perfect,
             ahead_s=ahead_s,
+            bids=switch("bids", bids),
         )
         first = arm_spaces(self.layout)
         per_arm = [spaces_like(first) for _ in world.arms]

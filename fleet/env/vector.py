@@ -123,7 +123,7 @@ class BatchEnv:
         exchanges: What carries the messages of the arms of each env; perfect and immediate if not given.
         decisions: Length of a step: one decision "interval", or until an arm may claim a job ("events"), which takes no
             exchanges.
-        scaled, ahead_s: As in `fleet.env.allocation_v2.AllocationEnv`.
+        scaled, ahead_s, bids: As in `fleet.env.allocation_v2.AllocationEnv`.
         keep_path: Keep the temperatures of the whole shift in `path_c`.
     """
 
@@ -142,6 +142,7 @@ class BatchEnv:
         decisions: Decisions = "interval",
         scaled: bool = True,
         ahead_s: float = AHEAD_S,
+        bids: bool = False,
         keep_path: bool = False,
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
@@ -155,6 +156,7 @@ class BatchEnv:
             scaled=scaled,
             delivered=exchanges is not None,
             ahead_s=ahead_s,
+            bids=switch("bids", bids),
         )
         _check_memory(num_envs, self.layout)
         autoreset, stagger = switch("autoreset", autoreset), switch("stagger", stagger)

@@ -153,7 +153,8 @@ def play(
         for e, seed in enumerate(seeds):
             with guarded([e]):
                 policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
-        if not any(reads_messages(each) for each in policies.values()):
+        messages = any(reads_messages(each) for each in policies.values())
+        if not messages:
             channel = PERFECT
         waits = channel.perfect and all(only_choices(each) for each in policies.values())
         env = BatchEnv(
@@ -166,6 +167,7 @@ def play(
             decisions="events" if waits else "interval",
             scaled=False,
             ahead_s=np.inf,
+            bids=messages,
             keep_path=True,
         )
         obs, _ = env.reset()

@@ -389,6 +389,7 @@ def make_env(
     render_mode: str | None = None,
     mask_in: "MaskPlace" = "obs",
     peers: int | None = None,
+    bids: bool = False,
     progress: Progress = quiet,
     **overrides: Any,  # one type per field
 ) -> "AllocationEnv":
@@ -405,6 +406,7 @@ def make_env(
         cache: Folder of plans and twins.
         max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v2.AllocationEnv`.
         peers: Number of peers in an arm's observation, the nearest ones; default: all.
+        bids: Whether an arm observes its peers' predictions for the open jobs.
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`; Any, as fields differ.
 
     Raises:
@@ -416,7 +418,7 @@ def make_env(
     chosen = scenario_with(scenario, overrides, make_env)
     near = near_of(chosen, peers)
     fleet = prepare(chosen, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
-    options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in, "near": near}
+    options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in, "near": near, "bids": bids}
     return env_of(fleet, plant=plant, bus=bus, channel=channel, **options)
 
 

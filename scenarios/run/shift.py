@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.policy import only_choices
+from agents.policy import only_choices, reads_messages
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
 from fleet.engine.step import TOTAL
@@ -90,6 +90,7 @@ def run(
         watch=recorder,
         scaled=False,
         ahead_s=np.inf,
+        bids=reads_messages(policy),
     )
     finished, reward = False, 0.0
     offers: list[Offer] = []

@@ -32,7 +32,7 @@ def observation(
         legal: Whether each option may be claimed, [option] or one for all.
         slack_s: Of each slot, for `due_in_s`.
     """
-    layout = Layout(peers + 1, slots, plans=plans)
+    layout = Layout(peers + 1, slots, plans=plans, bids=True)
     mask = np.concatenate([[1], np.broadcast_to(legal, slots * plans), [gives_back]]).astype(np.int8)
     blank = layout.read(np.zeros((peers + 1, layout.size), np.float32), np.tile(mask, (peers + 1, 1)))
     first = Observation(**{name: getattr(blank, name)[place] for name in NAMES})
@@ -60,7 +60,7 @@ def with_peers(seen: Observation, **fields: Any) -> Observation:
     return replace(seen, **changed)
 
 
-DRAWN = Layout(5, 6, plans=2)
+DRAWN = Layout(5, 6, plans=2, bids=True)
 """Layout of `drawn`."""
 
 

@@ -58,7 +58,7 @@ def reordered(layout: Layout, vectors: np.ndarray, slots: np.ndarray, members: n
     for field in FIELDS:
         part = getattr(seen, field.name)
         for axis, order in (("slot", slots), ("option", slots), ("member", members)):
-            if axis in field.axes:
+            if axis in field.axes and part.size:
                 part = np.take(part, order, axis=1 + field.axes.index(axis))
         named[field.name] = part
     return layout.pack(Observation(**named, peers=seen.peers, action_mask=vectors[:, :0]))

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.policy import Policy, on_arrays
-from agents.prices import Bids, best_pairs, bids_of, price_of
+from agents.policy import WAIT, Policy, on_arrays
+from agents.prices import BidPrice, Bids, best_pairs, bids_of, price_of
 from agents.registry import make_policy
-from fleet.observation import LazyObservation, Observation
+from fleet.env.allocation_v2 import parallel_env
+from fleet.observation import BIDS, LONG_S, LazyObservation, Observation
 from tests.agents.observations import NAMES, drawn, observation, of_arms
 from tests.profiles import examples
 
@@ -41,6 +42,14 @@ def test_the_advantage_is_that_over_the_mean_of_the_others_and_shared_by_those_t
     """Worth 10 to two arms of three, whose others have 5 on average; one of them gets the job."""
     price = price_of(recent([10.0, 10.0, 0.0], 1), np.zeros(1), 1000.0)
     np.testing.assert_allclose(price.of(np.full((3, 1), 100.0)), [[0.25], [0.25], [0.0]])
+
+
+@pytest.mark.parametrize(("worth", "price"), [([10, 0, 10], 0.25), ([10, 0, np.nan], 0.5), ([10, np.nan, np.nan], 0.0)])
+def test_an_arm_with_an_unknown_bid_counts_as_equal_to_each_other(worth, price) -> None:
+    """An advantage of 5 in one job of 1000 s, that the first arm shares with the third or not, or none."""
+    found = price_of(recent(worth, 1), np.zeros(1), 1000.0).of(np.full((3, 1), 100.0))
+    np.testing.assert_allclose(found[0], price)
+    assert found[1] == 0
 
 
 @given(st.integers(1, 6), st.floats(0.1, 100.0), st.integers(0, 5))
@@ -153,6 +162,86 @@ def test_a_job_counts_once_and_for_an_hour() -> None:
         assert policy.act(know(300.0, "c", busy_s=(0.0, 400.0))) == {"able": 0, "other": 0}
     later = after_scarce_jobs().act(know(1800.0 + 3601.0, "c", busy_s=(0.0, 60.0)))
     assert later == {"able": 1, "other": 0}
+
+
+def shared(seen: dict[str, Observation], *, age_s: float = 0.0) -> dict[str, Observation]:
+    """The same, with messages of this age: an arm knows of the other what that knows of itself."""
+    together = {name: np.stack([getattr(each, own) for each in seen.values()]) for name, own in OWN.items()}
+
+    def with_messages(place: int, each: Observation) -> Observation:
+        peers = np.array([a for a in range(len(seen)) if a != place])
+        ages_s = np.where(np.arange(len(seen)) == place, 0.0, age_s)
+        return LazyObservation(lambda name: getattr(each, name), **together, fleet_age_s=ages_s, peers=peers)
+
+    return {name: with_messages(place, each) for place, (name, each) in enumerate(seen.items())}
+
+
+OWN = {f"fleet_{name}": name for name in ("working", "faulted", "busy_s", "headroom_k", *BIDS.values())} | {
+    "fleet_difficulty": "difficulty"
+}
+"""What an arm shares, by the field of its peers."""
+
+
+@pytest.mark.parametrize(("age_s", "claim"), [(0.0, WAIT), (59.0, WAIT), (60.0, 1), (LONG_S, 1)])
+def test_an_arm_waits_for_a_peer_that_suits_better_while_its_messages_are_not_too_old(age_s, claim) -> None:
+    """The other arm, which is home soon, does the job in a tenth of the time."""
+    slow, fast = know(0.0, "c").values()
+    quick = LazyObservation(lambda name: getattr(fast, name), duration_s=fast.duration_s / 10.0)
+    busy = LazyObservation(
+        lambda name: getattr(quick, name), working=np.array(1.0), busy_s=np.array(70.0), action_mask=np.array([1, 0, 0])
+    )
+    policy = make_policy("bid_price_shared")
+    assert policy.act(shared({"able": slow, "other": busy}, age_s=age_s)) == {"able": claim, "other": WAIT}
+
+
+@pytest.mark.parametrize(("age_s", "claim"), [(0.0, WAIT), (LONG_S, 1)])
+def test_an_arm_that_hears_of_no_peer_does_not_stay_free_for_what_it_may_not_be_alone_with(age_s, claim) -> None:
+    policy = make_policy("bid_price_shared")
+    for k in range(4):
+        assert policy.act(shared(know(600.0 * k, "s"), age_s=age_s))["able"] == 1
+    assert policy.act(shared(know(1800.0, "c", busy_s=(0.0, 60.0)), age_s=age_s))["able"] == claim
+
+
+def test_a_job_counts_once_when_all_bids_for_it_have_arrived() -> None:
+    """Jobs arrive every 7 s; messages take 0 to 30 s, and decisions are made at any full second."""
+    rng, policy = np.random.default_rng(2), BidPrice()
+    counted, now_s = [], 0.0
+    for _ in range(200):
+        now_s += float(rng.integers(1, 20))
+        settled_s = float(rng.choice([0.0, 10.0, 30.0]))
+        least_s, most_s = policy._ages_of_new(10_000.0 - now_s, settled_s, ("a", "b"))
+        ages_s = {k: now_s - 7.0 * k - 0.5 for k in range(int((now_s + 6.5) / 7.0))}
+        new = [k for k, age_s in ages_s.items() if least_s <= age_s < most_s]
+        assert all(ages_s[k] >= settled_s for k in new)
+        counted += new
+    assert counted == list(range(len(counted)))
+    assert len(counted) > 200
+
+
+def test_without_bids_in_the_observation_the_error_says_how_to_get_them() -> None:
+    seen = shared(know(0.0, "c"))
+    bare = {
+        name: LazyObservation(lambda field, each=each: getattr(each, field), **NO_BIDS) for name, each in seen.items()
+    }
+    with pytest.raises(ValueError, match="bids=True"):
+        make_policy("bid_price_shared").act(bare)
+
+
+NO_BIDS = {name: np.zeros((0, 1)) for name in BIDS}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_all_messages_every_arm_claims_what_the_auctioneer_would_give_it(small, seed) -> None:
+    env = parallel_env(small.Shifts(arms=4, jobs=24, ticks=120, ambient_c=36.0), ahead_s=np.inf, bids=True)
+    env.reset(seed=seed)
+    central, alone, claims = make_policy("bid_price"), make_policy("bid_price_shared"), 0
+    while env.agents:
+        seen = env.knowledge()
+        actions = central.act(seen)
+        assert alone.act(seen) == actions
+        claims += sum(action > 0 for action in actions.values())
+        env.step(actions)
+    assert claims > 10
 
 
 def shift(rng: np.random.Generator, decisions: int = 6) -> list[dict[str, Observation]]:

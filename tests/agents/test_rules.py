@@ -77,7 +77,7 @@ def test_every_rule_plays_a_shift_legally_and_repeats_it_also_from_event_to_even
     shifts = small.Shifts(arms=arms, jobs=12, ticks=120, ambient_c=38.0, crowding=0.3)
     finished_s = []
     for decisions in ("interval", "interval", "events"):
-        env, policy = parallel_env(shifts, decisions=decisions), make_policy(name)
+        env, policy = parallel_env(shifts, decisions=decisions, bids=True), make_policy(name)
         for seed in range(2):
             env.reset(seed=seed)
             policy.reset(rng(seed))

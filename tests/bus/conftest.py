@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import of_arms
 from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
+from fleet.offered_plans import PLANS
 from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
@@ -26,10 +28,13 @@ def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int 
     empty = rng.random(slots) < 0.25
     for slot in np.flatnonzero(empty):
         jobs[slot] = ""
-    difficulty, p_saturation = rng.random((2, arms, slots)) * 10.0 ** rng.integers(-300, 1, (2, arms, slots))
-    difficulty[rng.random((arms, slots)) < 0.3] = np.nan
-    p_saturation[rng.random((arms, slots)) < 0.3] = np.nan
-    difficulty[:, empty] = p_saturation[:, empty] = np.nan
+    difficulty = rng.random((arms, slots)) * 10.0 ** rng.integers(-300, 1, (arms, slots))
+    duration_s, peak_c, p_saturation = rng.random((3, arms, slots, PLANS)) * np.reshape(
+        [900.0, 80.0, 1.0], (3, 1, 1, 1)
+    )
+    for values in (difficulty, duration_s, peak_c, p_saturation):
+        values[rng.random(values.shape) < 0.3] = np.nan
+        values[:, empty] = np.nan
     return Broadcast(
         time_s=time_s,
         mode=rng.integers(0, 3, arms),
@@ -38,6 +43,8 @@ def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int 
         busy_s=rng.uniform(0.0, 900.0, arms),
         jobs=tuple(jobs),
         difficulty=difficulty,
+        duration_s=duration_s,
+        peak_c=peak_c,
         p_saturation=p_saturation,
         twin=tuple(f"twin-{number}" for number in rng.integers(0, 2, arms)),
     )
@@ -45,7 +52,7 @@ def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int 
 
 def assert_equal(one: PeerView, other: PeerView) -> None:
     """The same arrays to the last bit; NaN equals NaN."""
-    for name in ("mode", "headroom_k", "busy_s", "difficulty", "p_saturation", "age_s"):
+    for name in (field.name for field in fields(PeerView)):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name, strict=True)
 
 

@@ -22,10 +22,10 @@ from hypothesis import strategies as st
 
 from agents.registry import make_policy
 from fleet.bus.exchange.channel import PERFECT, Channel, Partition
-from fleet.bus.exchange.memory import UNHEARD, Delivery, Exchange, PeerView
-from fleet.bus.exchange.zenoh import ZenohExchange
+from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange, PeerView
+from fleet.bus.exchange.zenoh import ZenohExchange, messages_of
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.messages import DifficultyScores, Info, State, decode, encoding
+from fleet.bus.protocol.messages import DifficultyScores, Info, State, decode, encode, encoding
 from fleet.bus.router import Router, open_client
 from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import BusError
@@ -279,6 +279,7 @@ def test_chance_must_be_given():
 
 
 FOUR = ("a", "b", "c", "d")
+BIDS = ("duration_s", "peak_c", "p_saturation")
 
 
 def test_every_arm_receives_every_broadcast_at_once(make_words):
@@ -288,7 +289,8 @@ def test_every_arm_receives_every_broadcast_at_once(make_words):
         np.testing.assert_array_equal(heard.mode[receiver], words.mode)
         np.testing.assert_array_equal(heard.headroom_k[receiver], words.headroom_k)
         np.testing.assert_array_equal(heard.difficulty[receiver], words.difficulty)
-        np.testing.assert_array_equal(heard.p_saturation[receiver], words.p_saturation)
+        for name in BIDS:
+            np.testing.assert_array_equal(getattr(heard, name)[receiver], getattr(words, name))
     np.testing.assert_array_equal(heard.age_s, np.zeros((4, 4)))
 
 
@@ -298,13 +300,13 @@ def test_scores_go_to_the_slot_of_their_job(make_words):
         make_words(np.random.default_rng(0), 2, 0.0, slots=3),
         jobs=("a", "b", "c"),
         difficulty=np.array([[1.0, 2.0, 3.0]] * 2),
-        p_saturation=np.array([[0.1, 0.2, 0.3]] * 2),
+        p_saturation=np.array([[[0.1, 0.4], [0.2, 0.5], [0.3, 0.6]]] * 2),
     )
     exchange.share(words)
     later = make_words(np.random.default_rng(1), 2, 10.0, slots=4)
     heard = exchange.share(replace(later, jobs=("c", "", "x", "a")))
     np.testing.assert_array_equal(heard.difficulty[0, 1], [3.0, np.nan, np.nan, 1.0])
-    np.testing.assert_array_equal(heard.p_saturation[0, 1], [0.3, np.nan, np.nan, 0.1])
+    np.testing.assert_array_equal(heard.p_saturation[0, 1], [[0.3, 0.6], [np.nan] * 2, [np.nan] * 2, [0.1, 0.4]])
 
 
 def test_on_a_ring_only_neighbours_are_heard(make_words):
@@ -349,8 +351,11 @@ def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, t
                 assert heard.mode[receiver, sender] == old.mode[sender]
                 assert heard.headroom_k[receiver, sender] == old.headroom_k[sender]
                 for slot, job in enumerate(words.jobs):
-                    expected = old.difficulty[sender, old.jobs.index(job)] if job and job in old.jobs else np.nan
-                    np.testing.assert_equal(heard.difficulty[receiver, sender, slot], expected)
+                    was_open = bool(job) and job in old.jobs
+                    for name in ("difficulty", *BIDS):
+                        expected = getattr(old, name)[sender, old.jobs.index(job)] if was_open else np.nan
+                        actual = getattr(heard, name)[receiver, sender, slot]
+                        np.testing.assert_array_equal(actual, np.broadcast_to(expected, np.shape(actual)))
 
 
 def test_lost_words_leave_the_last_known_and_its_age(make_words):
@@ -389,7 +394,7 @@ def test_relabelling_the_arms_relabels_what_is_heard(make_words, assert_same):
     plain, turned = Exchange(FOUR, channel), Exchange([FOUR[i] for i in order], channel)
     for tick in range(5):
         words = make_words(rng, 4, 10.0 * tick)
-        per_arm = ("mode", "temp_c", "headroom_k", "busy_s", "difficulty", "p_saturation")
+        per_arm = ("mode", "temp_c", "headroom_k", "busy_s", "difficulty", *BIDS)
         moved = replace(
             words, **{f: getattr(words, f)[order] for f in per_arm}, twin=tuple(words.twin[i] for i in order)
         )
@@ -495,8 +500,38 @@ def test_the_bus_carries_every_message_and_the_arms_know_what_the_memory_deliver
             known = [job for job in words.jobs if job]
             columns = [words.jobs.index(job) for job in known]
             assert message.jobs == tuple(known)
-            np.testing.assert_array_equal(np.array(message.difficulty, float), words.difficulty[arm, columns])
-            np.testing.assert_array_equal(np.array(message.p_saturation, float), words.p_saturation[arm, columns])
+            least = np.fmin.reduce(words.p_saturation[arm, columns], axis=-1)
+            np.testing.assert_allclose(np.array(message.difficulty, float), words.difficulty[arm, columns], atol=5e-5)
+            np.testing.assert_allclose(np.array(message.p_saturation, float), least, atol=5e-4)
+            for name, atol in {"duration_s": 0.05, "peak_c": 0.05, "p_saturation": 5e-4}.items():
+                values = getattr(message, f"bid_{name}")
+                if name == "p_saturation" and not values:
+                    assert not (np.isfinite(words.duration_s[arm]) & np.isnan(words.peak_c[arm])).any()
+                    continue
+                sent = np.array(values, float).reshape(len(columns), -1)
+                np.testing.assert_allclose(sent, getattr(words, name)[arm, columns], atol=atol + 1e-9)
+
+
+def test_scores_and_bids_for_sixteen_jobs_fit_into_a_kilobyte() -> None:
+    """With two plans a job, names of 15 characters, and figures of any length."""
+    rng, arms = np.random.default_rng(3), ("arm_0", "arm_1")
+    duration_s, peak_c, p_saturation = rng.random((3, 2, 16, 2)) * np.reshape([1000, 100, 1], (3, 1, 1, 1))
+    broadcast = Broadcast(
+        time_s=28_790.0,
+        mode=np.zeros(2, int),
+        temp_c=np.zeros((2, 7)),
+        headroom_k=np.zeros(2),
+        busy_s=np.zeros(2),
+        jobs=tuple(f"inspection_{i:04d}" for i in range(16)),
+        difficulty=rng.random((2, 16)),
+        duration_s=duration_s,
+        peak_c=peak_c,
+        p_saturation=p_saturation,
+        twin=("lstm-vae-3f9a", "lstm-vae-3f9a"),
+    )
+    for _, scores in messages_of(broadcast, arms, 2879):
+        assert len(scores.bid_duration_s) == len(scores.bid_peak_c) == 32
+        assert len(encode(scores)) <= 1024
 
 
 def test_an_exchange_takes_broadcasts_in_order(make_words):
@@ -584,8 +619,8 @@ import numpy as np
 from fleet.bus.exchange.memory import Broadcast
 from fleet.bus.exchange.zenoh import ZenohExchange
 bus = ZenohExchange(["a", "b"], "f", timeout_s=120.0)
-one = np.ones((2, 1))
-heard = bus.share(Broadcast(0.0, np.zeros(2, int), one, one[:, 0], one[:, 0], ("j",), one, one, ("", "")))
+one, plan = np.ones((2, 1)), np.ones((2, 1, 1))
+heard = bus.share(Broadcast(0.0, np.zeros(2, int), one, one[:, 0], one[:, 0], ("j",), one, plan, plan, plan, ("", "")))
 print(heard.difficulty.sum(), flush=True)
 {ending}
 """

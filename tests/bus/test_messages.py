@@ -221,7 +221,17 @@ states = st.builds(
 def difficulty_words(draw):
     jobs = tuple(draw(st.lists(names, max_size=5, unique=True)))
     columns = st.lists(st.none() | numbers, min_size=len(jobs), max_size=len(jobs)).map(tuple)
-    return DifficultyScores(draw(names), draw(ticks), draw(numbers), draw(names), jobs, draw(columns), draw(columns))
+    plans = draw(st.integers(0, 3)) * len(jobs)
+
+    def bids(values):
+        return draw(st.lists(st.none() | values, min_size=plans, max_size=plans).map(tuple))
+
+    return DifficultyScores(
+        *(draw(names), draw(ticks), draw(numbers), draw(names), jobs, draw(columns), draw(columns)),
+        bid_duration_s=bids(st.floats(0, 1e6)),
+        bid_peak_c=bids(st.floats(-50, 200)),
+        bid_p_saturation=bids(st.floats(0, 1)) if draw(st.booleans()) else (),
+    )
 
 
 infos = st.builds(Info, arm=names, joints=st.integers(1, 9), twin=names)
@@ -408,6 +418,10 @@ def test_struct_and_schema_refuse_the_same(word, data):
         (messages.State, {"q": [0.0]}),
         (messages.DifficultyScores, {"difficulty": [0.1]}),
         (messages.DifficultyScores, {"jobs": ["twice", "twice"]}),
+        (messages.DifficultyScores, {"bid_duration_s": [60.0, 70.0, 80.0], "bid_peak_c": [50.0, 51.0, 52.0]}),
+        (messages.DifficultyScores, {"bid_duration_s": [60.0, 70.0], "bid_peak_c": [50.0]}),
+        (messages.DifficultyScores, {"bid_duration_s": [60.0, 70.0], "bid_peak_c": [], "bid_p_saturation": []}),
+        (messages.DifficultyScores, {"bid_p_saturation": [0.5]}),
         (JobSpec, {"places": ["one"]}),
         (JobSpec, {"kind": "hold"}),
         (JobSpec, {"release_s": 10.0, "due_s": 9.0}),

@@ -37,7 +37,7 @@ ACT_REPLY, REFUSAL = (f"application/json;thermofleet.{name}.v4" for name in ("Ac
 
 def seen(arms: int = 2, slots: int = 3, rng: np.random.Generator | None = None) -> dict[str, Observation]:
     """Observations of arms; with `rng` random ones within their bounds."""
-    layout = Layout(arms, slots, plans=2)
+    layout = Layout(arms, slots, plans=2, bids=True)
     low, high = layout.bounds
     vectors = np.zeros((arms, layout.size), np.float32) if rng is None else rng.uniform(low, high, (arms, layout.size))
     shared, own = vectors[0, : layout.shared].astype(np.float32), vectors[:, layout.shared :].astype(np.float32)

@@ -8,7 +8,7 @@ import pytest
 
 from docs.tables import fill_tables, main
 from fleet.engine.batch import TERMS
-from fleet.observation import FIELDS, Layout
+from fleet.observation import BIDS, FIELDS, Layout
 from scenarios.prepare.batch import make_batch
 from scenarios.prepare.fleet import make_env
 from scenarios.spec.parse import override
@@ -35,7 +35,7 @@ def test_the_command_reports_an_outdated_table(tmp_path, capsys) -> None:
 def test_offsets_of_the_table_are_correct() -> None:
     layout = Layout(4, 16, plans=2)
     rows = dict(re.findall(r"^\| `(\w+)` \| \w+ \| ([\d–]+) \| [^|]+ \| [^|]+ \| [^|]+ …", TEXT, re.MULTILINE))
-    assert list(rows) == [field.name for field in FIELDS]
+    assert list(rows) == [field.name for field in FIELDS if field.name not in BIDS]
     ends = [int(place.split("–")[-1]) for place in rows.values()]
     assert [int(place.split("–")[0]) for place in rows.values()] == [0, *(end + 1 for end in ends[:-1])]
     assert ends[-1] == layout.size - 1 == 381
@@ -50,6 +50,10 @@ def test_the_size_in_the_page_is_correct(n, slots, plans) -> None:
     a, b, c, d = map(int, re.findall(formula, TEXT)[0])
     assert Layout(n, slots, plans=plans).size == a + (b + c * plans) * slots + n * (d + slots)
     assert Layout(n, slots, ((),) * n, plans=plans).size == a + (b + c * plans) * slots
+    (per_plan,) = re.findall(r"with bids another (\d+) n K P", TEXT)
+    assert Layout(n, slots, plans=plans, bids=True).size == a + (
+        b + c * plans + int(per_plan) * n * plans
+    ) * slots + n * (d + slots)
 
 
 def test_every_info_is_in_the_page(make, batch) -> None:

@@ -19,7 +19,7 @@ from fleet.engine.tables import tables_of
 from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import ScenarioError
 from fleet.heat.motor import gen3_motors
-from fleet.observation import FIELDS, LONG_S, Layout, Observation
+from fleet.observation import BIDS, FIELDS, LONG_S, Layout, Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 from scenarios.cell_layout import cell_of, near_of
@@ -261,6 +261,8 @@ def reference(world: World, state: State, slots: list[int], key: int, layout: La
             mine[f"fleet_{name}"] = [own[b][name] for b in members]
         mine["fleet_age_s"] = [0.0] * len(members)
         mine["fleet_difficulty"] = least[members]
+        for name in ("duration_s", "peak_c", "p_saturation"):
+            mine[f"fleet_{name}"] = np.array([own[b][name] for b in members if layout.bids])
     return {name: np.array([(shared | each)[name] for each in own], dtype=float) for name in shared | own[0]}
 
 
@@ -273,7 +275,7 @@ def reference_mask(world: World, state: State, slots: list[int], expected: dict[
 
 
 COMPARED = {"temp_c": 1e-4, "housing_c": 1e-4, "ambient_c": 1e-4, "headroom_k": 1e-4, "error_headroom_k": 1e-4,
-            "fleet_headroom_k": 1e-4, "peak_c": 1e-3, "job_peak_c": 1e-3}  # fmt: skip
+            "fleet_headroom_k": 1e-4, "peak_c": 1e-3, "fleet_peak_c": 1e-3, "job_peak_c": 1e-3}  # fmt: skip
 """Absolute tolerances of the fields in °C and K; of others it is 2e-5."""
 
 
@@ -317,6 +319,7 @@ def layouts(draw, arms: int):
         "scaled": draw(st.booleans()),
         "near": None if near is None else tuple(tuple(peers[:near]) for peers in order),
         "ahead_s": draw(st.sampled_from([np.inf, 0.0, 12.3, 40.3])),
+        "bids": draw(st.booleans()),
     }
 
 
@@ -352,7 +355,7 @@ def test_risks_equal_the_reference(small, play, pieces, curve) -> None:
     ]
     jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]
     world, plant = small.shop([jobs], arms=arms, ticks=60)
-    compare_with_reference(play, Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), 3)
+    compare_with_reference(play, Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), 3, bids=True)
 
 
 @pytest.mark.parametrize("near", [None, ((2,), (0,), (1,))])
@@ -361,7 +364,7 @@ def test_messages_that_arrive_at_once_give_what_the_arms_know_of_each_other(smal
     make = small.Shifts(arms=3, jobs=5, ticks=40, crowding=0.3)
     never = Channel(partitions=(Partition(1e8, 2e8, (("arm_0",),)),))
     compare_with_reference(
-        play, make(np.random.SeedSequence(4)), 4, Exchange(("arm_0", "arm_1", "arm_2"), never), near=near
+        play, make(np.random.SeedSequence(4)), 4, Exchange(("arm_0", "arm_1", "arm_2"), never), near=near, bids=True
     )
 
 
@@ -423,7 +426,7 @@ def received(arms: int, slots: int, **changes: np.ndarray) -> PeerView:
         "headroom_k": np.full((arms, arms), 30.0),
         "busy_s": np.zeros((arms, arms)),
         "difficulty": np.full((arms, arms, slots), np.nan),
-        "p_saturation": np.full((arms, arms, slots), np.nan),
+        **{name: np.full((arms, arms, slots, 1), np.nan) for name in ("duration_s", "peak_c", "p_saturation")},
         "age_s": np.zeros((arms, arms)),
     }
     return PeerView(**(base | changes))
@@ -512,6 +515,30 @@ def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
     assert all(np.isfinite(getattr(observed, field.name)).all() for field in FIELDS)
 
 
+def test_bids_are_those_that_were_received() -> None:
+    """A plan with both predictions, one without, no plan, and a slot without a job."""
+    one = np.full((2, 2, 2, 2), np.nan)
+    duration_s, peak_c, p_saturation = one.copy(), one.copy(), one.copy()
+    duration_s[:, 1, 0], peak_c[:, 1, 0, 0], p_saturation[:, 1, 0, 0] = (60.0, 70.0), 55.0, 0.25
+    layout = Layout(2, 2, plans=2, delivered=True, bids=True)
+    view = received(2, 2, duration_s=duration_s, peak_c=peak_c, p_saturation=p_saturation)
+    observed = peers_of(layout, view)
+    assert observed.peer_duration_s[0].tolist() == [[60.0, 70.0, 0.0, 0.0]]
+    assert observed.peer_peak_c[0].tolist() == [[55.0, 0.0, 0.0, 0.0]]
+    assert observed.peer_p_saturation[0].tolist() == [[0.25, 0.5, 0.0, 0.0]]
+
+
+def test_a_layout_without_bids_packs_observations_that_have_them() -> None:
+    rich, plain = Layout(3, 2, plans=2, bids=True), Layout(3, 2, plans=2)
+    low, high = rich.bounds
+    vectors = np.random.default_rng(1).uniform(low, high, (4, rich.size)).astype(np.float32)
+    seen = rich.read(vectors, np.ones((4, rich.actions), np.int8))
+    np.testing.assert_array_equal(rich.pack(seen), vectors)
+    packed = plain.read(plain.pack(seen), seen.action_mask)
+    for name in (field.name for field in FIELDS if field.name not in BIDS):
+        np.testing.assert_array_equal(getattr(packed, name), getattr(seen, name))
+
+
 def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     bench, rack = small.work("bench", 4.0), small.work("rack", 1.0)
     arms = [small.arm(0, [bench, rack]), small.arm(1, [bench], times=small.Times(1.0, 20.0, 4.0))]
@@ -590,7 +617,7 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     assert message.headroom_k.tolist() == [60.0 - 46.0, 60.0 - 53.0]
     assert message.temp_c.tolist() == measured[0].tolist()
     assert message.difficulty[:, 0] == pytest.approx(world.offers.difficulty[0, :, 0, 0])
-    assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0, 0])
+    assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0])
     assert np.isnan(message.difficulty[:, 1:]).all()
     assert np.isnan(message.p_saturation[:, 1:]).all()
 

@@ -114,7 +114,9 @@ def fresh(name: str) -> Policy:
 @pytest.mark.parametrize("name", [name for name, rule in RULES.items() if not rule.plans])
 def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, name) -> None:
     """Each step of a shift at which an arm may choose, converted to quotes and back."""
-    env = parallel_env(small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0, plans_per_job=PLANS), ahead_s=np.inf)
+    env = parallel_env(
+        small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0, plans_per_job=PLANS), ahead_s=np.inf, bids=True
+    )
     env.reset(seed=4)
     simulated, live, compared = fresh(name), fresh(name), 0
     while env.agents:
@@ -208,6 +210,10 @@ def test_quotes_become_observations() -> None:
     assert one.peer_working.tolist() == [0, 0, 1]
     assert two.peer_known.tolist() == [[1, 0], [0, 0], [0, 0]]
     assert two.peer_difficulty.tolist() == [[1.25, -1], [-1, -1], [-1, -1]]
+    assert two.peer_duration_s.tolist() == [[60.0, 55.0, 0, 0], [0, 0, 0, 0], [50.0, 0, 0, 0]]  # one, four, three
+    assert two.peer_peak_c.tolist() == [[55.0, 50.0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+    assert two.peer_p_saturation.tolist() == [[0.25, 0.125, 0, 0], [0, 0, 0, 0], [0.5, 0, 0, 0]]
+    assert one.peer_peak_c[0].tolist() == two.peak_c.tolist()
     assert two.fleet_difficulty.tolist() == [[-1, -1], [1.25, -1], [-1, -1], [-1, -1]]
 
 

@@ -37,8 +37,12 @@ class Broadcast:
     """Names of the open jobs, [slot]; "" for an empty slot, which is not broadcast."""
     difficulty: Array
     """[arm, slot], NaN where the arm has no score or cannot do the job."""
+    duration_s: Array
+    """Time that each plan for the job takes, [arm, slot, plan], NaN where the arm has none."""
+    peak_c: Array
+    """Predicted peak, °C, [arm, slot, plan], NaN where unknown."""
     p_saturation: Array
-    """[arm, slot], NaN where unknown."""
+    """[arm, slot, plan], NaN where unknown."""
     twin: tuple[str, ...]
     """Twin version per arm."""
 
@@ -58,8 +62,10 @@ class PeerView:
     """[receiver, sender], NaN if nothing was received."""
     difficulty: Array
     """[receiver, sender, slot] for the present slots (matched by job name), NaN where not broadcast."""
+    duration_s: Array
+    """[receiver, sender, slot, plan], NaN where not broadcast; likewise the next two."""
+    peak_c: Array
     p_saturation: Array
-    """[receiver, sender, slot], NaN where not broadcast."""
     age_s: Array
     """[receiver, sender]: simulation seconds since that broadcast; inf if nothing was received."""
 
@@ -224,23 +230,29 @@ class Delivery:
         return due_s
 
 
+_OF_ARMS = ("mode", "headroom_k", "busy_s")
+_OF_JOBS = ("difficulty", "duration_s", "peak_c", "p_saturation")
+"""Fields that a broadcast and a view have alike: [arm] and [arm, slot, ...]."""
+
+
 def _view_at_once(broadcast: Broadcast) -> PeerView:
     """The view of every arm that has received this broadcast."""
     arms = len(broadcast.mode)
-    fields = (broadcast.mode, broadcast.headroom_k, broadcast.busy_s, broadcast.difficulty, broadcast.p_saturation)
-    mode, headroom_k, busy_s, difficulty, p_saturation = (np.broadcast_to(f, (arms, *f.shape)) for f in fields)
-    return PeerView(mode, headroom_k, busy_s, difficulty, p_saturation, np.zeros((arms, arms)))
+    sent = {name: getattr(broadcast, name) for name in (*_OF_ARMS, *_OF_JOBS)}
+    return PeerView(
+        **{name: np.broadcast_to(values, (arms, *values.shape)) for name, values in sent.items()},
+        age_s=np.zeros((arms, arms)),
+    )
 
 
 def _view(now: Broadcast, received: Array, sent: dict[int, Broadcast]) -> PeerView:
     """The view of every arm, from the tick of the last broadcast that it has of each arm, [receiver, sender]."""
-    shape, slots = received.shape, len(now.jobs)
+    shape = received.shape
     view = PeerView(
         mode=np.full(shape, UNHEARD),
         headroom_k=np.full(shape, np.nan),
         busy_s=np.full(shape, np.nan),
-        difficulty=np.full((*shape, slots), np.nan),
-        p_saturation=np.full((*shape, slots), np.nan),
+        **{name: np.full((*shape, *getattr(now, name).shape[1:]), np.nan) for name in _OF_JOBS},
         age_s=np.full(shape, np.inf),
     )
     for tick in np.unique(received[received >= 0]).tolist():
@@ -249,11 +261,10 @@ def _view(now: Broadcast, received: Array, sent: dict[int, Broadcast]) -> PeerVi
         columns = {job: column for column, job in enumerate(then.jobs) if job}
         present = [slot for slot, job in enumerate(now.jobs) if job in columns]
         old = [columns[now.jobs[slot]] for slot in present]
-        view.mode[receivers, senders] = then.mode[senders]
-        view.headroom_k[receivers, senders] = then.headroom_k[senders]
-        view.busy_s[receivers, senders] = then.busy_s[senders]
+        for name in _OF_ARMS:
+            getattr(view, name)[receivers, senders] = getattr(then, name)[senders]
         view.age_s[receivers, senders] = now.time_s - then.time_s
         at = receivers[:, None], senders[:, None], present
-        view.difficulty[at] = then.difficulty[senders[:, None], old]
-        view.p_saturation[at] = then.p_saturation[senders[:, None], old]
+        for name in _OF_JOBS:
+            getattr(view, name)[at] = getattr(then, name)[senders[:, None], old]
     return view

@@ -197,31 +197,31 @@ class _ArmPublishers:
 
 def messages_of(broadcast: Broadcast, arms: tuple[str, ...], tick: int) -> list[tuple[State, DifficultyScores]]:
     """The messages of one step, [arm]; empty slots are left out."""
-    slots = [slot for slot, job in enumerate(broadcast.jobs) if job]
-    jobs = tuple(broadcast.jobs[slot] for slot in slots)
-    time_s = float(broadcast.time_s)
-    columns = zip(
-        arms,
-        broadcast.mode.tolist(),
-        broadcast.temp_c.tolist(),
-        broadcast.headroom_k.tolist(),
-        broadcast.busy_s.tolist(),
-        broadcast.twin,
-        _nullable(broadcast.difficulty[:, slots]),
-        _nullable(broadcast.p_saturation[:, slots]),
-        strict=True,
-    )
+    slots, time_s = [slot for slot, job in enumerate(broadcast.jobs) if job], float(broadcast.time_s)
+    jobs, p_saturation = tuple(broadcast.jobs[slot] for slot in slots), broadcast.p_saturation[:, slots]
+    duration_s, peak_c = broadcast.duration_s[:, slots], broadcast.peak_c[:, slots]
+    lacks_peak = np.any(~np.isnan(duration_s) & np.isnan(peak_c), axis=(1, 2)).tolist()
+    difficulty, least_p = _nullable(broadcast.difficulty[:, slots], 4), _nullable(np.fmin.reduce(p_saturation, -1), 3)
+    bid_s, bid_c, bid_p = _nullable(duration_s, 1), _nullable(peak_c, 1), _nullable(p_saturation, 3)
+    mode, temp_c = broadcast.mode.tolist(), broadcast.temp_c.tolist()
+    headroom_k, busy_s = broadcast.headroom_k.tolist(), broadcast.busy_s.tolist()
     return [
         (
-            State(arm, tick, time_s, MODES[mode], tuple(temp_c), headroom_k, busy_s=busy_s),
-            DifficultyScores(arm, tick, time_s, twin, jobs, difficulty, p_saturation),
+            State(arm, tick, time_s, MODES[mode[a]], tuple(temp_c[a]), headroom_k[a], busy_s=busy_s[a]),
+            DifficultyScores(
+                *(arm, tick, time_s, broadcast.twin[a], jobs, difficulty[a], least_p[a]),
+                bid_duration_s=bid_s[a],
+                bid_peak_c=bid_c[a],
+                bid_p_saturation=bid_p[a] if lacks_peak[a] else (),
+            ),
         )
-        for arm, mode, temp_c, headroom_k, busy_s, twin, difficulty, p_saturation in columns
+        for a, arm in enumerate(arms)
     ]
 
 
-def _nullable(values: Array) -> list[tuple[float | None, ...]]:
-    """Rows of an array [arm, job], with None for NaN."""
-    nullable = values.astype(object)
+def _nullable(values: Array, digits: int) -> list[tuple[float | None, ...]]:
+    """Rows of an array [arm, ...], rounded, with None for NaN."""
+    values = values.reshape(len(values), -1)
+    nullable = values.round(digits).astype(object)
     nullable[np.isnan(values)] = None
     return [tuple(row) for row in nullable.tolist()]

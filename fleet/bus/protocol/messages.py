@@ -28,6 +28,7 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=MOST_COUNT)]
 Number = Annotated[float, msgspec.Meta(ge=LEAST, le=MOST)]
 """Any quantity without bounds of its own: no sum or product of a few of them overflows."""
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Duration = Annotated[float, msgspec.Meta(ge=0, le=MOST)]
 Celsius = Annotated[float, msgspec.Meta(ge=-273.15, le=1000)]
 
 
@@ -115,8 +116,12 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
                 raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")
 
 
-class DifficultyScores(FiniteStruct, frozen=True):
-    """Difficulty of the open jobs for an arm, by its twin."""
+class DifficultyScores(FiniteStruct, frozen=True, omit_defaults=True):
+    """Difficulty of the open jobs for an arm, by its twin, and its bids for them.
+
+    A bid is what a peer needs to compute the worth of each plan for the arm: it knows the value of the job, and the
+    headroom of the arm by its `State`. What a worth weighs against heat is up to each policy, so no worth is sent.
+    """
 
     arm: Name
     tick: Count
@@ -132,9 +137,26 @@ class DifficultyScores(FiniteStruct, frozen=True):
     """Probability that a motor passes the warning limit, [job]; null where unknown."""
     peak_c: tuple[Number | None, ...] = ()
     """Predicted temperature of the hottest motor during the job, [job]; null where unknown, empty if all are."""
+    bid_duration_s: tuple[Duration | None, ...] = ()
+    """Bids: time that each plan for each job takes, the plans of the first job first, as many for each job; null where
+    there is none. Empty, like the next one, if the arm shares no bids."""
+    bid_peak_c: tuple[Celsius | None, ...] = ()
+    """Predicted temperature of the hottest motor in each of these plans; null where unknown."""
+    bid_p_saturation: tuple[Share | None, ...] = ()
+    """Probability that a motor passes the warning limit in each of these plans; null where unknown. Empty if the peaks
+    of all plans are known: the probability follows from them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        bids = len(self.bid_duration_s)
+        if bids and (not self.jobs or bids % len(self.jobs)):
+            raise ValueError(
+                f"DifficultyScores.bid_duration_s needs equally many plans for each of {len(self.jobs)} job(s) (got "
+                f"{bids} values)."
+            )
+        for name, least in (("bid_peak_c", bids), ("bid_p_saturation", 0)):
+            if (count := len(getattr(self, name))) not in (bids, least):
+                raise ValueError(f"DifficultyScores.{name} needs one value per plan ({bids}, got {count}).")
         for name in ("difficulty", "p_saturation", "peak_c"):
             values = getattr(self, name)
             if len(values) != len(self.jobs) and (values or name != "peak_c"):

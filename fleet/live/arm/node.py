@@ -40,6 +40,7 @@ from fleet.bus.protocol.auction import (
     JobSpec,
     Lease,
     LeaseRequest,
+    PlanQuote,
     Quote,
     QuoteRequest,
     Receipt,
@@ -57,6 +58,7 @@ from fleet.live.arm.body import Body
 from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
 from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.space import ANYWHERE
+from fleet.offered_plans import PLANS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +110,14 @@ class Publications:
         self._publish_state(state)
 
     def difficulty(self, estimates: tuple[JobEstimate, ...], twin: str, time_s: float) -> None:
-        """Publish how difficult jobs are for the arm, by the plan with the least difficulty."""
+        """Publish how difficult jobs are for the arm, by the plan with the least difficulty, and its bids for them."""
         plans = [estimate.least for estimate in estimates]
+        bids = [
+            next((plan for plan in estimate.plans if plan.plan == number), PlanQuote())
+            for estimate in estimates
+            for number in range(PLANS)
+        ]
+        lacks_peak = any(bid.peak_c is None and bid.duration_s is not None for bid in bids)
         self._publish_difficulty(
             DifficultyScores(
                 arm=self._arm,
@@ -117,9 +125,12 @@ class Publications:
                 time_s=time_s,
                 twin=twin,
                 jobs=tuple(estimate.job for estimate in estimates),
-                difficulty=tuple(plan.difficulty for plan in plans),
-                p_saturation=tuple(plan.p_saturation for plan in plans),
-                peak_c=tuple(plan.peak_c for plan in plans),
+                difficulty=_rounded((plan.difficulty for plan in plans), 4),
+                p_saturation=_rounded((plan.p_saturation for plan in plans), 3),
+                peak_c=_rounded((plan.peak_c for plan in plans), 1),
+                bid_duration_s=_rounded((bid.duration_s for bid in bids), 1),
+                bid_peak_c=_rounded((bid.peak_c for bid in bids), 1),
+                bid_p_saturation=_rounded((bid.p_saturation for bid in bids), 3) if lacks_peak else (),
             )
         )
 
@@ -139,6 +150,10 @@ class Publications:
                 epoch=epoch,
             )
         )
+
+
+def _rounded(values: Iterable[float | None], digits: int) -> tuple[float | None, ...]:
+    return tuple(None if value is None else round(value, digits) for value in values)
 
 
 PLANNING_S, POLL_S = 0.3, 0.05

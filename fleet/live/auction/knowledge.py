@@ -54,7 +54,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     """
     by_arm, limits = {**bidding.full, **bidding.quotes}, fleet.limits
     arms, time_s = fleet.order(by_arm), bidding.time_s
-    layout = Layout(len(arms), len(bidding.jobs), plans=PLANS)
+    layout = Layout(len(arms), len(bidding.jobs), plans=PLANS, bids=True)
     quotes, states = [by_arm.get(arm) for arm in arms], [bidding.states.get(arm) for arm in arms]
     estimates = [{} if quote is None else {offer.job: offer for offer in quote.estimates} for quote in quotes]
     offers = [_plans_of(by_job, bidding) for by_job in estimates]
@@ -97,6 +97,8 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     busy_s = stated(lambda state: state.busy_s)
     ambient_c = np.array([each.ambient_c if each else None for each in states], float)  # None becomes NaN
     temp_c = _per_joint(states, "temp_c", np.repeat(limits.warning_c - headroom_k[:, None], JOINTS, axis=1))
+    peak_c = np.where(scored, np.nan_to_num(table(lambda offer: offer.peak_c)), 0.0)
+    p_saturation = np.where(np.isnan(p_saturation), np.where(feasible, 0.5, 0.0), p_saturation)
     fields = Observation(
         left_s=np.full(len(arms), fleet.horizon_s - time_s),
         working=working | (modes == ""),
@@ -116,8 +118,8 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         station_free=per_job(stations),
         blocked=(feasible & ~free).reshape(len(arms), layout.slots, PLANS)[..., 0],
         difficulty=np.where(known, difficulty, np.where(feasible, -1.0, 0.0)),
-        peak_c=np.where(scored, np.nan_to_num(table(lambda offer: offer.peak_c)), 0.0),
-        p_saturation=np.where(np.isnan(p_saturation), np.where(feasible, 0.5, 0.0), p_saturation),
+        peak_c=peak_c,
+        p_saturation=p_saturation,
         duration_s=duration_s,
         due_in_s=due_s - time_s,
         age_s=time_s - per_job(queued_s),
@@ -131,6 +133,9 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         fleet_busy_s=of_all(busy_s),
         fleet_headroom_k=of_all(headroom_k),
         fleet_difficulty=of_all(least),
+        fleet_duration_s=of_all(duration_s),
+        fleet_peak_c=of_all(peak_c),
+        fleet_p_saturation=of_all(p_saturation),
         peers=layout.peers,
         action_mask=np.zeros(0),
     )
