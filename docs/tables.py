@@ -25,6 +25,7 @@ sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "docs")) if path not in 
 from reference_tables import TABLES as REFERENCE
 
 from agents.learned.evolution import read_log
+from agents.registry import RULES
 from benchmarks.paper.__main__ import study
 from benchmarks.result_tables import (
     FIGURES as ABLATION_FIGURES,
@@ -174,27 +175,44 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
         "references": references_text,
         "leaderboard_questions": partial(by_question, results / "leaderboard"),
         "leaderboard_top": partial(board_top, results / "leaderboard"),
+        "leaderboard_knowledge": partial(knowledge, results / "leaderboard"),
+        "leaderboard_surprises": partial(surprises, results / "leaderboard"),
         **{f"leaderboard_{split}": partial(board_text, results / "leaderboard", split) for split in JUDGED},
     }
 
 
-BOARD = ("", "policy", "predictions", "scope", "mean score", "difference", "heat binds", "it does not", "IQM",
+BOARD = ("", "policy", "scope", "mean score", "difference", "heat binds", "it does not", "true state", "IQM",
          "better in", "faults", "failed", "by", "code")  # fmt: skip
 
 
+def results_of(folder: Path, split: str, source: str) -> list[BoardResult]:
+    """The results on a split with predictions from one source."""
+    return [each for each in read_all(folder, split) if each.card.difficulty == source]
+
+
+def plans(entry: BoardResult) -> bool:
+    """Whether the policy of a result plans in a simulator."""
+    return entry.card.policy in RULES and RULES[entry.card.policy].plans
+
+
 def board_text(folder: Path, split: str) -> str:
-    """The leaderboard of a split: what is best of each scope, the table, and what must be known."""
-    board = board_of(split, read_all(folder, split))
+    """The leaderboard of a split: what is best of each scope, the table of policies, that of planners, and a remark."""
+    board = board_of(split, results_of(folder, split, SOURCE))
     if board is None:
         return f"No results on the split {split}."
-    rows: list[tuple[str, ...]] = []
-    for place, name in enumerate(board.order, start=1):
+    _, exact = scored(folder, split)
+    groups: dict[bool, list[tuple[str, ...]]] = {False: [], True: []}
+    for name in board.order:
         entry, (mean, difference_, stars, *rest) = board.entries[name], score_cells(board.scores, name)
-        card, stars = entry.card, stars.replace("*", "\\*")
-        cells = (title(entry), card.difficulty, card.scope, mean, f"{difference_} {stars}".strip(), *rest)
+        card, stars, place = entry.card, stars.replace("*", "\\*"), str(len(groups[plans(entry)]) + 1)
+        known = f"{exact.score[card.policy].mean():.2f}" if card.policy in exact.score else ""
+        cells = (place, title(entry), card.scope, mean, f"{difference_} {stars}".strip(), *rest[:2], known, *rest[2:])
         more = (f"{mean_of(entry, 'faults'):.2f}", str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
-        rows.append((str(place), *cells, *more))
-    return "\n\n".join([board.summary, table(BOARD, rows), board.remark])
+        groups[plans(entry)].append((*cells, *more))
+    parts = [board.summary, table(BOARD, groups[False])]
+    if groups[True]:
+        parts += ["Policies with a simulator of the cell:", table(BOARD, groups[True])]
+    return "\n\n".join([*parts, board.remark])
 
 
 SHOWN = 8
@@ -202,17 +220,106 @@ SHOWN = 8
 
 
 def board_top(folder: Path) -> str:
-    """The best policies of the test split and the two that all scores refer to, as README shows them."""
-    board = board_of("test", read_all(folder, "test"))
+    """The best policies of the test split without a simulator and the two that all scores refer to, for README."""
+    board = board_of("test", results_of(folder, "test", SOURCE))
     assert board is not None
+    _, exact = scored(folder, "test")
     rows: list[tuple[str, ...]] = []
-    for place, name in enumerate(board.order, start=1):
+    for place, name in enumerate((name for name in board.order if not plans(board.entries[name])), start=1):
         entry, score = board.entries[name], board.scores.policies[name]
         if place <= SHOWN or entry.card.policy in ("wspt", "random"):
             hot, cool = (f"{each.mean:.2f}" if each else "" for each in (score.hot, score.cool))
+            known = f"{exact.score[entry.card.policy].mean():.2f}" if entry.card.policy in exact.score else ""
             cells = (title(entry), entry.card.scope, score.mean.text(), hot, cool, f"{mean_of(entry, 'faults'):.2f}")
-            rows.append((str(place), *cells))
-    return table(("", "policy", "scope", "mean score", "heat binds", "it does not", "faults"), rows)
+            rows.append((str(place), *cells, known))
+    return table(("", "policy", "scope", "mean score", "heat binds", "it does not", "faults", "true state"), rows)
+
+
+KNOWLEDGE = {
+    "blind": "nothing",
+    "torque": "RMS torque over that of cool motion",
+    "trained": "d of the twin alone",
+    "rc-nominal": "thermometers, nominal thermal network",
+    "rc": "thermometers, identified network",
+    "twin": "the same, corrected by measured heat and temperatures",
+    "oracle": "true state",
+}
+"""States of knowledge by source, the least first. The first two with d and P(saturation) have no thermal network."""
+
+
+def known_scores(folder: Path) -> tuple[dict[str, BoardResult], Normalised]:
+    """Results of the best rule on the test split by its source of predictions, and their scores."""
+    found = {each.card.difficulty: each for each in read_all(folder, "test") if each.card.policy == CENTRAL}
+    some = {name: found[name] for name in KNOWLEDGE if name in found}
+    values = normalised(
+        {name: each.study_rows() for name, each in some.items()}, split_references("test"), failed_as_random=True
+    )
+    assert values is not None
+    return some, values
+
+
+def knowledge(folder: Path) -> str:
+    """Scores of one policy by what its arms know, and the share of the gain from nothing to the true state."""
+    found, values = known_scores(folder)
+    lines = {line.name: line for line in manifest("test")}
+    hot = np.array([lines[name].axes.heat != "cool" for name in values.instances])
+    surprised = hot & np.array([lines[name].axes.surprise != "nothing" for name in values.instances])
+    rows: list[tuple[str, ...]] = []
+    for name in found:
+        own = (values, values.only(hot), values.only(surprised))
+        means = [each.interval(each.score[name]).text() for each in own]
+        some = [share_of_gain(each, name) for each in own[1:]]
+        rows.append((KNOWLEDGE[name], f"`{name}`", *means, *some, f"{mean_of(found[name], 'faults'):.2f}"))
+    heads = ("the arms know", "source", "mean score", "heat binds", "and a surprise", "share of the gain")
+    return table((*heads, "with a surprise", "faults"), rows)
+
+
+def share_of_gain(values: Normalised, name: str) -> str:
+    """Share of the gain from `blind` to `oracle` that a source has, with the interval of shares that are not refuted.
+
+    A share r is refuted if the interval of (score − blind) − r (oracle − blind) excludes 0 (Fieller's method).
+    """
+    if name in ("blind", "oracle"):
+        return f"{float(name == 'oracle'):.0f}"
+    gain, whole = (values.score[each] - values.score["blind"] for each in (name, "oracle"))
+
+    def refuted(share: float) -> bool:
+        return values.interval(gain - share * whole).excludes_zero
+
+    best, ends = float(gain.mean() / whole.mean()), list[float]()
+    for direction in (-1.0, 1.0):
+        near, far = best, best + 3.0 * direction
+        for _ in range(30):
+            middle = (near + far) / 2.0
+            near, far = (near, middle) if refuted(middle) else (middle, far)
+        ends.append(near)
+    return f"{best:.2f} [{ends[0]:.2f}, {ends[1]:.2f}]"
+
+
+def surprises(folder: Path) -> str:
+    """Faults and scores where heat binds by what surprises the arms, of the networks with and without corrections."""
+    found, values = known_scores(folder)
+    lines = {line.name: line for line in manifest("test")}
+    hot = np.array([lines[name].axes.heat != "cool" for name in values.instances])
+    kind = np.array([lines[name].axes.surprise for name in values.instances])
+    shown_sources = [name for name in ("rc", "twin", "oracle") if name in found]
+    rows: list[tuple[str, ...]] = []
+    for each in ("nothing", "payload", "friction", "fan", "sensor"):
+        own = values.only(hot & (kind == each))
+        faults = [mean_of(found[name], "faults", own.instances) for name in shown_sources]
+        cells = [f"{own.score[name].mean():.2f}" for name in shown_sources]
+        rows.append(
+            (
+                each,
+                str(len(own.instances)),
+                *(f"{count:.2f}" for count in faults),
+                *cells,
+                shown(own.difference("twin", "rc")),
+            )
+        )
+    names = ("network", "corrected", "true state")
+    heads = (*(f"faults, {name}" for name in names), *(f"score, {name}" for name in names))
+    return table(("surprise", "instances", *heads, "corrected less network"), rows)
 
 
 CENTRAL, ALONE, BLIND = "bid_price", "wsept_local", "wspt"
@@ -247,10 +354,11 @@ def title(entry: BoardResult) -> str:
     return f"`{entry.card.policy}`{more}"
 
 
-def mean_of(entry: BoardResult, figure: str) -> float:
-    """Mean of a figure over the shifts of a result that did not fail."""
-    index = FIGURES.index(figure)
-    return sum(row.figures[index] for row in entry.rows if row.figures) / max(1, len(entry.rows) - entry.failures)
+def mean_of(entry: BoardResult, figure: str, instances: Sequence[str] = ()) -> float:
+    """Mean of a figure over the shifts of a result that did not fail, of some instances or else of all."""
+    index, some = FIGURES.index(figure), set(instances)
+    values = [row.figures[index] for row in entry.rows if row.figures and (not some or row.instance in some)]
+    return sum(values) / max(1, len(values))
 
 
 ABLATED = ("heat_wave", "active_waiting")
@@ -350,8 +458,8 @@ def trainings_table(folder: Path) -> str:
 
 
 def scored(folder: Path, split: str) -> tuple[dict[str, BoardResult], Normalised]:
-    """The results on a split by policy, and their scores."""
-    found = {each.card.policy: each for each in read_all(folder, split) if each.card.difficulty == SOURCE}
+    """The results on a split with exact predictions by policy, and their scores."""
+    found = {each.card.policy: each for each in results_of(folder, split, "oracle")}
     values = normalised(
         {name: each.study_rows() for name, each in found.items()}, split_references(split), failed_as_random=True
     )

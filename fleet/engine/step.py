@@ -311,9 +311,8 @@ def settle(sim: Simulation, terms: Array, e: int, a: int, spent: Spent, crossed:
         if spent.done_s <= cut_s:
             end_job(sim, terms, e, a, spent.done_s)
         arm["progress_s"] += cut_s
-        if sim.excess.shape[2] > 0 and arm["progress_s"] >= t.plans[nonnegative(arm["plan"])]["times_s"][0]:
-            work = t.alike[nonnegative(s.env[e]["fleet"]), nonnegative(arm["kind"])]
-            sim.excess[e, a, nonnegative(work)] = t.plans[nonnegative(arm["plan"])]["excess"]
+        if t.learns and arm["job"] >= 0:
+            keep_excess(sim, e, a)
         if spent.home_s <= cut_s:
             if recording:
                 record_event(events, HOME, e, a, arm["job"], -1, spent.home_s, 0.0)
@@ -328,6 +327,16 @@ def settle(sim: Simulation, terms: Array, e: int, a: int, spent: Spent, crossed:
         recover(sim, e, a, crossed.cool_s)
     if arm["mode"] == WORKING:
         set_phase(t.plans, arm)
+
+
+@jit
+def keep_excess(sim: Simulation, e: int, a: int) -> None:
+    """Keep what an arm measures of its job's heat, once its cycles have begun."""
+    t, arm = sim.tables, sim.state.arms[e, a]
+    plan = t.plans[nonnegative(arm["plan"])]
+    if arm["progress_s"] >= plan["times_s"][0]:
+        work = t.alike[nonnegative(sim.state.env[e]["fleet"]), nonnegative(arm["kind"])]
+        sim.excess[e, a, nonnegative(work)] = plan["excess"]
 
 
 @jit

@@ -17,6 +17,7 @@ from fleet.files import atomic_path
 from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Shift, SuiteScores, normalised, ranked, references_of, scores_of
+from scenarios.evaluate.sources import ALL_SOURCES
 from scenarios.evaluate.study import CARD, Row, RowKey, suite_of
 from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
@@ -49,7 +50,8 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     format: Literal[1]
     policy: Annotated[str, msgspec.Meta(min_length=1, max_length=80, pattern=PLAIN)]
-    difficulty: Literal["twin", "oracle", "blind"]
+    difficulty: Annotated[str, msgspec.Meta(max_length=40)]
+    """Source of the predictions, one of `scenarios.evaluate.sources.ALL_SOURCES`."""
     split: SplitName
     scope: Literal["arm", "central"]
     trainings: Annotated[int, msgspec.Meta(ge=1, le=MOST_TRAININGS)]
@@ -159,6 +161,8 @@ def _problems_of_card(submission: BoardResult) -> Iterator[str]:
             f"its policy '{card.policy}' must be built-in and have no hash, or have another name and one "
             "(bus:NAME has none)"
         )
+    if card.difficulty not in ALL_SOURCES:
+        yield f"its predictions are of no source '{card.difficulty}'"
     if card.manifest != manifest_hash(card.split):
         yield f"its manifest of the split {card.split} is another one (hash {card.manifest})"
     missing = [name for name in NEEDED if not card.versions.get(name)]
@@ -304,9 +308,9 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
     return made
 
 
-BASELINE = "wsept"
-"""Policy that differences refer to, with the predictions of `SOURCE`; without it the last of the board."""
-SOURCE = "oracle"
+BASELINE, SOURCE = "wsept", "twin"
+"""Policy that differences refer to, with the predictions of this source if it has several; without it the last of the
+board."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -388,10 +392,8 @@ def board_of(
     values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
     if values is None:
         return None
-    bases = (
-        name
-        for name, each in entries.items()
-        if (each.card.policy, each.card.difficulty, each.card.policy_hash) == (BASELINE, SOURCE, "")
-    )
-    base = next(bases, min(entries, key=lambda name: values.score[name].mean()))
+    bases = [
+        name for name, each in entries.items() if (each.card.policy, each.card.policy_hash) == (BASELINE, "")
+    ] or [min(entries, key=lambda name: values.score[name].mean())]
+    base = next((name for name in bases if entries[name].card.difficulty == SOURCE), bases[0])
     return Board(split=split, scores=scores_of(values, base), entries=entries, instances=len(manifest(split)))

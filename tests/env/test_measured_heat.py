@@ -8,13 +8,16 @@ import pytest
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.difficulty import KNOWN, Difficulty, Forecast
+from fleet.engine.batch import Engine, RewardWeights, empty_parts
 from fleet.engine.shift import shifts_of
 from fleet.engine.tables import tables_of
 from fleet.env.vector import BatchEnv, Library
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import ThermalModel, gen3_network, temperature_steps, thermal_model
 from fleet.motion import static_drive
+from fleet.observation import Layout
 from fleet.robot import JOINTS
+from fleet.telemetry import WORKING
 
 GAIN_K = 20.0
 
@@ -183,3 +186,36 @@ def test_readings_far_below_the_assumed_temperatures_are_not_believed(small) -> 
             assert peaks(env, obs)[0, 0] == pytest.approx(true_c - 2.0, abs=0.05)
         if tick == 100:  # 10 K too low: 3 K are
             assert peaks(env, obs)[0, 0] == pytest.approx(true_c - 3.0, abs=0.05)
+
+
+def test_compiled_and_plain_loops_agree_also_after_faults(small) -> None:
+    """Random claims of heavy jobs in hot air: arms fault, recover, and go home without a job."""
+    works = [small.work(place, payload) for place in ("bench", "rack") for payload in (small.WARM, small.HOT)]
+    fan = thermal_model(gen3_network(cooling="forced_air"))
+    arms = []
+    for i in range(3):
+        own = small.arm(i, works, model=Continues())
+        harder = {plans[0]: replace(plans[0], cycle=small.phase(10.0, 1.1 * small.torque(work.payload_kg)))
+                  for work, plans in own.plans.items()} if i else {}  # fmt: skip
+        arms.append(replace(own, executed=harder, learns=True, known=(fan, gen3_motors())))
+    jobs = [small.job(f"j{j}", works[j % 4], repetitions=60, release_s=30.0 * j) for j in range(24)]
+    world, _ = small.shop([jobs], arms=arms, ticks=400, slots=6, ambient_c=45.0)
+    tables, drawn = tables_of(world)
+    shift = shifts_of(drawn, [7])[0]
+    layout, one = Layout(3, 6, plans=1), np.zeros(1, int)
+    engines = [Engine(tables, 1, layout, RewardWeights(), jobs=24, compiled=compiled) for compiled in (True, False)]
+    parts = [empty_parts(layout, 1) for _ in engines]
+    for engine, out in zip(engines, parts, strict=True):
+        engine.reset(one, [shift])
+        engine.observe(one, out)
+    rng, lost = np.random.default_rng(3), 0
+    for _ in range(300):
+        actions = np.array([[int(rng.choice(np.flatnonzero(each[:-1]))) for each in engines[0].mask[0]]])
+        for engine, out in zip(engines, parts, strict=True):
+            engine.step(actions, out)
+        for mine, other in zip(*parts, strict=True):
+            assert np.array_equal(mine, other)
+        state = engines[0].state
+        lost += int(((state.job[0] < 0) & (state.plan[0] >= 0) & (state.mode[0] == WORKING)).sum())
+    assert engines[0].state.faults.sum() > 2
+    assert lost  # arms went home without a job
