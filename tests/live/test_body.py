@@ -308,3 +308,21 @@ def test_no_step_is_longer_than_the_limit(small):
     body.set_step(100.0)
     body.advance(20.0)
     assert body.time_s == 20.0
+
+
+def test_a_body_measures_the_heat_of_its_job_once_the_cycles_have_begun(small):
+    arm, job, plan = one_job(small, payload=small.WARM)
+    harder = replace(plan, cycle=small.phase(10.0, np.sqrt(1.3) * small.torque(small.WARM)))
+    found = {}
+    for learns in (True, False):
+        body = body_of(replace(arm, learns=learns, executed={plan: harder}, known=(arm.thermal, arm.motors)), dt_s=1.0)
+        body.start(job, plan, 0)
+        body.allow_cycles(3)
+        found[learns] = []
+        for second in range(1, 36):
+            body.advance(float(second))
+            found[learns].append(body.excess)
+    assert found[False] == [None] * 35
+    assert found[True][:2] == [None] * 2  # the approach takes 3 s
+    assert found[True][3:30] == pytest.approx([0.3] * 27, abs=1e-3)
+    assert found[True][-1] is None  # at home

@@ -7,12 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from fleet.bus.protocol.auction import JobSpec
-from fleet.difficulty import Blind, Difficulty, known_temperatures
+from fleet.difficulty import KNOWN, Blind, Difficulty, Forecast, known_temperatures
 from fleet.errors import InfeasibleJob
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import WINDING, drive_heat, gen3_network, thermal_model
 from fleet.job import Place
-from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
+from fleet.live.arm.estimator import MAX_WORKS, NOT_PLANNED, Estimator, NominalPeaks
 from fleet.motion import drive
 
 PLACES = {"bench": Place(name="bench", position_m=(0.5, 0.0, 0.2))}
@@ -191,3 +191,33 @@ def test_a_job_with_alternatives_is_planned_at_each_and_its_stations_are_those_t
 def test_impossible_alternatives_are_named(alternatives, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         spec(alternatives=alternatives)
+
+
+class Expects:
+    """A peak of 30 °C, and 20 K more with twice the assumed heat."""
+
+    version = "expects"
+
+    def score(self, plan, repetitions):
+        peak = Forecast(np.array([30.0]), np.zeros((1, KNOWN)), gain=np.array([20.0]))
+        return Difficulty(np.full(7, 0.1), peak=peak)
+
+
+def test_a_measured_excess_of_heat_counts_for_all_jobs_with_the_same_works(arm):
+    made, _ = estimator_of(arm, model=Expects())
+    jobs = [spec(name="a"), spec(name="b", repetitions=9), spec(name="heavier", payload_kg=2.0)]
+    for job in jobs:
+        made.prepare(job)
+    assert [each.plans[0].peak_c for each in made.estimate(jobs, KNOWN_C, 0.0)] == pytest.approx([30.0] * 3)
+    made.learn(jobs[0], 0.25)
+    assert [each.plans[0].peak_c for each in made.estimate(jobs, KNOWN_C, 0.0)] == pytest.approx([35.0, 35.0, 30.0])
+    made.learn(spec(name="impossible", places=("nowhere",)), 9.0)
+    assert made.excess_of(spec(name="impossible", places=("nowhere",))) == 0.0
+
+
+def test_of_very_many_works_the_oldest_excess_is_forgotten(arm):
+    made, _ = estimator_of(arm, model=Expects())
+    for number in range(MAX_WORKS + 1):
+        made.learn(spec(payload_kg=number * 4.0 / MAX_WORKS), 0.5)
+    assert made.excess_of(spec(payload_kg=0.0)) == 0.0
+    assert made.excess_of(spec(payload_kg=4.0)) == 0.5

@@ -85,6 +85,11 @@ class Body(Protocol):
         """Cycles of the current job that are done, by any arm."""
         ...
 
+    @property
+    def excess(self) -> float | None:
+        """Heat of the current job's cycles that it measures over that which it expects, less 1; None if unknown."""
+        ...
+
     def last_cycle_in_s(self) -> float:
         """Seconds until the last cycle of the current job could begin; inf without a job."""
         ...
@@ -164,6 +169,10 @@ class ReplayBody:
     def over(self) -> bool:
         """Whether its last sample has passed."""
         return self._row == len(self._log.time_s) - 1
+
+    @property
+    def excess(self) -> float | None:
+        return None
 
     @property
     def housing_c(self) -> np.ndarray:
@@ -315,6 +324,12 @@ class SimulatedBody:
     def cycles(self) -> int:
         assert self._task is not None, "no current job"
         return self._task.before + self._begun(done=True)
+
+    @property
+    def excess(self) -> float | None:
+        if not self._arm.learns or self._plan is None or not self._in_stint or self._progress_s < self._times_s[0]:
+            return None
+        return self._arm.driven(self._plan)[-1]
 
     @property
     def truth(self) -> State:

@@ -113,6 +113,8 @@ class Estimator:
         """Size of the plans of requested works."""
         self._offers: dict[tuple[tuple[Work, ...], int, int], Offers] = {}
         """By works that serve alike, number of repetitions and how many of them are done."""
+        self._excess: dict[tuple[Work, ...], float] = {}
+        """Excess of heat that was measured in works that serve alike, oldest first."""
 
     def plan_ahead(self, works: Iterable[Work]) -> None:
         """Plan some works before they are requested; they are never dropped."""
@@ -174,6 +176,20 @@ class Estimator:
             check_time()
             scored.append(ScoredPlan(plan, self.model.score(plan, _left(repetitions, done))))
         return tuple(scored)
+
+    def learn(self, job: JobSpec, excess: float) -> None:
+        """Correct later estimates of jobs with the same works by a measured excess of heat; see `Forecast.value`."""
+        works = self._works(job)
+        if isinstance(works, NoPlan):
+            return
+        if works not in self._excess and len(self._excess) >= MAX_WORKS:
+            del self._excess[next(iter(self._excess))]
+        self._excess[works] = excess
+
+    def excess_of(self, job: JobSpec) -> float:
+        """Excess of heat that was measured in jobs with the same works; 0 if none was."""
+        works = self._works(job)
+        return 0.0 if isinstance(works, NoPlan) else self._excess.get(works, 0.0)
 
     def job(self, job: JobSpec) -> Job:
         """Return the job with its work.
@@ -241,7 +257,8 @@ class Estimator:
             else JobEstimate(
                 job=job.name,
                 plans=tuple(
-                    _quote(n, times, scored, known_c, next(nominal_c), busy_s) for n, scored in enumerate(plans)
+                    _quote(n, times, scored, known_c, next(nominal_c), busy_s, self.excess_of(job))
+                    for n, scored in enumerate(plans)
                 ),
             )
             for (job, plans), times in zip(offers, left, strict=True)
@@ -297,21 +314,24 @@ def _left(repetitions: int, done: int) -> int:
     return max(1, repetitions - done)
 
 
-def _quote(number: int, left: int, scored: ScoredPlan, known_c: Array, nominal_c: float, busy_s: float) -> PlanQuote:
+def _quote(
+    number: int, left: int, scored: ScoredPlan, known_c: Array, nominal_c: float, busy_s: float, excess: float
+) -> PlanQuote:
     """Return what a plan costs; its peak is that of the arm's model, or else that of a nominal arm.
 
     Args:
         left: Cycles that are not done.
+        excess: As in `Forecast.value`.
     """
     plan, score = scored
-    own_c = None if score is None else score.peak_at(known_c)
+    own_c = None if score is None else score.peak_at(known_c, excess=excess)
     peak_c, hottest_c = nominal_c if own_c is None else own_c, float(known_c[:JOINTS].max())
     finish_s = busy_s + plan.approach.duration_s + left * plan.cycle.duration_s
     return PlanQuote(
         plan=number,
         peak_c=peak_c,
         gained_k=peak_c - hottest_c,
-        p_saturation=None if score is None else score.p_at(known_c),
+        p_saturation=None if score is None else score.p_at(known_c, excess=excess),
         joint_difficulty=None if score is None else tuple(score.per_joint.tolist()),
         difficulty=None if score is None else score.total,
         duration_s=plan.duration_s(left),

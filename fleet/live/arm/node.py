@@ -636,6 +636,8 @@ class ArmNode:
             self._body_award = ""
         if current := self._current:
             at_work = self._body_award == current.award.award and self._body.job
+            if at_work and (excess := self._body.excess) is not None:
+                self._estimator.learn(current.award.job, excess)
             cycles = self._body.cycles if at_work else current.cycles
             self.executor.record_progress(cycles, self._last_cycle_in_s(current) / self.clock.speed)
 
@@ -704,12 +706,12 @@ class ArmNode:
         if current is None or self._body_award != current.award.award:
             return {}
         job, score, left_s = current.award.job, self._scored(current.award).difficulty, self._body.free_in_s()
-        known_c = self._known_c()
+        known_c, excess = self._known_c(), self._estimator.excess_of(job)
         return {
             "job_value": job.value,
             "job_cycles_left": job.repetitions - self._body.cycles,
-            "job_peak_c": None if score is None else score.peak_at(known_c, left_s),
-            "job_p_saturation": None if score is None else score.p_at(known_c, left_s),
+            "job_peak_c": None if score is None else score.peak_at(known_c, left_s, excess),
+            "job_p_saturation": None if score is None else score.p_at(known_c, left_s, excess),
         }
 
     def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
