@@ -25,6 +25,7 @@ sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "docs")) if path not in 
 from reference_tables import TABLES as REFERENCE
 
 from agents.learned.evolution import read_log
+from benchmarks.alarms import stored_table
 from benchmarks.paper.__main__ import study
 from benchmarks.result_tables import (
     FIGURES as ABLATION_FIGURES,
@@ -487,6 +488,7 @@ def tables_of(results: Path) -> Tables:
         "score_sources": lambda: ablation_table(ablated("ablations/sources_{}", results), SCORE_SOURCES),
         "mpc_parts": lambda: ablation_table(ablated("ablations/mpc_{}", results), PARTS_OF_MPC),
         "twin_windows": lambda: ablation_table(ablated("twin_windows/{}", results), WINDOWS),
+        **{which: of(stored_table, which, results / "alarms.jsonl") for which in ("alarms", "alarms_before_faults")},
         **{which: of(paper_table, name, which, results) for name, several in PAPER.items() for which in several},
     }
 
