@@ -26,6 +26,7 @@ from reference_tables import TABLES as REFERENCE
 
 from agents.learned.evolution import read_log
 from agents.registry import RULES
+from benchmarks.alarms import stored_table
 from benchmarks.paper.__main__ import study
 from benchmarks.result_tables import (
     FIGURES as ABLATION_FIGURES,
@@ -595,6 +596,7 @@ def tables_of(results: Path) -> Tables:
         "score_sources": lambda: ablation_table(ablated("ablations/sources_{}", results), SCORE_SOURCES),
         "mpc_parts": lambda: ablation_table(ablated("ablations/mpc_{}", results), PARTS_OF_MPC),
         "twin_windows": lambda: ablation_table(ablated("twin_windows/{}", results), WINDOWS),
+        **{which: of(stored_table, which, results / "alarms.jsonl") for which in ("alarms", "alarms_before_faults")},
         **{which: of(paper_table, name, which, results) for name, several in PAPER.items() for which in several},
     }
 

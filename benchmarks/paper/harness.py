@@ -45,19 +45,20 @@ def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str = 
     return Table(head=tuple(head), rows=tuple(map(tuple, rows)), caption=caption)
 
 
-def mean_by_group(values: Iterable[tuple[str, float]]) -> Interval:
+def mean_by_group(values: Iterable[tuple[str, float]], *, least: float = -np.inf, most: float = np.inf) -> Interval:
     """The interval of the mean over groups that each have some values, such as an arm under several seeds.
 
     The groups are the sample; of a single group, its values are.
 
     Args:
         values: Name of the group, and a value of it.
+        least, most: As in `interval`.
     """
     groups = dict[str, list[float]]()
     for name, value in values:
         groups.setdefault(name, []).append(value)
     several = list(groups.values())
-    return interval([np.mean(each) for each in several] if len(several) > 1 else several[0])
+    return interval([np.mean(each) for each in several] if len(several) > 1 else several[0], least=least, most=most)
 
 
 def no_options(parser: ArgumentParser) -> None:

@@ -86,11 +86,11 @@ class Arm:
             drives = [drive(phase.profile, self.motors) for phase in phases]
             peak = np.abs(np.concatenate([phase.profile[:, 2] for phase in phases])).max(axis=0).astype(float)
             current_sq, friction_w = (np.array([getattr(d, n) for d in drives]) for n in ("current_sq", "friction_w"))
-            excess = self._excess(plan, drives[1]) if self.learns else 0.0
+            excess = self.excess(plan, drives[1]) if self.learns else 0.0
             self._driven[id(plan)] = plan, (times_s, current_sq, friction_w, peak, excess)
         return self._driven[id(plan)][1]
 
-    def _excess(self, plan: Plan, measured: Drive) -> float:
+    def excess(self, plan: Plan, measured: Drive) -> float:
         """Heat of a cycle, by measured currents and joint torques, over that which the arm expects of the plan, less 1.
 
         Both by the copper losses that it knows; of the joint that differs most, over the heat of the most loaded one.

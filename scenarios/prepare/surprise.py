@@ -66,7 +66,7 @@ def _heavier(scenario: Scenario, arm: Arm, loads: Sequence[Surprise]) -> dict[Pl
     model = ArmModel(arm.robot)
     return {
         plan: replace(
-            plan, **{name: _loaded(model, getattr(plan, name), factor) for name in ("approach", "cycle", "retreat")}
+            plan, **{name: loaded(model, getattr(plan, name), factor) for name in ("approach", "cycle", "retreat")}
         )
         for work, factor in factors.items()
         for plan in arm.plans.get(work, ())
@@ -74,8 +74,8 @@ def _heavier(scenario: Scenario, arm: Arm, loads: Sequence[Surprise]) -> dict[Pl
     }
 
 
-def _loaded(model: ArmModel, phase: Phase, factor: float) -> Phase:
-    """A phase with another mass where it carries one."""
+def loaded(model: ArmModel, phase: Phase, factor: float) -> Phase:
+    """A phase with the torques of another mass, `factor` times the declared one, where it carries one."""
     profile = distinct(phase.profile)
     count = len(profile)
     more_kg = (factor - 1.0) * phase.payload_kg[:count].astype(float)
