@@ -52,6 +52,27 @@ def screenshot(page: Path, picture: Path) -> None:
         browser.close()
 
 
+def draw_knowledge(picture: Path) -> None:
+    """Scores of the best rule by what its arms know, where heat binds: from nothing to the true state."""
+    from matplotlib.figure import Figure
+
+    from docs.tables import KNOWLEDGE, known_scores
+
+    found, values = known_scores(ROOT / "docs" / "results" / "leaderboard")
+    some = values if values.hot is None else values.only(values.hot)
+    names = [name for name in KNOWLEDGE if name in found][::-1]
+    scores = [some.interval(some.score[name]) for name in names]
+    figure = Figure(figsize=(7.5, 2.9), layout="constrained")
+    axes = figure.subplots()
+    reach = [[each.mean - each.low for each in scores], [each.high - each.mean for each in scores]]
+    labels = [KNOWLEDGE[name] for name in names]
+    axes.barh(labels, [each.mean for each in scores], xerr=reach, color="#3b7dd8", ecolor="#444444", capsize=3)
+    axes.axvline(0.0, color="black", linewidth=0.8)
+    axes.set(xlabel="normalised score where heat binds (0: random, 1: best known schedule)")
+    axes.grid(axis="x", alpha=0.3)
+    figure.savefig(picture, dpi=130)
+
+
 def main() -> None:
     """Make the pictures; prints the size of each."""
     with TemporaryDirectory() as folder:
@@ -64,6 +85,7 @@ def main() -> None:
         thermofleet("layout", scenario, "--out", str(PICTURES / "library" / f"{scenario}.png"), "--overwrite")
     trainings = sorted((ROOT / "docs" / "results" / "learned").glob("train-pairs-*"))
     draw_curves(trainings, PICTURES / "learning_pairs.png", "normalised score")
+    draw_knowledge(PICTURES / "knowledge.png")
     for picture in sorted(PICTURES.rglob("*.*")):
         print(f"{picture.relative_to(ROOT)}: {picture.stat().st_size / 1e6:.2f} MB")
 

@@ -392,8 +392,8 @@ def board_of(
     values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
     if values is None:
         return None
-    bases = [
-        name for name, each in entries.items() if (each.card.policy, each.card.policy_hash) == (BASELINE, "")
-    ] or [min(entries, key=lambda name: values.score[name].mean())]
+    bases = [name for name, each in entries.items() if (each.card.policy, each.card.policy_hash) == (BASELINE, "")] or [
+        min(entries, key=lambda name: values.score[name].mean())
+    ]
     base = next((name for name in bases if entries[name].card.difficulty == SOURCE), bases[0])
     return Board(split=split, scores=scores_of(values, base), entries=entries, instances=len(manifest(split)))

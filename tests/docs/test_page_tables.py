@@ -16,7 +16,8 @@ import pytest
 from benchmarks.harness import observed_bytes, step_figures
 from benchmarks.paper.cooling import cooling_tables
 from benchmarks.result_tables import difference, efficiency_table, env_table, live_table, steps_table, trainings
-from docs.tables import tables_of
+from docs.tables import share_of_gain, tables_of
+from scenarios.evaluate.scores import Normalised
 from scenarios.json_rows import Rows
 
 
@@ -31,6 +32,24 @@ def test_a_difference_is_bold_if_its_interval_excludes_zero() -> None:
     assert difference(0.5, -1.0, 2.0, 2) == "+0.50 (−1.00 … +2.00)"
     assert difference(0.0, math.nan, math.nan) == "+0.0"
     assert difference(1.0, None, None) == "+1.0"
+
+
+def test_the_share_of_a_gain_has_fiellers_interval() -> None:
+    """Second method: the roots of Fieller's quadratic with Student's t, for instances without cells and no skewness."""
+    blind, whole = np.zeros(40), 2.0 + 0.4 * np.tile([-1.0, 1.0], 20)
+    gain = 1.0 + 0.4 * np.repeat([-1.0, 1.0], 20)
+    names = tuple(f"{n}" for n in range(40))
+    score = {"blind": blind[None], "rc": gain[None], "oracle": whole[None]}
+    found = share_of_gain(Normalised(names, names, score), "rc")
+    t2 = 2.0227**2 / 40  # t of 39 degrees of freedom at .975
+    (a, b), (_, c) = np.cov(gain, whole)
+    p = np.array([2.0**2 - t2 * c, -2.0 * (1.0 * 2.0 - t2 * b), 1.0**2 - t2 * a])
+    low, high = sorted(np.roots(p).tolist())
+    best, ends = found.split(" ", 1)
+    assert best == "0.50"
+    assert json.loads(ends) == pytest.approx([low, high], abs=0.006)
+    assert share_of_gain(Normalised(names, names, score), "oracle") == "1"
+    assert share_of_gain(Normalised(names, names, score), "blind") == "0"
 
 
 def test_an_ablation_has_means_and_differences_to_the_first_source(tmp_path) -> None:
