@@ -166,10 +166,10 @@ def average_excess(sim: Simulation, e: int, mean: Array) -> None:
 
 @jit_inline
 def excess_of(sim: Simulation, e: int, a: int, kind: int) -> Real:
-    """Excess of heat of a kind of job that an arm assumes.
+    """Excess of heat that an arm assumes for a kind of job.
 
-    It is what the arm measured itself, or what its peers did if they tell at once. If its motors are warmer than they
-    should be, so it will be again.
+    It is its own measurement, else the mean of its peers if messages take no time, else 0; scaled by the ratio of the
+    measured to the expected rise of its motors.
     """
     if not sim.tables.learns:
         return _ZERO

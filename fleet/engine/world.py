@@ -48,9 +48,9 @@ class Arm:
     known: tuple[ThermalModel, Motors] | None = None
     """What the arm knows of its own heat, for its estimate of the housings; None: a nominal arm with its cooling."""
     before: "Arm | None" = None
-    """The arm until the shift, if something of it has changed since."""
+    """The arm as prepared, if something of it has changed since."""
     executed: Mapping[Plan, Plan] = field(default_factory=dict)
-    """Plans that need other torques than planned, with these torques."""
+    """Plans with their true torques, where these differ from the planned ones."""
     drift_k_per_s: float = 0.0
     """Drift of its readings of motor temperatures."""
     learns: bool = False

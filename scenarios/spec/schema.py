@@ -243,9 +243,9 @@ _SIZES: dict[SurpriseKind, tuple[float, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Surprise:
-    """Something that has changed since the arms were prepared, and that they are not told.
+    """A change since the arms were prepared that their predictions do not contain.
 
-    payload: the load of some jobs is heavier than declared. friction: the joints of an arm have more friction than when
+    payload: the load of some jobs has another mass than declared. friction: the joints of an arm have more friction than when
     its network was identified. fan: the fan of an arm stops when the shift begins. sensor: the motor temperatures that
     an arm reads drift. The true temperatures still decide about warnings and faults.
     """
@@ -262,7 +262,8 @@ class Surprise:
     def __post_init__(self) -> None:
         subject, other = ("jobs", "arm") if self.kind == "payload" else ("arm", "jobs")
         if not getattr(self, subject) or getattr(self, other):
-            raise ValueError(f"Surprise of kind {self.kind} needs `{subject}` and no `{other}`")
+            given = f"{subject} = '{getattr(self, subject)}', {other} = '{getattr(self, other)}'"
+            raise ValueError(f"Surprise of kind {self.kind} needs `{subject}` and no `{other}` (got {given})")
         check_between(self, *_SIZES[self.kind], "size")
 
 
