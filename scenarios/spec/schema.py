@@ -245,9 +245,9 @@ _SIZES: dict[SurpriseKind, tuple[float, float]] = {
 class Surprise:
     """A change since the arms were prepared that their predictions do not contain.
 
-    payload: the load of some jobs has another mass than declared. friction: the joints of an arm have more friction than when
-    its network was identified. fan: the fan of an arm stops when the shift begins. sensor: the motor temperatures that
-    an arm reads drift. The true temperatures still decide about warnings and faults.
+    payload: the load of some jobs has another mass than declared. friction: the joints of an arm have more friction
+    than when its network was identified. fan: the fan of an arm stops when the shift begins. sensor: the motor
+    temperatures that an arm reads drift. The true temperatures still decide about warnings and faults.
     """
 
     kind: SurpriseKind
