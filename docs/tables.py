@@ -18,6 +18,7 @@ from statistics import median
 from typing import Any  # values of JSON
 
 import numpy as np
+from msgspec.structs import replace
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "docs")) if path not in sys.path]
@@ -54,6 +55,7 @@ from scenarios.evaluate.leaderboard import (
     SOURCE,
     BoardResult,
     board_of,
+    read,
     read_all,
     split_references,
 )
@@ -249,9 +251,19 @@ KNOWLEDGE = {
 
 
 def known_scores(folder: Path) -> tuple[dict[str, BoardResult], Normalised]:
-    """Results of the best rule on the test split by its source of predictions, and their scores."""
-    found = {each.card.difficulty: each for each in read_all(folder, "test") if each.card.policy == CENTRAL}
-    some = {name: found[name] for name in KNOWLEDGE if name in found}
+    """Results of the best rule by its source of predictions, and their scores, in instances that all sources have.
+
+    Args:
+        folder: The leaderboard; beside it is the folder `knowledge` with results on a part of the split.
+    """
+    results = [*read_all(folder, "test"), *map(read, sorted((folder.parent / "knowledge").glob("*.jsonl")))]
+    found = {each.card.difficulty: each for each in results if each.card.policy == CENTRAL}
+    common = set.intersection(*({row.instance for row in each.rows} for each in found.values()))
+    some = {
+        name: replace(found[name], rows=tuple(row for row in found[name].rows if row.instance in common))
+        for name in KNOWLEDGE
+        if name in found
+    }
     values = normalised(
         {name: each.study_rows() for name, each in some.items()}, split_references("test"), failed_as_random=True
     )
@@ -272,7 +284,10 @@ def knowledge(folder: Path) -> str:
         some = [share_of_gain(each, name) for each in own[1:]]
         rows.append((KNOWLEDGE[name], f"`{name}`", *means, *some, f"{mean_of(found[name], 'faults'):.2f}"))
     heads = ("the arms know", "source", "mean score", "heat binds", "and a surprise", "share of the gain")
-    return table((*heads, "with a surprise", "faults"), rows)
+    count = (
+        f"{len(values.instances)} instances in {len(set(values.cells))} cells, {int(surprised.sum())} with a surprise."
+    )
+    return table((*heads, "with a surprise", "faults"), rows) + f"\n\n{count}"
 
 
 def share_of_gain(values: Normalised, name: str) -> str:
