@@ -62,13 +62,13 @@ def draw_knowledge(picture: Path) -> None:
     some = values if values.hot is None else values.only(values.hot)
     names = [name for name in KNOWLEDGE if name in found][::-1]
     scores = [some.interval(some.score[name]) for name in names]
-    figure = Figure(figsize=(7.5, 2.9), layout="constrained")
+    figure = Figure(figsize=(8.0, 2.9), layout="constrained")
     axes = figure.subplots()
     reach = [[each.mean - each.low for each in scores], [each.high - each.mean for each in scores]]
     labels = [KNOWLEDGE[name] for name in names]
     axes.barh(labels, [each.mean for each in scores], xerr=reach, color="#3b7dd8", ecolor="#444444", capsize=3)
     axes.axvline(0.0, color="black", linewidth=0.8)
-    axes.set(xlabel="normalised score where heat binds (0: random, 1: best known schedule)")
+    axes.set(xlabel="normalised score where heat binds")
     axes.grid(axis="x", alpha=0.3)
     figure.savefig(picture, dpi=130)
 

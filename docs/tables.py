@@ -320,8 +320,8 @@ def surprises(folder: Path) -> str:
     kind = np.array([lines[name].axes.surprise for name in values.instances])
     shown_sources = [name for name in ("rc", "twin", "oracle") if name in found]
     rows: list[tuple[str, ...]] = []
-    for each in ("nothing", "payload", "friction", "fan", "sensor"):
-        own = values.only(hot & (kind == each))
+    for each in ("nothing", "payload", "friction", "fan", "sensor", "any of these"):
+        own = values.only(hot & (kind == each if each != "any of these" else kind != "nothing"))
         faults = [mean_of(found[name], "faults", own.instances) for name in shown_sources]
         cells = [f"{own.score[name].mean():.2f}" for name in shown_sources]
         rows.append(

@@ -1,0 +1,33 @@
+"""Store results of the best rule by what its arms know: python -m benchmarks.knowledge FOLDER …
+
+Each folder is of `thermofleet compare` on the instances that `--instances` prints, those of the cells of the test split
+with at most eight arms, since past jobs of all arms are simulated for each source:
+
+    thermofleet compare --suite $(python -m benchmarks.knowledge --instances) --out runs/knowledge \
+        --policies bid_price@blind,bid_price@torque,bid_price@trained,bid_price@rc-nominal,bid_price@rc
+    python -m benchmarks.knowledge runs/knowledge
+"""
+
+import sys
+from pathlib import Path
+
+from scenarios.evaluate.leaderboard import submissions_of, write
+from scenarios.evaluate.store import read_card, read_rows
+from scenarios.suite.splits import cell_of_instance, manifest
+
+OUT = Path(__file__).parents[1] / "docs" / "results" / "knowledge"
+MOST_ARMS = 8
+
+
+def main(given: list[str]) -> None:
+    """Print the instances, or write a file for each source."""
+    if given == ["--instances"]:
+        print(",".join(line.name for line in manifest("test") if cell_of_instance(line).arms <= MOST_ARMS))
+        return
+    for folder in map(Path, given):
+        for each in submissions_of(read_card(folder), read_rows(folder), "thermofleet", ""):
+            print(write(each, OUT))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
