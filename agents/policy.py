@@ -328,7 +328,7 @@ def reads_messages(policy: Policy) -> bool:
     A central policy sees the observations of all arms. A class of scope `arm` declares `reads_messages = False` if it
     reads no field of the fleet.
     """
-    return policy.scope == "arm" and getattr(_kind_of(policy), "reads_messages", True)
+    return getattr(policy, "scope", "central") == "arm" and getattr(_kind_of(policy), "reads_messages", True)
 
 
 def _kind_of(policy: Policy | None) -> Any:

@@ -200,15 +200,15 @@ def plans(entry: BoardResult) -> bool:
 
 def board_text(folder: Path, split: str) -> str:
     """The leaderboard of a split: what is best of each scope, the table of policies, that of planners, and a remark."""
-    board = board_of(split, results_of(folder, split, SOURCE))
+    board = board_of(split, results_of(folder, split, SOURCE) or read_all(folder, split))
     if board is None:
         return f"No results on the split {split}."
-    _, exact = scored(folder, split)
+    exact = scored(folder, split)[1].score if results_of(folder, split, "oracle") else {}
     groups: dict[bool, list[tuple[str, ...]]] = {False: [], True: []}
     for name in board.order:
         entry, (mean, difference_, stars, *rest) = board.entries[name], score_cells(board.scores, name)
         card, stars, place = entry.card, stars.replace("*", "\\*"), str(len(groups[plans(entry)]) + 1)
-        known = f"{exact.score[card.policy].mean():.2f}" if card.policy in exact.score else ""
+        known = f"{exact[card.policy].mean():.2f}" if card.policy in exact else ""
         cells = (place, title(entry), card.scope, mean, f"{difference_} {stars}".strip(), *rest[:2], known, *rest[2:])
         more = (f"{mean_of(entry, 'faults'):.2f}", str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
         groups[plans(entry)].append((*cells, *more))

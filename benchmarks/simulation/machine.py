@@ -77,6 +77,9 @@ class SimulatedEstimator:
     def job(self, job: JobSpec) -> JobSpec:
         return job
 
+    def excess_of(self, job: JobSpec) -> float:
+        return 0.0
+
     def plans(self, job: JobSpec) -> tuple[Any, ...]:
         if job.name not in self._known:
             rng = Random(f"{self._arm} {job.name}")
@@ -111,7 +114,7 @@ class SimulatedArm:
 
     def __init__(self, name: str, deeds: Deeds, time_s: float) -> None:
         self.name, self.time_s, self._deeds = name, time_s, deeds
-        self.housing_c = HOUSING_C
+        self.housing_c, self.excess = HOUSING_C, None
         self._task: JobSpec | None = None
         self._plan: SimulatedPlan | None = None
         self._before = self._allowed = self._todo = 0

@@ -57,6 +57,7 @@ class ShiftSimulator:
         rows: Number of simulations at a time.
         noise_key: Of the sensors, which only policies notice.
         simulator: Makes that of the same shift for a policy that plans.
+        bids: Whether policies see the bids of peers.
         compiled: As in `Engine`.
     """
 
@@ -68,6 +69,7 @@ class ShiftSimulator:
         *,
         noise_key: int = 0,
         simulator: Callable[[], CellSimulator] | None = None,
+        bids: bool = False,
         compiled: bool | None = None,
     ) -> None:
         tables, drawn = tables_of(world)
@@ -75,7 +77,7 @@ class ShiftSimulator:
         self.jobs = int(world.jobs.exists[0].sum())
         self.evaluations = 0
         """Shifts simulated so far."""
-        self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+        self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job, bids=bids)
         self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
         self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled)
         self._parts = empty_parts(self._layout, rows)

@@ -129,7 +129,7 @@ def reference(
     episode, weights = ShiftFactory(fleet)(entropy), weights_of(fleet.scenario)
     world = episode.world
     simulator = partial(simulator_of_shift, fleet, task.seed)
-    rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key, simulator=simulator)
+    rules = ShiftSimulator(world, weights, 1, noise_key=episode.noise_key, simulator=simulator, bids=True)
     # One after the other: side by side, one that wants to be asked in every interval has all of them asked.
     starts = joined([_followed(rules, name, task) for name in policies])
     best = int(starts.reward.argmax())

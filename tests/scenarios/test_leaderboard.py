@@ -95,7 +95,7 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     text = board_text(sent, "test")
     assert f"Highest mean score of scope {scope_of('wsept')} `wsept` (0.75 [" in text
     (first,) = re.findall(r"\| 1 \|.*", text)
-    assert [cell.strip() for cell in first.split("|")][2:5] == ["`wsept`", "oracle", scope_of("wsept")]
+    assert [cell.strip() for cell in first.split("|")][2:4] == ["`wsept`", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text
     assert board_text(sent, "validation") == "No results on the split validation."
     assert run("leaderboard", tmp_path / "absent") == 2
