@@ -5,15 +5,18 @@ Plans, twins, networks and past jobs are those of the arms before. Only the simu
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fleet.arm.model import ArmModel
 from fleet.engine.world import Arm
 from fleet.motion import RATE_HZ, Phase, Plan, distinct
 from scenarios.prepare.arms import hardware_of
 from scenarios.spec.jobs import works_of
 from scenarios.spec.schema import Scenario, Surprise
+
+if TYPE_CHECKING:  # MuJoCo, which an arm whose plans are known does not load
+    from fleet.arm.model import ArmModel
 
 HOUR_S = 3600.0
 
@@ -61,6 +64,8 @@ def _heavier(scenario: Scenario, arm: Arm, loads: Sequence[Surprise]) -> dict[Pl
     """The plans of an arm for jobs with another load than declared, with the torques that they need."""
     if not loads:
         return {}
+    from fleet.arm.model import ArmModel
+
     streams = {stream.name: stream for stream in scenario.jobs}
     factors = {work: each.size for each in loads for work in works_of(scenario, streams[each.jobs])}
     model = ArmModel(arm.robot)
@@ -74,7 +79,7 @@ def _heavier(scenario: Scenario, arm: Arm, loads: Sequence[Surprise]) -> dict[Pl
     }
 
 
-def loaded(model: ArmModel, phase: Phase, factor: float) -> Phase:
+def loaded(model: "ArmModel", phase: Phase, factor: float) -> Phase:
     """A phase with the torques of another mass, `factor` times the declared one, where it carries one."""
     profile = distinct(phase.profile)
     count = len(profile)

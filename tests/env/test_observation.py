@@ -667,14 +667,15 @@ def test_the_peers_are_the_nearest_in_space(name, peers) -> None:
 
 @pytest.mark.ci_slow
 def test_fields_of_the_nearest_peers_equal_those_of_all_peers(plans, play) -> None:
-    options = {"difficulty": "blind", "cache": plans, "horizon_s": 600}
+    options = {"difficulty": "blind", "cache": plans, "horizon_s": 600, "bids": True}
     all_, few = (make_batch("quickstart", 3, seed=5, peers=n, **options) for n in (None, 2))
     single = make_env("quickstart", peers=2, **options)
     all_.reset(), few.reset()
     alone, _ = single.reset(seed=5)
     near = near_of(load("quickstart"), 2)
     assert near is not None
-    assert few.layout.size == all_.layout.size - 2 * (5 + few.layout.slots)
+    of_plans = 3 * (few.layout.actions - 2)
+    assert few.layout.size == all_.layout.size - 2 * (5 + few.layout.slots + of_plans)
     rng = np.random.default_rng(0)
     for _ in range(40):
         whole, part = all_.knowledge(), few.knowledge()

@@ -282,7 +282,7 @@ def test_a_live_policy_observes_what_it_observes_in_simulation(small, error_c, c
         world = replace(world, ambient_c=np.array([[ambient_c(tick * world.dt_s)] * 3 for tick in range(world.ticks)]))
         return Episode(world=world, plant=plant, twins=("scores",) * len(arms), sensors=seed)
 
-    env = parallel_env(episode, ahead_s=np.inf)
+    env = parallel_env(episode, ahead_s=np.inf, bids=True)
     env.reset(seed=0)
     policy = Comparing(env)
     live = LiveFleet(arms=NAMES, limits=limits, horizon_s=env.world.horizon_s)
