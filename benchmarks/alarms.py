@@ -15,6 +15,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from rich.console import Console
@@ -38,13 +39,13 @@ from scenarios.prepare.surprise import loaded
 from scenarios.prepare.twins import train_twins
 from scenarios.progress import quiet
 from scenarios.spec.jobs import draw_jobs
-from scenarios.spec.schema import Scenario
+from scenarios.spec.schema import Scenario, SurpriseKind
 from scenarios.suite.instances import CELLS, Axes, SuiteCell, Surprising, scenario_of, surprises_in
 from scenarios.table import Table
 from twin.baselines import untrained_config
 from twin.thermal.thermal_twin import CalibratedTwin
 from twin.vae.config import TwinConfig
-from twin.vae.measures import TAU, Features
+from twin.vae.measures import TAU, Features, fewest
 from twin.vae.twin import Twin
 
 Array = np.ndarray
@@ -63,7 +64,7 @@ SCALING, LIMIT, CHECK = "scaling", "limit", "check"
 QUIET, SURPRISED = {SCALING: 20, LIMIT: 40, CHECK: 40}, 12
 """Shifts of a cell without surprise by what they are for, and with each kind of surprise."""
 NOTHING: Surprising = "nothing"
-KINDS: tuple[Surprising, ...] = ("payload", "friction", "fan", "sensor")
+KINDS: tuple[Surprising, ...] = get_args(SurpriseKind)
 TEMPERATURE, BY_PLAN = "temperature", " by plan"
 SIGNALS = {
     "d": "d of the measured motion, Σ over joints",
@@ -314,8 +315,7 @@ def threshold(scores: Sequence[float], share: float = FALSE_ALARMS) -> float:
     """
     rank = int(np.ceil((len(scores) + 1) * (1.0 - share) - 1e-9))
     if rank > len(scores):
-        least = int(np.ceil(1.0 / share - 1.0 - 1e-9))
-        raise ValueError(f"A threshold of {share:g} needs at least {least} scores (got {len(scores)}).")
+        raise ValueError(f"A threshold of {share:g} needs at least {fewest(share)} scores (got {len(scores)}).")
     return float(np.sort(scores)[rank - 1])
 
 

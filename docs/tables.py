@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any  # values of JSON
+from typing import Any, get_args  # Any: values of JSON
 
 import numpy as np
 from msgspec.structs import replace
@@ -65,9 +65,9 @@ from scenarios.evaluate.scores import Normalised, SuiteScores, normalised, ranke
 from scenarios.evaluate.statistics import Interval, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
-from scenarios.spec.schema import SPLITS
+from scenarios.spec.schema import SPLITS, SurpriseKind
 from scenarios.suite.instances import CELLS, FAULTS, JUDGED
-from scenarios.suite.splits import cell_of_instance, instance, manifest
+from scenarios.suite.splits import cell_of_instance, heat_binds, instance, manifest
 from scenarios.table import markdown_table as table
 
 Array = np.ndarray
@@ -188,9 +188,23 @@ BOARD = ("", "policy", "scope", "mean score", "difference", "heat binds", "it do
          "better in", "faults", "failed", "by", "code")  # fmt: skip
 
 
-def results_of(folder: Path, split: str, source: str) -> list[BoardResult]:
-    """The results on a split with predictions from one source."""
-    return [each for each in read_all(folder, split) if each.card.difficulty == source]
+def with_source(results: Sequence[BoardResult], source: str) -> list[BoardResult]:
+    """The results with predictions from one source."""
+    return [each for each in results if each.card.difficulty == source]
+
+
+def scores_by_name(found: Mapping[str, BoardResult], split: str) -> Normalised:
+    """Scores of results on a split."""
+    rows = {name: each.study_rows() for name, each in found.items()}
+    values = normalised(rows, split_references(split), failed_as_random=True)
+    assert values is not None
+    return values
+
+
+def true_state(results: Sequence[BoardResult], split: str) -> dict[str, str]:
+    """Mean score with exact predictions by policy, as far as there are results."""
+    found = {each.card.policy: each for each in with_source(results, "oracle")}
+    return {name: f"{score.mean():.2f}" for name, score in scores_by_name(found, split).score.items()} if found else {}
 
 
 def plans(entry: BoardResult) -> bool:
@@ -200,15 +214,16 @@ def plans(entry: BoardResult) -> bool:
 
 def board_text(folder: Path, split: str) -> str:
     """The leaderboard of a split: what is best of each scope, the table of policies, that of planners, and a remark."""
-    board = board_of(split, results_of(folder, split, SOURCE) or read_all(folder, split))
+    results = read_all(folder, split)
+    board = board_of(split, with_source(results, SOURCE) or results)
     if board is None:
         return f"No results on the split {split}."
-    exact = scored(folder, split)[1].score if results_of(folder, split, "oracle") else {}
+    exact = true_state(results, split)
     groups: dict[bool, list[tuple[str, ...]]] = {False: [], True: []}
     for name in board.order:
         entry, (mean, difference_, stars, *rest) = board.entries[name], score_cells(board.scores, name)
         card, stars, place = entry.card, stars.replace("*", "\\*"), str(len(groups[plans(entry)]) + 1)
-        known = f"{exact[card.policy].mean():.2f}" if card.policy in exact else ""
+        known = exact.get(card.policy, "")
         cells = (place, title(entry), card.scope, mean, f"{difference_} {stars}".strip(), *rest[:2], known, *rest[2:])
         more = (f"{mean_of(entry, 'faults'):.2f}", str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
         groups[plans(entry)].append((*cells, *more))
@@ -224,17 +239,16 @@ SHOWN = 8
 
 def board_top(folder: Path) -> str:
     """The best policies of the test split without a simulator and the two that all scores refer to, for README."""
-    board = board_of("test", results_of(folder, "test", SOURCE))
+    results = read_all(folder, "test")
+    board, exact = board_of("test", with_source(results, SOURCE)), true_state(results, "test")
     assert board is not None
-    _, exact = scored(folder, "test")
     rows: list[tuple[str, ...]] = []
     for place, name in enumerate((name for name in board.order if not plans(board.entries[name])), start=1):
         entry, score = board.entries[name], board.scores.policies[name]
         if place <= SHOWN or entry.card.policy in ("wspt", "random"):
             hot, cool = (f"{each.mean:.2f}" if each else "" for each in (score.hot, score.cool))
-            known = f"{exact.score[entry.card.policy].mean():.2f}" if entry.card.policy in exact.score else ""
             cells = (title(entry), entry.card.scope, score.mean.text(), hot, cool, f"{mean_of(entry, 'faults'):.2f}")
-            rows.append((str(place), *cells, known))
+            rows.append((str(place), *cells, exact.get(entry.card.policy, "")))
     return table(("", "policy", "scope", "mean score", "heat binds", "it does not", "faults", "true state"), rows)
 
 
@@ -264,19 +278,20 @@ def known_scores(folder: Path) -> tuple[dict[str, BoardResult], Normalised]:
         for name in KNOWLEDGE
         if name in found
     }
-    values = normalised(
-        {name: each.study_rows() for name, each in some.items()}, split_references("test"), failed_as_random=True
-    )
-    assert values is not None
-    return some, values
+    return some, scores_by_name(some, "test")
+
+
+def surprise_where_heat_binds(values: Normalised) -> Array:
+    """What surprises the arms in each instance of the test split; "" where heat does not bind."""
+    kinds = {line.name: line.axes.surprise for line in manifest("test")}
+    return np.array([kinds[name] if heat_binds(name) else "" for name in values.instances])
 
 
 def knowledge(folder: Path) -> str:
     """Scores of one policy by what its arms know, and the share of the gain from nothing to the true state."""
     found, values = known_scores(folder)
-    lines = {line.name: line for line in manifest("test")}
-    hot = np.array([lines[name].axes.heat != "cool" for name in values.instances])
-    surprised = hot & np.array([lines[name].axes.surprise != "nothing" for name in values.instances])
+    kind = surprise_where_heat_binds(values)
+    hot, surprised = kind != "", ~np.isin(kind, ("", "nothing"))
     rows: list[tuple[str, ...]] = []
     for name in found:
         own = (values, values.only(hot), values.only(surprised))
@@ -315,24 +330,16 @@ def share_of_gain(values: Normalised, name: str) -> str:
 def surprises(folder: Path) -> str:
     """Faults and scores where heat binds by what surprises the arms, of the networks with and without corrections."""
     found, values = known_scores(folder)
-    lines = {line.name: line for line in manifest("test")}
-    hot = np.array([lines[name].axes.heat != "cool" for name in values.instances])
-    kind = np.array([lines[name].axes.surprise for name in values.instances])
+    kind = surprise_where_heat_binds(values)
+    parts = {each: kind == each for each in ("nothing", *get_args(SurpriseKind))}
+    parts["any of these"] = ~np.isin(kind, ("", "nothing"))
     shown_sources = [name for name in ("rc", "twin", "oracle") if name in found]
     rows: list[tuple[str, ...]] = []
-    for each in ("nothing", "payload", "friction", "fan", "sensor", "any of these"):
-        own = values.only(hot & (kind == each if each != "any of these" else kind != "nothing"))
-        faults = [mean_of(found[name], "faults", own.instances) for name in shown_sources]
-        cells = [f"{own.score[name].mean():.2f}" for name in shown_sources]
-        rows.append(
-            (
-                each,
-                str(len(own.instances)),
-                *(f"{count:.2f}" for count in faults),
-                *cells,
-                shown(own.difference("twin", "rc")),
-            )
-        )
+    for name, chosen in parts.items():
+        own = values.only(chosen)
+        faults = [f"{mean_of(found[source], 'faults', own.instances):.2f}" for source in shown_sources]
+        means = [f"{own.score[source].mean():.2f}" for source in shown_sources]
+        rows.append((name, str(len(own.instances)), *faults, *means, shown(own.difference("twin", "rc"))))
     names = ("network", "corrected", "true state")
     heads = (*(f"faults, {name}" for name in names), *(f"score, {name}" for name in names))
     return table(("surprise", "instances", *heads, "corrected less network"), rows)
@@ -475,12 +482,8 @@ def trainings_table(folder: Path) -> str:
 
 def scored(folder: Path, split: str) -> tuple[dict[str, BoardResult], Normalised]:
     """The results on a split with exact predictions by policy, and their scores."""
-    found = {each.card.policy: each for each in results_of(folder, split, "oracle")}
-    values = normalised(
-        {name: each.study_rows() for name, each in found.items()}, split_references(split), failed_as_random=True
-    )
-    assert values is not None
-    return found, values
+    found = {each.card.policy: each for each in with_source(read_all(folder, split), "oracle")}
+    return found, scores_by_name(found, split)
 
 
 def shown(difference: Interval) -> str:

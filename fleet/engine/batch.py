@@ -117,10 +117,10 @@ def reset_rows(
             for k in range(JOINTS):
                 arm["housing_c"][k] = net["start_housing_c"][k] + ambient_offset_k[n]
             arm["peak_c"] = hottest(arm["temp_c"])
-            for work in range(sim.excess.shape[2]):
-                sim.excess[e, a, work] = np.nan
-            sim.warmer[e, a] = 1.0
             if t.learns:
+                sim.warmer[e, a] = 1.0
+                for work in range(sim.excess.shape[2]):
+                    sim.excess[e, a, work] = np.nan
                 for k in range(JOINTS):
                     sim.assumed_c[e, a, k] = arm["temp_c"][k]
                     sim.assumed_c[e, a, JOINTS + k] = arm["housing_c"][k]

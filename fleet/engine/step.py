@@ -223,9 +223,8 @@ def follow_housings(
         load_w: Room for the loads of the housings, [lane].
     """
     for k in range(JOINTS):
-        warmed_w = (_HALF * (begin[k] + end[k]) + drift_k) * law["housing_winding"][k] + law["housing_ambient"][
-            k
-        ] * ambient_c
+        winding_c = _HALF * (begin[k] + end[k]) + drift_k
+        warmed_w = winding_c * law["housing_winding"][k] + law["housing_ambient"][k] * ambient_c
         load_w[k] = warmed_w + (friction_w[k] + (law["housing_idle_w"][k] if powered else _ZERO))
         begin[k] = arm["housing_c"][k]
     for m in range(len(load_w)):  # a number that the compiler does not know, so that it does not unroll

@@ -313,7 +313,7 @@ class ShiftFactory:
 
 
 def with_surprises(fleet: Fleet) -> Fleet:
-    """The fleet in the shifts of its scenario, whose surprises its arms are not told."""
+    """The fleet as it is in the shifts of its scenario, with the scenario's surprises."""
     variants = tuple(with_surprises(each) for each in fleet.variants)
     return replace(fleet, arms=surprised(fleet.scenario, fleet.arms), variants=variants)
 

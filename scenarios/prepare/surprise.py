@@ -5,7 +5,7 @@ Plans, twins, networks and past jobs are those of the arms before. Only the simu
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -46,18 +46,12 @@ def _surprised(scenario: Scenario, arm: Arm) -> Arm:
             spec = replace(spec, wear=spec.wear + surprise.size)
         elif surprise.kind == "fan":
             spec = replace(spec, cooling="still_air")
-    specs = (*scenario.arms[:index], spec, *scenario.arms[index + 1 :])
-    _, motors, thermal = hardware_of(replace(scenario, arms=specs), index)
+    changed: dict[str, Any] = {}  # fields of several types
+    if spec != scenario.arms[index]:
+        specs = (*scenario.arms[:index], spec, *scenario.arms[index + 1 :])
+        _, changed["motors"], changed["thermal"] = hardware_of(replace(scenario, arms=specs), index)
     drift_k_per_s = sum(surprise.size for surprise in own if surprise.kind == "sensor") / HOUR_S
-    changed = spec != scenario.arms[index]
-    return replace(
-        arm,
-        motors=motors if changed else arm.motors,
-        thermal=thermal if changed else arm.thermal,
-        before=arm,
-        executed=heavier,
-        drift_k_per_s=drift_k_per_s,
-    )
+    return replace(arm, before=arm, executed=heavier, drift_k_per_s=drift_k_per_s, **changed)
 
 
 def _heavier(scenario: Scenario, arm: Arm, loads: Sequence[Surprise]) -> dict[Plan, Plan]:

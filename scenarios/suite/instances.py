@@ -40,6 +40,7 @@ from scenarios.spec.schema import (
     SplitName,
     Spread,
     Surprise,
+    SurpriseKind,
     TwinSpec,
 )
 
@@ -261,7 +262,7 @@ Arriving = Literal["waves", "poisson", "trace", "rush"]
 Due = Literal["usual", "tight"]
 Faults = Literal["attended", "unattended", "noisy"]
 Bus = Literal["perfect", "late", "lossy", "ring", "cut"]
-Surprising = Literal["nothing", "payload", "friction", "fan", "sensor"]
+Surprising = Literal["nothing", SurpriseKind]
 
 LIGHT_LOAD = 0.55
 HEAVY_LOAD: dict[Level, float] = {"cool": 0.3, "warm": 0.3, "hot": 0.35, "severe": 0.5}
@@ -315,7 +316,7 @@ class Axes:
 SURPRISE_EVERY = 3
 """In one of three instances something surprises the arms."""
 PAYLOAD_FACTORS, FRICTION_SHARES, DRIFTS_K_PER_H = (1.15, 1.3), (1.5, 3.0), (6.0, 12.0)
-"""Ranges of the sizes of surprises; a sensor reads too much or, three times as often, too little."""
+"""Ranges of the sizes of surprises; a sensor drifts upwards or, three times as often, downwards."""
 READS_LESS = 0.75
 SURPRISED_ARMS = 1 / 3
 """Share of the arms whose friction has grown, or whose sensors drift, at least one."""
@@ -342,7 +343,7 @@ def draw_axes(rng: np.random.Generator, heat: Level, surprises: Sequence[Surpris
 def surprises_in(cell: SuiteCell) -> tuple[Surprising, ...]:
     """Kinds of surprises that a cell can have: without a fan none stops."""
     fans = any(arm.cooling == "forced_air" for arm in layout(cell).arms)
-    return ("payload", "friction", "fan", "sensor") if fans else ("payload", "friction", "sensor")
+    return tuple(kind for kind in get_args(SurpriseKind) if fans or kind != "fan")
 
 
 def _surprises(cell: SuiteCell, kind: Surprising, streams: Sequence[JobStream], seed: int) -> tuple[Surprise, ...]:

@@ -111,9 +111,9 @@ SURPRISES = [
 def test_arms_are_not_told(fleet, surprise) -> None:
     """At the start all of the observation is as without the surprise, and so is the simulator of planners."""
     changed = surprised(fleet, **surprise)
-    (_, plain), (_, told) = shift_of(fleet), shift_of(changed)
+    (_, plain), (_, other) = shift_of(fleet), shift_of(changed)
     for name, values in plain.items():
-        assert np.array_equal(values, told[name]), name
+        assert np.array_equal(values, other[name]), name
     for one, other in zip(as_known(fleet).arms, as_known(changed).arms, strict=True):
         assert one.thermal is other.thermal or np.array_equal(one.thermal.to_ambient, other.thermal.to_ambient)
         assert np.array_equal(one.motors.coulomb_nm, other.motors.coulomb_nm)
@@ -123,9 +123,9 @@ def test_arms_are_not_told(fleet, surprise) -> None:
 
 @pytest.mark.parametrize("surprise", SURPRISES, ids=lambda each: each["kind"])
 def test_the_source_oracle_knows(cell, fleet, surprise) -> None:
-    told = prepare(override(cell, surprises=[surprise]), difficulty="oracle", like=fleet)
+    exact = prepare(override(cell, surprises=[surprise]), difficulty="oracle", like=fleet)
     changed = surprised(fleet, **surprise)
-    for one, other in zip(told.arms, changed.arms, strict=True):
+    for one, other in zip(exact.arms, changed.arms, strict=True):
         assert one.beliefs[0].to_ambient == pytest.approx(other.thermal.to_ambient)
         assert one.beliefs[1].coulomb_nm == pytest.approx(other.motors.coulomb_nm)
         assert set(one.executed) == set(other.executed)
