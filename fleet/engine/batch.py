@@ -12,6 +12,7 @@ import numpy as np
 
 from fleet.engine.claims import set_phase
 from fleet.engine.crossings import hottest
+from fleet.engine.observe import COOLER_K, average_excess, excess_of
 from fleet.engine.state import DONE, RUNNING, WAITING, State
 from fleet.engine.step import (
     BLOCK,
@@ -325,6 +326,18 @@ class Engine:
     def infos(self) -> Array:
         """What had become of each arm after the last step, `INFO` [env, arm]; the next step overwrites it."""
         return self._simulation.infos
+
+    def measured(self, env: int, kinds: Sequence[int]) -> tuple[Array, Array]:
+        """What the arms of a row, which learn, know of their heat by measurement.
+
+        Returns:
+            Excess of heat for some kinds of jobs, [arm, kind], see `fleet.engine.observe.excess_of`; and the lowest
+            temperatures that are believed, °C, [arm, node].
+        """
+        mine, arms = self._simulation, range(self.layout.arms)
+        average_excess(mine, env, mine.room.excess)
+        excess = [[float(excess_of(mine, env, arm, kind)) for kind in kinds] for arm in arms]
+        return np.array(excess), mine.assumed_c[env] - COOLER_K
 
     def reset(self, envs: Array, shifts: Sequence[Shift]) -> None:
         """Put a new shift into each of some rows; `observe` then gives what their arms know."""

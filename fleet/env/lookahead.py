@@ -1,8 +1,9 @@
 """Simulate schedules from the present to the end of a shift, with what the dispatcher of a cell knows.
 
 It has the plans and space of all arms, their current jobs, the jobs in the slots, and of each arm the measured motor
-temperatures, the estimated housings and the identified thermal network. It has no jobs without a slot, no future jobs,
-no future ambient temperature, no sensor errors and no true temperatures.
+temperatures, the estimated housings and the identified thermal network. Arms that learn correct the heat of the plans
+and the temperatures as in their predictions. The simulator has no jobs without a slot, no future jobs, no future
+ambient temperature, no sensor errors and no true temperatures.
 """
 
 from collections.abc import Mapping
@@ -48,11 +49,10 @@ class CellSimulator:
     def __init__(
         self, tables: Tables, arms: int, slots: int, weights: RewardWeights, *, compiled: bool | None = None
     ) -> None:
-        self._ambient_c, self._weights = tables.ambient_c, weights
+        self._ambient_c, self._plans, self._weights = tables.ambient_c, tables.plans, weights
         layout = Layout(arms, slots, plans=tables.work.shape[3])
-        self._engine = Engine(
-            tables._replace(ambient_c=tables.ambient_c.copy()), SIDE_BY_SIDE, layout, weights, compiled=compiled
-        )
+        own = tables._replace(ambient_c=tables.ambient_c.copy(), plans=tables.plans.copy())
+        self._engine = Engine(own, SIDE_BY_SIDE, layout, weights, compiled=compiled)
         self._state: State | None = None
         none = np.zeros((0, 0))
         self._engine.play((none.astype(int), none.astype(int), none, none), np.zeros(0))  # compiles
@@ -60,7 +60,9 @@ class CellSimulator:
     def with_limits(self, warning_c: float, error_c: float) -> "CellSimulator":
         """A simulator of the same cell with other limits of the motors, °C, for a margin."""
         engine = self._engine
-        tables = engine.tables._replace(warning_c=warning_c, error_c=error_c, ambient_c=self._ambient_c)
+        tables = engine.tables._replace(
+            warning_c=warning_c, error_c=error_c, ambient_c=self._ambient_c, plans=self._plans
+        )
         return CellSimulator(tables, engine.layout.arms, engine.layout.slots, self._weights)
 
     @property
@@ -93,6 +95,8 @@ class CellSimulator:
         known.temp_c[0, :, WINDING] = [each.temp_c for each in seen.values()]
         known.temp_c[0, :, HOUSING] = [each.housing_c for each in seen.values()]
         mine, tick = self._engine, int(state.tick[env])
+        if engine.tables.learns:
+            self._correct(engine, env, known)
         mine.tables.work["difficulty"] = engine.tables.work["difficulty"]  # it decides between claims
         mine.tables.ambient_c[:] = self._ambient_c[:, [min(tick, mine.tables.ticks - 1)]]
         mine.reset(np.arange(SIDE_BY_SIDE), shifts_of(known, [0]) * SIDE_BY_SIDE)
@@ -103,6 +107,18 @@ class CellSimulator:
         unknown = ~np.isin(np.arange(count), open_)
         can[:, unknown], stations[unknown] = False, 0
         return Present(tick * self.dt_s, open_, can, stations)
+
+    def _correct(self, engine: Engine, env: int, known: State) -> None:
+        """Let the heat of the plans for known jobs, and the temperatures, be those that the arms measure."""
+        kinds = np.unique(known.kind[0, known.status[0] != GIVEN_UP])
+        excess, least_c = engine.measured(env, kinds.tolist())
+        known.temp_c[0] = np.maximum(known.temp_c[0], least_c)
+        tables = self._engine.tables
+        plans = tables.work["plan"][int(known.fleet[0])][kinds]  # [kind, arm, option]
+        factor = np.broadcast_to(1.0 + excess.T[..., None], plans.shape)
+        has = plans >= 0
+        for name in ("current_sq", "friction_w"):
+            tables.plans[name][plans[has]] = self._plans[name][plans[has]] * factor[has][:, None, None]
 
     def run(self, schedules: Plans, discount: Array) -> Script:
         """Results of at most `rows` schedules from the time of the last `look`.

@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agents.schedules import Schedules
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.batch import Engine, RewardWeights, empty_parts
 from fleet.engine.shift import shifts_of
 from fleet.engine.tables import tables_of
+from fleet.env.lookahead import CellSimulator
 from fleet.env.vector import BatchEnv, Library
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import ThermalModel, gen3_network, temperature_steps, thermal_model
@@ -109,6 +111,36 @@ def test_a_new_shift_begins_without_measurements(small) -> None:
     env.step(np.array([[1, 0, 0]]))
     obs, _ = env.reset()
     assert peaks(env, obs) == pytest.approx(np.full((3, 6), 30.0))
+
+
+def test_a_planner_simulates_the_heat_that_arms_have_measured(small) -> None:
+    """The copper losses of one more job: 1.3 times those of its two cycles and its ways, by I² R."""
+    env = env_of(small)
+    obs, _ = env.reset()
+    obs, *_ = env.step(np.array([[1, 0, 0]]))
+    known = env.layout.read_each(env.agents, obs["shared"][0], obs["own"][0], obs["action_mask"][0])
+    believed, energy_wh = env_of(small, learns=False, copper=1.0), []
+    weights = RewardWeights(finished_value=0.0, tardiness=0.0, above_warning=0.0, faults=0.0, energy=-1.0)
+    simulator = CellSimulator(believed._engine.tables, 3, 6, weights)
+    rest_w = heat_w(small.torque(0.0) / 3.0)
+    cell = env.lookahead(simulator, 0)
+    for job, cycles_s in ((2, 120.0), (1, 120.0)):  # at the bench, where arm 0 has measured, and at the rack
+        cell.look(known)
+        nobody = np.zeros((2, 6), int)
+        order = np.full((2, 6), np.inf)
+        order[1, job] = 0.0
+        schedules = Schedules(nobody + 1, nobody, order, np.zeros((2, 6)))
+        reward = simulator.run(schedules, np.ones(59)).reward
+        energy_wh.append(reward[0] - reward[1] + rest_w * cycles_s / 3600.0)
+    one_wh = heat_w(small.torque(small.WARM)) * 120.0 / 3600.0
+    assert energy_wh == pytest.approx([1.3 * one_wh, one_wh], rel=0.05)  # warm copper, and the rest, differ
+
+
+def heat_w(torque: np.ndarray) -> float:
+    """Copper losses of holding some torques at 25 °C, W."""
+    motors = gen3_motors()
+    load = static_drive(torque, motors)
+    return float((motors.copper_w_per_a2 * load.current_sq).sum())
 
 
 class Continues:
