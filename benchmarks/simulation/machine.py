@@ -114,7 +114,7 @@ class SimulatedArm:
 
     def __init__(self, name: str, deeds: Deeds, time_s: float) -> None:
         self.name, self.time_s, self._deeds = name, time_s, deeds
-        self.housing_c, self.excess = HOUSING_C, None
+        self.housing_c, self.excess, self.expected_c, self.warmer = HOUSING_C, None, None, 1.0
         self._task: JobSpec | None = None
         self._plan: SimulatedPlan | None = None
         self._before = self._allowed = self._todo = 0

@@ -173,12 +173,17 @@ def excess_of(sim: Simulation, e: int, a: int, kind: int) -> Real:
     """
     if not sim.tables.learns:
         return _ZERO
-    warmer = min(max(sim.warmer[e, a], _ONE), MOST_WARMER)
     work = nonnegative(sim.tables.alike[nonnegative(sim.state.env[e]["fleet"]), nonnegative(kind)])
     own, mean = sim.excess[e, a, work], sim.room.excess[work]
     if own != own:
         own = mean if sim.form.alike[0] != 0 and mean == mean else _ZERO
-    return (_ONE + own) * warmer - _ONE
+    return of_warmer(own, sim.warmer[e, a])
+
+
+@jit_inline
+def of_warmer(excess: Real, warmer: Real) -> Real:
+    """Excess of heat, with motors that are warmer than assumed by a factor."""
+    return (_ONE + excess) * min(max(warmer, _ONE), MOST_WARMER) - _ONE
 
 
 @jit_inline

@@ -272,8 +272,14 @@ def compare_temperatures(
     for k in range(JOINTS):
         measured_k += temp_c[k] + drift_k - ambient_c
         assumed_k += end[k] - ambient_c
+    sim.warmer[e, a] = smooth_ratio(sim.warmer[e, a], measured_k, assumed_k, t.dt_s)
+
+
+@jit_inline
+def smooth_ratio(warmer: Real, measured_k: Real, assumed_k: Real, dt_s: float) -> Real:
+    """Smoothed ratio of the measured to the assumed rise of the motors, summed, K, after a step."""
     ratio = measured_k / max(assumed_k, np.float32(JOINTS * LEAST_RISE_K))
-    sim.warmer[e, a] += np.float32(min(t.dt_s / SMOOTH_S, 1.0)) * (ratio - sim.warmer[e, a])
+    return warmer + np.float32(min(dt_s / SMOOTH_S, 1.0)) * (ratio - warmer)
 
 
 @jit

@@ -28,6 +28,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ResetReply, ResetRequest
 from fleet.bus.router import Router
+from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.errors import InfeasibleJob
 from fleet.heat.thermal import WINDING
 from fleet.job import Place
@@ -37,7 +38,7 @@ from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
 from fleet.live.arm.node import PLANNING_S, ArmConfig, ArmNode
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
-from fleet.robot import ThermalLimits
+from fleet.robot import JOINTS, ThermalLimits
 from tests.waiting import PATIENCE_S
 
 LIMITS = ThermalLimits()
@@ -77,7 +78,7 @@ def bus(tmp_path, small):
             links.append(stack.enter_context(BusClient(router.endpoint, "f")))
             return links[-1]
 
-        def arm(plan=None, body=None, speed=SPEED, clock_s=100.0, limits=LIMITS, warm=True, **config):
+        def arm(plan=None, body=None, speed=SPEED, clock_s=100.0, limits=LIMITS, warm=True, model=None, **config):
             content = small.work("bench")
             own = small.arm(0, [content])
             book = stack.enter_context(Journal(tmp_path / "arm_0.jsonl", ArmRecord))
@@ -90,7 +91,7 @@ def bus(tmp_path, small):
             executor = AwardExecutor(
                 "arm_0", book.append, history, nonce=str(history.boot), config=ExecutorConfig(valid_s=3.0)
             )
-            estimator = Estimator(own.model, plan or (lambda work: own.plans[content]), PLACES, NominalPeaks())
+            estimator = Estimator(model or own.model, plan or (lambda work: own.plans[content]), PLACES, NominalPeaks())
             clock = FleetClock(speed, time.monotonic(), clock_s)
             config = ArmConfig(**{"warning_c": 60.0, "rate_hz": 20.0, "boot": history.boot, **config})
             node = ArmNode(line, body, executor, estimator, clock, config)
@@ -331,6 +332,31 @@ def test_planning_delays_state_messages_by_one_plan_at_most(bus):
         return took_s < PLANNING_S + 0.4 and longest_s < 0.8 * PLANNING_S and 0 < len(late) < 20
 
     assert any(in_time(attempt) for attempt in range(5))  # a busy machine delays one attempt, a defect all
+
+
+class Continues:
+    """A peak at the temperature of the hottest motor, and 20 K more with twice the assumed heat."""
+
+    version = "continues"
+
+    def score(self, plan, repetitions):
+        peak = Forecast(np.zeros(JOINTS), np.eye(JOINTS, KNOWN), gain=np.full(JOINTS, 20.0))
+        return Difficulty(np.full(JOINTS, 0.1), peak=peak)
+
+
+class Warmer(SimulatedBody):
+    """At 25 °C by its sensors; it expects 50 °C, and has found its motors half as warm again as expected."""
+
+    expected_c, warmer = np.full(2 * JOINTS, 50.0), 1.5
+
+
+def test_an_arm_quotes_by_the_temperatures_and_the_heat_that_it_expects(bus):
+    """3 K less than it expects, which is more than it reads, and half of the 20 K of twice the heat."""
+    own = bus.small.arm(0, [bus.small.work("bench")])
+    body = Warmer(own, LIMITS, lambda _: 25.0, dt_s=1.0, rng=np.random.default_rng(0), time_s=100.0, warm=False)
+    bus.arm(body=body, model=Continues())
+    quote = bus.ask(bus.link(), "quote", request(), Quote)
+    assert quote.estimates[0].plans[0].peak_c == pytest.approx(47.0 + 10.0)
 
 
 def test_a_replayed_log_is_an_arm_that_takes_no_work(bus):

@@ -7,9 +7,14 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+from fleet.engine.batch import Engine, RewardWeights, empty_parts
+from fleet.engine.observe import COOLER_K
+from fleet.engine.shift import shifts_of
+from fleet.engine.tables import tables_of
 from fleet.env.allocation_v2 import Episode, parallel_env
-from fleet.heat.thermal import WINDING
+from fleet.heat.thermal import WINDING, modal_model
 from fleet.live.arm.body import MAX_STEPS, SimulatedBody
+from fleet.observation import Layout
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED
 
@@ -326,3 +331,47 @@ def test_a_body_measures_the_heat_of_its_job_once_the_cycles_have_begun(small):
     assert found[True][:2] == [None] * 2  # the approach takes 3 s
     assert found[True][3:30] == pytest.approx([0.3] * 27, abs=1e-3)
     assert found[True][-1] is None  # at home
+
+
+@pytest.mark.parametrize("drift_k_per_s", [0.0, 0.01, -0.01])
+def test_a_reading_that_drifts_is_warmer_or_cooler_than_the_arm_expects(small, drift_k_per_s):
+    """At home in a steady state, by 7 d t of the rise of all motors; a rise of less than 1 K each counts as 1 K.
+
+    Smoothed with a time constant of 100 s, the ratio lags by as much.
+    """
+    arm, _, _ = one_job(small)
+    arm = replace(arm, learns=True, known=(arm.thermal, arm.motors), drift_k_per_s=drift_k_per_s)
+    body = body_of(arm, warm=True)
+    first_c, rise_k = body.expected_c, float((body.truth.temp_c[0, 0, WINDING] - 25.0).sum())
+    assert rise_k > 7.0
+    for tick in range(1, 201):
+        body.advance(DT_S * tick)
+    np.testing.assert_allclose(body.expected_c, first_c, atol=0.02)
+    assert body.warmer == pytest.approx(1.0 + 7.0 * drift_k_per_s * (2000.0 - 100.0) / rise_k, abs=0.03)
+
+
+def test_a_body_compares_its_temperatures_as_the_arms_of_a_simulated_shift_do(small):
+    """At work, with a network that cools half as much as the arm believes and motors that are not those it believes."""
+    content = small.work(payload_kg=small.WARM)
+    arm = small.arm(0, [content], times=small.Times(approach=20.0, cycle=30.0, retreat=20.0))
+    half = 0.5 * arm.thermal.to_ambient
+    worse = modal_model(arm.thermal.capacity, arm.thermal.laplacian - np.diag(half), half)
+    hotter = replace(arm.motors, copper_w_per_a2=1.1 * arm.motors.copper_w_per_a2)
+    arm = replace(arm, thermal=worse, motors=hotter, learns=True, known=(arm.thermal, arm.motors))
+    job = small.job("a", content, repetitions=40)
+    world, _ = small.shop([[job]], arms=[arm], dt_s=DT_S, ticks=150, slots=1)
+    tables, drawn = tables_of(world)
+    engine = Engine(tables, 1, Layout(1, 1), RewardWeights())
+    engine.reset(np.arange(1), shifts_of(drawn, [7]))
+    parts = empty_parts(engine.layout, 1)
+    engine.observe(np.arange(1), parts)
+    body = body_of(arm)
+    body.start(job, arm.plans[content][0], 0)
+    body.allow_cycles(40)
+    for tick in range(1, 151):
+        engine.step(np.ones((1, 1), int) if tick == 1 else None, parts)
+        body.advance(DT_S * tick)
+    excess, least_c = engine.measured(0, [0])
+    assert body.warmer > 1.05
+    assert excess[0, 0] == pytest.approx(body.warmer - 1.0, abs=0.01)
+    np.testing.assert_allclose(body.expected_c, least_c[0] + COOLER_K, atol=0.2)

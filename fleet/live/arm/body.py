@@ -22,11 +22,11 @@ from fleet.difficulty import Blind
 from fleet.engine.profile_plant import ProfilePlant, telemetry_of
 from fleet.engine.shift import StepRecord, initial, step
 from fleet.engine.state import DONE, State, World
-from fleet.engine.step import ROUNDING_S
+from fleet.engine.step import ROUNDING_S, smooth_ratio
 from fleet.engine.world import Arm, build_world
 from fleet.events import Event
 from fleet.heat.motor import current
-from fleet.heat.thermal import HOUSING, WINDING, HousingObserver, housing_observer
+from fleet.heat.thermal import HOUSING, WINDING, HousingObserver, ThermalModel, housing_observer
 from fleet.job import Job
 from fleet.motion import Plan
 from fleet.robot import ThermalLimits
@@ -88,6 +88,16 @@ class Body(Protocol):
     @property
     def excess(self) -> float | None:
         """Heat of the current job's cycles that it measures over that which it expects, less 1; None if unknown."""
+        ...
+
+    @property
+    def expected_c(self) -> Array | None:
+        """Temperatures that it expects of the heat that it measures, °C, [node]; None if unknown."""
+        ...
+
+    @property
+    def warmer(self) -> float:
+        """Measured rise of its motors above the air over the expected one, smoothed; 1 if unknown."""
         ...
 
     def last_cycle_in_s(self) -> float:
@@ -180,7 +190,7 @@ class ReplayBody:
 
     # It takes no jobs.
 
-    job, is_free, cycles, away = "", False, 0, None
+    job, is_free, cycles, away, expected_c, warmer = "", False, 0, None, None, 1.0
 
     def last_cycle_in_s(self) -> float:
         return np.inf
@@ -249,6 +259,31 @@ _CARRIED = (
 
 
 @dataclass(eq=False)
+class ExpectedHeat:
+    """What an arm expects of its temperatures by the heat that it measures, as the arms of a simulated shift.
+
+    See `fleet.engine.step.compare_temperatures`.
+    """
+
+    thermal: ThermalModel
+    """Its network, as identified."""
+    temp_c: Array
+    """[node]."""
+    warmer: float = 1.0
+
+    def step(self, heat_w: Array, dt_s: float, ambient_c: float, measured_c: Array) -> None:
+        """Go on by a step.
+
+        Args:
+            heat_w: [node].
+            measured_c: At its end, [joint].
+        """
+        self.temp_c = self.thermal.step(self.temp_c, heat_w, ambient_c, dt_s)
+        measured_k, expected_k = (float((each - ambient_c).sum()) for each in (measured_c, self.temp_c[WINDING]))
+        self.warmer = float(smooth_ratio(self.warmer, measured_k, expected_k, dt_s))
+
+
+@dataclass(eq=False)
 class _Current:
     """The current job."""
 
@@ -297,6 +332,8 @@ class SimulatedBody:
         self._world, self._plant = self._build_world(None, warm=warm)
         self._state = initial(self._world)
         self._last: tuple[World, StepRecord] | None = None
+        start_c = np.concatenate([self._state.temp_c[0, 0, WINDING], self._state.housing_c[0, 0]])
+        self._expected = ExpectedHeat(arm.beliefs[0], start_c) if arm.learns else None
 
     # Properties
 
@@ -330,6 +367,14 @@ class SimulatedBody:
         if not self._arm.learns or self._plan is None or not self._in_stint or self._progress_s < self._times_s[0]:
             return None
         return self._arm.driven(self._plan)[-1]
+
+    @property
+    def expected_c(self) -> Array | None:
+        return None if self._expected is None else self._expected.temp_c
+
+    @property
+    def warmer(self) -> float:
+        return 1.0 if self._expected is None else self._expected.warmer
 
     @property
     def truth(self) -> State:
@@ -435,8 +480,17 @@ class SimulatedBody:
         leaves = task is not None and self._prepare_stint(task)
         done = step(self._world, self._state, np.array([[int(leaves)]]), self._plant, log, compiled=False)
         self._last, self._state = (self._world, done.record), done.state
+        if self._expected is not None:
+            self._compare(self._expected, done.record, ambient_c)
         events = [replace(e, time_s=e.time_s + shift_s) for e in log if e.kind in _REPORTED]
         return events if task is None else events + self._job_events(task, int(done.record.todo[0, 0]), log, shift_s)
+
+    def _compare(self, expected: ExpectedHeat, record: StepRecord, ambient_c: float) -> None:
+        """Compare temperatures with those expected of the heat in a step, by currents and the copper that it knows."""
+        heat_w, known = record.heat_w[0, 0].copy(), self._arm.beliefs[1]
+        heat_w[WINDING] *= known.copper_w_per_a2 / self._arm.motors.copper_w_per_a2
+        drift_k = self._arm.drift_k_per_s * self.time_s
+        expected.step(heat_w, self._dt_s, ambient_c, self._state.temp_c[0, 0, WINDING] + drift_k)
 
     def _prepare_stint(self, task: _Current) -> bool:
         """Apply the allowed cycles to the next step; return whether the arm leaves home in it."""
