@@ -12,6 +12,7 @@ MODULES = {
     "sweep": "sweep:SWEEP",
     "parsimony": "sweep:PARSIMONY",
     "reliability": "reliability:RELIABILITY",
+    "surprises": "reliability:SURPRISES",
     "questions": "real_logs:QUESTIONS_OF_LOGS",
     "identification": "real_logs:IDENTIFICATION",
     "transfer": "transfer:TRANSFER",

@@ -1,9 +1,11 @@
-"""P(saturation) and predicted peaks at the awards of simulated shifts, compared with the outcomes: `reliability`."""
+"""P(saturation) and predicted peaks at the awards of simulated shifts, compared with the outcomes: `reliability` of
+one scenario, and `surprises` in the suite, where something is not as the arms assume."""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
+from itertools import product
 
 import numpy as np
 from sklearn.metrics import brier_score_loss, roc_auc_score
@@ -13,6 +15,8 @@ from benchmarks.paper.harness import (
     Experiment,
     Unit,
     content_key,
+    matching,
+    mean_by_group,
     names,
     number,
     scenarios_of,
@@ -24,14 +28,16 @@ from benchmarks.paper.harness import (
 from fleet.difficulty import SETTLING_S
 from fleet.engine.shift import StepRecord
 from fleet.events import Event
+from fleet.files import cache_folder
 from fleet.heat.thermal import WINDING
-from scenarios.evaluate.sources import drawn
+from scenarios.evaluate.sources import Fleets, drawn
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.parse import choose
 from scenarios.spec.schema import Scenario
+from scenarios.suite.splits import cell_name, cell_of_instance, heat_binds, instance, manifest
 from scenarios.table import Table
 
 Array = np.ndarray
@@ -239,4 +245,66 @@ RELIABILITY = Experiment(
     options=reliability_options,
     units=reliability_units,
     tables=reliability_tables,
+)
+
+
+SOURCES = ("torque", "trained", "rc", "twin", "oracle")
+MOST_ARMS = 6
+RULE = "bid_price"
+
+
+def surprise_rows(names_of: Mapping[str, str], source: str, keys: Collection[str]) -> Iterator[tuple[str, Row]]:
+    """The awards of instances with predictions from one source.
+
+    Args:
+        names_of: Instances by their keys.
+    """
+    fleets, folder = Fleets(), cache_folder()
+    for key in keys:
+        one = instance(names_of[key])
+        awards = awards_of_shift(fleets.of(one.scenario, source, RISK, folder), RULE, one.seed)
+        p, passed = awards.p.round(4), awards.passed.astype(int)
+        kind = _LINES[one.name].axes.surprise
+        yield key, {"source": source, "instance": one.name, "surprise": kind, "p": p, "passed": passed}
+
+
+_LINES = {line.name: line for line in manifest("test")}
+
+
+def surprise_units(given: Namespace) -> list[Unit]:
+    """A unit for each source and cell of the test split with at most `MOST_ARMS`, where heat binds."""
+    chosen = [name for name in _LINES if heat_binds(name) and cell_of_instance(_LINES[name]).arms <= MOST_ARMS]
+    units: list[Unit] = []
+    for cell, source in product(dict.fromkeys(map(cell_name, chosen)), SOURCES):
+        wanted = {f"{source}/{name}": name for name in chosen if cell_name(name) == cell}
+        units.append(Unit(tuple(wanted), partial(surprise_rows, wanted, source)))
+    return units
+
+
+def surprise_tables(rows: Sequence[Row]) -> dict[str, Table]:
+    """Accuracy of P by source, in instances with and without a surprise."""
+    lines: list[tuple[str, ...]] = []
+    for source, surprised in product(SOURCES, (False, True)):
+        own = [row for row in matching(rows, source=source) if (row["surprise"] != "nothing") == surprised]
+        own = [row for row in own if row["p"]]
+        p, passed = (np.concatenate([row[name] for row in own]) for name in ("p", "passed"))
+        brier = mean_by_group(
+            (
+                (cell_name(row["instance"]), float(np.square(np.subtract(row["p"], row["passed"])).mean()))
+                for row in own
+            ),
+            least=0.0,
+            most=1.0,
+        )
+        shares = (f"{passed.mean():.3f}", f"{p.mean():.3f}", f"{calibration_error(p, passed):.3f}", brier.text(3))
+        lines.append((source, "yes" if surprised else "no", str(len(own)), str(len(p)), *shares))
+    heads = ("predictions", "surprise", "instances", "awards", "passed", "mean P", "ECE", "Brier")
+    return {"surprises": table_of(heads, lines)}
+
+
+SURPRISES = Experiment(
+    help="P(saturation) at awards of `bid_price` in instances of the test split where heat binds, and the outcomes.\n\n"
+    "A quarter of an hour, once the twins are prepared.",
+    units=surprise_units,
+    tables=surprise_tables,
 )
