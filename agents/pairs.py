@@ -1,184 +1,126 @@
-"""A learned score of pairs of arm and option: `wsept` with learned weights, matched as `wsept` matches.
+"""Learned corrections of `bid_price`: of its prices, and of the gain of each pair of arm and option.
 
-score = rate · exp(f) + g · mean rate, where `rate` is the expected worth per time with learned prices (`Worth`), and f
-and g are weighted sums of the pair's numbers. All parameters are one vector; zeros give `wsept` without due dates and
-with the deviation `PEAK_SD_K`.
+gain' = gain · exp(f) + g · mean rate, where f and g are weighted sums of the pair's numbers, and the gain follows from
+worths and prices with learned parameters (`Prices`). All parameters are one vector; zeros give `bid_price`.
 
 Numbers of one option come from one arm's observation; numbers of the set (alternatives of the job, other jobs of the
-arm, arms that are home soon) come from the observations of all arms. They do not depend on the order or number of arms
-and slots.
+arm, peers) come from the observations of all arms. They do not depend on the order or number of arms and slots.
 """
 
 import json
-from functools import cache
-from importlib import resources
-from importlib.resources.abc import Traversable
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.heat import Wsept
-from agents.policy import Local, plans_of, without_empty
-from agents.rules import CentralRule, Matched
+from agents.heat import Wsept, error_of, warning_of
+from agents.policy import per_option, plans_of
+from agents.prices import BidPrice, Bids, Weights
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Observation
 
 Array = np.ndarray
 
-PAIR_FEATURES, FILLS = 28, 26
-"""Numbers of a pair; the one of them that is 1 for a job that ends just before the shift does."""
-SOON_S = 180.0
-"""Time until home of arms whose claim a job might wait for."""
+PAIR_FEATURES = 26
+"""Numbers of a pair."""
 MOST = 4.0
 """Bound of every number of a pair."""
-PEAK_SD_K = 2.5
-"""Standard deviation of true peaks around predicted ones, if `Worth.spread` is 0."""
 
 
-class _Trained(Wsept):
-    """`wsept` with the deviation of true peaks that trainings begin with."""
+class Prices(NamedTuple):
+    """Learned parameters of worths and prices, [env] each or one; 0 changes nothing."""
 
-    peak_sd_k = PEAK_SD_K
-
-
-class Worth(NamedTuple):
-    """Learned parameters of the worth per time, [env] each."""
-
-    margin: Array
+    margin: Any
     """Predicted peaks may be this much higher, in units of 10 K."""
-    spread: Array
+    spread: Any
     """Logarithm of the factor on the deviation of true peaks."""
-    fault: Array
+    fault: Any
     """Logarithm of the factor on the price of a fault."""
-    minute: Array
+    minute: Any
     """Logarithm of the factor on the price of a minute above the warning limit."""
-    tardiness: Array
-    """Factor on the price of tardiness."""
-    end: Array
-    """Share of the value that a claim loses if it cannot end before the shift does."""
-    overhead: Array
-    """Time of every job besides its duration, in units of 2 min."""
+    time: Any
+    """Logarithm of the factor on the price of an arm's time."""
+    most: Any
+    """Logarithm of the factor on the highest price."""
 
 
-Places = tuple[Array, Array, Array]
-"""Env, arm and option of pairs, int [pair] each."""
+PARAMETERS = len(Prices._fields) + 2 * PAIR_FEATURES
+"""Length of the vector of parameters."""
 
 
-class Pairs(NamedTuple):
-    """The legal pairs of an instant, in the order of their envs."""
-
-    at: Places
-    rate: Array
-    """Worth per second, [pair]."""
-    scale: Array
-    """Mean size of the rates in the env of a pair, [pair]."""
-    features: Array
-    """[pair, PAIR_FEATURES]."""
-
-
-def worth_per_second(seen: Observation, at: Places, learned: Worth) -> Array:
-    """Expected worth per second of some pairs, [pair].
+def features_of(seen: Observation, bids: Bids, cost: Array) -> Array:
+    """Numbers of all pairs of arm and option, float [env, arm, option, PAIR_FEATURES]; 0 for what an arm cannot do.
 
     Args:
         seen: Observations [env, arm].
-        at: Env, arm and option of each pair.
+        bids, cost: Of every option, as of `agents.prices.gain_of`.
     """
-    env, arm, option = at
-    value, duration_s = seen.value[env, arm, option // plans_of(seen)], seen.duration_s[at].astype(float)
-    hottest_c = seen.temp_c.max(axis=-1)[env, arm]
-    warning_c = seen.headroom_k[env, arm] + hottest_c
-    peak_c = _Trained.predicted_peak_c(seen.peak_c[at], seen.p_saturation[at], warning_c)
-    error_c = seen.error_headroom_k[env, arm] + hottest_c + 10.0 * learned.margin[env]
-    ends = _step((seen.left_s[env, arm] - duration_s) / 20.0)
-    value_left = value * (1.0 - np.clip(learned.end[env], 0.0, 1.0) * (1.0 - ends))
-    factors = [np.exp(each[env]) for each in (learned.spread, learned.fault, learned.minute)]
-    worth = _Trained.worth_of(value_left, duration_s, peak_c, hottest_c, warning_c, error_c, factors)
-    late = Wsept.tardiness_price * value * np.maximum(-seen.slack_s[at], 0.0) / 60.0
-    duration_s = duration_s + 120.0 * np.maximum(learned.overhead[env], -0.2)
-    return (worth - learned.tardiness[env] * late) / np.maximum(duration_s, 1.0)
+    plans, can = plans_of(seen), bids.worth > 0
+    rate, scale = rates_of(bids)
+    own = np.where(can, rate / scale, -MOST)
+    by_job = own.reshape(*own.shape[:2], -1, plans)
+    best = by_job.max(axis=-1)
 
+    def of_job(values: Array) -> Array:
+        return np.broadcast_to(values, best.shape).repeat(plans, axis=-1)
 
-def pairs_of(seen: Observation, learned: Worth) -> Pairs:
-    """The legal pairs of arms and options; arguments as of `worth_per_second`."""
-    legal = seen.action_mask[..., 1:-1] > 0
-    env, arm, option = np.nonzero(legal)
-    at = env, arm, option
-    rate = worth_per_second(seen, at, learned)
-    count = np.maximum(np.bincount(env, minlength=len(legal)), 1)
-    scale = np.maximum(np.bincount(env, np.abs(rate), len(legal)) / count, 1e-6)
-    return Pairs(at, rate, scale[env], _features(seen, at, learned, rate, scale))
-
-
-def _features(seen: Observation, at: Places, learned: Worth, rate: Array, scale: Array) -> Array:
-    env, arm, option = at
-    plans = plans_of(seen)
-    envs, arms, options = seen.duration_s.shape
-    slots, slot = seen.offered.shape[-1], option // plans
-    duration_s, slack_s, left_s = np.maximum(seen.duration_s[at], 1.0), seen.slack_s[at], seen.left_s[env, arm]
-    value = seen.value[env, arm, slot]
-    hottest_c = seen.temp_c.max(axis=-1)[env, arm]
-    warning_c = seen.headroom_k[env, arm] + hottest_c
-    peak_c = np.where(seen.peak_c[at] > 0, seen.peak_c[at], hottest_c)
-    relative = np.full((envs, arms, options), -MOST)
-    relative[at] = own = rate / scale[env]
-    best = relative.reshape(envs, arms, slots, plans).max(axis=-1)
-    soonest = _best_soon(seen, learned, scale)
-    can = (seen.feasible > 0).reshape(envs, arms, slots, plans).any(axis=-1)
-    waiting_s = np.maximum(slack_s + duration_s, 0.0)
+    duration_s, hottest_c = bids.duration_s, seen.temp_c.max(axis=-1)[..., None]
+    warning_c, left_s = warning_of(seen)[..., None], seen.left_s[..., None]
+    peak_c = np.where(seen.peak_c > 0, seen.peak_c, hottest_c)
+    waiting_s = np.maximum(per_option(seen, seen.due_in_s), 0.0)
+    slack_s, value = seen.slack_s, per_option(seen, seen.value)
+    able = can.reshape(*can.shape[:2], -1, plans).any(axis=-1)
     offered, free = seen.offered[:, 0].sum(axis=-1), seen.idle.sum(axis=1)
-    mean_value = np.maximum((seen.value[:, 0] * seen.offered[:, 0]).sum(axis=-1) / np.maximum(offered, 1.0), 1e-6)
-    fastest_s = np.full((envs, slots), np.inf)
-    np.minimum.at(fastest_s, (env, slot), duration_s)
-    mean_s = np.bincount(env, duration_s, envs) / np.maximum(np.bincount(env, minlength=envs), 1)
+    count = np.maximum(can.sum(axis=(1, 2), keepdims=True), 1)
+    mean_value = np.where(can, value, 0.0).sum(axis=(1, 2), keepdims=True) / count
+    fastest_s = np.where(can, duration_s, np.inf).reshape(*can.shape[:2], -1, plans).min(axis=(1, 3))[:, None]
+    others = np.maximum(able.sum(axis=1, keepdims=True) - able, 1)
+    positive = np.where(able, best, 0.0)
+    mean_of_others = (positive.sum(axis=1, keepdims=True) - positive) / others
     columns = (
-        seen.expires[env, arm, slot] * np.exp(-waiting_s / 300.0),
+        per_option(seen, seen.expires) * np.exp(-waiting_s / 300.0),
         np.exp(-np.maximum(slack_s, 0.0) / 600.0),
         np.tanh(slack_s / 1800.0),
-        np.maximum(slack_s, 0.0) / (2.0 * mean_s[env]),
         _step(slack_s / 60.0),
-        np.log1p(seen.age_s[env, arm, slot] / 60.0) / 3.0,
+        np.log1p(per_option(seen, seen.age_s) / 60.0) / 3.0,
         (peak_c - warning_c) / 10.0,
         (hottest_c - warning_c) / 10.0,
         (peak_c - hottest_c) / 10.0,
         np.log(duration_s / 240.0),
-        np.log(np.maximum(value, 1e-6) / mean_value[env]),
-        seen.payload_kg[env, arm, slot] / 4.0,
-        np.maximum(seen.difficulty[at], 0.0),
-        np.log(duration_s / fastest_s[env, slot]),
-        own - _best_of_others(best, axis=1)[env, arm, slot],
-        own - _best_of_others(best, axis=2)[env, arm, slot],
-        own - soonest[env, slot],
-        can.mean(axis=1)[env, slot],
-        np.log1p(can.sum(axis=-1))[env, arm] / 3.0,
-        np.log((offered + 1.0) / (free + 1.0))[env],
-        (free / arms)[env],
+        np.log(np.maximum(value, 1e-6) / np.maximum(mean_value, 1e-6)),
+        per_option(seen, seen.payload_kg) / 4.0,
+        np.maximum(seen.difficulty, 0.0),
+        np.log(duration_s / of_job(np.where(np.isfinite(fastest_s), fastest_s, 1.0))),
+        own - of_job(_best_of_others(best, axis=1)),
+        own - of_job(_best_of_others(best, axis=2)),
+        own - of_job(mean_of_others),
+        of_job(able.mean(axis=1, keepdims=True)),
+        np.log1p(able.sum(axis=-1, keepdims=True)) / 3.0,
+        np.log((offered + 1.0) / (free + 1.0))[:, None, None],
+        (free / can.shape[1])[:, None, None],
         np.exp(-left_s / 900.0),
         duration_s / np.maximum(left_s, 60.0),
-        option % plans > 0,
-        seen.returns[env, arm, slot],
-        (seen.headroom_k.mean(axis=1) / 10.0)[env],
-        np.where(duration_s <= left_s, np.exp((duration_s - left_s) / 120.0), 0.0),
-        _step((duration_s - left_s) / 20.0),
+        np.arange(can.shape[-1]) % plans > 0,
+        per_option(seen, seen.returns),
+        cost / np.maximum(bids.worth, 1e-6),
+        (seen.headroom_k.mean(axis=1) / 10.0)[:, None, None],
     )
-    features = np.empty((len(env), PAIR_FEATURES))
+    features = np.empty((*can.shape, PAIR_FEATURES))
     for k, column in enumerate(columns):
-        features[:, k] = column
-    return np.clip(features, -MOST, MOST, out=features)
+        features[..., k] = column
+    np.clip(features, -MOST, MOST, out=features)
+    return np.where(can[..., None], features, 0.0)
 
 
-def _best_soon(seen: Observation, learned: Worth, scale: Array) -> Array:
-    """Largest worth per second of arms that are home soon, relative to a scale [env], for each job, [env, slot]."""
-    soon = (seen.working > 0) & (seen.busy_s <= SOON_S)
-    env, arm, option = np.nonzero(soon[..., None] & (seen.feasible > 0))
-    at = env, arm, option
-    best = np.zeros((len(scale), seen.offered.shape[-1]))
-    if len(env):
-        duration_s, busy_s = np.maximum(seen.duration_s[at], 1.0), seen.busy_s[env, arm]
-        rate = np.maximum(worth_per_second(seen, at, learned), 0.0) * duration_s / (duration_s + busy_s)
-        np.maximum.at(best, (env, option // plans_of(seen)), rate / scale[env])
-    return best
+def rates_of(bids: Bids) -> tuple[Array, Array]:
+    """Worth per second of every option, [env, arm, option], and its mean over those that are worth anything,
+    [env, 1, 1]."""
+    can = bids.worth > 0
+    rate = np.where(can, bids.worth / bids.duration_s, 0.0)
+    scale = rate.sum(axis=(1, 2), keepdims=True) / np.maximum(can.sum(axis=(1, 2), keepdims=True), 1)
+    return rate, np.maximum(scale, 1e-6)
 
 
 def _step(values: Array) -> Array:
@@ -197,43 +139,10 @@ def _best_of_others(values: Array, axis: int) -> Array:
 
 
 PAIRS, PAIRS_CARD = "pairs.npy", "pairs.json"
-OUTPUTS = 2
-PARAMETERS = len(Worth._fields) + PAIR_FEATURES * OUTPUTS
-"""Length of the vector of parameters."""
 
 
-def first_parameters() -> Array:
-    """Initial parameters of a training, float [PARAMETERS]: zeros, except for the end of the shift and faults.
-
-    A job that cannot end before the shift does has no value, and one that just can has twice the score. A predicted
-    peak may be 4 K above the error limit, and deviates twice as much.
-    """
-    parameters = np.zeros(PARAMETERS)
-    first = Worth(0.4, np.log(2.0), 0.0, 0.0, 0.0, end=1.0, overhead=0.0)  # pyright: ignore[reportArgumentType]
-    parameters[: len(first)] = first
-    parameters[len(Worth._fields) + FILLS * OUTPUTS] = 0.7
-    return parameters
-
-
-def scores(seen: Observation, parameters: Array) -> Array:
-    """Scores of all options, [env, arm, option]; −inf where a claim is not legal or not wanted.
-
-    Args:
-        seen: Observations [env, arm].
-        parameters: [env, PARAMETERS].
-    """
-    worth, weights = np.split(parameters, [len(Worth._fields)], axis=-1)
-    pairs = pairs_of(without_empty(seen), Worth(*worth.T))
-    each = weights.reshape(-1, PAIR_FEATURES, OUTPUTS)[pairs.at[0]]
-    f, g = np.clip(np.einsum("pk,pko->op", pairs.features, each), -3.0, 3.0)
-    score = pairs.rate * np.exp(f) + g * pairs.scale
-    result = np.full(seen.duration_s.shape, -np.inf)
-    result[pairs.at] = np.where(score > 0, score, -np.inf)
-    return result
-
-
-class PairPolicy(Matched, CentralRule):
-    """Matching by learned scores of arms and jobs.
+class LearnedPrices(BidPrice):
+    """`bid_price` with learned parameters.
 
     Args:
         parameters: float [PARAMETERS], as a training found them.
@@ -242,15 +151,36 @@ class PairPolicy(Matched, CentralRule):
     only_choices = True
 
     def __init__(self, parameters: Array) -> None:
-        self._parameters = np.asarray(parameters, dtype=float)
+        self.parameters = np.asarray(parameters, dtype=float)
+        learned = Prices(*self.parameters[: len(Prices._fields)].tolist())
+        self.price_share = BidPrice.price_share * float(np.exp(learned.time))
+        self.most_of_rate = BidPrice.most_of_rate * float(np.exp(learned.most))
+        super().__init__()
 
-    def cost(self, seen: Observation) -> Array:
-        """Minus the scores, [env, arm, option]; inf for claims that are not wanted."""
-        return -scores(seen, np.broadcast_to(self._parameters, (len(seen.action_mask), PARAMETERS)))
+    @classmethod
+    def worths(cls, policies: Sequence[Any], seen: Observation) -> Array:
+        """As of `bid_price`, with the learned prices of heat."""
+        parameters = np.stack([each.parameters for each in policies]).astype(np.float32)  # as the observation
+        learned = Prices(*parameters.T[: len(Prices._fields), :, None, None])
+        value, hottest_c = per_option(seen, seen.value), seen.temp_c.max(axis=-1)[..., None]
+        warning_c = warning_of(seen)[..., None]
+        error_c = error_of(seen)[..., None] + Wsept.margin_k + 10.0 * learned.margin
+        peak_c = Wsept.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
+        factors = [np.exp(each) for each in (learned.spread, learned.fault, learned.minute)]
+        return Wsept.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c, factors)
+
+    @classmethod
+    def weights(cls, policies: Sequence[Any], seen: Observation, bids: Bids, cost: Array) -> Weights:
+        """The learned factor and shift of the gain of every option."""
+        learned = np.stack([each.parameters[len(Prices._fields) :] for each in policies])
+        _, scale = rates_of(bids)
+        each = features_of(seen, bids, cost) @ learned.reshape(len(policies), 1, PAIR_FEATURES, 2)
+        f, g = np.moveaxis(np.clip(each, -3.0, 3.0), -1, 0)
+        return Weights(np.exp(f), g * scale)
 
 
-PAIRS_FORMAT = 4
-"""Increase it when the numbers of a pair or the network change."""
+PAIRS_FORMAT = 5
+"""Increase it when the parameters change their meaning."""
 
 
 def save_pairs(parameters: Array, folder: Path, **details: object) -> None:
@@ -267,17 +197,12 @@ def save_pairs(parameters: Array, folder: Path, **details: object) -> None:
         draft.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
 
-def load_pairs(folder: Path) -> PairPolicy:
+def load_pairs(folder: Path) -> LearnedPrices:
     """The policy that `save_pairs` wrote.
 
     Raises:
         CheckpointError: a file is missing, damaged or of another format.
     """
-    return PairPolicy(_parameters(folder))
-
-
-def _parameters(folder: Traversable) -> Array:
-    """Parameters in a folder; errors as of `load_pairs`."""
     try:
         found = json.loads((folder / PAIRS_CARD).read_text(encoding="utf-8"))["format"]
         with (folder / PAIRS).open("rb") as opened:
@@ -288,35 +213,4 @@ def _parameters(folder: Traversable) -> Array:
         raise CheckpointError(f"{folder / PAIRS_CARD}: format {found} is not {PAIRS_FORMAT}. Train the policy again.")
     if parameters.shape != (PARAMETERS,) or not np.isfinite(parameters).all():
         raise CheckpointError(f"{folder / PAIRS}: must be {PARAMETERS} finite numbers (shape {parameters.shape}).")
-    return parameters
-
-
-@cache
-def shipped_parameters() -> Array:
-    """The parameters that come with the project: the best on the validation split of several trainings."""
-    return _parameters(resources.files("agents") / "weights")
-
-
-class WseptLearned(PairPolicy):
-    """As `wsept`, by scores that were learned on the training split of the suite with the true state."""
-
-    only_choices = True
-
-    def __init__(self) -> None:
-        super().__init__(shipped_parameters())
-
-
-class WseptUntrained(PairPolicy):
-    """As `wsept_learned`, with the parameters that a training begins with: its ablation."""
-
-    only_choices = True
-
-    def __init__(self) -> None:
-        super().__init__(first_parameters())
-
-
-class WseptLearnedLocal(Local):
-    """As `wsept_learned` for a fleet of one: every arm claims the job with the highest score for it."""
-
-    central = WseptLearned
-    only_choices = True
+    return LearnedPrices(parameters)

@@ -83,7 +83,7 @@ def no_simulator(name: str) -> FleetError:
     """The error of a policy that plans, where there is no simulator of its cell."""
     return FleetError(
         f"The policy '{name}' needs a simulator of its cell, which is not available here. Use it in `run`, `compare` "
-        "and `bounds`. Choose another, for example wsept_learned."
+        "and `bounds`. Choose another, for example bid_price."
     )
 
 

@@ -63,8 +63,6 @@ class TimePrice(NamedTuple):
     """The same, each job times its patience, [job + 1, arm]."""
     most: Array
     """Highest price per second, [arm]."""
-    busy: float
-    """Worth per second of the least of the jobs that fill the arms' time, 0 if there is time for all."""
 
     def of(self, duration_s: Array) -> Array:
         """Advantage that each arm misses in work of some durations, in the shape of the durations, [arm, option]."""
@@ -79,11 +77,9 @@ LEAST_ADVANTAGE = 0.05
 MOST_OF_RATE = 0.8
 """Highest price, as a share of the worth per time of the arm's advantages: it does not refuse the jobs that it is kept
 free for."""
-FULL = 0.8
-"""Share of the arms' time that can be filled."""
 
 
-def price_of(bids: Bids, patience_s: Array, over_s: float) -> TimePrice:
+def price_of(bids: Bids, patience_s: Array, over_s: float, most_of_rate: float = MOST_OF_RATE) -> TimePrice:
     """Prices by the bids for recent jobs.
 
     An arm with an unknown bid counts as equal to each arm that it is compared with.
@@ -101,15 +97,13 @@ def price_of(bids: Bids, patience_s: Array, over_s: float) -> TimePrice:
     advantage = np.where(known, total, 0.0) / max(arms - 1, 1)
     counts = (advantage > LEAST_ADVANTAGE * worth.max(axis=1, keepdims=True)) & np.isfinite(patience_s)[:, None]
     advantage = np.where(counts, advantage, 0.0)
-    most = MOST_OF_RATE * advantage.sum(axis=0) / np.maximum(np.where(counts, duration_s, 0.0).sum(axis=0), 1.0)
+    most = most_of_rate * advantage.sum(axis=0) / np.maximum(np.where(counts, duration_s, 0.0).sum(axis=0), 1.0)
     order = np.argsort(patience_s, kind="stable")
     # One of the arms with an advantage gets the job.
     share = (advantage / np.maximum(counts.sum(axis=1, keepdims=True), 1) / over_s)[order]
     patience_s = patience_s[order]
     spared = share * np.where(np.isfinite(patience_s), patience_s, 0.0)[:, None]
-    return TimePrice(
-        patience_s, _sums(share), _sums(spared), most, _busy(Bids(worth, duration_s), FULL * arms * over_s)
-    )
+    return TimePrice(patience_s, _sums(share), _sums(spared), most)
 
 
 def _sums(rows: Array) -> Array:
@@ -117,35 +111,41 @@ def _sums(rows: Array) -> Array:
     return np.concatenate([np.zeros((1, *rows.shape[1:])), rows.cumsum(axis=0)])
 
 
-def _busy(bids: Bids, room_s: float) -> float:
-    """Worth per second (mean of able arms) of the job at which all jobs, the highest first, fill a time; 0 if none."""
-    able = bids.worth > 0
-    some = able.any(axis=1)
-    count = able[some].sum(axis=1)
-    mean_s = np.where(able, bids.duration_s, 0.0)[some].sum(axis=1) / count
-    rate = bids.worth[some].sum(axis=1) / count / mean_s
-    order = np.argsort(-rate, kind="stable")
-    first = int(np.searchsorted(mean_s[order].cumsum(), room_s))
-    return float(rate[order[first]]) if first < len(order) else 0.0
-
-
 PATIENCE_S = 7200.0
 """Time in which the worth of a later start falls to 1/e."""
 
 
-def gain_of(bids: Bids, dues: Dues, start_s: Array, cost: Array, crowd: Array, busy: Array) -> Array:
+class Weights(NamedTuple):
+    """Changes of the gain of options: their worth per second is multiplied and increased."""
+
+    factor: Any
+    more: Any
+
+
+UNWEIGHTED = Weights(1.0, 0.0)
+
+
+def gain_of(
+    bids: Bids,
+    dues: Dues,
+    start_s: Array,
+    cost: Array,
+    crowd: Array,
+    weights: Weights = UNWEIGHTED,
+) -> Array:
     """Worth per second of jobs less the price of the arms' time, at least 0, in the shape of the bids.
 
     Args:
         start_s: Time until the start; like the others in a shape that fits that of the bids.
         cost: Price of the arm's time for the job, as of `TimePrice.of`.
         crowd: Share of the time until the start that counts as time of the arm.
-        busy: Cost of each second of work.
+        weights: Applied after the costs.
     """
     worth, duration_s = bids
     later = Wsept.later_worth(worth * np.exp(-start_s / PATIENCE_S), duration_s, start_s, dues)
     rate = (later - cost) / (duration_s + crowd * start_s) * Wsept.urgency(dues)
-    return np.where((worth > 0) & (later > 0), np.maximum(rate - busy, 0.0), 0.0)
+    gain = rate * weights.factor + weights.more
+    return np.where((worth > 0) & (later > 0), np.maximum(gain, 0.0), 0.0)
 
 
 def best_pairs(gain: Array) -> list[tuple[int, int]]:
@@ -176,8 +176,10 @@ class BidPrice(CentralArrayPolicy):
     """Time for which prices hold."""
     prior_s: ClassVar = 600.0
     """Time without jobs before the shift that is assumed."""
-    busy_share: ClassVar = 0.5
-    """Share of `TimePrice.busy` that a later start costs for each second of work."""
+    price_share: float = 1.0
+    """Share of the price of an arm's time that counts."""
+    most_of_rate: float = MOST_OF_RATE
+    """As in `price_of`."""
 
     def __init__(self) -> None:
         self.reset(np.random.default_rng(0))
@@ -194,9 +196,10 @@ class BidPrice(CentralArrayPolicy):
         """The claims of the best pairs."""
         seen, plans = without_empty(seen), plans_of(seen)
         duration_s = np.maximum(seen.duration_s, 1.0).astype(float)
-        worth = np.where(seen.feasible, Wsept.worth(seen), 0.0)
+        worth = np.where(seen.feasible, cls.worths(policies, seen), 0.0)
         bids = bids_of(worth, duration_s, plans)
-        cost, busy = cls._prices(policies, seen, bids, duration_s, tuple(arms))
+        cost = cls._prices(policies, seen, bids, duration_s, tuple(arms))
+        weights = cls.weights(policies, seen, Bids(worth, duration_s), cost)
         delay_s = np.where(seen.faulted > 0, LONG_S, np.where(seen.working > 0, seen.busy_s, 0.0))[..., None]
         able = worth > 0
         mean_s = np.where(able, duration_s, 0.0).sum(axis=-1) / np.maximum(able.sum(axis=-1), 1)
@@ -205,8 +208,7 @@ class BidPrice(CentralArrayPolicy):
         dues, legal = dues_of(seen), legal_options(seen)
 
         def gain(start_s: Array) -> Array:
-            later_busy = np.where(start_s > 0, cls.busy_share * busy, 0.0)
-            return gain_of(Bids(worth, duration_s), dues, start_s, cost, crowd, later_busy)
+            return gain_of(Bids(worth, duration_s), dues, start_s, cost, crowd, weights)
 
         now = np.where((delay_s > 0) | legal, gain(delay_s), 0.0)
         gains = np.stack([now, gain(delay_s + mean_s[..., None])], axis=1)
@@ -220,11 +222,21 @@ class BidPrice(CentralArrayPolicy):
         return actions
 
     @classmethod
+    def worths(cls, policies: Sequence[Any], seen: Observation) -> Array:
+        """Expected worth of every option without tardiness, [env, arm, option]."""
+        return Wsept.worth(seen)
+
+    @classmethod
+    def weights(cls, policies: Sequence[Any], seen: Observation, bids: Bids, cost: Array) -> Weights:
+        """Changes of the gain of every option, in shapes that fit [env, arm, option]; arguments as of `gain_of`."""
+        return UNWEIGHTED
+
+    @classmethod
     def _prices(
         cls, policies: Sequence[Any], seen: Observation, bids: Bids, duration_s: Array, arms: tuple[str, ...]
-    ) -> tuple[Array, Array]:
-        """Price of every option, [env, arm, option], and `TimePrice.busy`, [env, 1, 1], with the jobs that are new."""
-        cost, busy = np.zeros(duration_s.shape), np.zeros((len(policies), 1, 1))
+    ) -> Array:
+        """Price of every option, [env, arm, option]."""
+        cost = np.zeros(duration_s.shape)
         left_s, age_s = seen.left_s[:, 0].tolist(), seen.age_s[:, 0]
         lasts_s = np.where(seen.expires[:, 0] > 0, seen.due_in_s[:, 0] + age_s, np.inf)
         first = seen.offered[:, 0] & (seen.returns[:, 0] == 0)
@@ -240,9 +252,8 @@ class BidPrice(CentralArrayPolicy):
                 policy._jobs += [(left_s[env], *row) for row in rows]
             price = policy._current(left_s[env], float(age_s[env].max()))
             if price.most.any():
-                cost[env] = price.of(duration_s[env])
-            busy[env] = price.busy
-        return cost, busy
+                cost[env] = policy.price_share * price.of(duration_s[env])
+        return cost
 
     @classmethod
     def ages_s(cls, seen: Observation) -> Array:
@@ -269,7 +280,8 @@ class BidPrice(CentralArrayPolicy):
         _, worth, duration_s, patience_s = zip(*self._jobs, strict=True) if self._jobs else ((),) * 4
         shape = (len(self._jobs), len(self._arms))
         recent = Bids(np.reshape(worth, shape), np.reshape(duration_s, shape))
-        self._price = price_of(recent, np.array(patience_s, float), min(self.window_s, past_s + self.prior_s))
+        over_s = min(self.window_s, past_s + self.prior_s)
+        self._price = price_of(recent, np.array(patience_s, float), over_s, self.most_of_rate)
         return self._price
 
 

@@ -62,14 +62,6 @@ RULES: dict[str, BuiltInPolicy] = {
     "wsept_local": BuiltInPolicy(
         "heat:WseptLocal", "time per expected worth, each arm for itself", "Rothkopf 1966", scope="arm"
     ),
-    "wsept_untrained": BuiltInPolicy("pairs:WseptUntrained", "time per worth with the first parameters of a training"),
-    "wsept_learned": BuiltInPolicy("pairs:WseptLearned", "time per learned worth", "Salimans et al. 2017"),
-    "wsept_learned_local": BuiltInPolicy(
-        "pairs:WseptLearnedLocal",
-        "time per learned worth, each arm for itself",
-        "Salimans et al. 2017",
-        scope="arm",
-    ),
     "bid_price": BuiltInPolicy(
         "prices:BidPrice",
         "(expected worth less price of the arm's time) per second, over the next two jobs of each arm",

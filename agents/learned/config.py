@@ -85,7 +85,7 @@ class PpoConfig:
     minibatch: int = 128
     """Choices in one optimiser step of the actor."""
     learning_rate: float = option(
-        "Learning rate; default: 0.0003, with --suite 0.08.",
+        "Learning rate; default: 0.0003, with --suite 0.02.",
         3e-4,
         low=0,
         high=10,

@@ -24,9 +24,9 @@ class EvolutionConfig:
 
     samples: int = 32
     """Samples of an iteration, even: half of them mirror the others."""
-    deviation: float = 0.2
+    deviation: float = 0.1
     """Standard deviation of every parameter in a sample."""
-    learning_rate: float = 0.08
+    learning_rate: float = 0.02
     decay: int = 60
     """Iterations after which the learning rate is halved, then a third, and so on."""
     averaged: int = 8

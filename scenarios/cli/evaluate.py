@@ -39,7 +39,7 @@ def train_command(
     length: Annotated[Given, From(TrainingLength, "minutes", "iterations")],
     models: Annotated[Given, From(RunSpec, "difficulty", "risk")],
     suite: str | None = option(
-        "Split of the suite to train scores of arm-job pairs over by evolution; must be train. Validation is on the "
+        "Split of the suite to train prices of `bid_price` over by evolution; must be train. Validation is on the "
         "split validation.",
         None,
     ),
@@ -51,8 +51,8 @@ def train_command(
     discount_hours: float = option(
         "Time constant of the discount, h: a reward this much later counts 1/e.", 2.0, low=0.01, high=1000
     ),
-    instances: int = option("With --suite: number of training instances.", 36, low=1, high=200),
-    validation_instances: int = option("With --suite: number of validation instances.", 60, low=1, high=200),
+    instances: int = option("With --suite: number of training instances.", 48, low=1, high=200),
+    validation_instances: int = option("With --suite: number of validation instances.", 80, low=1, high=200),
     seeds: int = option("Number of trainings, one after another; the first has --seed.", 1, low=1, high=100),
     out: Path | None = option(
         "Folder of the policy; default: runs/SCENARIO-ALGO-SEED or runs/SPLIT-pairs-SEED. Not with --seeds.", None
@@ -90,7 +90,7 @@ def train_command(
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
         choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
     if suite is not None and algo is not None:
-        raise FleetError("--algo needs a scenario: --suite trains scores of arm-job pairs.")
+        raise FleetError("--algo needs a scenario: --suite trains prices of bid_price.")
     from agents.learned.evolution import CURVE
     from scenarios.train.training import Trained, holds_training
 

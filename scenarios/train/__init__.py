@@ -1,1 +1,1 @@
-"""Training of policies: networks on a scenario or a split, and scores of arm-job pairs by evolution."""
+"""Training of policies: networks on a scenario, and prices of `bid_price` on a split by evolution."""

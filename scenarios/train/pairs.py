@@ -1,4 +1,4 @@
-"""Train scores of arm–job pairs over a split of the suite by evolution, with validation on another split."""
+"""Train prices of `bid_price` over a split of the suite by evolution, with validation on another split."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,13 +10,11 @@ import numpy as np
 
 from agents.learned.config import TrainingLength
 from agents.learned.evolution import Evolution, EvolutionConfig
-from agents.pairs import PARAMETERS, first_parameters, save_pairs, scores
-from agents.policy import WAIT
-from agents.rules import matched_options
+from agents.pairs import PARAMETERS, LearnedPrices, save_pairs
 from fleet.engine.batch import RewardWeights
-from fleet.env.vector import BatchEnv, Library, Obs
+from fleet.env.vector import BatchEnv, Library
 from scenarios.evaluate.references import ShiftReference
-from scenarios.evaluate.rollout import rollout
+from scenarios.evaluate.rollout import acts_of, rollout
 from scenarios.prepare.batch import library_of
 from scenarios.prepare.fleet import prepare
 from scenarios.progress import Count, Progress, quiet
@@ -98,25 +96,17 @@ def rewards(instance: TrainingInstance, parameters: Array, seeds: Sequence[int])
     env = BatchEnv(
         instance.library, len(seeds), weights=instance.weights, decisions="events", scaled=False, ahead_s=np.inf
     )
-
-    def act(obs: Obs, running: Array) -> Array:
-        actions = np.full((len(seeds), instance.arms), WAIT)
-        asked = np.flatnonzero(running & obs["action_mask"][..., 1:-1].any(axis=(1, 2)))
-        if len(asked):
-            seen = env.layout.read_parts(obs["shared"][asked], obs["own"][asked], obs["action_mask"][asked])
-            actions[asked] = 1 + matched_options(-scores(seen, parameters[asked]), env.layout.plans)
-        return actions
-
-    return rollout(env, env.reset(seed=list(seeds))[0], act)
+    policies = {row: LearnedPrices(each) for row, each in enumerate(parameters)}
+    return rollout(env, env.reset(seed=list(seeds))[0], acts_of(env, policies))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairPlan(TrainingLength):
     """Length of a training, and its validation."""
 
-    instances: int = 12
+    instances: int = 24
     """Instances of an iteration, of different cells; all samples have the same shifts."""
-    validate_every: int = 8
+    validate_every: int = 5
 
 
 def train_pairs(
@@ -132,7 +122,7 @@ def train_pairs(
 ) -> Trained:
     """Train over instances, as `run_training` says; the best parameters are a policy.
 
-    Iteration 0 is `agents.pairs.first_parameters`, the teacher is `wsept`.
+    It begins with zeros, which is `bid_price`.
 
     Args:
         card: What else `pairs.json` and `training.json` say; a resume must have the same.
@@ -143,7 +133,7 @@ def train_pairs(
     """
     card = {**card, "config": asdict(config), "instances": plan.instances}
     check_folder(out, card, PAIRS_STATE, resume=resume)
-    learner = PairLearner(Evolution(first_parameters(), config), training, validation, plan.instances)
+    learner = PairLearner(Evolution(np.zeros(PARAMETERS), config), training, validation, plan.instances)
     return run_training(learner, out, plan, card, validate_every=plan.validate_every, resume=resume, tell=tell)
 
 
@@ -174,7 +164,7 @@ class PairLearner:
         return validation_score(self.validation, self.search.average)
 
     def validate_teacher(self) -> float:
-        """That of `wsept`."""
+        """That of `bid_price`."""
         return validation_score(self.validation, np.zeros(PARAMETERS))
 
     def iterate(self) -> Iterator[dict[str, Any]]:

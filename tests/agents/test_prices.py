@@ -58,14 +58,6 @@ def test_the_time_of_equal_arms_has_no_price(arms, worth, count) -> None:
     assert (price.of(np.full((max(arms, 2), 3), 900.0)) == 0).all()
 
 
-@pytest.mark.parametrize(("jobs", "rate"), [(3, 0.0), (4, 0.1), (5, 0.1)])
-def test_the_least_job_that_fills_the_time_is_the_measure_of_a_busy_fleet(jobs, rate) -> None:
-    """Two arms have 0.8 · 2000 s; each job takes 400 s."""
-    worth = 400.0 * np.array([0.4, 0.3, 0.2, 0.1, 0.05])[:jobs, None].repeat(2, axis=1)
-    price = price_of(Bids(worth, np.full((jobs, 2), 400.0)), np.full(jobs, np.inf), 1000.0)
-    assert price.busy == pytest.approx(rate)
-
-
 @examples(60)
 @given(st.integers(0, 2**32))
 def test_other_labels_of_arms_give_other_labels_of_prices(seed) -> None:
@@ -76,7 +68,6 @@ def test_other_labels_of_arms_give_other_labels_of_prices(seed) -> None:
     price = price_of(bids, patience_s, 1800.0)
     moved = price_of(Bids(*(each[:, order] for each in bids)), patience_s, 1800.0)
     np.testing.assert_allclose(moved.of(duration_s[order]), price.of(duration_s)[order], rtol=1e-9, atol=1e-12)
-    assert moved.busy == pytest.approx(price.busy)
 
 
 @examples(60)

@@ -11,7 +11,7 @@ from agents.learned.config import TrainingLength
 from agents.learned.evolution import CURVE, LOG, EvolutionConfig
 from agents.learned.policy import load_policy
 from agents.learned.ppo import PpoConfig
-from agents.pairs import PAIRS_CARD, PARAMETERS, Worth, first_parameters
+from agents.pairs import PAIRS_CARD, PARAMETERS, Prices
 from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.evaluate.references import load_references
@@ -115,11 +115,11 @@ def ground():
 def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
     """In the same shift, decision by decision, with perfect messages; and other parameters give another reward."""
     fleet = prepare(override(load("quickstart"), horizon_s=1200.0), difficulty="oracle")
-    expected = [outcome.reward for outcome in outcomes(fleet, "wsept_untrained", [3, 4])]
-    found = rewards(ground, np.tile(first_parameters(), (2, 1)), [3, 4])
+    expected = [outcome.reward for outcome in outcomes(fleet, "bid_price", [3, 4])]
+    found = rewards(ground, np.zeros((2, PARAMETERS)), [3, 4])
     np.testing.assert_allclose(found, expected, rtol=1e-9)
-    refuses_all = first_parameters()
-    refuses_all[Worth._fields.index("spread")] = (
+    refuses_all = np.zeros(PARAMETERS)
+    refuses_all[Prices._fields.index("spread")] = (
         5.0  # true peaks that deviate by 740 K: each claim is as likely to fault as not
     )
     assert rewards(ground, refuses_all[None], [3])[0] < expected[0] - 1.0
