@@ -35,7 +35,7 @@ from scenarios.evaluate.statistics import Interval
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import OnBus, policy_at
 from scenarios.prepare.fleet import Fleet, env_of, prepare, with_surprises, world_of
-from scenarios.prepare.surprise import loaded
+from scenarios.prepare.surprise import phase_with_load
 from scenarios.prepare.twins import train_twins
 from scenarios.progress import quiet
 from scenarios.spec.jobs import draw_jobs
@@ -111,7 +111,7 @@ def first_cycle(plan: Plan, robot: Robot) -> tuple[Plan, Array]:
         return Phase(phase.profile[:count], phase.payload_kg[:count])
 
     cycle = part(plan.cycle, WATCHED_S)
-    more = loaded(ArmModel(robot), cycle, 2.0).profile[:, TAU] - cycle.profile[:, TAU]
+    more = phase_with_load(ArmModel(robot), cycle, 2.0).profile[:, TAU] - cycle.profile[:, TAU]
     return replace(plan, approach=part(plan.approach, 0.0), cycle=cycle, retreat=part(plan.retreat, 0.0)), more
 
 

@@ -32,7 +32,7 @@ from scenarios.extras import require_extra
 from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms, problems_of
 from scenarios.prepare.randomisation import Randomisation, ShiftConditions, randomisation_of
 from scenarios.prepare.shipped import is_shipped
-from scenarios.prepare.surprise import surprised
+from scenarios.prepare.surprise import arms_with_surprises
 from scenarios.progress import Count, Progress, check_progress, quiet
 from scenarios.spec.jobs import JobSampler, all_works, rehearsal_works, weights_of
 from scenarios.spec.load import scenario_with
@@ -196,8 +196,8 @@ def _arms(
             for arm, twin, heat in zip(arms, twins, heats, strict=True)
         ]
     elif difficulty == "oracle":
-        return [_with_oracle(scenario, arm) for arm in surprised(scenario, arms)], planned
-    return list(surprised(scenario, arms)), planned
+        return [_with_oracle(scenario, arm) for arm in arms_with_surprises(scenario, arms)], planned
+    return list(arms_with_surprises(scenario, arms)), planned
 
 
 def _blind_arm(planned: PlannedArm, works: Sequence[Work], folder: Path) -> Arm:
@@ -315,7 +315,7 @@ class ShiftFactory:
 def with_surprises(fleet: Fleet) -> Fleet:
     """The fleet as it is in the shifts of its scenario, with the scenario's surprises."""
     variants = tuple(with_surprises(each) for each in fleet.variants)
-    return replace(fleet, arms=surprised(fleet.scenario, fleet.arms), variants=variants)
+    return replace(fleet, arms=arms_with_surprises(fleet.scenario, fleet.arms), variants=variants)
 
 
 def as_known(fleet: Fleet) -> Fleet:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # MuJoCo, which an arm whose plans are known does not load
 HOUR_S = 3600.0
 
 
-def surprised(scenario: Scenario, arms: Sequence[Arm]) -> tuple[Arm, ...]:
+def arms_with_surprises(scenario: Scenario, arms: Sequence[Arm]) -> tuple[Arm, ...]:
     """The arms as they are in the shift, each with itself as it was `before`, by the surprises of the scenario.
 
     Args:
@@ -65,7 +65,8 @@ def _heavier(scenario: Scenario, arm: Arm, loads: Sequence[Surprise]) -> dict[Pl
     model = ArmModel(arm.robot)
     return {
         plan: replace(
-            plan, **{name: loaded(model, getattr(plan, name), factor) for name in ("approach", "cycle", "retreat")}
+            plan,
+            **{name: phase_with_load(model, getattr(plan, name), factor) for name in ("approach", "cycle", "retreat")},
         )
         for work, factor in factors.items()
         for plan in arm.plans.get(work, ())
@@ -73,7 +74,7 @@ def _heavier(scenario: Scenario, arm: Arm, loads: Sequence[Surprise]) -> dict[Pl
     }
 
 
-def loaded(model: "ArmModel", phase: Phase, factor: float) -> Phase:
+def phase_with_load(model: "ArmModel", phase: Phase, factor: float) -> Phase:
     """A phase with the torques of another mass, `factor` times the declared one, where it carries one."""
     profile = distinct(phase.profile)
     count = len(profile)
