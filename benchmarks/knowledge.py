@@ -1,10 +1,11 @@
-"""Store results of the best rule by what its arms know: python -m benchmarks.knowledge FOLDER …
+"""Store results of the best rule and of `mpc` by what the arms know: python -m benchmarks.knowledge FOLDER …
 
 Each folder is of `thermofleet compare` on the instances that `--instances` prints, those of the cells of the test split
 with at most eight arms, since past jobs of all arms are simulated for each source:
 
     thermofleet compare --suite $(python -m benchmarks.knowledge --instances) --out runs/knowledge \
-        --policies bid_price@blind,bid_price@torque,bid_price@trained,bid_price@rc-nominal,bid_price@rc
+        --policies bid_price@blind,bid_price@torque,bid_price@untrained,bid_price@trained,bid_price@rc-nominal,\
+    bid_price@rc,mpc@rc,benchmarks/mpc_parts.py:WithoutHeat@rc
     python -m benchmarks.knowledge runs/knowledge
 """
 

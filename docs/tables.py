@@ -179,6 +179,7 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
         "leaderboard_questions": partial(by_question, results / "leaderboard"),
         "leaderboard_top": partial(board_top, results / "leaderboard"),
         "leaderboard_knowledge": partial(knowledge, results / "leaderboard"),
+        "leaderboard_planners": partial(planners, results / "leaderboard"),
         "leaderboard_surprises": partial(surprises, results / "leaderboard"),
         **{f"leaderboard_{split}": partial(board_text, results / "leaderboard", split) for split in JUDGED},
     }
@@ -255,6 +256,7 @@ def board_top(folder: Path) -> str:
 KNOWLEDGE = {
     "blind": "nothing",
     "torque": "RMS torque over that of cool motion",
+    "untrained": "d of the twin before its training",
     "trained": "d of the twin alone",
     "rc-nominal": "thermometers, nominal thermal network",
     "rc": "thermometers, identified network",
@@ -265,20 +267,52 @@ KNOWLEDGE = {
 
 
 def known_scores(folder: Path) -> tuple[dict[str, BoardResult], Normalised]:
-    """Results of the best rule by its source of predictions, and their scores, in instances that all sources have.
+    """Results of the best rule by its source of predictions, and their scores; see `common_scores`."""
+    return common_scores(folder, {name: (CENTRAL, name) for name in KNOWLEDGE})
+
+
+def common_scores(folder: Path, wanted: Mapping[str, tuple[str, str]]) -> tuple[dict[str, BoardResult], Normalised]:
+    """Results by name, as far as they are stored, and their scores, in the instances that all of them have.
 
     Args:
         folder: The leaderboard; beside it is the folder `knowledge` with results on a part of the split.
+        wanted: Policy and source of predictions of each.
     """
     results = [*read_all(folder, "test"), *map(read, sorted((folder.parent / "knowledge").glob("*.jsonl")))]
-    found = {each.card.difficulty: each for each in results if each.card.policy == CENTRAL}
+    by_card = {(each.card.policy, each.card.difficulty): each for each in results}
+    found = {name: by_card[which] for name, which in wanted.items() if which in by_card}
     common = set.intersection(*({row.instance for row in each.rows} for each in found.values()))
     some = {
-        name: replace(found[name], rows=tuple(row for row in found[name].rows if row.instance in common))
-        for name in KNOWLEDGE
-        if name in found
+        name: replace(each, rows=tuple(row for row in each.rows if row.instance in common))
+        for name, each in found.items()
     }
     return some, scores_by_name(some, "test")
+
+
+PLANNERS = {
+    "`mpc` that knows of no heat": ("WithoutHeat", "rc"),
+    "`mpc` with the identified network": ("mpc", "rc"),
+    "the same, corrected by measured heat and temperatures": ("mpc", "twin"),
+    "`mpc` with the true network and state": ("mpc", "oracle"),
+    "`bid_price` with the identified network, corrected": ("bid_price", "twin"),
+}
+"""Rows of the table of planners: policy and source of predictions; the first policy is of benchmarks/mpc_parts.py."""
+
+
+def planners(folder: Path) -> str:
+    """Scores of `mpc` by what its simulator knows of heat, and of the best rule."""
+    found, values = common_scores(folder, PLANNERS)
+    kind = surprise_where_heat_binds(values)
+    parts = (kind == kind, kind != "", ~np.isin(kind, ("", "nothing")), kind == "")
+    rows = [
+        (
+            name,
+            *(values.only(part).interval(values.only(part).score[name]).text() for part in parts),
+            f"{mean_of(found[name], 'faults'):.2f}",
+        )
+        for name in found
+    ]
+    return table(("policy", "mean score", "heat binds", "and a surprise", "it does not", "faults"), rows)
 
 
 def surprise_where_heat_binds(values: Normalised) -> Array:
@@ -365,9 +399,15 @@ def by_question(folder: Path) -> str:
         means = (f"{own.score[policy].mean():.2f}" for policy in (CENTRAL, ALONE, BLIND))
         pairs = (ALONE, BLIND), (BASELINE, ALONE), (CENTRAL, ALONE)
         gains = (shown(own.difference(*pair)) for pair in pairs)
-        count = f"{np.mean([faults[each] for each in own.instances]):.2f}"
+        quiet = [each for each in own.instances if lines[each].axes.surprise == "nothing"]
+        count = " (".join(f"{np.mean([faults[each] for each in some]):.2f}" for some in (own.instances, quiet)) + ")"
         rows.append((name, str(len(own.instances)), count, *means, *gains))
-    heads = ("cells, heat", "instances", f"faults of `{BLIND}`", *(f"`{each}`" for each in (CENTRAL, ALONE, BLIND)))
+    heads = (
+        "cells, heat",
+        "instances",
+        f"faults of `{BLIND}` (no surprise)",
+        *(f"`{each}`" for each in (CENTRAL, ALONE, BLIND)),
+    )
     return table((*heads, "knowing the heat", "one decision", "prices"), rows)
 
 
@@ -475,9 +515,9 @@ def trainings_table(folder: Path) -> str:
         validated = [row for row in log if "validation" in row]
         best = max(validated, key=lambda row: row["validation"])
         iterations = max(row.get("number", 0) for row in log)
-        scores = (validated[0]["validation"], best["validation"], validated[-1]["teacher"])
+        scores = (validated[0]["validation"], best["validation"], validated[-1]["validation"])
         rows.append((training.name.rpartition("-")[2], str(iterations), *(f"{score:.3f}" for score in scores)))
-    return table(("training", "iterations", "first parameters", "best", "`wsept`"), rows)
+    return table(("training", "iterations", "`bid_price`, the beginning", "best", "last"), rows)
 
 
 def scored(folder: Path, split: str) -> tuple[dict[str, BoardResult], Normalised]:
@@ -498,12 +538,12 @@ def by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Arr
     parts: dict[str, SuiteScores] = {}
     for name, chosen in {"all instances": np.ones_like, **groups}.items():
         own = values.only(chosen(arms).astype(bool))
-        parts[f"{name} ({len(own.instances)} in {len(set(own.cells))} cells)"] = scores_of(own, BASELINE)
+        parts[f"{name} ({len(own.instances)} in {len(set(own.cells))} cells)"] = scores_of(own, CENTRAL)
     rows: list[tuple[str, ...]] = []
     for name in ranked(next(iter(parts.values()))):
         cells = [title(found[name])]
         for scores in parts.values():
-            cells.append("" if name == BASELINE else shown(scores.policies[name].difference))
+            cells.append("" if name == CENTRAL else shown(scores.policies[name].difference))
         rows.append((*cells, f"{mean_of(found[name], 'faults'):.2f}"))
     return table(("policy", *parts, "faults"), rows)
 
@@ -554,6 +594,7 @@ def coverage_by_clusters(path: Path) -> str:
 PAPER = {
     "readings": ("readings_any", "readings_joint"),
     "sides": ("sides",),
+    "surprises": ("surprises",),
     "questions": ("questions_25s", "questions_6s"),
     "sweep": ("sweep",),
     "parsimony": ("parsimony",),
@@ -606,7 +647,7 @@ def tables_of(results: Path) -> Tables:
         **benchmark_tables(results),
         "sample_efficiency": lambda: efficiency_table(trainings(results / "sample_efficiency/heat_wave.jsonl")),
         "trainings": of(trainings_table, results / "learned"),
-        "learned_test": of(by_size, board, "test", TEST_SIZES),
+        "leaderboard_sizes": of(by_size, board, "test", TEST_SIZES),
         "workers": of(workers_table, scaling / "workers.jsonl"),
         "growing_halls": of(halls_table, scaling / "arms.jsonl"),
         "large_fleet": of(commands_table, scaling),
