@@ -66,7 +66,7 @@ from scenarios.evaluate.statistics import Interval, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
 from scenarios.spec.schema import SPLITS, SurpriseKind
-from scenarios.suite.instances import CELLS, FAULTS, JUDGED
+from scenarios.suite.instances import CELLS, FAULTS, JUDGED, Bus
 from scenarios.suite.splits import cell_of_instance, heat_binds, instance, manifest
 from scenarios.table import markdown_table as table
 
@@ -177,6 +177,7 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
         "bounds": lambda: reference_table(load_references(results / "bounds_library.jsonl")).markdown(),
         "references": references_text,
         "leaderboard_questions": partial(by_question, results / "leaderboard"),
+        "leaderboard_bus": partial(by_bus, results / "leaderboard"),
         "leaderboard_top": partial(board_top, results / "leaderboard"),
         "leaderboard_knowledge": partial(knowledge, results / "leaderboard"),
         "leaderboard_planners": partial(planners, results / "leaderboard"),
@@ -409,6 +410,28 @@ def by_question(folder: Path) -> str:
         *(f"`{each}`" for each in (CENTRAL, ALONE, BLIND)),
     )
     return table((*heads, "knowing the heat", "one decision", "prices"), rows)
+
+
+BY_MESSAGES = "bid_price_shared"
+"""The best rule by messages."""
+
+
+def by_bus(folder: Path) -> str:
+    """Worth of messages by the bus of the instances, with exact predictions and with those of twins."""
+    results, bus = read_all(folder, "test"), {line.name: line.axes.bus for line in manifest("test")}
+    rows: list[tuple[str, ...]] = []
+    for kind in get_args(Bus):
+        cells: list[str] = []
+        for source in ("oracle", SOURCE):
+            found = {each.card.policy: each for each in with_source(results, source)}
+            values = scores_by_name(found, "test")
+            own = values.only(np.array([bus[name] == kind for name in values.instances]))
+            cells += [f"{own.score[policy].mean():.2f}" for policy in (BY_MESSAGES, ALONE)]
+            cells.append(shown(own.difference(BY_MESSAGES, ALONE)))
+        rows.append((kind, str(sum(each == kind for each in bus.values())), *cells))
+    policies = (f"`{BY_MESSAGES}`", f"`{ALONE}`", "difference")
+    heads = (*(f"{each}, exact" for each in policies), *(f"{each}, twins" for each in policies))
+    return table(("bus", "instances", *heads), rows)
 
 
 def title(entry: BoardResult) -> str:
