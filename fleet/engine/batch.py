@@ -214,6 +214,7 @@ class Engine:
         events: Record the events of each step in `events`.
         trace: Record in `trace` how each arm spent the last step.
         path: Keep the temperatures at the end of all intervals of a shift in `path_c`.
+        shares_heat: Whether arms tell each other at once what heat they measure, if all hear all without delay.
         compiled: Compile the loops, or run them in plain Python; by default as `Kernel.chosen` decides.
         threads: Rows are divided among this many threads; results do not depend on it.
     """
@@ -229,6 +230,7 @@ class Engine:
         events: bool = False,
         trace: bool = False,
         path: bool = False,
+        shares_heat: bool = True,
         compiled: bool | None = None,
         threads: int = 1,
     ) -> None:
@@ -257,7 +259,7 @@ class Engine:
             np.full((envs, arms, works), np.nan, np.float32),
             np.zeros((envs, arms, nodes), np.float32),
             np.ones((envs, arms), np.float32),
-            form_of(layout),
+            form_of(layout, shares_heat=shares_heat),
             room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK), works),
             weights_per_unit(weights),
             NO_SCRIPT,

@@ -176,7 +176,7 @@ def excess_of(sim: Simulation, e: int, a: int, kind: int) -> Real:
     work = nonnegative(sim.tables.alike[nonnegative(sim.state.env[e]["fleet"]), nonnegative(kind)])
     own, mean = sim.excess[e, a, work], sim.room.excess[work]
     if own != own:
-        own = mean if sim.form.alike[0] != 0 and mean == mean else _ZERO
+        own = mean if sim.form.shares_heat[0] != 0 and mean == mean else _ZERO
     return of_warmer(own, sim.warmer[e, a])
 
 

@@ -295,6 +295,8 @@ class Form(NamedTuple):
     """Arms that are home later than this have no options, float32 [1]."""
     bids: Array
     """1 where members share their bids, else 0, int [1]."""
+    shares_heat: Array
+    """1 where arms tell each other at once what heat they measure, else 0, int [1]."""
 
 
 class Script(NamedTuple):
@@ -421,12 +423,13 @@ class Simulation(NamedTuple):
     script: Script
 
 
-def form_of(layout: Layout) -> Form:
+def form_of(layout: Layout, *, shares_heat: bool) -> Form:
     """A layout as the kernels want it."""
     scales = Offsets(*(np.float32(1.0 / field.scale if layout.scaled else 1.0) for field in FIELDS))
     offsets = Offsets(*map(np.uint32, layout.offsets))
     alike, ahead_s = np.array([layout.is_shared], int), np.array([layout.ahead_s], np.float32)
-    return Form(offsets, scales, layout.members, alike, ahead_s, np.array([layout.bids], int))
+    bids, tells = np.array([layout.bids], int), np.array([shares_heat and layout.is_shared], int)
+    return Form(offsets, scales, layout.members, alike, ahead_s, bids, tells)
 
 
 def tables_of(world: World) -> tuple[Tables, State]:

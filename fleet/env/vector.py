@@ -125,6 +125,7 @@ class BatchEnv:
             exchanges.
         scaled, ahead_s, bids: As in `fleet.env.allocation_v2.AllocationEnv`.
         keep_path: Keep the temperatures of the whole shift in `path_c`.
+        shares_heat: Without exchanges: whether the arms tell each other what heat they measure, as on a perfect bus.
     """
 
     def __init__(
@@ -144,6 +145,7 @@ class BatchEnv:
         ahead_s: float = AHEAD_S,
         bids: bool = False,
         keep_path: bool = False,
+        shares_heat: bool = True,
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
         self.agents = library.arms
@@ -177,6 +179,7 @@ class BatchEnv:
             self.layout,
             weights or RewardWeights(),
             path=keep_path,
+            shares_heat=shares_heat,
             threads=at_least_one("threads", threads),
         )
         self._seeds = seeds_of(seed, num_envs)

@@ -153,7 +153,7 @@ def play(
         for e, seed in enumerate(seeds):
             with guarded([e]):
                 policies[e] = policy_at(policy, seed, OnBus(fleet=fleet.scenario.name))
-        messages = any(reads_messages(each) for each in policies.values())
+        messages, at_once = any(reads_messages(each) for each in policies.values()), channel.perfect
         if not messages:
             channel = PERFECT
         waits = channel.perfect and all(only_choices(each) for each in policies.values())
@@ -169,6 +169,7 @@ def play(
             ahead_s=np.inf,
             bids=messages,
             keep_path=True,
+            shares_heat=at_once,
         )
         obs, _ = env.reset()
         start_c = env.temp_c.copy()

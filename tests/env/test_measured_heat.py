@@ -34,7 +34,9 @@ class Expects:
         return Difficulty(np.full(JOINTS, 0.1), peak=peak)
 
 
-def env_of(small, *, learns: bool = True, copper: float = 1.3, channel: Channel | None = None) -> BatchEnv:
+def env_of(
+    small, *, learns: bool = True, copper: float = 1.3, channel: Channel | None = None, shares_heat: bool = True
+) -> BatchEnv:
     """Three arms; holds at the bench make `copper` times the heat in arm 0 that it expects."""
     bench, rack = small.work("bench", small.WARM), small.work("rack", small.WARM)
     arms = []
@@ -54,8 +56,9 @@ def env_of(small, *, learns: bool = True, copper: float = 1.3, channel: Channel 
     names = tuple(f"arm_{i}" for i in range(3))
     exchanges = None if channel is None else [Exchange(names, channel)]
     return BatchEnv(
-        Library(names, 6, tables, lambda _: shift), 1, seed=0, scaled=False, exchanges=exchanges, ahead_s=np.inf
-    )
+        Library(names, 6, tables, lambda _: shift), 1, seed=0, scaled=False, exchanges=exchanges, ahead_s=np.inf,
+        shares_heat=shares_heat,
+    )  # fmt: skip
 
 
 def peaks(env: BatchEnv, obs) -> np.ndarray:
@@ -90,8 +93,9 @@ def test_an_arm_believes_its_own_measurement_and_the_others_their_mean(small) ->
     assert found[:, left] == pytest.approx([36.0, 30.0, 33.0], abs=0.02)  # .3, 0, and their mean
 
 
-def test_arms_whose_messages_take_time_know_what_they_measured_themselves(small) -> None:
-    env = env_of(small, channel=Channel(delay_s=30.0))
+@pytest.mark.parametrize("apart", [{"channel": Channel(delay_s=30.0)}, {"shares_heat": False}], ids=["late", "none"])
+def test_arms_whose_messages_take_time_know_what_they_measured_themselves(small, apart) -> None:
+    env = env_of(small, **apart)
     env.reset()
     obs, *_ = env.step(np.array([[1, 0, 0]]))
     assert peaks(env, obs)[:, 1] == pytest.approx([36.0, 30.0, 30.0], abs=0.01)

@@ -25,13 +25,13 @@ from scenarios.evaluate.scores import normalised, references_of, scores_of
 from scenarios.evaluate.statistics import interval
 from scenarios.evaluate.study import Case, Row, RowKey
 from scenarios.policy_loader import PolicyFailed, policy_of
-from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.prepare.fleet import Fleet, prepare, with_surprises
 from scenarios.prepare.oracle import Oracle, peaks
 from scenarios.run.shift import run
 from scenarios.spec.jobs import JobSampler, downtime_s, fault_price, weights_of
 from scenarios.spec.load import load
 from scenarios.spec.options import RunSpec
-from scenarios.spec.parse import parse_scenario
+from scenarios.spec.parse import override, parse_scenario
 from scenarios.spec.schema import Ambient, RewardSpec
 from scenarios.suite.splits import manifest
 
@@ -156,6 +156,19 @@ def test_a_seed_gives_the_same_whatever_the_other_seeds_are(fleet, policy, chann
 
 def test_figures_with_late_messages_are_those_of_each_shift_run_alone(fleet) -> None:
     check_equal(outcomes(fleet, "consensus", SEEDS, LATE), one_by_one(fleet, "consensus", SEEDS, LATE))
+
+
+def test_measured_heat_that_is_not_shared_at_once_is_not_known_to_policies_without_messages_either(hot) -> None:
+    """With a load that is heavier than declared; as in each shift run alone."""
+    heavier = {"kind": "payload", "jobs": "hold", "size": 1.5}
+    fleet = with_surprises(replace(hot, scenario=override(hot.scenario, surprises=[heavier])))
+    fleet = replace(fleet, arms=tuple(replace(arm, learns=True) for arm in fleet.arms))
+    for policy in ("wsept_local", "wsept"):
+        late, at_once = (outcomes(fleet, policy, range(12), channel) for channel in (LATE, PERFECT))
+        differ = [seed for seed in range(12) if late[seed] != at_once[seed]][:2]
+        assert differ
+        check_equal([late[seed] for seed in differ], one_by_one(fleet, policy, differ, LATE))
+        check_equal([at_once[seed] for seed in differ], one_by_one(fleet, policy, differ))
 
 
 def test_late_messages_change_what_arms_agree_on(hot) -> None:
