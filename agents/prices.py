@@ -60,7 +60,7 @@ class TimePrice(NamedTuple):
     advantage: Array
     """Advantage per second in the first k of these jobs, [job + 1, arm]."""
     spared: Array
-    """The same, each job times its patience, [job + 1, arm]."""
+    """The same, each job times its patience, [job + 1, arm]: what is not missed in work that is longer."""
     most: Array
     """Highest price per second, [arm]."""
 
@@ -75,8 +75,8 @@ class TimePrice(NamedTuple):
 LEAST_ADVANTAGE = 0.05
 """Smaller advantages do not count; as a share of the best bid for the job."""
 MOST_OF_RATE = 0.8
-"""Highest price, as a share of the worth per time of the arm's advantages: it does not refuse the jobs that it is kept
-free for."""
+"""Highest price, as a share of the worth per time of the arm's advantages: below 1, so that the price alone
+does not make an arm refuse the jobs that it is kept free for."""
 
 
 def price_of(bids: Bids, patience_s: Array, over_s: float, most_of_rate: float = MOST_OF_RATE) -> TimePrice:
@@ -111,7 +111,7 @@ def _sums(rows: Array) -> Array:
     return np.concatenate([np.zeros((1, *rows.shape[1:])), rows.cumsum(axis=0)])
 
 
-PATIENCE_S = 7200.0
+LATER_S = 7200.0
 """Time in which the worth of a later start falls to 1/e."""
 
 
@@ -119,7 +119,7 @@ class Weights(NamedTuple):
     """Changes of the gain of options: their worth per second is multiplied and increased."""
 
     factor: Any
-    more: Any
+    added: Any
 
 
 UNWEIGHTED = Weights(1.0, 0.0)
@@ -142,9 +142,9 @@ def gain_of(
         weights: Applied after the costs.
     """
     worth, duration_s = bids
-    later = Wsept.later_worth(worth * np.exp(-start_s / PATIENCE_S), duration_s, start_s, dues)
+    later = Wsept.later_worth(worth * np.exp(-start_s / LATER_S), duration_s, start_s, dues)
     rate = (later - cost) / (duration_s + crowd * start_s) * Wsept.urgency(dues)
-    gain = rate * weights.factor + weights.more
+    gain = rate * weights.factor + weights.added
     return np.where((worth > 0) & (later > 0), np.maximum(gain, 0.0), 0.0)
 
 

@@ -66,7 +66,7 @@ from scenarios.evaluate.statistics import Interval, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
 from scenarios.spec.schema import SPLITS, SurpriseKind
-from scenarios.suite.instances import CELLS, FAULTS, JUDGED, Bus
+from scenarios.suite.instances import FAULTS, JUDGED, Bus
 from scenarios.suite.splits import cell_of_instance, heat_binds, instance, manifest
 from scenarios.table import markdown_table as table
 
@@ -313,7 +313,7 @@ def planners(folder: Path) -> str:
         )
         for name in found
     ]
-    return table(("policy", "mean score", "heat binds", "and a surprise", "it does not", "faults"), rows)
+    return table(("policy", "mean score", "heat binds", "heat binds, surprise", "it does not", "faults"), rows)
 
 
 def surprise_where_heat_binds(values: Normalised) -> Array:
@@ -333,11 +333,11 @@ def knowledge(folder: Path) -> str:
         means = [each.interval(each.score[name]).text() for each in own]
         some = [share_of_gain(each, name) for each in own[1:]]
         rows.append((KNOWLEDGE[name], f"`{name}`", *means, *some, f"{mean_of(found[name], 'faults'):.2f}"))
-    heads = ("the arms know", "source", "mean score", "heat binds", "and a surprise", "share of the gain")
+    heads = ("the arms know", "source", "mean score", "heat binds", "heat binds, surprise", "share of the gain")
     count = (
         f"{len(values.instances)} instances in {len(set(values.cells))} cells, {int(surprised.sum())} with a surprise."
     )
-    return table((*heads, "with a surprise", "faults"), rows) + f"\n\n{count}"
+    return table((*heads, "share, surprise", "faults"), rows) + f"\n\n{count}"
 
 
 def share_of_gain(values: Normalised, name: str) -> str:
@@ -521,11 +521,11 @@ def ablation_table(folders: Mapping[str, Path], columns: Mapping[str, str]) -> s
     return table(("", *columns.values()), rows) + sizes_text(folders)
 
 
-TRAINED = {cell.arms for cell in CELLS if cell.split == "train"}
-"""Numbers of arms of the fleets of the training split."""
+SMALL = 8
+"""Most arms of the cells for which all sources of predictions are prepared."""
 TEST_SIZES: Mapping[str, Callable[[Array], Array]] = {
-    "trained sizes": lambda arms: arms <= max(TRAINED),
-    "larger": lambda arms: arms > max(TRAINED),
+    "4 to 8 arms": lambda arms: arms <= SMALL,
+    "16 to 64 arms": lambda arms: arms > SMALL,
 }
 """Groups of instances by their numbers of arms."""
 

@@ -1,9 +1,9 @@
-"""Simulate schedules from the present to the end of a shift, with what the dispatcher of a cell knows.
+"""Simulate schedules from the present to the end of a shift, with what a dispatcher observes.
 
 It has the plans and space of all arms, their current jobs, the jobs in the slots, and of each arm the measured motor
-temperatures, the estimated housings and the identified thermal network. Arms that learn correct the heat of the plans
-and the temperatures as in their predictions. The simulator has no jobs without a slot, no future jobs, no future
-ambient temperature, no sensor errors and no true temperatures.
+temperatures, the estimated housings and the identified thermal network. If the arms learn (source `twin`), the heat of
+the plans and the temperatures are corrected as in their predictions. The simulator has no jobs without a slot, no
+future jobs, no future ambient temperature, no sensor errors and no true temperatures.
 """
 
 from collections.abc import Mapping
@@ -109,7 +109,7 @@ class CellSimulator:
         return Present(tick * self.dt_s, open_, can, stations)
 
     def _correct(self, engine: Engine, env: int, known: State) -> None:
-        """Let the heat of the plans for known jobs, and the temperatures, be those that the arms measure."""
+        """Set the heat of the plans for known jobs, and the temperatures, to the corrected values."""
         kinds = np.unique(known.kind[0, known.status[0] != GIVEN_UP])
         excess, least_c = engine.measured(env, kinds.tolist())
         known.temp_c[0] = np.maximum(known.temp_c[0], least_c)

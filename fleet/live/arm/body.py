@@ -97,7 +97,7 @@ class Body(Protocol):
 
     @property
     def warmer(self) -> float:
-        """Measured rise of its motors above the air over the expected one, smoothed; 1 if unknown."""
+        """Measured rise of its motors over the ambient temperature by the expected one, smoothed; 1 if unknown."""
         ...
 
     def last_cycle_in_s(self) -> float:
@@ -259,10 +259,10 @@ _CARRIED = (
 
 
 @dataclass(eq=False)
-class ExpectedHeat:
-    """What an arm expects of its temperatures by the heat that it measures, as the arms of a simulated shift.
+class ExpectedTemperatures:
+    """Temperatures that the identified network of an arm yields for the heat that it measures.
 
-    See `fleet.engine.step.compare_temperatures`.
+    It is the live counterpart of `fleet.engine.step.compare_temperatures`.
     """
 
     thermal: ThermalModel
@@ -270,9 +270,10 @@ class ExpectedHeat:
     temp_c: Array
     """[node]."""
     warmer: float = 1.0
+    """See `Body.warmer`."""
 
     def step(self, heat_w: Array, dt_s: float, ambient_c: float, measured_c: Array) -> None:
-        """Go on by a step.
+        """Advance by one step.
 
         Args:
             heat_w: [node].
@@ -333,7 +334,7 @@ class SimulatedBody:
         self._state = initial(self._world)
         self._last: tuple[World, StepRecord] | None = None
         start_c = np.concatenate([self._state.temp_c[0, 0, WINDING], self._state.housing_c[0, 0]])
-        self._expected = ExpectedHeat(arm.beliefs[0], start_c) if arm.learns else None
+        self._expected = ExpectedTemperatures(arm.beliefs[0], start_c) if arm.learns else None
 
     # Properties
 
@@ -485,7 +486,7 @@ class SimulatedBody:
         events = [replace(e, time_s=e.time_s + shift_s) for e in log if e.kind in _REPORTED]
         return events if task is None else events + self._job_events(task, int(done.record.todo[0, 0]), log, shift_s)
 
-    def _compare(self, expected: ExpectedHeat, record: StepRecord, ambient_c: float) -> None:
+    def _compare(self, expected: ExpectedTemperatures, record: StepRecord, ambient_c: float) -> None:
         """Compare temperatures with those expected of the heat in a step, by currents and the copper that it knows."""
         heat_w, known = record.heat_w[0, 0].copy(), self._arm.beliefs[1]
         heat_w[WINDING] *= known.copper_w_per_a2 / self._arm.motors.copper_w_per_a2
