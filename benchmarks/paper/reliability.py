@@ -248,7 +248,7 @@ RELIABILITY = Experiment(
 )
 
 
-SOURCES = ("torque", "trained", "rc", "twin", "oracle")
+SOURCES = ("rc", "twin", "oracle")
 MOST_ARMS = 6
 RULE = "bid_price"
 
@@ -271,11 +271,18 @@ def surprise_rows(names_of: Mapping[str, str], source: str, keys: Collection[str
 _LINES = {line.name: line for line in manifest("test")}
 
 
+def surprise_options(parser: ArgumentParser) -> None:
+    """Options of `surprises`."""
+    parser.add_argument("--sources", type=names, default=[*SOURCES], help=f"predictions [{','.join(SOURCES)}]")
+    parser.add_argument("--cells", type=whole(1), help="number of cells [all]")
+
+
 def surprise_units(given: Namespace) -> list[Unit]:
     """A unit for each source and cell of the test split with at most `MOST_ARMS`, where heat binds."""
     chosen = [name for name in _LINES if heat_binds(name) and cell_of_instance(_LINES[name]).arms <= MOST_ARMS]
     units: list[Unit] = []
-    for cell, source in product(dict.fromkeys(map(cell_name, chosen)), SOURCES):
+    cells = [*dict.fromkeys(map(cell_name, chosen))][: given.cells]
+    for cell, source in product(cells, given.sources):
         wanted = {f"{source}/{name}": name for name in chosen if cell_name(name) == cell}
         units.append(Unit(tuple(wanted), partial(surprise_rows, wanted, source)))
     return units
@@ -284,7 +291,8 @@ def surprise_units(given: Namespace) -> list[Unit]:
 def surprise_tables(rows: Sequence[Row]) -> dict[str, Table]:
     """Accuracy of P by source, in instances with and without a surprise."""
     lines: list[tuple[str, ...]] = []
-    for source, surprised in product(SOURCES, (False, True)):
+    sources = dict.fromkeys(row["source"] for row in rows)
+    for source, surprised in product(sources, (False, True)):
         own = [row for row in matching(rows, source=source) if (row["surprise"] != "nothing") == surprised]
         own = [row for row in own if row["p"]]
         p, passed = (np.concatenate([row[name] for row in own]) for name in ("p", "passed"))
@@ -305,6 +313,7 @@ def surprise_tables(rows: Sequence[Row]) -> dict[str, Table]:
 SURPRISES = Experiment(
     help="P(saturation) at awards of `bid_price` in instances of the test split where heat binds, and the outcomes.\n\n"
     "A quarter of an hour, once the twins are prepared.",
+    options=surprise_options,
     units=surprise_units,
     tables=surprise_tables,
 )

@@ -23,6 +23,7 @@ TINY = {
     "sweep": "--scenarios heat_wave --arms 0 --only ours --train 10 --test 60",
     "parsimony": "--scenarios heat_wave --train 6 --test 60",
     "reliability": "--policies wspt --seeds 1 --fleets 1",
+    "surprises": "--sources oracle --cells 1",
     "questions": "--seeds 1 --epochs 4",
     "identification": "",
     "transfer": "--seeds 1 --jobs 2 4 --source-jobs 6 --source-steps 4 --held-out 4 --test 9 "
