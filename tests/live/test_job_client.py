@@ -155,8 +155,8 @@ def test_to_ask_gets_a_reply_a_refusal_or_none(place, threads):
             here.client.submit_and_wait([JOB])
         key = keys.of_jobs("f", "status")
         assert here.link.ask(key, StatusRequest(), Status, timeout_s=PATIENCE_S).auctioneer == "boss"
-    with pytest.raises(NoReply, match="in time"):
-        here.link.ask(key, StatusRequest(), Status, timeout_s=0.1)
+    with pytest.raises(NoReply, match="in time"):  # the thread may still have dropped a first request
+        here.link.ask(key, StatusRequest(), Status, timeout_s=0.1, attempts=3)
     here.other.close()
     with pytest.raises(NoReply, match="There is no auctioneer in this fleet"):
         here.link.ask(key, StatusRequest(), Status, timeout_s=0.1, attempts=2)
