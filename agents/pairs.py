@@ -27,6 +27,8 @@ PAIR_FEATURES = 26
 """Numbers of a pair."""
 MOST = 4.0
 """Bound of every number of a pair."""
+MOST_PARAMETER = 20.0
+"""Bound of every parameter of a stored policy."""
 
 
 class Prices(NamedTuple):
@@ -207,10 +209,15 @@ def load_pairs(folder: Path) -> LearnedPrices:
         found = json.loads((folder / PAIRS_CARD).read_text(encoding="utf-8"))["format"]
         with (folder / PAIRS).open("rb") as opened:
             parameters = np.load(opened, allow_pickle=False)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"There is no policy over pairs in '{folder}' ({error}).") from error
+    except Exception as error:  # whatever it is, the files are missing or damaged
+        reason = f"{type(error).__name__}: {error}"
+        raise CheckpointError(f"There is no policy over pairs in '{folder}' ({reason}).") from error
     if found != PAIRS_FORMAT:
         raise CheckpointError(f"{folder / PAIRS_CARD}: format {found} is not {PAIRS_FORMAT}. Train the policy again.")
-    if parameters.shape != (PARAMETERS,) or not np.isfinite(parameters).all():
-        raise CheckpointError(f"{folder / PAIRS}: must be {PARAMETERS} finite numbers (shape {parameters.shape}).")
+    shape, kind = np.shape(parameters), getattr(parameters, "dtype", None)
+    if shape != (PARAMETERS,) or kind != np.float32 or not (np.abs(parameters) <= MOST_PARAMETER).all():
+        raise CheckpointError(
+            f"{folder / PAIRS}: must be {PARAMETERS} finite numbers, float32, from {-MOST_PARAMETER:g} to "
+            f"{MOST_PARAMETER:g} (got shape {shape}, {kind}). Train the policy again."
+        )
     return LearnedPrices(parameters)

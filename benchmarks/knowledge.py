@@ -25,6 +25,8 @@ def main(given: list[str]) -> None:
     if given == ["--instances"]:
         print(",".join(line.name for line in manifest("test") if cell_of_instance(line).arms <= MOST_ARMS))
         return
+    if not given or given[0].startswith("-"):
+        raise SystemExit(__doc__)
     for folder in map(Path, given):
         for each in submissions_of(read_card(folder), read_rows(folder), "thermofleet", ""):
             print(write(each, OUT))

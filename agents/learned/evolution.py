@@ -91,10 +91,12 @@ class Evolution:
             with np.load(path, allow_pickle=False) as saved:
                 found = {name: saved[name] for name in saved.files}
             state, done = found.pop("state"), int(found.pop("done"))
-        except (OSError, ValueError, KeyError) as error:
+        except Exception as error:  # whatever it is, the file is damaged
             raise CheckpointError(f"{path}: the training cannot be resumed ({error}).") from error
         if state.shape != (4, len(self.mean)):
             raise CheckpointError(f"{path}: the training cannot be resumed: it has another number of parameters.")
+        if not np.isfinite(state).all():
+            raise CheckpointError(f"{path}: the training cannot be resumed: its state is not finite.")
         (self.mean, self.average, self._first_moment, self._second_moment), self.done = state, done
         return {name: float(value) for name, value in found.items()}
 

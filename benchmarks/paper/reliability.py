@@ -30,7 +30,7 @@ from fleet.engine.shift import StepRecord
 from fleet.events import Event
 from fleet.files import cache_folder
 from fleet.heat.thermal import WINDING
-from scenarios.evaluate.sources import Fleets, drawn
+from scenarios.evaluate.sources import Fleets, check_source, drawn
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
@@ -281,6 +281,8 @@ def surprise_units(given: Namespace) -> list[Unit]:
     """A unit for each source and cell of the test split with at most `MOST_ARMS`, where heat binds."""
     chosen = [name for name in _LINES if heat_binds(name) and cell_of_instance(_LINES[name]).arms <= MOST_ARMS]
     units: list[Unit] = []
+    for source in given.sources:
+        check_source(source)
     cells = [*dict.fromkeys(map(cell_name, chosen))][: given.cells]
     for cell, source in product(cells, given.sources):
         wanted = {f"{source}/{name}": name for name in chosen if cell_name(name) == cell}
@@ -295,6 +297,8 @@ def surprise_tables(rows: Sequence[Row]) -> dict[str, Table]:
     for source, surprised in product(sources, (False, True)):
         own = [row for row in matching(rows, source=source) if (row["surprise"] != "nothing") == surprised]
         own = [row for row in own if row["p"]]
+        if not own:
+            continue
         p, passed = (np.concatenate([row[name] for row in own]) for name in ("p", "passed"))
         brier = mean_by_group(
             (

@@ -37,7 +37,8 @@ NEEDED = ("python", "thermofleet", "numpy", "numba", "scipy")
 """Versions that a result must state."""
 MOST_FIGURE = 1e9
 MOST_LOSS = 100.0
-"""Least possible reward: this many times the way from random to the upper bound, below random."""
+"""Least possible reward: this many times the unit of the score, or the way from random to the upper bound, below
+random."""
 SHOWN = 3
 """Problems that an error names."""
 PLAIN = r"^[^\x00-\x1f\x7f-\x9f|<>`\u2028\u2029\ud800-\udfff]*$"
@@ -215,7 +216,7 @@ def _problems_of_shift(row: ResultLine, line: ManifestLine, known: ShiftReferenc
         yield f"has a hottest motor of {own['peak_c']:g} °C, not within {PEAK_LOW_C:g} to {PEAK_HIGH_C:g}"
     if reward > own["value"] + SLACK * (1 + own["value"]):
         yield f"has a reward of {reward:.4g}, above the finished value {own['value']:.4g}: all else is a cost"
-    if known and reward < (least := known.random - MOST_LOSS * (known.upper - known.random)):
+    if known and reward < (least := known.random - MOST_LOSS * max(known.unit, known.upper - known.random)):
         yield f"has a reward of {reward:.4g}, below what the worst policy could lose ({least:.4g})"
     if known and reward > known.upper + SLACK * (1 + abs(known.upper)):
         yield f"has a reward of {reward:.4g}, above the upper bound {known.upper:.4g}, which no policy exceeds"

@@ -161,7 +161,12 @@ def check_folder(out: Path, card: Mapping[str, Any], state: str, *, resume: bool
         return
     if not (holds_training(out) and (out / state).is_file()):
         raise FleetError(f"'{out}' holds no training to resume.")
-    before = json.loads((out / TRAINING).read_text(encoding="utf-8"))
+    try:
+        before = json.loads((out / TRAINING).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FleetError(f"'{out / TRAINING}' is damaged ({error}); the training cannot be resumed.") from error
+    if not isinstance(before, dict):
+        raise FleetError(f"'{out / TRAINING}' is damaged (no JSON object); the training cannot be resumed.")
     was, now = (each | each.get("config", {}) | {"config": None} for each in (before, json.loads(json.dumps(card))))
     for name, value in now.items():
         if was.get(name) != value:

@@ -9,6 +9,7 @@ from agents.learned.evolution import Evolution, EvolutionConfig
 from agents.pairs import (
     PAIR_FEATURES,
     PAIRS,
+    PAIRS_CARD,
     PARAMETERS,
     LearnedPrices,
     Prices,
@@ -149,3 +150,23 @@ def test_the_search_finds_a_known_optimum_and_goes_on_where_it_was(tmp_path) -> 
     (tmp_path / "state.npz").write_bytes(b"rubbish")
     with pytest.raises(CheckpointError, match="cannot be resumed"):
         again.load(tmp_path / "state.npz")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(b"PK\x03\x04 rubbish"),
+        lambda path: np.save(path, np.zeros(PARAMETERS, complex)),
+        lambda path: np.save(path, np.full(PARAMETERS, "x")),
+        lambda path: np.save(path, np.full(PARAMETERS, np.nan, np.float32)),
+        lambda path: np.save(path, np.full(PARAMETERS, 1e30, np.float32)),
+        lambda path: path.with_name(PAIRS_CARD).write_text("[" * 100_000),
+    ],
+    ids=["empty", "zip", "complex", "text", "nan", "huge", "nested"],
+)
+def test_a_damaged_folder_is_refused_in_a_sentence(tmp_path, damage) -> None:
+    save_pairs(np.zeros(PARAMETERS), tmp_path)
+    damage(tmp_path / PAIRS)
+    with pytest.raises(CheckpointError):
+        load_pairs(tmp_path)

@@ -13,7 +13,7 @@ from fleet.engine.shift import shifts_of
 from fleet.engine.tables import tables_of
 from fleet.env.allocation_v2 import Episode, parallel_env
 from fleet.heat.thermal import WINDING, modal_model
-from fleet.live.arm.body import MAX_STEPS, SimulatedBody
+from fleet.live.arm.body import MAX_STEPS, ExpectedTemperatures, SimulatedBody
 from fleet.observation import Layout
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED
@@ -22,8 +22,9 @@ DT_S = 10.0
 LIMITS = ThermalLimits()
 
 
-def body_of(arm, *, dt_s=DT_S, limits=LIMITS, ambient_c=lambda time_s: 25.0, warm=False, seed=0):
-    return SimulatedBody(arm, limits, ambient_c, dt_s=dt_s, rng=np.random.default_rng(seed), warm=warm)
+def body_of(arm, *, dt_s=DT_S, limits=LIMITS, ambient_c=lambda time_s: 25.0, warm=False, seed=0, time_s=0.0):
+    rng = np.random.default_rng(seed)
+    return SimulatedBody(arm, limits, ambient_c, dt_s=dt_s, rng=rng, warm=warm, time_s=time_s)
 
 
 def one_job(small, *, repetitions=3, payload=None, times=None):
@@ -333,21 +334,38 @@ def test_a_body_measures_the_heat_of_its_job_once_the_cycles_have_begun(small):
     assert found[True][-1] is None  # at home
 
 
-@pytest.mark.parametrize("drift_k_per_s", [0.0, 0.01, -0.01])
-def test_a_reading_that_drifts_is_warmer_or_cooler_than_the_arm_expects(small, drift_k_per_s):
-    """At home in a steady state, by 7 d t of the rise of all motors; a rise of less than 1 K each counts as 1 K.
+@pytest.mark.parametrize(("drift_k_per_s", "time_s"), [(0.0, 0.0), (0.01, 0.0), (-0.01, 0.0), (0.01, 36_000.0)])
+def test_a_reading_that_drifts_is_warmer_or_cooler_than_the_arm_expects(small, drift_k_per_s, time_s):
+    """At home in a steady state, by 7 d t of the rise of all motors, also in an arm that starts late.
 
     Smoothed with a time constant of 100 s, the ratio lags by as much.
     """
     arm, _, _ = one_job(small)
-    arm = replace(arm, learns=True, known=(arm.thermal, arm.motors), drift_k_per_s=drift_k_per_s)
-    body = body_of(arm, warm=True)
+    quiet = replace(arm.motors, sensor_noise_k=np.zeros(7))
+    arm = replace(arm, motors=quiet, learns=True, known=(arm.thermal, quiet), drift_k_per_s=drift_k_per_s)
+    body = body_of(arm, warm=True, time_s=time_s)
     first_c, rise_k = body.expected_c, float((body.truth.temp_c[0, 0, WINDING] - 25.0).sum())
     assert rise_k > 7.0
+    read_c = [np.array(body.read_sensors().temp_c)]
     for tick in range(1, 201):
-        body.advance(DT_S * tick)
+        body.advance(time_s + DT_S * tick)
+        read_c.append(np.array(body.read_sensors().temp_c))
+        if tick == 150:
+            body.set_step(DT_S / 2.0)
+            body.set_time(body.time_s)
     np.testing.assert_allclose(body.expected_c, first_c, atol=0.02)
     assert body.warmer == pytest.approx(1.0 + 7.0 * drift_k_per_s * (2000.0 - 100.0) / rise_k, abs=0.03)
+    np.testing.assert_allclose(np.diff(read_c, axis=0), drift_k_per_s * DT_S, atol=0.02)
+
+
+def test_without_a_reading_an_arm_does_not_change_what_it_has_found(small):
+    arm, _, _ = one_job(small)
+    expected = ExpectedTemperatures(arm.thermal, np.full(14, 40.0), warmer=1.2)
+    expected.step(np.zeros(14), 10.0, 25.0, np.full(7, np.nan))
+    assert expected.warmer == 1.2
+    assert (expected.temp_c < 40.0).all()
+    with pytest.raises(ValueError, match="must be > 0 s"):
+        body_of(arm).set_step(0.0)
 
 
 def test_a_body_compares_its_temperatures_as_the_arms_of_a_simulated_shift_do(small):

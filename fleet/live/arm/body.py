@@ -277,11 +277,12 @@ class ExpectedTemperatures:
 
         Args:
             heat_w: [node].
-            measured_c: At its end, [joint].
+            measured_c: At its end, [joint]; a step without it leaves `warmer` as it is.
         """
         self.temp_c = self.thermal.step(self.temp_c, heat_w, ambient_c, dt_s)
         measured_k, expected_k = (float((each - ambient_c).sum()) for each in (measured_c, self.temp_c[WINDING]))
-        self.warmer = float(smooth_ratio(self.warmer, measured_k, expected_k, dt_s))
+        if np.isfinite(measured_k):
+            self.warmer = float(smooth_ratio(self.warmer, measured_k, expected_k, dt_s))
 
 
 @dataclass(eq=False)
@@ -407,8 +408,7 @@ class SimulatedBody:
         if self._last is None:
             still = np.zeros_like(self._arm.rest_tau)
             temp_c, motors, tau = self._state.temp_c[0, 0], self._arm.motors, self._arm.rest_tau
-            drift_k = self._arm.drift_k_per_s * self.time_s
-            noisy_c = temp_c[WINDING] + drift_k + motors.sensor_noise_k * self._rng.standard_normal(still.shape)
+            noisy_c = temp_c[WINDING] + self._drift_k + motors.sensor_noise_k * self._rng.standard_normal(still.shape)
             values = (noisy_c, self._arm.robot.home_q(), still, tau, current(tau, still, temp_c[HOUSING], motors))
             return SensorReading("idle", *(tuple(v.tolist()) for v in values))
         world, record = self._last
@@ -452,14 +452,17 @@ class SimulatedBody:
         self._start_s += time_s - self.time_s
 
     def set_step(self, dt_s: float) -> None:
-        time_s, ticks, dt_s = self.time_s, float(self._state.tick[0]), min(dt_s, self._max_dt_s)
+        if not dt_s > 0:
+            raise ValueError(f"The step of a body must be > 0 s (got {dt_s}).")
+        time_s, before_s, dt_s = self.time_s, float(self._state.tick[0]) * self._dt_s, min(dt_s, self._max_dt_s)
+        ticks = int(before_s / dt_s + ROUNDING_S)
         phi, gamma = self._world.thermal.step_matrices(dt_s)
-        # The engine counts its time in ticks of the new length.
-        later_s = ticks * (dt_s - self._dt_s)
+        # The engine counts its time in ticks of the new length, of which as many have passed.
+        later_s = ticks * dt_s - before_s
         clear_at_s, moved_at_s = self._state.clear_at_s + later_s, self._state.moved_at_s + later_s
         observer = HousingObserver(*(part[None] for part in housing_observer(*self._arm.beliefs, dt_s)))
         self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma, observer=observer)
-        self._state = self._state.changed(clear_at_s=clear_at_s, moved_at_s=moved_at_s)
+        self._state = self._state.changed(tick=np.array([ticks]), clear_at_s=clear_at_s, moved_at_s=moved_at_s)
         self._dt_s = dt_s
         self.set_time(time_s)
 
@@ -490,8 +493,7 @@ class SimulatedBody:
         """Compare temperatures with those expected of the heat in a step, by currents and the copper that it knows."""
         heat_w, known = record.heat_w[0, 0].copy(), self._arm.beliefs[1]
         heat_w[WINDING] *= known.copper_w_per_a2 / self._arm.motors.copper_w_per_a2
-        drift_k = self._arm.drift_k_per_s * self.time_s
-        expected.step(heat_w, self._dt_s, ambient_c, self._state.temp_c[0, 0, WINDING] + drift_k)
+        expected.step(heat_w, self._dt_s, ambient_c, self._state.temp_c[0, 0, WINDING] + self._drift_k)
 
     def _prepare_stint(self, task: _Current) -> bool:
         """Apply the allowed cycles to the next step; return whether the arm leaves home in it."""
@@ -548,6 +550,11 @@ class SimulatedBody:
                 report("return", at_s, float(cycles), f"{cycles} of {total} cycles kept")
                 self._task = None
         return events
+
+    @property
+    def _drift_k(self) -> float:
+        """By which its readings have drifted since its start, as the engine counts time."""
+        return self._arm.drift_k_per_s * float(self._state.tick[0]) * self._dt_s
 
     # Arrays of the engine
 
