@@ -285,7 +285,7 @@ def test_several_instances_are_told_apart_or_together(scenario, plans):
 @pytest.mark.ci_slow
 def test_folders_of_trainings_are_one_policy(scenario, plans, tmp_path):
     for k in (0, 1, 10):
-        save_pairs(np.eye(1, PARAMETERS)[0] * -9.0 * k, tmp_path / f"pairs-{k}")  # refuses warm jobs, then all
+        save_pairs(np.eye(1, PARAMETERS)[0] * -9.0 * min(k, 2), tmp_path / f"pairs-{k}")  # refuses warm jobs, then all
     every = str(tmp_path / "pairs-*")
     rows = runner.run_study(study_of(scenario, "wsept", every), cache_dir=plans, workers=1)
     assert [(row.key.policy, row.key.training) for row in rows[::3]] == [("wsept", 0), *((every, k) for k in range(3))]
