@@ -224,6 +224,7 @@ def guarded(guard: Callable[[], Guard], policy: Policy | ArmPolicy) -> Policy | 
 
 
 Floats = Array | float
+UNCHANGED: Sequence[Floats] = (1.0, 1.0, 1.0)
 
 
 class Thermometer(Matched, CentralRule):
@@ -301,12 +302,19 @@ class Wsept(Matched, CentralRule):
         return np.where(worth > 0, worth * self.urgency(dues) / duration_s, -np.inf)
 
     @classmethod
-    def worth(cls, seen: Observation) -> Array:
-        """Expected value less the expected cost of heat of every option, begun now, [env, arm, option]."""
+    def worth(cls, seen: Observation, cooler_k: Floats = 0.0, factors: Sequence[Floats] = UNCHANGED) -> Array:
+        """Expected value less the expected cost of heat of every option, begun now, [env, arm, option].
+
+        Args:
+            cooler_k: Added to `margin_k`.
+            factors: As in `worth_of`.
+        """
         value, hottest_c = per_option(seen, seen.value), seen.temp_c.max(axis=-1)[..., None]
         warning_c, error_c = warning_of(seen)[..., None], error_of(seen)[..., None]
         peak_c = cls.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
-        return cls.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c + cls.margin_k)
+        return cls.worth_of(
+            value, seen.duration_s, peak_c, hottest_c, warning_c, error_c + cls.margin_k + cooler_k, factors
+        )
 
     @classmethod
     def later_worth(cls, worth: Array, duration_s: Array, start_s: Array, dues: Dues) -> Array:
@@ -346,7 +354,7 @@ class Wsept(Matched, CentralRule):
         hottest_c: Floats,
         warning_c: Floats,
         error_c: Floats,
-        factors: Sequence[Floats] = (1.0, 1.0, 1.0),
+        factors: Sequence[Floats] = UNCHANGED,
     ) -> Array:
         """Expected value of jobs less the expected cost of heat, [n].
 

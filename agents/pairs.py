@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.heat import Wsept, error_of, warning_of
+from agents.heat import Wsept, warning_of
 from agents.policy import per_option, plans_of
 from agents.prices import BidPrice, Bids, Weights
 from fleet.errors import CheckpointError
@@ -52,18 +52,21 @@ PARAMETERS = len(Prices._fields) + 2 * PAIR_FEATURES
 """Length of the vector of parameters."""
 
 
-def features_of(seen: Observation, bids: Bids, cost: Array) -> Array:
+def features_of(seen: Observation, bids: Bids, cost: Array, relative: Array) -> Array:
     """Numbers of all pairs of arm and option, float [env, arm, option, PAIR_FEATURES]; 0 for what an arm cannot do.
 
     Args:
         seen: Observations [env, arm].
         bids, cost: Of every option, as of `agents.prices.gain_of`.
+        relative: Worth per second of every option over the mean of the fleet.
     """
     plans, can = plans_of(seen), bids.worth > 0
-    rate, scale = rates_of(bids)
-    own = np.where(can, rate / scale, -MOST)
-    by_job = own.reshape(*own.shape[:2], -1, plans)
-    best = by_job.max(axis=-1)
+    own = np.where(can, relative, -MOST)
+
+    def by_job(values: Array) -> Array:
+        return values.reshape(*values.shape[:2], -1, plans)
+
+    best, able = by_job(own).max(axis=-1), by_job(can).any(axis=-1)
 
     def of_job(values: Array) -> Array:
         return np.broadcast_to(values, best.shape).repeat(plans, axis=-1)
@@ -73,11 +76,10 @@ def features_of(seen: Observation, bids: Bids, cost: Array) -> Array:
     peak_c = np.where(seen.peak_c > 0, seen.peak_c, hottest_c)
     waiting_s = np.maximum(per_option(seen, seen.due_in_s), 0.0)
     slack_s, value = seen.slack_s, per_option(seen, seen.value)
-    able = can.reshape(*can.shape[:2], -1, plans).any(axis=-1)
     offered, free = seen.offered[:, 0].sum(axis=-1), seen.idle.sum(axis=1)
     count = np.maximum(can.sum(axis=(1, 2), keepdims=True), 1)
     mean_value = np.where(can, value, 0.0).sum(axis=(1, 2), keepdims=True) / count
-    fastest_s = np.where(can, duration_s, np.inf).reshape(*can.shape[:2], -1, plans).min(axis=(1, 3))[:, None]
+    fastest_s = by_job(np.where(can, duration_s, np.inf)).min(axis=(1, 3))[:, None]
     others = np.maximum(able.sum(axis=1, keepdims=True) - able, 1)
     positive = np.where(able, best, 0.0)
     mean_of_others = (positive.sum(axis=1, keepdims=True) - positive) / others
@@ -164,19 +166,15 @@ class LearnedPrices(BidPrice):
         """As of `bid_price`, with the learned prices of heat."""
         parameters = np.stack([each.parameters for each in policies]).astype(np.float32)  # as the observation
         learned = Prices(*parameters.T[: len(Prices._fields), :, None, None])
-        value, hottest_c = per_option(seen, seen.value), seen.temp_c.max(axis=-1)[..., None]
-        warning_c = warning_of(seen)[..., None]
-        error_c = error_of(seen)[..., None] + Wsept.margin_k + 10.0 * learned.margin
-        peak_c = Wsept.predicted_peak_c(seen.peak_c, seen.p_saturation, warning_c)
         factors = [np.exp(each) for each in (learned.spread, learned.fault, learned.minute)]
-        return Wsept.worth_of(value, seen.duration_s, peak_c, hottest_c, warning_c, error_c, factors)
+        return Wsept.worth(seen, 10.0 * learned.margin, factors)
 
     @classmethod
     def weights(cls, policies: Sequence[Any], seen: Observation, bids: Bids, cost: Array) -> Weights:
         """The learned factor and shift of the gain of every option."""
         learned = np.stack([each.parameters[len(Prices._fields) :] for each in policies])
-        _, scale = rates_of(bids)
-        each = features_of(seen, bids, cost) @ learned.reshape(len(policies), 1, PAIR_FEATURES, 2)
+        rate, scale = rates_of(bids)
+        each = features_of(seen, bids, cost, rate / scale) @ learned.reshape(len(policies), 1, PAIR_FEATURES, 2)
         f, g = np.moveaxis(np.clip(each, -3.0, 3.0), -1, 0)
         return Weights(np.exp(f), g * scale)
 

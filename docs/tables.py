@@ -28,6 +28,7 @@ from reference_tables import TABLES as REFERENCE
 from agents.learned.evolution import read_log
 from agents.registry import RULES
 from benchmarks.alarms import stored_table
+from benchmarks.knowledge import MOST_ARMS
 from benchmarks.paper.__main__ import study
 from benchmarks.result_tables import (
     FIGURES as ABLATION_FIGURES,
@@ -418,13 +419,12 @@ BY_MESSAGES = "bid_price_shared"
 
 def by_bus(folder: Path) -> str:
     """Worth of messages by the bus of the instances, with exact predictions and with those of twins."""
-    results, bus = read_all(folder, "test"), {line.name: line.axes.bus for line in manifest("test")}
+    bus = {line.name: line.axes.bus for line in manifest("test")}
+    by_source = [scored(folder, "test", source)[1] for source in ("oracle", SOURCE)]
     rows: list[tuple[str, ...]] = []
     for kind in get_args(Bus):
         cells: list[str] = []
-        for source in ("oracle", SOURCE):
-            found = {each.card.policy: each for each in with_source(results, source)}
-            values = scores_by_name(found, "test")
+        for values in by_source:
             own = values.only(np.array([bus[name] == kind for name in values.instances]))
             cells += [f"{own.score[policy].mean():.2f}" for policy in (BY_MESSAGES, ALONE)]
             cells.append(shown(own.difference(BY_MESSAGES, ALONE)))
@@ -521,11 +521,9 @@ def ablation_table(folders: Mapping[str, Path], columns: Mapping[str, str]) -> s
     return table(("", *columns.values()), rows) + sizes_text(folders)
 
 
-SMALL = 8
-"""Most arms of the cells for which all sources of predictions are prepared."""
 TEST_SIZES: Mapping[str, Callable[[Array], Array]] = {
-    "4 to 8 arms": lambda arms: arms <= SMALL,
-    "16 to 64 arms": lambda arms: arms > SMALL,
+    "4 to 8 arms": lambda arms: arms <= MOST_ARMS,
+    "16 to 64 arms": lambda arms: arms > MOST_ARMS,
 }
 """Groups of instances by their numbers of arms."""
 
@@ -543,9 +541,9 @@ def trainings_table(folder: Path) -> str:
     return table(("training", "iterations", "`bid_price`, the beginning", "best", "last"), rows)
 
 
-def scored(folder: Path, split: str) -> tuple[dict[str, BoardResult], Normalised]:
-    """The results on a split with exact predictions by policy, and their scores."""
-    found = {each.card.policy: each for each in with_source(read_all(folder, split), "oracle")}
+def scored(folder: Path, split: str, source: str = "oracle") -> tuple[dict[str, BoardResult], Normalised]:
+    """The results on a split by policy, with exact predictions or from another source, and their scores."""
+    found = {each.card.policy: each for each in with_source(read_all(folder, split), source)}
     return found, scores_by_name(found, split)
 
 

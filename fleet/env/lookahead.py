@@ -49,7 +49,7 @@ class CellSimulator:
     def __init__(
         self, tables: Tables, arms: int, slots: int, weights: RewardWeights, *, compiled: bool | None = None
     ) -> None:
-        self._ambient_c, self._plans, self._weights = tables.ambient_c, tables.plans, weights
+        self._tables, self._weights = tables, weights
         layout = Layout(arms, slots, plans=tables.work.shape[3])
         own = tables._replace(ambient_c=tables.ambient_c.copy(), plans=tables.plans.copy())
         self._engine = Engine(own, SIDE_BY_SIDE, layout, weights, compiled=compiled)
@@ -60,9 +60,7 @@ class CellSimulator:
     def with_limits(self, warning_c: float, error_c: float) -> "CellSimulator":
         """A simulator of the same cell with other limits of the motors, °C, for a margin."""
         engine = self._engine
-        tables = engine.tables._replace(
-            warning_c=warning_c, error_c=error_c, ambient_c=self._ambient_c, plans=self._plans
-        )
+        tables = self._tables._replace(warning_c=warning_c, error_c=error_c)
         return CellSimulator(tables, engine.layout.arms, engine.layout.slots, self._weights)
 
     @property
@@ -98,7 +96,7 @@ class CellSimulator:
         if engine.tables.learns:
             self._correct(engine, env, known)
         mine.tables.work["difficulty"] = engine.tables.work["difficulty"]  # it decides between claims
-        mine.tables.ambient_c[:] = self._ambient_c[:, [min(tick, mine.tables.ticks - 1)]]
+        mine.tables.ambient_c[:] = self._tables.ambient_c[:, [min(tick, mine.tables.ticks - 1)]]
         mine.reset(np.arange(SIDE_BY_SIDE), shifts_of(known, [0]) * SIDE_BY_SIDE)
         mine.load(known)
         self._state = mine.state.copy(slice(0, 1))
@@ -118,7 +116,7 @@ class CellSimulator:
         factor = np.broadcast_to(1.0 + excess.T[..., None], plans.shape)
         has = plans >= 0
         for name in ("current_sq", "friction_w"):
-            tables.plans[name][plans[has]] = self._plans[name][plans[has]] * factor[has][:, None, None]
+            tables.plans[name][plans[has]] = self._tables.plans[name][plans[has]] * factor[has][:, None, None]
 
     def run(self, schedules: Plans, discount: Array) -> Script:
         """Results of at most `rows` schedules from the time of the last `look`.

@@ -15,6 +15,7 @@ from agents.pairs import (
     Prices,
     features_of,
     load_pairs,
+    rates_of,
     save_pairs,
 )
 from agents.policy import on_arrays, without_empty
@@ -104,7 +105,9 @@ def test_numbers_of_a_pair_are_bounded_and_those_of_its_job_and_arm() -> None:
     seen = without_empty(LazyObservation(lambda name: getattr(one, name)[None]))
     worth, duration_s = np.zeros((1, 5, 12)), np.full((1, 5, 12), 60.0)
     worth[0, :2, 0], duration_s[0, 1, 0] = 2.0, 120.0
-    numbers = features_of(seen, Bids(worth, duration_s), np.zeros((1, 5, 12)))
+    bids = Bids(worth, duration_s)
+    rate, scale = rates_of(bids)
+    numbers = features_of(seen, bids, np.zeros((1, 5, 12)), rate / scale)
     assert numbers.shape == (1, 5, 12, PAIR_FEATURES)
     assert np.abs(numbers).max() <= 4.0
     assert (numbers[0, 2:] == 0).all()
