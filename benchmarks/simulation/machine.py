@@ -15,7 +15,7 @@ import numpy as np
 
 from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
 from fleet.events import Event
-from fleet.live.arm.body import SensorReading
+from fleet.live.arm.body import UNKNOWN, SensorReading
 from fleet.robot import JOINTS
 
 HOUSING_C = np.full(JOINTS, 30.0)
@@ -114,7 +114,7 @@ class SimulatedArm:
 
     def __init__(self, name: str, deeds: Deeds, time_s: float) -> None:
         self.name, self.time_s, self._deeds = name, time_s, deeds
-        self.housing_c, self.excess, self.expected_c, self.warmer = HOUSING_C, None, None, 1.0
+        self.housing_c, self.excess, self.found = HOUSING_C, None, UNKNOWN
         self._task: JobSpec | None = None
         self._plan: SimulatedPlan | None = None
         self._before = self._allowed = self._todo = 0

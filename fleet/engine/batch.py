@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.engine.claims import set_phase
 from fleet.engine.crossings import hottest
-from fleet.engine.observe import COOLER_K, average_excess, excess_of
+from fleet.engine.observe import average_excess, excess_of, line_of
 from fleet.engine.state import DONE, RUNNING, WAITING, State
 from fleet.engine.step import (
     BLOCK,
@@ -119,7 +119,8 @@ def reset_rows(
                 arm["housing_c"][k] = net["start_housing_c"][k] + ambient_offset_k[n]
             arm["peak_c"] = hottest(arm["temp_c"])
             if t.learns:
-                sim.warmer[e, a] = 1.0
+                for i in range(sim.moments.shape[2]):
+                    sim.moments[e, a, i] = 0.0
                 for work in range(sim.excess.shape[2]):
                     sim.excess[e, a, work] = np.nan
                 for k in range(JOINTS):
@@ -258,7 +259,7 @@ class Engine:
             np.zeros((envs if path else 0, tables.ticks, arms, NODES), np.float32),
             np.full((envs, arms, works), np.nan, np.float32),
             np.zeros((envs, arms, nodes), np.float32),
-            np.ones((envs, arms), np.float32),
+            np.zeros((envs, arms, 4), np.float32),
             form_of(layout, shares_heat=shares_heat),
             room_for(arms, slots, tables.stations.shape[2], min(envs, BLOCK), works),
             weights_per_unit(weights),
@@ -333,13 +334,13 @@ class Engine:
         """What the arms of a row, which learn, know of their heat by measurement.
 
         Returns:
-            Excess of heat for some kinds of jobs, [arm, kind], see `fleet.engine.observe.excess_of`; and the lowest
-            temperatures that are believed, °C, [arm, node].
+            Excess of heat for some kinds of jobs, [arm, kind], see `fleet.engine.observe.excess_of`; and the offset of
+            the sensors, K, [arm].
         """
         mine, arms = self._simulation, range(self.layout.arms)
         average_excess(mine, env, mine.room.excess)
         excess = [[float(excess_of(mine, env, arm, kind)) for kind in kinds] for arm in arms]
-        return np.array(excess), mine.assumed_c[env] - COOLER_K
+        return np.array(excess), np.array([line_of(each)[1] for each in mine.moments[env]])
 
     def reset(self, envs: Array, shifts: Sequence[Shift]) -> None:
         """Put a new shift into each of some rows; `observe` then gives what their arms know."""

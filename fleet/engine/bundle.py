@@ -33,7 +33,7 @@ structref.define_proxy(Bundle, BundleType, list(Simulation._fields))
 
 
 def _make(
-    tables, state, offers, events, trace, drive, infos, path_c, excess, assumed_c, warmer, form, room, weights, script
+    tables, state, offers, events, trace, drive, infos, path_c, excess, assumed_c, moments, form, room, weights, script
 ):  # pyright: ignore
     return Bundle(
         tables,
@@ -46,7 +46,7 @@ def _make(
         path_c,
         excess,
         assumed_c,
-        warmer,
+        moments,
         form,
         room,
         weights,

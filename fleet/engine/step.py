@@ -238,8 +238,6 @@ def follow_housings(
 
 SMOOTH_S = 100.0
 """Time constant with which measured temperatures are compared with assumed ones."""
-LEAST_RISE_K = 1.0
-"""Mean rise of the motors above the air that is compared, at least."""
 
 
 @jit
@@ -266,20 +264,30 @@ def compare_temperatures(
     law = t.believed[nonnegative(sim.state.env[e]["fleet"]), a]
     load_nodes(t, law, assumed_c, current_sq, friction_w, powered, ambient_c, begin)
     advance(law, begin, end)
-    measured_k = assumed_k = _ZERO
     for n in range(NODES):
         assumed_c[n] = end[n]
+    compare(sim.moments[e, a], end, temp_c, drift_k, ambient_c, t.dt_s)
+
+
+@jit
+def compare(moments: Array, expected_c: Array, measured_c: Array, drift_k: Real, ambient_c: Real, dt_s: float) -> None:
+    """Smooth the moments of a line through the differences of measured and expected motor temperatures.
+
+    Args:
+        moments: Sums over the joints of x, x², y and xy, float32 [4]; x is the expected rise above the air and y the
+            difference, K.
+        expected_c: After a step, [node].
+        measured_c: After the step, less the drift, [joint or node].
+    """
+    x = xx = y = xy = _ZERO
     for k in range(JOINTS):
-        measured_k += temp_c[k] + drift_k - ambient_c
-        assumed_k += end[k] - ambient_c
-    sim.warmer[e, a] = smooth_ratio(sim.warmer[e, a], measured_k, assumed_k, t.dt_s)
-
-
-@jit_inline
-def smooth_ratio(warmer: Real, measured_k: Real, assumed_k: Real, dt_s: float) -> Real:
-    """Smoothed ratio of the measured to the assumed rise of the motors, summed, K, after a step."""
-    ratio = measured_k / max(assumed_k, np.float32(JOINTS * LEAST_RISE_K))
-    return warmer + np.float32(min(dt_s / SMOOTH_S, 1.0)) * (ratio - warmer)
+        rise_k, more_k = expected_c[k] - ambient_c, measured_c[k] + drift_k - expected_c[k]
+        x, xx, y, xy = x + rise_k, xx + rise_k * rise_k, y + more_k, xy + rise_k * more_k
+    share = np.float32(min(dt_s / SMOOTH_S, 1.0))
+    moments[0] += share * (x - moments[0])
+    moments[1] += share * (xx - moments[1])
+    moments[2] += share * (y - moments[2])
+    moments[3] += share * (xy - moments[3])
 
 
 @jit
@@ -543,7 +551,7 @@ def step_rows(
         s.path_c,
         s.excess,
         s.assumed_c,
-        s.warmer,
+        s.moments,
         s.form,
         s.room,
         s.weights,

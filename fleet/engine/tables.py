@@ -413,9 +413,9 @@ class Simulation(NamedTuple):
     assumed_c: Array
     """Temperatures that each arm should have by what it believes and by the currents that it measures, from the start
     of the shift, float32 [env, arm, node]; without columns no arm learns."""
-    warmer: Array
-    """Rise of the measured motor temperatures above the air over that of the assumed ones, smoothed, float32
-    [env, arm]."""
+    moments: Array
+    """Of the differences of measured and assumed motor temperatures, see `fleet.engine.step.compare`, float32
+    [env, arm, 4]."""
     form: Form
     room: Room
     weights: Array

@@ -215,11 +215,11 @@ def test_a_measured_excess_of_heat_counts_for_all_jobs_with_the_same_works(arm):
     assert made.excess_of(spec(name="impossible", places=("nowhere",))) == 0.0
 
 
-def test_warmer_motors_than_expected_count_as_more_heat_up_to_twice(arm):
+def test_more_heat_than_expected_counts_for_all_jobs(arm):
     made, _ = estimator_of(arm, model=Expects())
     made.learn(spec(), 0.25)
-    for warmer, excess in ((0.5, 0.25), (1.0, 0.25), (1.2, 0.5), (9.0, 1.5)):
-        made.warmer = warmer
+    for ratio, excess in ((1.0, 0.25), (1.2, 0.5), (2.0, 1.5)):
+        made.heat_ratio = ratio
         assert made.excess_of(spec()) == pytest.approx(excess)
         assert made.excess_of(spec(payload_kg=2.0)) == pytest.approx((1.0 + excess) / 1.25 - 1.0)
 

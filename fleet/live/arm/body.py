@@ -12,17 +12,18 @@ stopped. Once it has recovered it ends that cycle and goes home, if no person ha
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import ceil, floor
 from typing import Literal, Protocol
 
 import numpy as np
 
 from fleet.difficulty import Blind
+from fleet.engine.observe import line_of
 from fleet.engine.profile_plant import ProfilePlant, telemetry_of
 from fleet.engine.shift import StepRecord, initial, step
 from fleet.engine.state import DONE, State, World
-from fleet.engine.step import ROUNDING_S, smooth_ratio
+from fleet.engine.step import ROUNDING_S, compare
 from fleet.engine.world import Arm, build_world
 from fleet.events import Event
 from fleet.heat.motor import current
@@ -33,6 +34,10 @@ from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Mode
 
 Array = np.ndarray
+
+
+UNKNOWN = (1.0, 0.0)
+"""`Body.found` of an arm that has found nothing."""
 
 
 @dataclass(frozen=True)
@@ -91,13 +96,11 @@ class Body(Protocol):
         ...
 
     @property
-    def expected_c(self) -> Array | None:
-        """Temperatures that it expects of the heat that it measures, °C, [node]; None if unknown."""
-        ...
+    def found(self) -> tuple[float, float]:
+        """Ratio of the measured to the expected heat, and by how much its sensors read too much, K; 1 and 0 if unknown.
 
-    @property
-    def warmer(self) -> float:
-        """Measured rise of its motors over the ambient temperature by the expected one, smoothed; 1 if unknown."""
+        See `fleet.engine.observe.line_of`.
+        """
         ...
 
     def last_cycle_in_s(self) -> float:
@@ -190,7 +193,7 @@ class ReplayBody:
 
     # It takes no jobs.
 
-    job, is_free, cycles, away, expected_c, warmer = "", False, 0, None, None, 1.0
+    job, is_free, cycles, away, found = "", False, 0, None, UNKNOWN
 
     def last_cycle_in_s(self) -> float:
         return np.inf
@@ -269,20 +272,19 @@ class ExpectedTemperatures:
     """Its network, as identified."""
     temp_c: Array
     """[node]."""
-    warmer: float = 1.0
-    """See `Body.warmer`."""
+    moments: Array = field(default_factory=lambda: np.zeros(4, np.float32))
+    """See `fleet.engine.step.compare`."""
 
     def step(self, heat_w: Array, dt_s: float, ambient_c: float, measured_c: Array) -> None:
         """Advance by one step.
 
         Args:
             heat_w: [node].
-            measured_c: At its end, [joint]; a step without it leaves `warmer` as it is.
+            measured_c: At its end, [joint]; a step without it leaves `moments` as they are.
         """
         self.temp_c = self.thermal.step(self.temp_c, heat_w, ambient_c, dt_s)
-        measured_k, expected_k = (float((each - ambient_c).sum()) for each in (measured_c, self.temp_c[WINDING]))
-        if np.isfinite(measured_k):
-            self.warmer = float(smooth_ratio(self.warmer, measured_k, expected_k, dt_s))
+        if np.isfinite(measured_c).all():
+            compare(self.moments, self.temp_c, measured_c, 0.0, ambient_c, dt_s)
 
 
 @dataclass(eq=False)
@@ -371,12 +373,11 @@ class SimulatedBody:
         return self._arm.driven(self._plan)[-1]
 
     @property
-    def expected_c(self) -> Array | None:
-        return None if self._expected is None else self._expected.temp_c
-
-    @property
-    def warmer(self) -> float:
-        return 1.0 if self._expected is None else self._expected.warmer
+    def found(self) -> tuple[float, float]:
+        if self._expected is None:
+            return UNKNOWN
+        ratio, offset_k = line_of(self._expected.moments)
+        return float(ratio), float(offset_k)
 
     @property
     def truth(self) -> State:

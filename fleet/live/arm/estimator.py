@@ -16,7 +16,6 @@ from fleet.arm.space import plan_key, space_name
 from fleet.arm.time_limit import check_time, time_limit
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
-from fleet.engine.observe import of_warmer
 from fleet.errors import InfeasibleJob, printable
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, WINDING, gen3_network, temperature_steps, thermal_model
@@ -116,8 +115,8 @@ class Estimator:
         """By works that serve alike, number of repetitions and how many of them are done."""
         self._excess: dict[tuple[Work, ...], float] = {}
         """Excess of heat that was measured in works that serve alike, oldest first."""
-        self.warmer = 1.0
-        """By how much its motors are warmer than expected; see `fleet.live.arm.body.Body.warmer`."""
+        self.heat_ratio = 1.0
+        """Of the measured to the expected heat, see `fleet.live.arm.body.Body.found`."""
 
     def plan_ahead(self, works: Iterable[Work]) -> None:
         """Plan some works before they are requested; they are never dropped."""
@@ -193,7 +192,7 @@ class Estimator:
         """Excess of heat of a job, by what was measured in jobs with the same works and by the temperatures."""
         works = self._works(job)
         own = 0.0 if isinstance(works, NoPlan) else self._excess.get(works, 0.0)
-        return float(of_warmer(own, self.warmer))
+        return (1.0 + own) * self.heat_ratio - 1.0
 
     def job(self, job: JobSpec) -> Job:
         """Return the job with its work.

@@ -51,10 +51,8 @@ from fleet.bus.protocol.keys import STATE_HZ
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ResetReply, ResetRequest
 from fleet.difficulty import known_temperatures
-from fleet.engine.observe import COOLER_K
 from fleet.errors import BusError, Refused, printable
 from fleet.events import EVENTS_PER_BOOT, Event
-from fleet.heat.thermal import NODES
 from fleet.live.arm.awards import ActiveAward, ArmHistory, AwardExecutor, FaultCleared
 from fleet.live.arm.body import Body
 from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
@@ -529,10 +527,9 @@ class ArmNode:
         return self._config.ambient_c(self.clock.now_s(time.monotonic()))
 
     def _known_c(self) -> Array:
-        known_c = known_temperatures(np.array(self._reading.temp_c), self._body.housing_c, self._ambient_c)
-        if (expected_c := self._body.expected_c) is not None:
-            known_c[..., :NODES] = np.maximum(known_c[..., :NODES], expected_c - COOLER_K)
-        return known_c
+        _, offset_k = self._body.found
+        read_c, housing_c = np.array(self._reading.temp_c), self._body.housing_c
+        return known_temperatures(read_c - offset_k, housing_c - offset_k, self._ambient_c)
 
     def publish_difficulty(self, estimates: tuple[JobEstimate, ...], real_s: float) -> None:
         """Publish how difficult jobs are for the arm, by the plan with the least difficulty."""
@@ -639,7 +636,7 @@ class ArmNode:
         if self._reading.mode == "faulted" and self.executor.active:
             self.executor.return_all(self._body.time_s, real_s, "the arm is faulted")
             self._body_award = ""
-        self._estimator.warmer = self._body.warmer
+        self._estimator.heat_ratio, _ = self._body.found
         if current := self._current:
             at_work = self._body_award == current.award.award and self._body.job
             if at_work and (excess := self._body.excess) is not None:
