@@ -1,24 +1,10 @@
-"""Variants of `mpc` without discount, search or heat, for `thermofleet compare`; docs/policies.md has the command."""
+"""`mpc` without heat, for `thermofleet compare`; docs/leaderboard.md has the command."""
 
 from agents.planners import Mpc
 from agents.policy import CellLookahead
 
 OUT_OF_REACH_C = 1e6
 """Limits of motor temperatures where heat shall not count."""
-
-
-class WithoutDiscount(Mpc):
-    """A later reward counts as much as an early one."""
-
-    tau_s = 1e12
-    only_choices = True
-
-
-class WithoutSearch(Mpc):
-    """New jobs are put where they are worth most, and nothing is changed afterwards."""
-
-    evaluations = 0
-    only_choices = True
 
 
 class WithoutHeat(Mpc):

@@ -1,6 +1,5 @@
 """Tables of stored results, and their cells: benchmarks print them, `docs/tables.py` puts them into pages."""
 
-import csv
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -11,8 +10,7 @@ from typing import Any  # values of JSON
 import numpy as np
 
 from scenarios.evaluate.rollout import KINDS as FIGURE_KINDS
-from scenarios.evaluate.statistics import Figure, Interval, figures_of, interval, paired, paired_counts
-from scenarios.json_rows import Row, Rows
+from scenarios.evaluate.statistics import Figure, figures_of, paired, paired_counts
 from scenarios.table import markdown_table as table
 
 
@@ -77,19 +75,6 @@ def _channel_cell(name: str, x: np.ndarray, base: np.ndarray) -> str:
     d = (paired_counts if name == "faults" else paired)(x, base)
     text = d.text(digits, "+")
     return f"{mean} ({bold_if(d.excludes_zero, text)})"
-
-
-def live_table(measured: dict[str, Any]) -> str:
-    """Jobs finished and faults of each policy, simulated and live.
-
-    Args:
-        measured: A result of `benchmarks/bench_policies.py`.
-    """
-    rows = [
-        (f"`{row['policy']}`", row["scope"], *(str(n) for kind in ("simulated", "live") for n in row[kind].values()))
-        for row in measured["rows"]
-    ]
-    return table(("policy", "scope", "simulated: finished", "faults", "live: finished", "faults"), rows)
 
 
 KINDS = ("interval", "events")
@@ -179,55 +164,6 @@ def processor_sentence(measured: dict[str, Any]) -> str:
     )
 
 
-TRAININGS = {
-    "random": "`random`",
-    "rule": "the rule `{rule}`",
-    "mappo_warm": "`--algo mappo --warm-start {warm_start}`",
-    "mappo": "`--algo mappo`",
-    "ippo": "`--algo ippo`",
-    "benchmarl_mappo": "BenchMARL, MAPPO",
-    "benchmarl_ippo": "BenchMARL, IPPO",
-}
-"""Methods in the order of the table; the values in braces are those of the configuration."""
-BUDGET_SHARES = (0.0, 0.25, 0.5, 1.0)
-"""Parts of the budget in the table."""
-COSTS = {"hours": "simulated hours", "cpu_s": "CPU s"}
-"""What a training used from its first to its last evaluation, and the heading."""
-
-
-def trainings(path: Path) -> dict[str, list[Row]]:
-    """The trainings of every method, by its label, in the order of the table."""
-    rows = Rows(path)
-    by_method = {method: [row for row in rows.by_key.values() if row["method"] == method] for method in TRAININGS}
-    return {TRAININGS[method].format(**own[0]["config"]): own for method, own in by_method.items() if own}
-
-
-def course(own: Iterable[Row]) -> dict[int, Interval]:
-    """Mean reward of a shift over trainings, by env steps."""
-    by_steps = dict[int, list[float]]()
-    for row in own:
-        for point in row["points"]:
-            by_steps.setdefault(round(point["env_steps"]), []).append(point["reward"])
-    return {steps: interval(rewards) for steps, rewards in by_steps.items()}
-
-
-def efficiency_table(found: dict[str, list[Row]]) -> str:
-    """Rewards at parts of the budget with intervals over trainings, and what the trainings cost.
-
-    Args:
-        found: As `trainings`.
-    """
-    budget = max(steps for own in found.values() for steps in course(own))
-    at = [round(share * budget) for share in BUDGET_SHARES]
-    rows: list[tuple[str, ...]] = []
-    for label, own in found.items():
-        rewards = course(own)
-        cost = [f"{np.mean([row['points'][-1][k] - row['points'][0][k] for row in own]):,.0f}" for k in COSTS]
-        cells = (rewards[steps].text(1) if steps in rewards else "" for steps in at)
-        rows.append((label, str(len(own)), *cells, *cost))
-    return table(("", "seeds", *(f"{steps:,} env steps" for steps in at), *COSTS.values()), rows)
-
-
 Array = np.ndarray
 Shift = tuple[int, int, int]
 """Fleet, training and seed."""
@@ -267,24 +203,7 @@ class StoredAblation:
 
 
 def stored(folder: Path) -> StoredAblation:
-    """The content of a folder."""
-    if not (folder / "ablation.json").exists():
-        return _of_study(folder)
-    plan = json.loads((folder / "ablation.json").read_text(encoding="utf-8"))["plan"]
-    with (folder / "ablation.csv").open(newline="", encoding="utf-8") as file:
-        rows = [
-            (row["scores"], (int(row["fleet"]), int(row["training"]), int(row["seed"])), row)
-            for row in csv.DictReader(file)
-        ]
-    shifts = _by_name((name, shift, {each: float(row[each]) for each in FIGURES}) for name, shift, row in rows)
-    return StoredAblation(
-        {name: shifts[name] for name in plan["scores"]},
-        (plan["fleets"], plan["trainings"], plan["seeds"]),
-        plan["first_seed"],
-    )
-
-
-def _of_study(folder: Path) -> StoredAblation:
+    """The content of the folder of a comparison."""
     from scenarios.evaluate.store import read_rows
 
     rows = read_rows(folder)

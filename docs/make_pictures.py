@@ -16,7 +16,7 @@ from scenarios.train.training import draw_curves
 
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "docs" / "pictures"
-FILM_RUN = ("quickstart", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "20")
+FILM_RUN = ("quickstart", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "5")
 FILM = ("--size", "640x360", "--speed", "240", "--fps", "8", "--overwrite")
 REPORT_RUN = ("active_waiting", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "1")
 CELLS = (

@@ -37,17 +37,14 @@ from benchmarks.result_tables import (
     bold_if,
     channel_table,
     difference,
-    efficiency_table,
     env_ratios_table,
     env_table,
     halls_table,
-    live_table,
     processor_sentence,
     read_json,
     signed,
     steps_table,
     stored,
-    trainings,
 )
 from docs.bus_contract import asyncapi, schema_document
 from fleet.errors import FleetError
@@ -448,35 +445,10 @@ def mean_of(entry: BoardResult, figure: str, instances: Sequence[str] = ()) -> f
 
 
 ABLATED = ("heat_wave", "active_waiting")
-
-WRAPPED = {"wspt": "wspt@blind", "wsept": "wsept@rc", "least_difficulty": "least_difficulty@blind"}
+WRAPPED = {"wspt": "wspt@blind", "wsept": "wsept@rc"}
 """Policies of the table of wrappers, with their sources."""
 DIGITS = {"faults": 2}
 """Decimals of a figure; 1 for others."""
-MPC_PARTS = "benchmarks/mpc_parts.py"
-SCORE_SOURCES = {
-    "wsept@rc": "`wsept`, identified network",
-    "wsept@blind": "blind",
-    "wsept@oracle": "oracle",
-    "thermometer@blind": "`thermometer`, blind",
-    "limited:wspt@blind": "`limited:wspt`, blind",
-    "fuzzy:wspt@blind": "`fuzzy:wspt`, blind",
-}
-PARTS_OF_MPC = {
-    "mpc@rc": "`mpc`, identified network",
-    "mpc@oracle": "true network",
-    "mpc@rc-nominal": "nominal network",
-    f"{MPC_PARTS}:WithoutHeat@rc": "without heat",
-    f"{MPC_PARTS}:WithoutDiscount@rc": "without discount",
-    f"{MPC_PARTS}:WithoutSearch@rc": "without search",
-    "wsept@rc": "`wsept`",
-}
-WINDOWS = {
-    "trained-4s-32": "4 s, 32 units",
-    "trained-1s-16": "1 s, 16 units",
-    "untrained": "1 s, 16 units, untrained",
-    "blind": "blind",
-}
 
 
 def ablated(folder: str, results: Path) -> dict[str, Path]:
@@ -509,16 +481,6 @@ def wrappers_table(folders: Mapping[str, Path]) -> str:
             some = ablation_rows(folder, (bare, f"limited:{bare}", f"fuzzy:{bare}"))
             rows += [(f"`{policy}`, `{name}`: {heading}", *cells) for heading, cells in some]
     return table(("policy, scenario", "bare", "`limited:`", "`fuzzy:`"), rows) + sizes_text(folders)
-
-
-def ablation_table(folders: Mapping[str, Path], columns: Mapping[str, str]) -> str:
-    """Mean of the first column and differences to it; `–` for a source that a scenario was not measured with."""
-    rows = [
-        (f"`{name}`: {heading}", *cells)
-        for name, folder in folders.items()
-        for heading, cells in ablation_rows(folder, tuple(columns))
-    ]
-    return table(("", *columns.values()), rows) + sizes_text(folders)
 
 
 TEST_SIZES: Mapping[str, Callable[[Array], Array]] = {
@@ -653,7 +615,6 @@ def tables_of(results: Path) -> Tables:
         "ladder": of(ladder, results / "ladder"),
         "named_scenarios": of(named, results / "named"),
         "decisions": of_file(decisions, "ladder/decisions.json"),
-        "live_policies": of_file(live_table, "live_policies.json"),
         "steps": of_file(steps_table, "steps.json"),
         "env_rows": of_file(env_table, "env.json"),
         "env_ratios": of_file(env_ratios_table, "env.json"),
@@ -666,16 +627,12 @@ def tables_of(results: Path) -> Tables:
         "coverage_limits": of(coverage_by_limit, results / "coverage.json"),
         "coverage_clusters": of(coverage_by_clusters, results / "coverage.json"),
         **benchmark_tables(results),
-        "sample_efficiency": lambda: efficiency_table(trainings(results / "sample_efficiency/heat_wave.jsonl")),
         "trainings": of(trainings_table, results / "learned"),
         "leaderboard_sizes": of(by_size, board, "test", TEST_SIZES),
         "workers": of(workers_table, scaling / "workers.jsonl"),
         "growing_halls": of(halls_table, scaling / "arms.jsonl"),
         "large_fleet": of(commands_table, scaling),
-        "wrappers_measured": lambda: wrappers_table(ablated("ablations/sources_{}", results)),
-        "score_sources": lambda: ablation_table(ablated("ablations/sources_{}", results), SCORE_SOURCES),
-        "mpc_parts": lambda: ablation_table(ablated("ablations/mpc_{}", results), PARTS_OF_MPC),
-        "twin_windows": lambda: ablation_table(ablated("twin_windows/{}", results), WINDOWS),
+        "wrappers_measured": lambda: wrappers_table(ablated("wrappers/{}", results)),
         **{which: of(stored_table, which, results / "alarms.jsonl") for which in ("alarms", "alarms_before_faults")},
         **{which: of(paper_table, name, which, results) for name, several in PAPER.items() for which in several},
     }

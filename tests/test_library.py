@@ -1,9 +1,11 @@
 """Every scenario of the library, found by looking: it loads, it can be done, it runs under every rule."""
 
+import re
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agents.registry import RULES
@@ -11,7 +13,8 @@ from fleet.robot import JOINTS
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.log import telemetry_table
 from scenarios.run.shift import run
-from scenarios.spec.jobs import all_works
+from scenarios.show.layout import describe
+from scenarios.spec.jobs import all_works, alternatives_of
 from scenarios.spec.load import library, load
 from scenarios.spec.options import RunSpec
 
@@ -57,6 +60,25 @@ def test_every_work_can_be_done_by_two_arms_or_more(fleet_of, name):
     assert lonely == {}
     assert fleet.scenario.description.endswith((".", "?"))
     assert len(fleet.scenario.arms) >= 2
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("assembly", "scale_64")])
+def test_most_arms_can_do_most_jobs(fleet_of, name):
+    """Second method: by the rates of the streams, not by jobs of sampled shifts."""
+    fleet = fleet_of(name)
+    share = rate = 0.0
+    for stream in fleet.scenario.jobs:
+        times = getattr(stream.arrivals, "every_s", None) or fleet.scenario.horizon_s
+        for payload_kg in stream.payload_kg:
+            works = alternatives_of(fleet.scenario, stream, payload_kg)
+            able = np.mean([any(work in arm.plans for work in works) for arm in fleet.arms])
+            weight = getattr(stream.arrivals, "count", 1) / times / len(stream.payload_kg)
+            share, rate = share + weight * float(able), rate + weight
+    assert share / rate > 0.59
+    said = "\n".join(map(str, describe(fleet.scenario)))
+    shown = re.search(r"(\d+)% of the arms can do a job", said)
+    assert shown is not None
+    assert int(shown[1]) / 100 == pytest.approx(share / rate, abs=0.06)
 
 
 @pytest.mark.parametrize(("name", "policy"), list(cases()))

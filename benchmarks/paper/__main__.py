@@ -11,7 +11,6 @@ MODULES = {
     "sides": "readings:SIDES",
     "sweep": "sweep:SWEEP",
     "parsimony": "sweep:PARSIMONY",
-    "reliability": "reliability:RELIABILITY",
     "surprises": "reliability:SURPRISES",
     "questions": "real_logs:QUESTIONS_OF_LOGS",
     "identification": "real_logs:IDENTIFICATION",

@@ -1,27 +1,21 @@
-"""P(saturation) and predicted peaks at the awards of simulated shifts, compared with the outcomes: `reliability` of
-one scenario, and `surprises` in the suite, where something is not as the arms assume."""
+"""P(saturation) at the awards of shifts of the suite, compared with the outcomes, also where something is not as the
+arms assume: `surprises`."""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
 from functools import partial
 from itertools import product
 
 import numpy as np
-from sklearn.metrics import brier_score_loss, roc_auc_score
+from sklearn.metrics import roc_auc_score
 
 from agents.policy import WAIT
 from benchmarks.paper.harness import (
     Experiment,
     Unit,
-    content_key,
     matching,
     mean_by_group,
     names,
-    number,
-    scenarios_of,
-    seed_options,
-    seeds_of,
     table_of,
     whole,
 )
@@ -30,13 +24,11 @@ from fleet.engine.shift import StepRecord
 from fleet.events import Event
 from fleet.files import cache_folder
 from fleet.heat.thermal import WINDING
-from scenarios.evaluate.sources import Fleets, check_source, drawn
+from scenarios.evaluate.sources import Fleets, check_source
 from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
-from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
-from scenarios.spec.options import RISK, RiskName
-from scenarios.spec.parse import choose
-from scenarios.spec.schema import Scenario
+from scenarios.prepare.fleet import Fleet, env_of, let_plan
+from scenarios.spec.options import RISK
 from scenarios.suite.splits import cell_name, cell_of_instance, heat_binds, instance, manifest
 from scenarios.table import Table
 
@@ -70,90 +62,14 @@ def calibration_error(p: Array, event: Array, *, bins: int = BINS) -> float:
     return float(np.average(apart, weights=[group.sum() for group in groups]))
 
 
-POLICIES = "wspt,wspt_cool,least_difficulty"
-FIRST_SEED = 10_000
-"""Seeds from this one on were not used for tuning."""
+def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> tuple[Array, Array]:
+    """P(saturation) at each award of a shift with a known outcome, and whether a motor passed the warning limit.
 
-
-@dataclass(frozen=True, eq=False)
-class Awards:
-    """Awards with a known outcome, arrays [award]."""
-
-    p: Array
-    """P(saturation) at the award."""
-    predicted_c: Array
-    """Predicted peak at the award."""
-    peak_c: Array
-    """True peak, counted as in `fleet.difficulty.SETTLING_S`; NaN if a fault ended the plan."""
-    passed: Array
-    """Whether a motor passed the warning limit, bool."""
-    unknown: int = 0
-    """Number of awards without a known outcome: the shift ended, or the arm gave the job back."""
-
-    def __len__(self) -> int:
-        return len(self.p)
-
-
-def join(parts: Sequence[Awards]) -> Awards:
-    """Concatenate the awards of several shifts."""
-    columns = [field.name for field in fields(Awards)[:-1]]
-    arrays = [np.concatenate([getattr(part, name) for part in parts]) for name in columns]
-    return Awards(*arrays, unknown=sum(part.unknown for part in parts))
-
-
-def verdict(awards: Awards) -> Row:
-    """Accuracy of the predictions at these awards.
-
-    AUROC is unknown if all awards had the same outcome; the errors of the peak are over plans that no fault ended.
-
-    Raises:
-        ValueError: no awards.
+    The outcome is unknown if the shift ended, or the arm gave the job back.
     """
-    error_k = awards.predicted_c - awards.peak_c
-    error_k = error_k[np.isfinite(error_k)]
-    both, peaks = 0 < awards.passed.sum() < len(awards), len(error_k) > 0
-    return {
-        "awards": len(awards),
-        "passed": int(awards.passed.sum()),
-        "ece": calibration_error(awards.p, awards.passed),
-        "brier": float(brier_score_loss(awards.passed, awards.p, pos_label=True)),
-        "auroc": float(roc_auc_score(awards.passed, awards.p)) if both else np.nan,
-        "peak_rms_k": float(np.sqrt(np.mean(error_k**2))) if peaks else np.nan,
-        "peak_bias_k": float(error_k.mean()) if peaks else np.nan,
-    }
-
-
-def reliability_rows(
-    scenario: Scenario,
-    seeds: Sequence[int],
-    fleets: int,
-    risk: RiskName,
-    wanted: Mapping[str, str],
-    keys: Collection[str],
-) -> Iterator[tuple[str, Row]]:
-    """Awards over all seeds and over several draws of the arms' deviations, of each policy.
-
-    Args:
-        fleets: Number of draws: with `spread.seed` of the scenario and the following numbers.
-        wanted: Policies by their keys.
-    """
-    missing = {key: policy for key, policy in wanted.items() if key in keys}
-    found: dict[str, list[Awards]] = {key: [] for key in missing}
-    for draw in range(fleets):
-        fleet = prepare(drawn(scenario, draw), risk=risk)
-        for key, policy in missing.items():
-            found[key] += [awards_of_shift(fleet, policy, seed) for seed in seeds]
-    for key, parts in found.items():
-        awards = join(parts)
-        card = {"scenario": scenario.name, "policy": missing[key], "risk": risk, "unknown": awards.unknown}
-        yield key, card | verdict(awards)
-
-
-def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
-    """The awards of one shift, with the predictions at each award and the outcome of its plan."""
     records: list[StepRecord] = []
     env = env_of(fleet, bus="memory", keep_events=True, watch=records.append, decisions="interval")
-    chooser, stated = policy_at(policy, seed), dict[tuple[str, int], tuple[float, float]]()
+    chooser, stated = policy_at(policy, seed), dict[tuple[str, int], float]()
     try:
         env.reset(seed=seed)
         let_plan(chooser, fleet, env, seed)
@@ -161,25 +77,20 @@ def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
             known, tick = env.knowledge(), env.tick
             actions = chooser.act(known)
             for arm, action in actions.items():
-                own = known[arm]
                 if WAIT < action < env.layout.actions - 1:
-                    option = int(action) - 1
-                    stated[arm, tick] = float(own.p_saturation[option]), float(own.peak_c[option])
+                    stated[arm, tick] = float(known[arm].p_saturation[int(action) - 1])
             env.step(actions)
     finally:
         env.close()
     ends_c = np.concatenate([record.end_c for record in records])[..., WINDING]  # [step, arm, joint]
-    rows, unknown = [], 0
+    p, passed = list[float](), list[bool]()
     for arm, begin_s, end_s, faulted in _plans(env.events):
-        tick = round(begin_s / env.world.dt_s)
-        if end_s is None:
-            unknown += 1
-            continue
-        own_c = ends_c[:, env.possible_agents.index(arm)]
-        peak_c = np.nan if faulted else _true_peak(own_c, env.world.dt_s, begin_s, end_s)
-        rows.append((*stated[arm, tick], peak_c, faulted or peak_c >= fleet.scenario.limits.warning_c))
-    p, predicted_c, peak_c, passed = np.array(rows, dtype=float).reshape(-1, 4).T
-    return Awards(p, predicted_c, peak_c, passed.astype(bool), unknown)
+        if end_s is not None:
+            own_c = ends_c[:, env.possible_agents.index(arm)]
+            peak_c = _true_peak(own_c, env.world.dt_s, begin_s, end_s)
+            p.append(stated[arm, round(begin_s / env.world.dt_s)])
+            passed.append(faulted or peak_c >= fleet.scenario.limits.warning_c)
+    return np.array(p), np.array(passed, dtype=bool)
 
 
 def _plans(events: Sequence[Event]) -> Iterator[tuple[str, float, float | None, bool]]:
@@ -207,47 +118,6 @@ def _true_peak(ends_c: Array, dt_s: float, begin_s: float, end_s: float) -> floa
     return float(ends_c[max(first, 1) - 1 : max(last, 1)].max())
 
 
-def reliability_tables(rows: Sequence[Row]) -> dict[str, Table]:
-    """Accuracy of P and peaks, a row for each policy."""
-    lines: list[tuple[str, ...]] = []
-    for row in rows:
-        who = f"{row['scenario']}, {row['policy']}, {row['risk']}"
-        counts = (str(row[name]) for name in ("awards", "passed", "unknown"))
-        shown = (f"{number(row[name]):.3f}" for name in ("ece", "brier", "auroc"))
-        lines.append((who, *counts, *shown, f"{number(row['peak_rms_k']):.2f}", f"{number(row['peak_bias_k']):+.2f}"))
-    heads = ("shift", "awards", "passed", "unknown", "ECE", "Brier", "AUROC", "peak RMS, K", "peak bias, K")
-    caption = "P(saturation) and predicted peak at each award, and the outcome"
-    return {"reliability": table_of(heads, lines, caption)}
-
-
-def reliability_options(parser: ArgumentParser) -> None:
-    """Options of `reliability`."""
-    parser.add_argument("scenario", nargs="?", default="heat_wave", help="scenario [heat_wave]")
-    parser.add_argument("--policies", type=names, default=names(POLICIES), help=f"policies [{POLICIES}]")
-    parser.add_argument("--risk", default=RISK, help=f"model of P, as of `thermofleet run` [{RISK}]")
-    parser.add_argument("--fleets", type=whole(1), default=3, help="draws of the arms' deviations [3]")
-    seed_options(parser, 4, FIRST_SEED)
-
-
-def reliability_units(given: Namespace) -> list[Unit]:
-    """One unit with a row for each policy."""
-    (scenario,), risk = scenarios_of([given.scenario]), choose("risk", given.risk, RiskName)
-    seeds = seeds_of(given)
-    basis = content_key([*seeds], given.fleets, risk)
-    wanted = {f"{scenario.name}/{policy}/{basis}": policy for policy in given.policies}
-    return [Unit(tuple(wanted), partial(reliability_rows, scenario, seeds, given.fleets, risk, wanted))]
-
-
-RELIABILITY = Experiment(
-    help="P(saturation) and predicted peaks at awards, compared with the outcomes in simulated shifts.\n\n"
-    "P is the probability that a motor is at or above the warning limit from two minutes after the start of a plan\n"
-    "until its end, or that a fault ends it. A shift takes some seconds, training for each fleet a minute per arm.",
-    options=reliability_options,
-    units=reliability_units,
-    tables=reliability_tables,
-)
-
-
 SOURCES = ("rc", "twin", "oracle")
 MOST_ARMS = 6
 RULE = "bid_price"
@@ -262,8 +132,8 @@ def surprise_rows(names_of: Mapping[str, str], source: str, keys: Collection[str
     fleets, folder = Fleets(), cache_folder()
     for key in keys:
         one = instance(names_of[key])
-        awards = awards_of_shift(fleets.of(one.scenario, source, RISK, folder), RULE, one.seed)
-        p, passed = awards.p.round(4), awards.passed.astype(int)
+        p, passed = awards_of_shift(fleets.of(one.scenario, source, RISK, folder), RULE, one.seed)
+        p, passed = p.round(4), passed.astype(int)
         kind = _LINES[one.name].axes.surprise
         yield key, {"source": source, "instance": one.name, "surprise": kind, "p": p, "passed": passed}
 
@@ -308,9 +178,10 @@ def surprise_tables(rows: Sequence[Row]) -> dict[str, Table]:
             least=0.0,
             most=1.0,
         )
-        shares = (f"{passed.mean():.3f}", f"{p.mean():.3f}", f"{calibration_error(p, passed):.3f}", brier.text(3))
+        measured = (passed.mean(), p.mean(), calibration_error(p, passed), roc_auc_score(passed, p))
+        shares = (*(f"{each:.3f}" for each in measured), brier.text(3))
         lines.append((source, "yes" if surprised else "no", str(len(own)), str(len(p)), *shares))
-    heads = ("predictions", "surprise", "instances", "awards", "passed", "mean P", "ECE", "Brier")
+    heads = ("predictions", "surprise", "instances", "awards", "passed", "mean P", "ECE", "AUROC", "Brier")
     return {"surprises": table_of(heads, lines)}
 
 

@@ -99,7 +99,7 @@ def run_command(
 def demo_command(
     out: Path = option("Folder of the two recordings and of the page that compares them.", Path("out/demo")),
     *,
-    given: Annotated[Given, From(RunSpec, "seed", seed=20)],
+    given: Annotated[Given, From(RunSpec, "seed", seed=5)],
 ) -> None:
     """Run the quickstart shift under two policies, and compare them on one page."""
     from scenarios.result_folder import disk_errors

@@ -7,7 +7,7 @@ networks predict peak temperatures.
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -65,20 +65,14 @@ class PlannedFleet:
         every = range(len(self.scenario.arms))
         return plan_arms(self.scenario, every, rehearsal_works(self.scenario), self.folder, self.progress)
 
-    def learned(
-        self, training: int, evidence: "Evidence", *, trained: bool = True, changes: Mapping[str, int] | None = None
-    ) -> "list[Learned]":
-        """The arms' twins of a training, or the same networks before training, with P of a regression.
-
-        Args:
-            changes: Fields of the configuration with other values.
-        """
+    def learned(self, training: int, evidence: "Evidence", *, trained: bool = True) -> "list[Learned]":
+        """The arms' twins of a training, or the same networks before training, with P of a regression."""
         from scenarios.prepare.twins import train_twins, training_seed
         from twin.baselines import untrained_config
         from twin.vae.config import TwinConfig
 
         spec = self.scenario.twin
-        config = (TwinConfig.quick() if spec.size == "quick" else TwinConfig()).changed(**changes or {})
+        config = TwinConfig.quick() if spec.size == "quick" else TwinConfig()
         seed = training_seed(self.scenario, training)
         config = config if trained else untrained_config(config)
         twins = train_twins(self.scenario, self.arms, self.folder, self.progress, config=config, seed=seed)
@@ -223,10 +217,8 @@ class _Constant:
         return Difficulty(np.full(JOINTS, 0.5), p_saturation=0.5)
 
 
-def _vae(
-    planned: PlannedFleet, training: int, *, trained: bool = True, changes: Mapping[str, int] | None = None
-) -> Fleet:
-    return planned.scored(planned.learned(training, "excess", trained=trained, changes=changes))
+def _vae(planned: PlannedFleet, training: int, *, trained: bool = True) -> Fleet:
+    return planned.scored(planned.learned(training, "excess", trained=trained))
 
 
 def _changed(planned: PlannedFleet, fleet: Fleet, change: Callable[[DifficultyModel], _Changed]) -> Fleet:
@@ -278,10 +270,6 @@ SOURCES: dict[str, Callable[[PlannedFleet, int], Fleet]] = {
     "random": _random,
     "inverted": lambda planned, training: _changed(planned, _vae(planned, training), inverted),
     "constant": lambda planned, _: planned.scored([_Constant()] * len(planned.arms)),
-    # The VAE with other windows and sizes.
-    "trained-1s-16": partial(_vae, changes={"window": 12, "hidden": 16}),
-    "trained-1s-32": partial(_vae, changes={"window": 12, "hidden": 32}),
-    "trained-4s-32": partial(_vae, changes={"window": 50, "hidden": 32}),
 }
 """The fleet with the predictions of each source besides `PREPARED`, from its plans and the training, from 0."""
 UNTRAINED = ("torque", "weighted-torque", "rc-nominal", "rc", "constant")

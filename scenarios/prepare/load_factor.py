@@ -33,6 +33,8 @@ class LoadFactor:
     thermal: float
     blind: float
     time: float
+    able: float
+    """Share of the arms that can do a job, mean over the jobs."""
 
     @property
     def regime(self) -> str:
@@ -48,14 +50,15 @@ def load_factor(world: World) -> LoadFactor:
     plan = world.offers.plan[0][:, jobs, 0]
     possible = plan >= 0
     if not possible.any():
-        return LoadFactor(0.0, 0.0, 0.0)
+        return LoadFactor(0.0, 0.0, 0.0, 0.0)
     times = world.plans.times_s[plan]
     length_s = times[..., 0] + world.jobs.repetitions[0, jobs] * times[..., 1] + times[..., 2]
     busy = np.where(possible, length_s, 0.0) / world.horizon_s
     heat = _heat_share(world, plan) * busy
     time = _least(busy, possible)
     blind = (heat * possible / possible.sum(axis=0)).sum(axis=1).max()
-    return LoadFactor(thermal=_least(heat, possible, busy, max(1.0, time)), blind=float(blind), time=time)
+    thermal, able = _least(heat, possible, busy, max(1.0, time)), float(possible.mean())
+    return LoadFactor(thermal=thermal, blind=float(blind), time=time, able=able)
 
 
 def _heat_share(world: World, plan: Array) -> Array:

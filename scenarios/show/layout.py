@@ -254,7 +254,7 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
     fleet = prepare(scenario, difficulty="blind", progress=progress)
     factory = ShiftFactory(fleet)
     factors = [load_factor(factory(np.random.SeedSequence(seed)).world) for seed in range(SEEDS)]
-    thermal, blind, time = np.mean([astuple(f) for f in factors], axis=0)
+    thermal, blind, time, able = np.mean([astuple(f) for f in factors], axis=0)
     regimes = [f.regime for f in factors]
     points = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
     ambient = ", ".join(points) if len(points) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
@@ -264,6 +264,7 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
         f"thermal load factor {thermal:.2f} for the best assignment, {blind:.2f} for an equal split, "
         f"time load {time:.2f} (mean of {SEEDS} seeds): {max(set(regimes), key=regimes.count)}\n"
+        f"{able:.0%} of the arms can do a job (mean over the jobs)\n"
         f"{_fault_cost(scenario)}\n"
         f"people touch an arm for up to {people.contact_s:g} s: surfaces burn from {people.burn_c:g} °C"
     )

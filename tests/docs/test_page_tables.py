@@ -15,10 +15,9 @@ import pytest
 
 from benchmarks.harness import observed_bytes, step_figures
 from benchmarks.paper.cooling import cooling_tables
-from benchmarks.result_tables import difference, efficiency_table, env_table, live_table, steps_table, trainings
-from docs.tables import share_of_gain, tables_of
+from benchmarks.result_tables import difference, env_table, steps_table
+from docs.tables import share_of_gain
 from scenarios.evaluate.scores import Normalised
-from scenarios.json_rows import Rows
 
 
 def cells(text: str) -> list[list[str]]:
@@ -52,30 +51,6 @@ def test_the_share_of_a_gain_has_fiellers_interval() -> None:
     assert share_of_gain(Normalised(names, names, score), "blind") == "0"
 
 
-def test_an_ablation_has_means_and_differences_to_the_first_source(tmp_path) -> None:
-    folder = tmp_path / "twin_windows" / "heat_wave"
-    folder.mkdir(parents=True)
-    plan = {"policy": "wspt", "scores": ["blind", "trained-4s-32"], "fleets": 2, "trainings": 1, "seeds": 2}
-    (folder / "ablation.json").write_text(json.dumps({"scenario": "heat_wave", "plan": {**plan, "first_seed": 5}}))
-    rows = [
-        (scores, fleet, 0, seed, 1.0 if scores == "blind" else 0.0, 10.0 * fleet + seed + more, 7.0)
-        for scores, more in (("blind", 2.0), ("trained-4s-32", 0.0))
-        for fleet in range(2)
-        for seed in (5, 6, 7)  # the plan has two seeds
-    ]
-    head = "scores,fleet,training,seed,faults,value,reward"
-    (folder / "ablation.csv").write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]) + "\n")
-    (tmp_path / "twin_windows" / "active_waiting").symlink_to(folder)
-    text = tables_of(tmp_path)["twin_windows"]()
-    faults, value, reward, *_ = cells(text)
-    assert faults[:2] == ["`heat_wave`: faults", "0.00"]
-    assert value[1] == "10.5"  # of 5, 6, 15 and 16
-    assert value[4].startswith("+2.0")
-    assert value[2:4] == ["–", "–"]  # sources that were not measured
-    assert reward[1] == "7.0"
-    assert "`heat_wave`: 2 fleets × 2 seeds" in text
-
-
 def test_cooling_has_differences_of_value_to_the_first_way() -> None:
     def row(cooling: str, mean: float, change: float) -> dict[str, object]:
         value = {"mean": mean, "difference": change, "difference_low": change - 1, "difference_high": change + 1}
@@ -101,16 +76,6 @@ def test_steps_are_ranges_over_policies() -> None:
 
     text = steps_table({"rows": [row("a", 20, 10), row("b", 50, 50)]})
     assert cells(text) == [["`hall`", "100", "20–50", "2–5", "10.0 %", "50–100 %", "1.0 %", "25 %"]]
-
-
-def test_a_live_shift_stands_beside_the_simulated_one() -> None:
-    row = {
-        "policy": "wspt",
-        "scope": "central",
-        "simulated": {"finished": 65, "faults": 0},
-        "live": {"finished": 66, "faults": 1},
-    }
-    assert cells(live_table({"rows": [row]})) == [["`wspt`", "central", "65", "0", "66", "1"]]
 
 
 def test_observed_bytes_are_those_of_all_arrays_and_repeated_axes_count_once() -> None:
@@ -192,41 +157,6 @@ def test_a_table_of_figures_without_a_mark_is_found() -> None:
     words = "| option | meaning |\n|---|---|\n| `--seeds` | number of seeds, 20 by default |\n"
     marked = f"<!-- made by docs/tables.py: ladder -->\n\n{figures}\n<!-- end -->\n"
     assert tables_of_figures(f"{words}\n{marked}\n{figures}") == ["policy"]
-
-
-FILE = Path(__file__).parents[2] / "docs/results/sample_efficiency/heat_wave.jsonl"
-
-
-def points(*rewards: float) -> list[dict[str, float]]:
-    return [
-        {"env_steps": 1000.0 * n, "hours": 10.0 * n, "cpu_s": 50.0 + n, "reward": reward}
-        for n, reward in enumerate(rewards)
-    ]
-
-
-def test_a_cell_is_the_mean_over_trainings_with_its_t_interval(tmp_path) -> None:
-    rows = Rows(tmp_path / "rows.jsonl")
-    rows.append("random/0", {"method": "random", "seed": 0, "points": points(7.0), "config": {}})
-    for seed, end in enumerate((1.0, 2.0, 3.0)):
-        row = {"method": "mappo", "seed": seed, "points": points(0.0, 5.0, 5.0, 5.0, end), "config": {}}
-        rows.append(f"mappo/{seed}", row)
-    *_, random, mappo = efficiency_table(trainings(rows.path)).splitlines()
-    assert random == "| `random` | 1 | 7.0 |  |  |  | 0 | 0 |"
-    # Student's t of two degrees of freedom: 2 ± 4.3027 / √3.
-    assert mappo == "| `--algo mappo` | 3 | 0.0 | 5.0 | 5.0 | 2.0 [-0.5, 4.5] | 40 | 4 |"
-
-
-def test_all_trainings_of_the_page_have_the_same_shifts_code_and_evaluations() -> None:
-    found = trainings(FILE)
-    rows = [row for own in found.values() for row in own]
-    for own in found.values():
-        assert [row["seed"] for row in own] == list(range(len(own)))
-    for name in ("scenario", "difficulty", "shifts", "code"):
-        assert all(row[name] == rows[0][name] for row in rows), name
-    trained = [row for row in rows if len(row["points"]) > 1]
-    assert trained
-    for row in trained:
-        assert [point["env_steps"] for point in row["points"]] == pytest.approx(range(0, 24_001, 6_000))
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

@@ -232,7 +232,7 @@ def test_motors_that_are_as_warm_as_assumed_or_cooler_are_believed(small) -> Non
 
 @pytest.mark.parametrize(("drift_k_per_s", "least_k", "most_k"), [(-0.01, -20.0, -17.0), (0.01, 8.0, 20.0)])
 def test_an_idle_arm_finds_by_how_much_its_sensors_have_drifted(small, drift_k_per_s, least_k, most_k) -> None:
-    """After 20 K: too low but for what the offset lags; too high, it may also be heat of motors that are hardly warm."""
+    """Of 20 K: too low but for what the offset lags; too high, it may also be heat of motors that are hardly warm."""
     still = thermal_model(gen3_network())
     env = idle_env(small, true=still, believed=still, drift_k_per_s=drift_k_per_s)
     env.reset()

@@ -22,7 +22,6 @@ TINY = {
     "sides": "--count 2 --train 20 --exploration 6 --reference 20 --test 60 --novel 2",
     "sweep": "--scenarios heat_wave --arms 0 --only ours --train 10 --test 60",
     "parsimony": "--scenarios heat_wave --train 6 --test 60",
-    "reliability": "--policies wspt --seeds 1 --fleets 1",
     "surprises": "--sources oracle --cells 1",
     "questions": "--seeds 1 --epochs 4",
     "identification": "",

@@ -39,7 +39,7 @@ def surprised(fleet: Fleet, **surprise) -> Fleet:
 
 
 def test_a_heavier_load_needs_the_torque_of_its_true_mass(fleet) -> None:
-    changed = surprised(fleet, kind="payload", jobs="hold_at_fixture", size=1.25)
+    changed = surprised(fleet, kind="payload", jobs="hold_part", size=1.25)
     found = 0
     for arm in changed.arms:
         model = ArmModel(arm.robot)
@@ -57,7 +57,7 @@ def test_a_heavier_load_needs_the_torque_of_its_true_mass(fleet) -> None:
 
 
 def test_a_load_of_the_declared_mass_changes_nothing(fleet) -> None:
-    changed = surprised(fleet, kind="payload", jobs="hold_at_fixture", size=1.0)
+    changed = surprised(fleet, kind="payload", jobs="hold_part", size=1.0)
     for arm in changed.arms:
         for plan, executed in arm.executed.items():
             assert executed.phases == plan.phases
@@ -100,7 +100,7 @@ def test_readings_drift_by_the_rate_times_the_time(fleet) -> None:
 
 
 SURPRISES = [
-    {"kind": "payload", "jobs": "hold_at_fixture", "size": 1.5},
+    {"kind": "payload", "jobs": "hold_part", "size": 1.5},
     {"kind": "friction", "arm": "arm_1", "size": 2.0},
     {"kind": "fan", "arm": "arm_0"},
     {"kind": "sensor", "arm": "arm_2", "size": 9.0},
