@@ -9,6 +9,7 @@ from benchmarks.paper import harness
 MODULES = {
     "readings": "readings:READINGS",
     "sides": "readings:SIDES",
+    "forms": "forms:FORMS_STUDY",
     "sweep": "sweep:SWEEP",
     "parsimony": "sweep:PARSIMONY",
     "surprises": "reliability:SURPRISES",

@@ -9,7 +9,7 @@ how much new light motion do they call unusual?
 from argparse import ArgumentParser, Namespace
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import product
 
 import numpy as np
@@ -22,6 +22,7 @@ from benchmarks.paper.harness import (
     KeyedRows,
     Unit,
     content_key,
+    matching,
     mean_by_group,
     names,
     size_given,
@@ -29,12 +30,23 @@ from benchmarks.paper.harness import (
     table_of,
     whole,
 )
-from benchmarks.paper.subjects import ALARM_RATE, SCENARIOS, TAU, Sample, Study, Subject, arm_of, carrier_of, subjects_of
+from benchmarks.paper.subjects import (
+    ALARM_RATE,
+    SCENARIOS,
+    TAU,
+    Sample,
+    Sizes,
+    Study,
+    Subject,
+    arm_of,
+    carrier_of,
+    subjects_of,
+)  # fmt: skip
 from fleet.difficulty import heat_weights
 from fleet.motion import CHANNELS
 from fleet.robot import JOINTS
-from scenarios.evaluate.statistics import difference_of
 from scenarios.json_rows import Row
+from scenarios.prepare.twins import records
 from scenarios.table import Table
 from twin.vae.config import LOGVAR_RANGE, TwinConfig
 from twin.vae.model import one_thread
@@ -49,8 +61,8 @@ class Form:
     """A form of the network."""
 
     label: str
-    explains: slice = slice(0, len(CHANNELS))
-    """Channels that the decoder yields."""
+    torque_only: bool = False
+    """The decoder yields the torque, not all channels."""
     given: int = 0
     """Joints whose angle and velocity the decoder knows at every sample: none, 1 for its own, or all."""
     payload: bool = False
@@ -63,19 +75,23 @@ class Form:
     others: bool = False
     """Trained on the motion of the other arms; only the z-scores are those of the arm."""
 
+    @property
+    def explains(self) -> slice:
+        """Channels that the decoder yields."""
+        return slice(TAU if self.torque_only else 0, len(CHANNELS))
 
-TORQUE = slice(TAU, TAU + 1)
+
 FORMS: Mapping[str, Form] = {
     "paper": Form("reconstruction of angle, velocity and torque (paper)"),
     "likelihood": Form("the same with learned variances, likelihood", variance=True),
     "payload": Form("the same, payload known", payload=True),
     "others": Form("the same, trained on other arms, own z-scores", others=True),
-    "motion": Form("torque, motion of the joint known", TORQUE, given=1),
-    "motion_untrained": Form("the same, untrained", TORQUE, given=1, trained=False),
-    "motion_all": Form("torque, motion of all joints known", TORQUE, given=JOINTS),
-    "motion_payload": Form("torque, motion of all joints and payload known", TORQUE, given=JOINTS, payload=True),
-    "motion_likelihood": Form("torque, motion of all joints known, likelihood", TORQUE, given=JOINTS, variance=True),
-    "dynamics": Form("torque, motion of all joints known, no latent", TORQUE, given=JOINTS, latent=0),
+    "motion": Form("torque, motion of the joint known", True, given=1),
+    "motion_untrained": Form("the same, untrained", True, given=1, trained=False),
+    "motion_all": Form("torque, motion of all joints known", True, given=JOINTS),
+    "motion_payload": Form("torque, motion of all joints and payload known", True, given=JOINTS, payload=True),
+    "motion_likelihood": Form("torque, motion of all joints known, likelihood", True, given=JOINTS, variance=True),
+    "dynamics": Form("torque, motion of all joints known, no latent", True, given=JOINTS, latent=0),
 }
 RIVALS = {"difficulty": "Σ d of the paper's network", "torque_error": "its torque error", "torque": "squared torque"}
 """Scores without a network of their own."""
@@ -84,9 +100,9 @@ RIVALS = {"difficulty": "Σ d of the paper's network", "torque_error": "its torq
 class Net(nn.Module):
     """Encoder of a joint's windows to a Gaussian latent, and decoder from it and what is given."""
 
-    def __init__(self, form: Form, given: int) -> None:
+    def __init__(self, form: Form, given: int, hidden: int) -> None:
         super().__init__()
-        hidden, self.form = CONFIG.hidden, form
+        self.form = form
         outputs = form.explains.stop - form.explains.start
         self.encoder = nn.LSTM(len(CHANNELS) + form.payload, hidden, batch_first=True)
         self.posterior = nn.Linear(hidden, 2 * form.latent) if form.latent else None
@@ -134,8 +150,10 @@ def inputs_of(form: Form, z: Array, payload: Array, joint: int) -> tuple[Tensor,
     return torch.from_numpy(z[:, :, joint]), torch.from_numpy(given)
 
 
-def fitted(form: Form, z: Array, payload: Array, joint: int, noise: Array, seed: int) -> Net:
-    """The network of a joint after training on windows; the arguments as in `inputs_of`.
+def fitted(
+    form: Form, z: Array, payload: Array, joint: int, noise: Array, seed: int, config: TwinConfig = CONFIG
+) -> Net:
+    """The network of a joint after training on windows; the first arguments as in `inputs_of`.
 
     Args:
         noise: Of the sensors, in z-scores, [channel].
@@ -143,21 +161,21 @@ def fitted(form: Form, z: Array, payload: Array, joint: int, noise: Array, seed:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         x, given = inputs_of(form, z, payload, joint)
-        net = Net(form, given.shape[2])
+        net = Net(form, given.shape[2], config.hidden)
         if not form.trained:
             return net.eval()
-        steps = CONFIG.epochs * -(-len(x) // CONFIG.batch)
-        optimizer = torch.optim.Adam(net.parameters(), lr=CONFIG.learning_rate)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, CONFIG.learning_rate, total_steps=steps)
+        steps = config.epochs * -(-len(x) // config.batch)
+        optimizer = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=steps)
         sensors = torch.from_numpy(noise.astype(np.float32))
-        for _ in range(CONFIG.epochs):
-            for some in torch.randperm(len(x)).split(CONFIG.batch):
+        for _ in range(config.epochs):
+            for some in torch.randperm(len(x)).split(config.batch):
                 noisy = x[some] + sensors * torch.randn_like(x[some])
                 error, kl = net(noisy, given[some], torch.randn(len(some), form.latent))
                 loss = error if form.variance else 0.5 * error.square()
                 optimizer.zero_grad()
-                (loss.sum((1, 2)) + CONFIG.beta * kl).mean().backward()
-                nn.utils.clip_grad_norm_(net.parameters(), CONFIG.clip)
+                (loss.sum((1, 2)) + config.beta * kl).mean().backward()
+                nn.utils.clip_grad_norm_(net.parameters(), config.clip)
                 optimizer.step()
                 schedule.step()
         return net.eval()
@@ -183,15 +201,15 @@ class Motion:
     @classmethod
     def of(cls, sample: Sample, seed: np.random.SeedSequence) -> "Motion":
         """Some windows of the plans of a sample."""
-        each = [windows_of([phase.profile for phase in plan.phases if len(phase.profile)], CONFIG) for plan in sample.plans]
+        each = [windows_of(records([plan]), CONFIG) for plan in sample.plans]
         payload = np.repeat([plan.work.payload_kg for plan in sample.plans], [len(part) for part in each])
         joined = np.concatenate([np.concatenate(each).reshape(len(payload), -1), payload[:, None]], axis=1)
         chosen = draw_windows(joined, CONFIG.max_windows, seed)
         return cls(chosen[:, :-1].reshape(-1, *each[0].shape[1:]), chosen[:, -1])
 
 
-def job_scores(form: Form, nets: Sequence[Net], scaler: Scaler, sample: Sample) -> Array:
-    """Time mean of the errors of each job and joint, summed over the values, [job, joint, value]."""
+def job_scores(nets: Sequence[Net], scaler: Scaler, sample: Sample) -> Array:
+    """Time mean of the errors of each job, joint and value, [job, joint, value]."""
     jobs = cut_jobs(sample.plans, sample.repetitions, CONFIG)
     payload = np.array([plan.work.payload_kg for plan in sample.plans])[jobs.job]
     z = scaler.to_z(jobs.windows)
@@ -230,47 +248,54 @@ SAMPLES = ("reference", "test", "novel")
 
 
 def form_rows(
-    subject: Subject, others: Sequence[Subject], trainings: int, size: FormSize, wanted: Mapping[str, tuple[str, int]]
+    subject: Subject, others: Sequence[Subject], size: FormSize, wanted: Mapping[str, tuple[str, int]]
 ) -> Iterator[tuple[str, Row]]:
     """The measures of every form and training on one arm.
 
     Args:
+        others: Arms from which the form `others` learns.
         wanted: Form or rival, and training, by key.
     """
     study = subject.study(**asdict(size))
-    carrier = carrier_of(study)
-    own = Motion.of(study.train, subject.entropy)
+    carrier, own = carrier_of(study), motion_of(subject, size)
     scaler = Scaler.fit(own.windows)
-    weight = heat_weights(np.square(own.windows[..., TAU]).mean(axis=(0, 1)))
-    z = {False: (scaler.to_z(own.windows), own.payload)}
-    if any(FORMS[name].others for name, _ in wanted.values() if name in FORMS):
-        several = [Motion.of(each.study(**asdict(size) | {"reference": 0, "test": 0, "novel": 0}).train, each.entropy)
-                   for each in others]  # fmt: skip
-        each_z = [Scaler.fit(motion.windows).to_z(motion.windows) for motion in several]
-        z[True] = np.concatenate(each_z), np.concatenate([motion.payload for motion in several])
-    base: dict[int, dict[str, Array]] = {}
+    weight, noise = heat_weights(np.square(own.windows[..., TAU]).mean(axis=(0, 1))), CONFIG.noise / scaler.std
+    learned = {False: (scaler.to_z(own.windows), own.payload)}
+    if any(name in FORMS and FORMS[name].others for name, _ in wanted.values()):
+        learned[True] = _together([motion_of(each, size) for each in others])
+    found: dict[tuple[str, int], dict[str, Array]] = {}
     for key, (name, training) in wanted.items():
-        form = FORMS[name if name in FORMS else "paper"]
-        found = base.get(training) if form is FORMS["paper"] else None
-        if found is None:
+        form = name if name in FORMS else "paper"
+        if (form, training) not in found:
             seeds = np.random.SeedSequence([subject.seed, training]).generate_state(JOINTS)
-            noise = np.array(CONFIG.noise) / scaler.std
             with one_thread():
-                nets = [fitted(form, *z[form.others], k, noise[k], int(seeds[k])) for k in range(JOINTS)]
-                found = {each: job_scores(form, nets, scaler, getattr(study, each)) for each in SAMPLES}
-        if form is FORMS["paper"]:
-            base[training] = found
-        summed = {each: values.sum(axis=2) for each, values in found.items()}
+                known = learned[FORMS[form].others]
+                nets = [fitted(FORMS[form], *known, k, noise[k], int(seeds[k])) for k in range(JOINTS)]
+                found[form, training] = {each: job_scores(nets, scaler, getattr(study, each)) for each in SAMPLES}
+        errors, factor = found[form, training], None if name == "difficulty" else weight
         match name:
             case "difficulty":
-                scores, factor = {each: 1.0 - np.exp(-values) for each, values in summed.items()}, None
+                scores = {each: 1.0 - np.exp(-values.sum(axis=2)) for each, values in errors.items()}
             case "torque_error":
-                scores, factor = {each: values[..., TAU] for each, values in found.items()}, weight
+                scores = {each: values[..., TAU] for each, values in errors.items()}
             case "torque":
-                scores, factor = {each: _squared_torque(getattr(study, each), scaler) for each in SAMPLES}, weight
+                scores = {each: _squared_torque(getattr(study, each), scaler) for each in SAMPLES}
             case _:
-                scores, factor = summed, weight
+                scores = {each: values.sum(axis=2) for each, values in errors.items()}
         yield key, {"arm": subject.name, "form": name, "training": training, **judged(scores, study, carrier, factor)}
+
+
+@cache
+def motion_of(subject: Subject, size: FormSize) -> Motion:
+    """The training motion of an arm."""
+    study = subject.study(**asdict(size) | {"reference": 0, "test": 0, "novel": 0})
+    return Motion.of(study.train, subject.entropy)
+
+
+def _together(each: Sequence[Motion]) -> tuple[Array, Array]:
+    """Training windows of several arms, each in its own z-scores, and their payloads."""
+    z = np.concatenate([Scaler.fit(motion.windows).to_z(motion.windows) for motion in each])
+    return z, np.concatenate([motion.payload for motion in each])
 
 
 def _squared_torque(sample: Sample, scaler: Scaler) -> Array:
@@ -280,25 +305,23 @@ def _squared_torque(sample: Sample, scaler: Scaler) -> Array:
     return jobs.mean(np.square(jobs.windows[..., TAU])) / known
 
 
+MEASURES = ("any", "carrier", "found", "novel")
 HEADS = ("score", "AUROC, any joint", "less squared torque", "AUROC, carrying joint", "overheating jobs found",
          "new light motion above")  # fmt: skip
 
 
 def form_tables(rows: Sequence[Row]) -> dict[str, Table]:
     """A row for each form, with intervals over arms."""
+    rival = {(row["arm"], row["training"]): row["any"] for row in matching(rows, form="torque")}
     lines: list[tuple[str, ...]] = []
     for name in dict.fromkeys(row["form"] for row in rows):
-        own = {(row["arm"], row["training"]): row for row in rows if row["form"] == name}
-        rival = {(row["arm"], row["training"]): row for row in rows if row["form"] == "torque"}
-        cells = {m: mean_by_group((arm_of(arm), row[m]) for (arm, _), row in own.items()) for m in next(iter(own.values())) if m in MEASURES}
-        lead = mean_by_group((arm_of(key[0]), row["any"] - rival[key]["any"]) for key, row in own.items() if key in rival)
+        own = [(arm_of(row["arm"]), row) for row in matching(rows, form=name)]
+        cells = {each: mean_by_group((arm, row[each]) for arm, row in own).text(3) for each in MEASURES}
+        lead = mean_by_group((arm, row["any"] - rival[row["arm"], row["training"]]) for arm, row in own)
         label = FORMS[name].label if name in FORMS else RIVALS[name]
-        lines.append((label, cells["any"].text(3), "" if name == "torque" else lead.text(3, "+"), cells["carrier"].text(3),
-                      cells["found"].text(), cells["novel"].text()))  # fmt: skip
+        less = "" if name == "torque" else lead.text(3, "+")
+        lines.append((label, cells["any"], less, cells["carrier"], cells["found"], cells["novel"]))
     return {"forms": table_of(HEADS, lines)}
-
-
-MEASURES = ("any", "carrier", "found", "novel")
 
 
 def form_options(parser: ArgumentParser) -> None:
@@ -312,22 +335,25 @@ def form_options(parser: ArgumentParser) -> None:
 def form_units(given: Namespace) -> list[Unit]:
     """A unit for each arm."""
     size = size_given(given, FormSize)
-    subjects = subjects_of(given.scenarios, arms=range(given.arms), seeds=[1], sizes=SIZES)
-    basis = content_key(asdict(size))
+    subjects = subjects_of(given.scenarios, arms=range(given.arms), seeds=[1], sizes=Sizes())
+    basis = content_key(asdict(size), given.arms, given.scenarios)
     units: list[Unit] = []
     for subject in subjects:
         pairs = product((*RIVALS, *FORMS), range(given.trainings))
         keys = {f"{subject.name}/{name}/{training}/{basis}": (name, training) for name, training in pairs}
         others = [each for each in subjects if each is not subject]
-        units.append(Unit(tuple(keys), partial(_missing, subject, others, given.trainings, size, keys)))
+        units.append(Unit(tuple(keys), partial(_missing, subject, others, size, keys)))
     return units
 
 
 def _missing(
-    subject: Subject, others: Sequence[Subject], trainings: int, size: FormSize, keys: Mapping[str, tuple[str, int]],
+    subject: Subject,
+    others: Sequence[Subject],
+    size: FormSize,
+    keys: Mapping[str, tuple[str, int]],
     missing: Collection[str],
-) -> KeyedRows:  # fmt: skip
-    return form_rows(subject, others, trainings, size, {key: what for key, what in keys.items() if key in missing})
+) -> KeyedRows:
+    return form_rows(subject, others, size, {key: what for key, what in keys.items() if key in missing})
 
 
 FORMS_STUDY = Experiment(

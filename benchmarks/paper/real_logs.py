@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from sklearn.metrics import roc_auc_score
 
+from benchmarks.paper.forms import FORMS, errors_of, fitted
 from benchmarks.paper.harness import Experiment, Unit, content_key, one_row, table_of, whole
 from benchmarks.paper.subjects import CARRIER
 from fleet.errors import FleetError, LogError
@@ -32,8 +33,9 @@ from twin.logs.recording import READINGS, Recording, Stretch, cool_stretches, he
 from twin.thermal.identify import HeatModel, Noise, ParameterVector, Problem, identify
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Calibration
+from twin.vae.model import one_thread
 from twin.vae.twin import Twin
-from twin.vae.window import cut, starts, windows_of
+from twin.vae.window import cut, draw_windows, starts, windows_of
 
 Array = np.ndarray
 
@@ -45,8 +47,9 @@ AHEAD_S = 300.0
 """Time after a window in which its peak temperature is taken."""
 CONFIG = TwinConfig(record_hz=2.0, epochs=40, restarts=1).changed(**LOG_INPUT)
 """Windows of 25 s at the sampling rate of the logs, a new one every 10 samples."""
-MOTION = ("d", "load", "latent", "rms_torque")
-"""Scores of joint 2 from the motion in the window alone; d ranks as the error that it is a function of."""
+MOTION = ("d", "load", "latent", "explained", "rms_torque")
+"""Scores of joint 2 from the motion in the window alone; d ranks as the error that it is a function of. `explained`:
+error of a network that explains the torque by the motion of the joint (`forms`)."""
 
 
 def log_options(parser: ArgumentParser, seeds: int) -> None:
@@ -151,26 +154,40 @@ def _judged(
             f"None of the {len(test)} test logs lasts {config.window / config.rate_hz:g} s; add longer logs."
         )
     joined = {name: np.concatenate([part[name] for part in cuts]) for name in cuts[0]}
-    scores = motion_scores(twin, joined.pop("windows"), windows_of(records, twin.config))
+    scores = motion_scores(twin, joined.pop("windows"), windows_of(records, twin.config), seed)
     return joined | scores
 
 
-def motion_scores(twin: Twin, windows: Array, known: Array) -> dict[str, Array]:
+def motion_scores(twin: Twin, windows: Array, known: Array, seed: int) -> dict[str, Array]:
     """Scores of joint 2 by the names of `MOTION`, each [window].
 
     Args:
         windows: Motion, SI, [window, time, joint, channel].
         known: Windows of the training, likewise.
+        seed: Of the other network.
     """
     features, cool = twin.window_features(windows), twin.window_features(known)
     torque_sq = np.square(windows[..., CHANNELS.index("tau")], dtype=float).mean(axis=1)
     values = (
-        features.errors.sum(axis=-1),
-        features.one_sided,
-        Calibration(cool, np.zeros(len(cool.packed), int)).latent(features),
-        np.sqrt(torque_sq),
+        features.errors.sum(axis=-1)[:, CARRIER],
+        features.one_sided[:, CARRIER],
+        Calibration(cool, np.zeros(len(cool.packed), int)).latent(features)[:, CARRIER],
+        _explained(twin, windows, known, seed),
+        np.sqrt(torque_sq)[:, CARRIER],
     )
-    return {name: each[:, CARRIER] for name, each in zip(MOTION, values, strict=True)}
+    return dict(zip(MOTION, values, strict=True))
+
+
+def _explained(twin: Twin, windows: Array, known: Array, seed: int) -> Array:
+    """Mean error of the torque of joint 2 that its motion does not explain, [window]."""
+    config, form = twin.config, FORMS["motion"]
+    chosen = draw_windows(known, config.max_windows, np.random.SeedSequence(seed))
+    noise = np.array(config.noise) / twin.scaler.std[CARRIER]
+    nothing = np.zeros(len(chosen)), np.zeros(len(windows))
+    with one_thread():
+        net = fitted(form, twin.scaler.to_z(chosen), nothing[0], CARRIER, noise, seed, config)
+        errors = errors_of(net, twin.scaler.to_z(windows), nothing[1], CARRIER)
+    return errors.mean(axis=(1, 2))
 
 
 def _up_to_carrier(recording: Recording) -> Recording:
@@ -277,16 +294,15 @@ def question_tables(rows: Sequence[Row]) -> dict[str, Table]:
     """A table for each length of the windows, of its first seed."""
     tables: dict[str, Table] = {}
     for row in rows:
-        of = f"windows of {row['windows']}, seed {row['seed']}"
         lines: list[tuple[str, ...]] = []
         for question, answer in row["answers"].items():
             auroc = [bounds(each).text() for each in answer["auroc"].values()]
             leads = [bounds(each).text(sign="+") for each in answer["lead"].values()]
             lines.append((question, _counts(answer), *auroc, *leads))
-        heads = ("question", "windows (files with)", "d", "load", "latent", "RMS torque")
-        table = table_of(
-            (*heads, "difference: d", "load", "latent"), lines, f"AUROC and its difference to that of RMS torque; {of}"
-        )
+        heads = ("question", "windows (files with)", "d", "load", "latent", "torque, motion known", "RMS torque")
+        caption = f"AUROC and its difference to that of RMS torque; windows of {row['windows']}, seed {row['seed']}"
+        differences = ("difference: d", "load", "latent", "torque, motion known")
+        table = table_of((*heads, *differences), lines, caption)
         tables.setdefault(f"questions_{row['windows']}", table)
     return tables
 
