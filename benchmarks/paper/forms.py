@@ -158,7 +158,7 @@ def fitted(
     Args:
         noise: Of the sensors, in z-scores, [channel].
     """
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), one_thread():
         torch.manual_seed(seed)
         x, given = inputs_of(form, z, payload, joint)
         net = Net(form, given.shape[2], config.hidden)
@@ -184,7 +184,7 @@ def fitted(
 def errors_of(net: Net, z: Array, payload: Array, joint: int) -> Array:
     """Absolute error, or negative log likelihood, of each sample and value, [batch, time, value]."""
     x, given = inputs_of(net.form, z, payload, joint)
-    with torch.no_grad():
+    with torch.no_grad(), one_thread():
         error, _ = net(x, given, torch.zeros(len(x), net.form.latent))
     return (error if net.form.variance else error.abs()).numpy()
 
@@ -268,10 +268,9 @@ def form_rows(
         form = name if name in FORMS else "paper"
         if (form, training) not in found:
             seeds = np.random.SeedSequence([subject.seed, training]).generate_state(JOINTS)
-            with one_thread():
-                known = learned[FORMS[form].others]
-                nets = [fitted(FORMS[form], *known, k, noise[k], int(seeds[k])) for k in range(JOINTS)]
-                found[form, training] = {each: job_scores(nets, scaler, getattr(study, each)) for each in SAMPLES}
+            known = learned[FORMS[form].others]
+            nets = [fitted(FORMS[form], *known, k, noise[k], int(seeds[k])) for k in range(JOINTS)]
+            found[form, training] = {each: job_scores(nets, scaler, getattr(study, each)) for each in SAMPLES}
         errors, factor = found[form, training], None if name == "difficulty" else weight
         match name:
             case "difficulty":
@@ -328,7 +327,7 @@ def form_options(parser: ArgumentParser) -> None:
     """Options of `forms`."""
     parser.add_argument("--scenarios", type=names, default=names(SCENARIOS), help=f"scenarios [{SCENARIOS}]")
     parser.add_argument("--arms", type=whole(1), default=2, help="arms of each scenario [2]")
-    parser.add_argument("--trainings", type=whole(1), default=3, help="trainings of each network [3]")
+    parser.add_argument("--trainings", type=whole(1), default=2, help="trainings of each network [2]")
     size_options(parser, FormSize)
 
 

@@ -33,7 +33,6 @@ from twin.logs.recording import READINGS, Recording, Stretch, cool_stretches, he
 from twin.thermal.identify import HeatModel, Noise, ParameterVector, Problem, identify
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Calibration
-from twin.vae.model import one_thread
 from twin.vae.twin import Twin
 from twin.vae.window import cut, draw_windows, starts, windows_of
 
@@ -184,10 +183,8 @@ def _explained(twin: Twin, windows: Array, known: Array, seed: int) -> Array:
     chosen = draw_windows(known, config.max_windows, np.random.SeedSequence(seed))
     noise = np.array(config.noise) / twin.scaler.std[CARRIER]
     nothing = np.zeros(len(chosen)), np.zeros(len(windows))
-    with one_thread():
-        net = fitted(form, twin.scaler.to_z(chosen), nothing[0], CARRIER, noise, seed, config)
-        errors = errors_of(net, twin.scaler.to_z(windows), nothing[1], CARRIER)
-    return errors.mean(axis=(1, 2))
+    net = fitted(form, twin.scaler.to_z(chosen), nothing[0], CARRIER, noise, seed, config)
+    return errors_of(net, twin.scaler.to_z(windows), nothing[1], CARRIER).mean(axis=(1, 2))
 
 
 def _up_to_carrier(recording: Recording) -> Recording:

@@ -19,6 +19,8 @@ COMMAND = re.compile(r"python -m benchmarks\.paper ([\w-]+)((?: [^`#\n>]+)?)")
 RESULTS = "docs/results/"
 TINY = {
     "readings": "--scenarios quickstart --train 20 --exploration 6 --reference 125 --test 60 --novel 70",
+    "forms": "--scenarios quickstart --arms 1 --trainings 1 --train 20 --exploration 6 --reference 20 --test 60 "
+    "--novel 8",
     "sides": "--count 2 --train 20 --exploration 6 --reference 20 --test 60 --novel 2",
     "sweep": "--scenarios heat_wave --arms 0 --only ours --train 10 --test 60",
     "parsimony": "--scenarios heat_wave --train 6 --test 60",
