@@ -15,6 +15,8 @@ from playwright.sync_api import sync_playwright
 from scenarios.train.training import draw_curves
 
 ROOT = Path(__file__).parents[1]
+if str(ROOT) not in sys.path:
+    sys.path.insert(0, str(ROOT))
 PICTURES = ROOT / "docs" / "pictures"
 FILM_RUN = ("quickstart", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "5")
 FILM = ("--size", "640x360", "--speed", "240", "--fps", "8", "--overwrite")
