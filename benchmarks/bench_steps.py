@@ -82,7 +82,7 @@ def main() -> None:
     given = options(
         __doc__,
         "scenario",
-        scenario=(str, "default: all of the library"),
+        scenario=("", "default: all of the library"),
         seed=0,
         policies=",".join(RULES),
         difficulty="blind",
