@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from fleet.engine.claims import set_phase
+from fleet.engine.corrections import line_of
 from fleet.engine.crossings import hottest
-from fleet.engine.observe import average_excess, excess_of, line_of
+from fleet.engine.observe import average_excess, excess_of
 from fleet.engine.state import DONE, RUNNING, WAITING, State
 from fleet.engine.step import (
     BLOCK,

@@ -8,10 +8,10 @@ import numpy as np
 
 from fleet.difficulty import KNOWN, probability_of
 from fleet.engine.claims import is_closed
+from fleet.engine.corrections import line_of
 from fleet.engine.crossings import hottest
 from fleet.engine.state import LANES
 from fleet.engine.tables import Simulation, Tables
-from fleet.heat.thermal import NODES
 from fleet.jit import Real, jit_inline, nonnegative
 from fleet.observation import FIELDS, LONG_S
 from fleet.robot import JOINTS
@@ -28,14 +28,6 @@ PEAK_LOW_C, PEAK_HIGH_C = _LOW["peak_c"], _HIGH["peak_c"]
 MOST_KG, MOST_VALUE, MOST_RETURNS = _HIGH["payload_kg"], _HIGH["value"], _HIGH["returns"]
 _LONG_S, _ZERO, _ONE, _HALF = np.float32(LONG_S), np.float32(0.0), np.float32(1.0), np.float32(0.5)
 NEVER = np.float32(-np.inf)
-SPREAD_K, SPREAD_RATIO, SPREAD_OFFSET_K = np.float32(2.0), np.float32(0.5), np.float32(6.0)
-"""Standard deviations before anything is measured: of a difference of temperatures that neither heat nor sensors
-explain, of the ratio of heat about 1, and of the offset of the sensors."""
-CAUTION_RATIO, CAUTION_OFFSET = np.float32(1.0), np.float32(2.0)
-"""Standard errors by which motors must make more heat than expected, and sensors read too much, before it counts."""
-MOST_RATIO = np.float32(2.0)
-"""Upper bound of the ratio of heat."""
-
 assert LANES == 8, "the largest of the lanes is found by halves"
 
 
@@ -68,15 +60,12 @@ def observe(sim: Simulation, rows: Array, shared: Array, own: Array) -> None:
                 show_members(sim, e, a, mine, slot_kind, filled, hottest_c, busy_s)
             show_arm(sim, e, a, mine, measured_c[a], hottest_c[a], busy_s[a])
             shown = busy_s[a] <= form.ahead_s[0]
+            offset_k = line_of(sim.moments[e, a])[1] if t.learns else _ZERO
             for k in range(JOINTS):
-                known_c[k], known_c[JOINTS + k] = measured_c[a, k], arm["housing_c"][k]
-            if t.learns:
-                offset_k = line_of(sim.moments[e, a])[1]
-                for n in range(NODES):
-                    known_c[n] -= offset_k
+                known_c[k], known_c[JOINTS + k] = measured_c[a, k] - offset_k, arm["housing_c"][k]
             known_c[2 * JOINTS] = air_at(t, s.env[e], a)
             if arm["mode"] == WORKING and arm["pending"]:
-                show_job(sim, e, a, mine, hottest_c[a], busy_s[a], known_c, values_c)
+                show_job(sim, e, a, mine, hottest_c[a] - offset_k, busy_s[a], known_c, values_c)
             if shown:
                 show_options(sim, e, a, mine, slot_kind, left, filled)
                 if forecasts:
@@ -183,35 +172,6 @@ def excess_of(sim: Simulation, e: int, a: int, kind: int) -> Real:
     if own != own:
         own = mean if sim.form.shares_heat[0] != 0 and mean == mean else _ZERO
     return (_ONE + own) * line_of(sim.moments[e, a])[0] - _ONE
-
-
-@jit_inline
-def line_of(moments: Array) -> tuple[Real, Real]:
-    """What differences of measured and expected motor temperatures say of the heat and of the sensors of an arm.
-
-    More heat, or worse cooling, makes a difference in proportion to the rise of a motor; sensors that drift alike make
-    the same one everywhere. The line is the most probable one with normal priors (Bishop, Pattern Recognition and
-    Machine Learning, 2006, eq. 3.53). Both results err towards too hot: less heat than expected counts as expected,
-    and what is not certainly an offset counts as heat.
-
-    Args:
-        moments: As in `fleet.engine.step.compare`.
-
-    Returns:
-        Ratio of the measured to the expected heat, from 1 to `MOST_RATIO`, and offset of the sensors, K.
-    """
-    weight = _ONE / (SPREAD_K * SPREAD_K)
-    a = moments[1] * weight + _ONE / (SPREAD_RATIO * SPREAD_RATIO)
-    b = moments[0] * weight
-    c = np.float32(JOINTS) * weight + _ONE / (SPREAD_OFFSET_K * SPREAD_OFFSET_K)
-    if c * moments[3] < b * moments[2]:  # less heat than expected
-        b = _ZERO
-    variance = a / (a * c - b * b)
-    offset_k = (moments[2] - moments[3] * b / a) * weight * variance
-    if offset_k > _ZERO:
-        offset_k = max(offset_k - CAUTION_OFFSET * np.sqrt(variance), _ZERO)
-    slope = (moments[3] - offset_k * moments[0]) * weight / a - CAUTION_RATIO / np.sqrt(a)
-    return min(max(_ONE + slope, _ONE), MOST_RATIO), offset_k
 
 
 @jit_inline

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.engine.claims import give_up, resolve_claims, return_to_queue, set_phase, update_offers
+from fleet.engine.corrections import compare, line_of
 from fleet.engine.crossings import Crossed, hottest, step_with_crossing
 from fleet.engine.observe import observe
 from fleet.engine.state import DONE, GIVEN_UP, LANES, WAITING, State
@@ -103,7 +104,8 @@ def step_arms(sim: Simulation, terms: Array, rows: Array) -> None:
             for n in range(NODES):
                 arm["temp_c"][n] = end[n]
             drift_k = law["drift_k_per_s"] * np.float32(env["tick"] * dt_s)
-            follow_housings(law, arm, begin, end, friction_w, powered, ambient_c, drift_k, load_w)
+            offset_k = line_of(sim.moments[e, a])[1] if t.learns else _ZERO
+            follow_housings(law, arm, begin, end, friction_w, powered, ambient_c, drift_k - offset_k, load_w)
             if t.learns:
                 compare_temperatures(sim, e, a, current_sq, friction_w, powered, ambient_c, drift_k, begin, end)
             arm["energy_j"] += crossed.energy_j
@@ -219,7 +221,7 @@ def follow_housings(
 
     Args:
         begin, end: Temperatures of the network, which are overwritten.
-        drift_k: By which readings of the motors have drifted.
+        drift_k: By which readings of the motors have drifted, less the offset that the arm has found.
         load_w: Room for the loads of the housings, [lane].
     """
     for k in range(JOINTS):
@@ -234,10 +236,6 @@ def follow_housings(
         end[m] = total
     for m in range(JOINTS):
         arm["housing_c"][m] = end[m]
-
-
-SMOOTH_S = 100.0
-"""Time constant with which measured temperatures are compared with assumed ones."""
 
 
 @jit
@@ -267,27 +265,6 @@ def compare_temperatures(
     for n in range(NODES):
         assumed_c[n] = end[n]
     compare(sim.moments[e, a], end, temp_c, drift_k, ambient_c, t.dt_s)
-
-
-@jit
-def compare(moments: Array, expected_c: Array, measured_c: Array, drift_k: Real, ambient_c: Real, dt_s: float) -> None:
-    """Smooth the moments of a line through the differences of measured and expected motor temperatures.
-
-    Args:
-        moments: Sums over the joints of x, x², y and xy, float32 [4]; x is the expected rise above the air and y the
-            difference, K.
-        expected_c: After a step, [node].
-        measured_c: After the step, less the drift, [joint or node].
-    """
-    x = xx = y = xy = _ZERO
-    for k in range(JOINTS):
-        rise_k, more_k = expected_c[k] - ambient_c, measured_c[k] + drift_k - expected_c[k]
-        x, xx, y, xy = x + rise_k, xx + rise_k * rise_k, y + more_k, xy + rise_k * more_k
-    share = np.float32(min(dt_s / SMOOTH_S, 1.0))
-    moments[0] += share * (x - moments[0])
-    moments[1] += share * (xx - moments[1])
-    moments[2] += share * (y - moments[2])
-    moments[3] += share * (xy - moments[3])
 
 
 @jit

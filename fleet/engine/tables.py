@@ -414,7 +414,7 @@ class Simulation(NamedTuple):
     """Temperatures that each arm should have by what it believes and by the currents that it measures, from the start
     of the shift, float32 [env, arm, node]; without columns no arm learns."""
     moments: Array
-    """Of the differences of measured and assumed motor temperatures, see `fleet.engine.step.compare`, float32
+    """Of the differences of measured and assumed motor temperatures, see `fleet.engine.corrections.compare`, float32
     [env, arm, 4]."""
     form: Form
     room: Room

@@ -110,7 +110,7 @@ class CellSimulator:
         """Set the heat of the plans for known jobs, and the temperatures, to the corrected values."""
         kinds = np.unique(known.kind[0, known.status[0] != GIVEN_UP])
         excess, offset_k = engine.measured(env, kinds.tolist())
-        known.temp_c[0] -= offset_k[:, None]
+        known.temp_c[0, :, WINDING] -= offset_k[:, None]
         tables = self._engine.tables
         plans = tables.work["plan"][int(known.fleet[0])][kinds]  # [kind, arm, option]
         factor = np.broadcast_to(1.0 + excess.T[..., None], plans.shape)

@@ -1,9 +1,11 @@
 """Arms correct their predictions by the heat that they measure at work, and tell each other."""
 
 from dataclasses import replace
+from typing import Any  # what scipy's stubs do not tell
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq, minimize_scalar
 
 from agents.schedules import Schedules
 from fleet.bus.exchange.channel import Channel
@@ -193,10 +195,17 @@ def line(measured_c: np.ndarray, expected_c: np.ndarray) -> tuple[float, float]:
     rows = np.column_stack([root * (expected_c - 25.0).ravel(), root])
     rows = np.vstack([rows, [1.0 / 0.5, 0.0], [0.0, np.sqrt(1.0 / 6.0**2 + 7.0 * 0.9 ** len(measured_c) / 2.0**2)]])
     values = np.append(root * (measured_c - expected_c).ravel(), [0.0, 0.0])
-    slope, offset_k = np.linalg.lstsq(rows, values)[0]
-    known = rows if slope > 0.0 else rows[:, 1:]  # less heat than expected: a line without a slope
-    offset_k, error_k = np.linalg.lstsq(known, values)[0][-1], np.sqrt(np.linalg.inv(known.T @ known)[-1, -1])
-    offset_k = offset_k if offset_k < 0.0 else max(offset_k - 2.0 * error_k, 0.0)
+
+    def cost(offset_k: float) -> float:
+        """Least sum of squares with this offset and a slope of at least 0."""
+        slope = max(np.linalg.lstsq(rows[:, :1], values - rows[:, 1] * offset_k)[0][0], 0.0)
+        return float(np.sum((values - rows @ [slope, offset_k]) ** 2))
+
+    offset_k = float(minimize_scalar(cost, bounds=(-200.0, 200.0), options={"xatol": 1e-6}).x)
+    if offset_k > 0.0:  # where the cost rises by 2², the square of two standard errors, or 0
+        least = cost(offset_k) + 4.0
+        root: Any = brentq(lambda k: cost(k) - least, -200.0, offset_k)
+        offset_k = max(float(root), 0.0)
     slope = np.linalg.lstsq(rows[:, :1], values - rows[:, 1] * offset_k)[0][0]
     return float(np.clip(1.0 + slope - 1.0 / np.linalg.norm(rows[:, 0]), 1.0, 2.0)), float(offset_k)
 

@@ -19,11 +19,11 @@ from typing import Literal, Protocol
 import numpy as np
 
 from fleet.difficulty import Blind
-from fleet.engine.observe import line_of
+from fleet.engine.corrections import compare, line_of
 from fleet.engine.profile_plant import ProfilePlant, telemetry_of
 from fleet.engine.shift import StepRecord, initial, step
 from fleet.engine.state import DONE, State, World
-from fleet.engine.step import ROUNDING_S, compare
+from fleet.engine.step import ROUNDING_S
 from fleet.engine.world import Arm, build_world
 from fleet.events import Event
 from fleet.heat.motor import current
@@ -99,7 +99,7 @@ class Body(Protocol):
     def found(self) -> tuple[float, float]:
         """Ratio of the measured to the expected heat, and by how much its sensors read too much, K; 1 and 0 if unknown.
 
-        See `fleet.engine.observe.line_of`.
+        See `fleet.engine.corrections.line_of`.
         """
         ...
 
@@ -273,7 +273,7 @@ class ExpectedTemperatures:
     temp_c: Array
     """[node]."""
     moments: Array = field(default_factory=lambda: np.zeros(4, np.float32))
-    """See `fleet.engine.step.compare`."""
+    """See `fleet.engine.corrections.compare`."""
 
     def step(self, heat_w: Array, dt_s: float, ambient_c: float, measured_c: Array) -> None:
         """Advance by one step.
@@ -486,9 +486,16 @@ class SimulatedBody:
         done = step(self._world, self._state, np.array([[int(leaves)]]), self._plant, log, compiled=False)
         self._last, self._state = (self._world, done.record), done.state
         if self._expected is not None:
+            self._correct_housings(line_of(self._expected.moments)[1])
             self._compare(self._expected, done.record, ambient_c)
         events = [replace(e, time_s=e.time_s + shift_s) for e in log if e.kind in _REPORTED]
         return events if task is None else events + self._job_events(task, int(done.record.todo[0, 0]), log, shift_s)
+
+    def _correct_housings(self, offset_k: float) -> None:
+        """Change the estimate of the housings after a step to that from readings less an offset."""
+        observer = self._world.observer
+        less_k = observer.gain[0] @ (observer.from_winding[0] * offset_k)
+        self._state = self._state.changed(housing_c=self._state.housing_c - less_k)
 
     def _compare(self, expected: ExpectedTemperatures, record: StepRecord, ambient_c: float) -> None:
         """Compare temperatures with those expected of the heat in a step, by currents and the copper that it knows."""

@@ -528,8 +528,7 @@ class ArmNode:
 
     def _known_c(self) -> Array:
         _, offset_k = self._body.found
-        read_c, housing_c = np.array(self._reading.temp_c), self._body.housing_c
-        return known_temperatures(read_c - offset_k, housing_c - offset_k, self._ambient_c)
+        return known_temperatures(np.array(self._reading.temp_c) - offset_k, self._body.housing_c, self._ambient_c)
 
     def publish_difficulty(self, estimates: tuple[JobEstimate, ...], real_s: float) -> None:
         """Publish how difficult jobs are for the arm, by the plan with the least difficulty."""
