@@ -254,9 +254,9 @@ def board_top(folder: Path) -> str:
 
 KNOWLEDGE = {
     "blind": "nothing",
-    "torque": "RMS torque over that of cool motion",
-    "untrained": "d of the twin before its training",
-    "trained": "d of the twin alone",
+    "torque": "thermometers, regression on squared torque",
+    "untrained": "thermometers, regression on errors of the untrained twin",
+    "trained": "thermometers, regression on errors of the twin",
     "rc-nominal": "thermometers, nominal thermal network",
     "rc": "thermometers, identified network",
     "twin": "the same, corrected by measured heat and temperatures",
@@ -333,7 +333,8 @@ def knowledge(folder: Path) -> str:
         rows.append((KNOWLEDGE[name], f"`{name}`", *means, *some, f"{mean_of(found[name], 'faults'):.2f}"))
     heads = ("the arms know", "source", "mean score", "heat binds", "heat binds, surprise", "share of the gain")
     count = (
-        f"{len(values.instances)} instances in {len(set(values.cells))} cells, {int(surprised.sum())} with a surprise."
+        f"{len(values.instances)} instances in {len(set(values.cells))} cells; heat binds in {int(hot.sum())}, "
+        f"{int(surprised.sum())} of them with a surprise."
     )
     return table((*heads, "share, surprise", "faults"), rows) + f"\n\n{count}"
 

@@ -5,6 +5,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
+from typing import get_args
 
 import numpy as np
 from sklearn.metrics import roc_auc_score
@@ -29,6 +30,7 @@ from scenarios.json_rows import Row
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet, env_of, let_plan
 from scenarios.spec.options import RISK
+from scenarios.suite.instances import Surprising
 from scenarios.suite.splits import cell_name, cell_of_instance, heat_binds, instance, manifest
 from scenarios.table import Table
 
@@ -161,12 +163,12 @@ def surprise_units(given: Namespace) -> list[Unit]:
 
 
 def surprise_tables(rows: Sequence[Row]) -> dict[str, Table]:
-    """Accuracy of P by source, in instances with and without a surprise."""
+    """Accuracy of P by source and kind of surprise."""
     lines: list[tuple[str, ...]] = []
     sources = dict.fromkeys(row["source"] for row in rows)
-    for source, surprised in product(sources, (False, True)):
-        own = [row for row in matching(rows, source=source) if (row["surprise"] != "nothing") == surprised]
-        own = [row for row in own if row["p"]]
+    kinds = [kind for kind in get_args(Surprising) if any(row["surprise"] == kind for row in rows)]
+    for kind, source in product(kinds, sources):
+        own = [row for row in matching(rows, source=source, surprise=kind) if row["p"]]
         if not own:
             continue
         p, passed = (np.concatenate([row[name] for row in own]) for name in ("p", "passed"))
@@ -178,10 +180,11 @@ def surprise_tables(rows: Sequence[Row]) -> dict[str, Table]:
             least=0.0,
             most=1.0,
         )
-        measured = (passed.mean(), p.mean(), calibration_error(p, passed), roc_auc_score(passed, p))
+        auroc = roc_auc_score(passed, p) if 0 < passed.sum() < len(passed) else np.nan
+        measured = (passed.mean(), p.mean(), calibration_error(p, passed), auroc)
         shares = (*(f"{each:.3f}" for each in measured), brier.text(3))
-        lines.append((source, "yes" if surprised else "no", str(len(own)), str(len(p)), *shares))
-    heads = ("predictions", "surprise", "instances", "awards", "passed", "mean P", "ECE", "AUROC", "Brier")
+        lines.append((kind, source, str(len(own)), str(len(p)), *shares))
+    heads = ("surprise", "predictions", "instances", "awards", "passed", "mean P", "ECE", "AUROC", "Brier")
     return {"surprises": table_of(heads, lines)}
 
 

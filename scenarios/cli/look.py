@@ -157,7 +157,8 @@ def layout_command(
     if as_json:
         print_json(report)
     else:
-        for part in layout_tables(chosen, report):
+        tables, sentence = layout_tables(chosen, report)
+        for part in (*tables, sentence):
             out_console.print(part)
     if out is not None:
         from matplotlib.image import imsave

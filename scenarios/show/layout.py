@@ -17,7 +17,7 @@ from scenarios.prepare.arms import PlannedArm, plan_arms, problems_of
 from scenarios.prepare.fleet import ShiftFactory, prepare, space_of
 from scenarios.prepare.load_factor import load_factor
 from scenarios.progress import Progress, quiet
-from scenarios.spec.jobs import all_works, fault_price, works_of
+from scenarios.spec.jobs import all_works, alternatives_of, fault_price, works_of
 from scenarios.spec.schema import ArmSpec, JobStream, Scenario
 from scenarios.table import Table
 
@@ -245,6 +245,12 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
 
 SEEDS = 5
 """Shifts over which the load factor is averaged."""
+REGIMES = {
+    "hopeless": "more than the fleet can do without overheating or being late",
+    "heat decides": "who does what decides whether motors overheat",
+    "relaxed": "no assignment overheats a motor",
+}
+"""Sentences of the regimes of `LoadFactor`."""
 MOST_REASONS = 20
 """Reasons that are shown why an arm cannot do a job."""
 
@@ -256,21 +262,32 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
     factors = [load_factor(factory(np.random.SeedSequence(seed)).world) for seed in range(SEEDS)]
     thermal, blind, time, able = np.mean([astuple(f) for f in factors], axis=0)
     regimes = [f.regime for f in factors]
+    regime = max(set(regimes), key=regimes.count)
     points = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
     ambient = ", ".join(points) if len(points) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
     people = scenario.people
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
-        f"thermal load factor {thermal:.2f} for the best assignment, {blind:.2f} for an equal split, "
-        f"time load {time:.2f} (mean of {SEEDS} seeds): {max(set(regimes), key=regimes.count)}\n"
+        f"thermal load factor {thermal:.2f} for the best assignment that the arms have time for, {blind:.2f} for an "
+        f"equal split, time load {time:.2f} (mean of {SEEDS} seeds; 1 is what the fleet can do): {REGIMES[regime]}\n"
         f"{able:.0%} of the arms can do a job (mean over the jobs)\n"
         f"{_fault_cost(scenario)}\n"
-        f"people touch an arm for up to {people.contact_s:g} s: surfaces burn from {people.burn_c:g} °C"
+        f"people touch an arm for up to {people.contact_s:g} s: a surface of {people.burn_c:g} °C or more burns"
     )
     refused = list(dict.fromkeys(map(str, fleet.infeasible)))
     more = [f"… and {len(refused) - MOST_REASONS} more."] if len(refused) > MOST_REASONS else []
-    tail = "\n".join([*refused[:MOST_REASONS], *more]) or "Every arm can do every job."
+    nobody = [
+        f"No arm can do '{stream.name}' at {' → '.join(names)}; its other places serve."
+        for stream in scenario.jobs
+        for works, names in zip(
+            zip(*(alternatives_of(scenario, stream, kg) for kg in stream.payload_kg), strict=True),
+            stream.alternatives,
+            strict=True,
+        )
+        if not any(work in arm.plans for work in works for arm in fleet.arms)
+    ]
+    tail = "\n".join([*nobody, *refused[:MOST_REASONS], *more]) or "Every arm can do every job."
     return [head, _arms(scenario), _jobs(scenario), tail]
 
 

@@ -201,7 +201,8 @@ def line(measured_c: np.ndarray, expected_c: np.ndarray) -> tuple[float, float]:
         slope = max(np.linalg.lstsq(rows[:, :1], values - rows[:, 1] * offset_k)[0][0], 0.0)
         return float(np.sum((values - rows @ [slope, offset_k]) ** 2))
 
-    offset_k = float(minimize_scalar(cost, bounds=(-200.0, 200.0), options={"xatol": 1e-6}).x)
+    best: Any = minimize_scalar(cost, bounds=(-200.0, 200.0), options={"xatol": 1e-6})
+    offset_k = float(best.x)
     if offset_k > 0.0:  # where the cost rises by 2², the square of two standard errors, or 0
         least = cost(offset_k) + 4.0
         root: Any = brentq(lambda k: cost(k) - least, -200.0, offset_k)

@@ -459,6 +459,7 @@ def test_the_command_shows_the_cell_and_fails_if_there_are_problems(cache, tmp_p
     code, out, _ = call("quickstart", "--out", picture)
     assert code == 0
     assert "At most 4 of 4 arms can work at once" in out
+    assert "Table(" not in out
     assert picture.read_bytes().startswith(b"\x89PNG")
     code, _, err = call("quickstart", "--out", picture)
     assert (code, "exists" in err or "overwrite" in err) == (2, True)
