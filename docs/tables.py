@@ -77,7 +77,7 @@ DOCS = ROOT / "docs"
 
 NAMED = ("faults", "value", "on_time", "reward", "hot_surface_min")
 """Figures of the table of named scenarios; those that are 0 everywhere are left out."""
-SOURCES = {"oracle": "true state", "twin": "identified network"}
+SOURCES = {"oracle": "true state", "twin": "identified network, corrected"}
 """Score sources of the measured table, by the end of the file's name."""
 
 

@@ -116,7 +116,6 @@ BY_HAND = {
     ("docs/identification.md", "question"): "`benchmarks.paper` prints it, from logs that are not in the repository",
     ("docs/performance.md", ""): "times of one machine; the commands beside the tables print them",
     ("docs/performance.md", "what"): "times of one machine; the commands in the table print them",
-    ("docs/results/twin.md", "scenario"): "`benchmarks.paper reliability` prints it: an hour",
     ("docs/ros2.md", "ROS 2"): "settings",
     ("docs/scaling.md", ""): "to be made from files",
     ("docs/scaling.md", "what fails first"): "calculated from the table above it",

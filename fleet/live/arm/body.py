@@ -283,7 +283,7 @@ class ExpectedTemperatures:
             measured_c: At its end, [joint]; a step without it leaves `moments` as they are.
         """
         self.temp_c = self.thermal.step(self.temp_c, heat_w, ambient_c, dt_s)
-        if np.isfinite(measured_c).all():
+        if np.isfinite(measured_c).all() and np.isfinite(self.temp_c).all():
             compare(self.moments, self.temp_c, measured_c, 0.0, ambient_c, dt_s)
 
 
