@@ -578,6 +578,7 @@ def coverage_by_clusters(path: Path) -> str:
 PAPER = {
     "readings": ("readings_any", "readings_joint"),
     "sides": ("sides",),
+    "forms": ("forms",),
     "surprises": ("surprises",),
     "questions": ("questions_25s", "questions_6s"),
     "sweep": ("sweep",),
