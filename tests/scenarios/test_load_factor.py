@@ -83,11 +83,12 @@ def test_a_job_that_one_arm_cannot_do_loads_the_other_and_twice_the_jobs_are_twi
     arms = [small.arm(0, [content, other]), small.arm(1, [other])]
     found = load_of(small, [small.job("a", content)], arms)
     assert found.time == pytest.approx(ONE_JOB_S / HORIZON_S)
+    assert found.able == 0.5
     content = small.work(payload_kg=small.WARM)
     arms = equal_arms(small, 2, content)
     jobs = [small.job(f"job_{i}", content) for i in range(4)]
     assert load_of(small, jobs, arms).thermal == pytest.approx(2 * load_of(small, jobs[:2], arms).thermal)
-    assert load_of(small, [], arms) == LoadFactor(thermal=0.0, blind=0.0, time=0.0)
+    assert load_of(small, [], arms) == LoadFactor(thermal=0.0, blind=0.0, time=0.0, able=0.0)
 
 
 def test_heavier_is_never_cooler(small):
@@ -126,4 +127,4 @@ def test_the_best_assignment_is_one_that_the_arms_have_time_for(small):
     ],
 )
 def test_the_regime_in_a_word(thermal, blind, time, word):
-    assert LoadFactor(thermal=thermal, blind=blind, time=time).regime == word
+    assert LoadFactor(thermal=thermal, blind=blind, time=time, able=1.0).regime == word
