@@ -65,8 +65,14 @@ class PlannedFleet:
         every = range(len(self.scenario.arms))
         return plan_arms(self.scenario, every, rehearsal_works(self.scenario), self.folder, self.progress)
 
-    def learned(self, training: int, evidence: "Evidence", *, trained: bool = True) -> "list[Learned]":
-        """The arms' twins of a training, or the same networks before training, with P of a regression."""
+    def learned(
+        self, training: int, evidence: "Evidence", *, trained: bool = True, thermometers: bool = True
+    ) -> "list[Learned]":
+        """The arms' twins of a training, or the same networks before training, with P of a regression.
+
+        Args:
+            thermometers: As in `with_regressions`.
+        """
         from scenarios.prepare.twins import train_twins, training_seed
         from twin.baselines import untrained_config
         from twin.vae.config import TwinConfig
@@ -76,10 +82,15 @@ class PlannedFleet:
         seed = training_seed(self.scenario, training)
         config = config if trained else untrained_config(config)
         twins = train_twins(self.scenario, self.arms, self.folder, self.progress, config=config, seed=seed)
-        return self.with_regressions(twins, evidence=evidence)
+        return self.with_regressions(twins, evidence=evidence, thermometers=thermometers)
 
     def with_regressions(
-        self, twins: "Sequence[Twin]", *, evidence: "Evidence" = "excess", jobs: int | None = None
+        self,
+        twins: "Sequence[Twin]",
+        *,
+        evidence: "Evidence" = "excess",
+        jobs: int | None = None,
+        thermometers: bool = True,
     ) -> "list[Learned]":
         """Every arm's twin with a regression on its past jobs, which is cached.
 
@@ -87,6 +98,8 @@ class PlannedFleet:
 
         Args:
             jobs: Past jobs of each arm; default: `scenarios.prepare.calibrate.PAST_JOBS`.
+            thermometers: Whether the regression reads temperatures. Without them an arm knows of its past jobs whether
+                a motor warned, and of a new one the plan and the duration.
         """
         from scenarios.prepare.calibrate import PAST_JOBS, nominal_network, past_key, simulate_past
         from scenarios.prepare.twins import CachedModel, load_or_make
@@ -104,15 +117,17 @@ class PlannedFleet:
             def make(home: Path, _report: Callable[[float], None]) -> str | None:
                 past = simulate_past(scenario, arm, heat.heat_model, jobs=count)
                 features = twin.features(past.plans, past.repetitions.tolist())
+                known_c = past.known_c if thermometers else np.zeros_like(past.known_c)  # constants get no slope
                 try:
-                    fitted = fit_regression(features, past.duration_s, past.known_c, past.passed, evidence=evidence)
+                    fitted = fit_regression(features, past.duration_s, known_c, past.passed, evidence=evidence)
                 except NotEnoughExperience as error:
                     name = arm.hardware.robot.name
                     return f"{scenario.name}: arm '{name}' gets no probability of saturation. {error}"
                 save_regression(fitted, home)
                 return None
 
-            key = past_key(scenario, arm, f"{evidence}-{twin.version}-{heat.version}", count)
+            read = evidence if thermometers else f"{evidence}-alone"
+            key = past_key(scenario, arm, f"{read}-{twin.version}-{heat.version}", count)
             return CachedModel(self.folder / "saturation" / key, load, make)
 
         models = [model(arm, twin) for arm, twin in zip(self.arms, twins, strict=True)]
@@ -217,19 +232,19 @@ class _Constant:
         return Difficulty(np.full(JOINTS, 0.5), p_saturation=0.5)
 
 
-def _vae(planned: PlannedFleet, training: int, *, trained: bool = True) -> Fleet:
-    return planned.scored(planned.learned(training, "excess", trained=trained))
+def _vae(planned: PlannedFleet, training: int, *, trained: bool = True, thermometers: bool = True) -> Fleet:
+    return planned.scored(planned.learned(training, "excess", trained=trained, thermometers=thermometers))
 
 
 def _changed(planned: PlannedFleet, fleet: Fleet, change: Callable[[DifficultyModel], _Changed]) -> Fleet:
     return planned.scored([change(arm.model) for arm in fleet.arms])
 
 
-def _torque(planned: PlannedFleet) -> Fleet:
+def _torque(planned: PlannedFleet, *, thermometers: bool = True) -> Fleet:
     from scenarios.prepare.twins import exploration_records, records, require_cool_plans
     from twin.baselines import known_torque
 
-    scenario, twins = planned.scenario, planned.learned(0, "torque")
+    scenario, twins = planned.scenario, planned.learned(0, "torque", thermometers=thermometers)
 
     def training_records(arm: PlannedArm) -> list[Array]:
         cool = require_cool_plans(arm.all_plans, arm.hardware, scenario)
@@ -261,6 +276,10 @@ SOURCES: dict[str, Callable[[PlannedFleet, int], Fleet]] = {
     "trained": _vae,
     "untrained": partial(_vae, trained=False),
     "unweighted": lambda planned, training: _changed(planned, _vae(planned, training), unweighted),
+    # The same without thermometers: the paper's case.
+    "trained-alone": partial(_vae, thermometers=False),
+    "untrained-alone": partial(_vae, trained=False, thermometers=False),
+    "torque-alone": lambda planned, _: _changed(planned, _torque(planned, thermometers=False), unweighted),
     # RMS torque over that of the training motion.
     "torque": lambda planned, _: _changed(planned, _torque(planned), unweighted),
     "weighted-torque": lambda planned, _: _torque(planned),
@@ -272,7 +291,7 @@ SOURCES: dict[str, Callable[[PlannedFleet, int], Fleet]] = {
     "constant": lambda planned, _: planned.scored([_Constant()] * len(planned.arms)),
 }
 """The fleet with the predictions of each source besides `PREPARED`, from its plans and the training, from 0."""
-UNTRAINED = ("torque", "weighted-torque", "rc-nominal", "rc", "constant")
+UNTRAINED = ("torque", "torque-alone", "weighted-torque", "rc-nominal", "rc", "constant")
 """Sources that do not depend on the training: one stands for all."""
 ALL_SOURCES = (*PREPARED, *SOURCES)
 """Names, as `--difficulty` of `thermofleet compare` takes them."""
