@@ -5,6 +5,7 @@ with at most eight arms, since past jobs of all arms are simulated for each sour
 
     thermofleet compare --suite $(python -m benchmarks.knowledge --instances) --out runs/knowledge \
         --policies bid_price@blind,bid_price@torque,bid_price@untrained,bid_price@trained,bid_price@rc-nominal,\
+    bid_price@torque-alone,bid_price@untrained-alone,bid_price@trained-alone,\
     bid_price@rc,mpc@rc,benchmarks/mpc_parts.py:WithoutHeat@rc
     python -m benchmarks.knowledge runs/knowledge
 """

@@ -254,6 +254,9 @@ def board_top(folder: Path) -> str:
 
 KNOWLEDGE = {
     "blind": "nothing",
+    "torque-alone": "no thermometers, regression on squared torque",
+    "untrained-alone": "no thermometers, regression on errors of the untrained twin",
+    "trained-alone": "no thermometers, regression on errors of the twin",
     "torque": "thermometers, regression on squared torque",
     "untrained": "thermometers, regression on errors of the untrained twin",
     "trained": "thermometers, regression on errors of the twin",
