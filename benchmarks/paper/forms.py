@@ -338,9 +338,10 @@ def form_units(given: Namespace) -> list[Unit]:
     basis = content_key(asdict(size), given.arms, given.scenarios)
     units: list[Unit] = []
     for subject in subjects:
-        pairs = product((*RIVALS, *FORMS), range(given.trainings))
-        keys = {f"{subject.name}/{name}/{training}/{basis}": (name, training) for name, training in pairs}
         others = [each for each in subjects if each is not subject]
+        possible = [name for name, form in FORMS.items() if others or not form.others]
+        pairs = product((*RIVALS, *possible), range(given.trainings))
+        keys = {f"{subject.name}/{name}/{training}/{basis}": (name, training) for name, training in pairs}
         units.append(Unit(tuple(keys), partial(_missing, subject, others, size, keys)))
     return units
 
