@@ -30,6 +30,7 @@ from benchmarks.paper.harness import (
     table_of,
     whole,
 )
+from benchmarks.paper.readings import ArmSize
 from benchmarks.paper.subjects import (
     ALARM_RATE,
     SCENARIOS,
@@ -49,7 +50,7 @@ from scenarios.json_rows import Row
 from scenarios.prepare.twins import records
 from scenarios.table import Table
 from twin.vae.config import LOGVAR_RANGE, TwinConfig
-from twin.vae.model import one_thread
+from twin.vae.model import kl, one_thread
 from twin.vae.window import Scaler, cut_jobs, draw_windows, windows_of
 
 Array = np.ndarray
@@ -118,21 +119,21 @@ class Net(nn.Module):
             given: Inputs of the decoder, [batch, time, input]; the payload is the last.
             noise: Of the latent, [batch, latent].
         """
-        inputs, kl = [given], torch.zeros(len(x))
+        inputs, nats = [given], torch.zeros(len(x))
         if self.posterior is not None and self.expand is not None:
             seen = torch.cat([x, given[..., -1:]], dim=2) if self.form.payload else x
             summary = torch.tanh(self.encoder(seen)[1][0][-1])
             mu, logvar = self.posterior(summary).chunk(2, dim=1)
             logvar = logvar.clamp(*LOGVAR_RANGE)
-            kl = 0.5 * (mu.square() + logvar.exp() - 1.0 - logvar).sum(1)
+            nats = kl(mu, logvar)
             z = mu + noise * torch.exp(0.5 * logvar)
             inputs.append(torch.tanh(self.expand(z))[:, None].expand(-1, x.shape[1], -1))
         wanted, found = x[..., self.form.explains], self.out(self.decoder(torch.cat(inputs, dim=2))[0])
         if not self.form.variance:
-            return wanted - found, kl
+            return wanted - found, nats
         mean, logvar = found.chunk(2, dim=2)
         logvar = logvar.clamp(*LOGVAR_RANGE)
-        return 0.5 * ((wanted - mean).square() * torch.exp(-logvar) + logvar), kl
+        return 0.5 * ((wanted - mean).square() * torch.exp(-logvar) + logvar), nats
 
 
 def inputs_of(form: Form, z: Array, payload: Array, joint: int) -> tuple[Tensor, Tensor]:
@@ -171,10 +172,10 @@ def fitted(
         for _ in range(config.epochs):
             for some in torch.randperm(len(x)).split(config.batch):
                 noisy = x[some] + sensors * torch.randn_like(x[some])
-                error, kl = net(noisy, given[some], torch.randn(len(some), form.latent))
+                error, nats = net(noisy, given[some], torch.randn(len(some), form.latent))
                 loss = error if form.variance else 0.5 * error.square()
                 optimizer.zero_grad()
-                (loss.sum((1, 2)) + config.beta * kl).mean().backward()
+                (loss.sum((1, 2)) + config.beta * nats).mean().backward()
                 nn.utils.clip_grad_norm_(net.parameters(), config.clip)
                 optimizer.step()
                 schedule.step()
@@ -203,9 +204,8 @@ class Motion:
         """Some windows of the plans of a sample."""
         each = [windows_of(records([plan]), CONFIG) for plan in sample.plans]
         payload = np.repeat([plan.work.payload_kg for plan in sample.plans], [len(part) for part in each])
-        joined = np.concatenate([np.concatenate(each).reshape(len(payload), -1), payload[:, None]], axis=1)
-        chosen = draw_windows(joined, CONFIG.max_windows, seed)
-        return cls(chosen[:, :-1].reshape(-1, *each[0].shape[1:]), chosen[:, -1])
+        chosen = draw_windows(np.arange(len(payload)), CONFIG.max_windows, seed)
+        return cls(np.concatenate(each)[chosen], payload[chosen])
 
 
 def job_scores(nets: Sequence[Net], scaler: Scaler, sample: Sample) -> Array:
@@ -233,22 +233,11 @@ def judged(scores: Mapping[str, Array], study: Study, carrier: int, weight: Arra
     }
 
 
-@dataclass(frozen=True)
-class FormSize:
-    """Numbers of jobs of an arm."""
-
-    train: int = 200
-    exploration: int = 64
-    reference: int = 200
-    test: int = 500
-    novel: int = 150
-
-
 SAMPLES = ("reference", "test", "novel")
 
 
 def form_rows(
-    subject: Subject, others: Sequence[Subject], size: FormSize, wanted: Mapping[str, tuple[str, int]]
+    subject: Subject, others: Sequence[Subject], size: ArmSize, wanted: Mapping[str, tuple[str, int]]
 ) -> Iterator[tuple[str, Row]]:
     """The measures of every form and training on one arm.
 
@@ -285,7 +274,7 @@ def form_rows(
 
 
 @cache
-def motion_of(subject: Subject, size: FormSize) -> Motion:
+def motion_of(subject: Subject, size: ArmSize) -> Motion:
     """The training motion of an arm."""
     study = subject.study(**asdict(size) | {"reference": 0, "test": 0, "novel": 0})
     return Motion.of(study.train, subject.entropy)
@@ -328,12 +317,12 @@ def form_options(parser: ArgumentParser) -> None:
     parser.add_argument("--scenarios", type=names, default=names(SCENARIOS), help=f"scenarios [{SCENARIOS}]")
     parser.add_argument("--arms", type=whole(1), default=2, help="arms of each scenario [2]")
     parser.add_argument("--trainings", type=whole(1), default=2, help="trainings of each network [2]")
-    size_options(parser, FormSize)
+    size_options(parser, ArmSize)
 
 
 def form_units(given: Namespace) -> list[Unit]:
     """A unit for each arm."""
-    size = size_given(given, FormSize)
+    size = size_given(given, ArmSize)
     subjects = subjects_of(given.scenarios, arms=range(given.arms), seeds=[1], sizes=Sizes())
     basis = content_key(asdict(size), given.arms, given.scenarios)
     units: list[Unit] = []
@@ -349,7 +338,7 @@ def form_units(given: Namespace) -> list[Unit]:
 def _missing(
     subject: Subject,
     others: Sequence[Subject],
-    size: FormSize,
+    size: ArmSize,
     keys: Mapping[str, tuple[str, int]],
     missing: Collection[str],
 ) -> KeyedRows:

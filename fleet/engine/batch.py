@@ -340,8 +340,9 @@ class Engine:
         """
         mine, arms = self._simulation, range(self.layout.arms)
         average_excess(mine, env, mine.room.excess)
-        excess = [[float(excess_of(mine, env, arm, kind)) for kind in kinds] for arm in arms]
-        return np.array(excess), np.array([line_of(each)[1] for each in mine.moments[env]])
+        lines = [line_of(each) for each in mine.moments[env]]
+        excess = [[float(excess_of(mine, env, arm, kind, lines[arm][0])) for kind in kinds] for arm in arms]
+        return np.array(excess), np.array([offset_k for _, offset_k in lines])
 
     def reset(self, envs: Array, shifts: Sequence[Shift]) -> None:
         """Put a new shift into each of some rows; `observe` then gives what their arms know."""

@@ -60,16 +60,16 @@ def observe(sim: Simulation, rows: Array, shared: Array, own: Array) -> None:
                 show_members(sim, e, a, mine, slot_kind, filled, hottest_c, busy_s)
             show_arm(sim, e, a, mine, measured_c[a], hottest_c[a], busy_s[a])
             shown = busy_s[a] <= form.ahead_s[0]
-            offset_k = line_of(sim.moments[e, a])[1] if t.learns else _ZERO
+            ratio, offset_k = line_of(sim.moments[e, a]) if t.learns else (_ONE, _ZERO)
             for k in range(JOINTS):
                 known_c[k], known_c[JOINTS + k] = measured_c[a, k] - offset_k, arm["housing_c"][k]
             known_c[2 * JOINTS] = air_at(t, s.env[e], a)
             if arm["mode"] == WORKING and arm["pending"]:
-                show_job(sim, e, a, mine, hottest_c[a] - offset_k, busy_s[a], known_c, values_c)
+                show_job(sim, e, a, mine, hottest_c[a] - offset_k, busy_s[a], known_c, ratio, values_c)
             if shown:
                 show_options(sim, e, a, mine, slot_kind, left, filled)
                 if forecasts:
-                    show_forecasts(sim, e, a, mine, slot_kind, filled, known_c, values_c)
+                    show_forecasts(sim, e, a, mine, slot_kind, filled, known_c, ratio, values_c)
         if form.bids[0] != 0:
             if alike:
                 show_bids(sim, 0, shared[e], own[e], filled)
@@ -159,10 +159,10 @@ def average_excess(sim: Simulation, e: int, mean: Array) -> None:
 
 
 @jit_inline
-def excess_of(sim: Simulation, e: int, a: int, kind: int) -> Real:
+def excess_of(sim: Simulation, e: int, a: int, kind: int, ratio: Real) -> Real:
     """Excess of heat that an arm assumes for a kind of job.
 
-    It is its own measurement, else the mean of its peers if messages take no time, else 0; scaled by the ratio of
+    It is its own measurement, else the mean of its peers if messages take no time, else 0; scaled by the `ratio` of
     `line_of`.
     """
     if not sim.tables.learns:
@@ -171,7 +171,7 @@ def excess_of(sim: Simulation, e: int, a: int, kind: int) -> Real:
     own, mean = sim.excess[e, a, work], sim.room.excess[work]
     if own != own:
         own = mean if sim.form.shares_heat[0] != 0 and mean == mean else _ZERO
-    return (_ONE + own) * line_of(sim.moments[e, a])[0] - _ONE
+    return (_ONE + own) * ratio - _ONE
 
 
 @jit_inline
@@ -211,7 +211,15 @@ def show_arm(sim: Simulation, e: int, a: int, mine: Array, measured_c: Array, ho
 
 @jit_inline
 def show_job(
-    sim: Simulation, e: int, a: int, mine: Array, hottest_c: Real, busy_s: Real, known_c: Array, room: Array
+    sim: Simulation,
+    e: int,
+    a: int,
+    mine: Array,
+    hottest_c: Real,
+    busy_s: Real,
+    known_c: Array,
+    ratio: Real,
+    room: Array,
 ) -> None:
     """Put an arm's current job into its part."""
     t, s, at, unit = sim.tables, sim.state, sim.form.offsets, sim.form.inverse
@@ -230,7 +238,7 @@ def show_job(
             if work["risk"] >= 0 or work["peak"] >= 0:
                 p, peak_c = predict(
                     p, work["risk"], work["peak"], t.forecast_first, t.forecast_block, t.forecast_curve, known_c,
-                    busy_s, excess_of(sim, e, a, kind), room,
+                    busy_s, excess_of(sim, e, a, kind, ratio), room,
                 )  # fmt: skip
                 if work["peak"] >= 0:
                     peak_c = max(peak_c, min(max(hottest_c, LOW_C), HIGH_C))
@@ -257,14 +265,22 @@ def show_options(sim: Simulation, e: int, a: int, mine: Array, slot_kind: Array,
 
 @jit_inline
 def show_forecasts(
-    sim: Simulation, e: int, a: int, mine: Array, slot_kind: Array, filled: int, known_c: Array, room: Array
+    sim: Simulation,
+    e: int,
+    a: int,
+    mine: Array,
+    slot_kind: Array,
+    filled: int,
+    known_c: Array,
+    ratio: Real,
+    room: Array,
 ) -> None:
     """Put the predictions of an arm's plans from its present temperatures into its part."""
     t, form, fleet = sim.tables, sim.form, nonnegative(sim.state.env[e]["fleet"])
     at, options = form.offsets, nonnegative(t.work.shape[3])
     first, block, curve = t.forecast_first, t.forecast_block, t.forecast_curve
     for k in range(filled):
-        works, excess = t.work[fleet, nonnegative(slot_kind[k]), a], excess_of(sim, e, a, slot_kind[k])
+        works, excess = t.work[fleet, nonnegative(slot_kind[k]), a], excess_of(sim, e, a, slot_kind[k], ratio)
         for n in range(options):
             work, option = works[n], k * options + n
             if work["risk"] >= 0 or work["peak"] >= 0:
