@@ -41,6 +41,7 @@ def greedy(difficulty: dict[str, dict[str, float]], able: list[str]) -> dict[str
 
 
 @example(29830, 2, 1)  # the bid of one arm came later than the other had chosen
+@example(118385827, 2, 2)  # so did that of a faulted arm, by which its peer knows how well each job suits it
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 4))
 def test_without_message_loss_the_allocation_is_that_of_a_central_policy(seed, arms, jobs):
     """The first job of every arm, where every job has a separate station; some arms are faulted."""

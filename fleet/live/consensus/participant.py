@@ -531,7 +531,7 @@ class Participant:
         if len(bids) < self.claimant.majority:
             return
         mine = {offer.job for offer in own.estimates}
-        behind = any(bid.capacity and not mine <= {offer.job for offer in bid.estimates} for bid in bids.values())
+        behind = any(not mine <= {offer.job for offer in bid.estimates} for bid in bids.values())
         early = self._present - bids.keys() or behind or real_s < self.changed_s + QUIET_S
         if early and real_s < self._bid_s + self._timing.window_s:
             return
