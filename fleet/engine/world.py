@@ -11,10 +11,12 @@ from fleet.engine.state import JobTable, Law, Offers, PlanTable, World
 from fleet.heat.motor import Motors, gen3_motors, stack_motors
 from fleet.heat.thermal import (
     HOUSING,
+    WINDING,
     HousingObserver,
     ThermalModel,
     gen3_network,
     housing_observer,
+    node_heat,
     stack_models,
     steady_state,
     thermal_model,
@@ -25,6 +27,8 @@ from fleet.offered_plans import PLANS, offered_plans
 from fleet.robot import GEN3, Robot, ThermalLimits
 
 Array = np.ndarray
+CYCLES_S = 900.0
+"""Time after which rises of the hottest motor are compared: that of a typical job, before its housing has settled."""
 Space = Callable[[Sequence[Plan]], tuple[Array, Array]]
 """Volume of each plan, int [plan], and which volumes two arms cannot take at a time, bool [volume, volume]."""
 
@@ -91,16 +95,21 @@ class Arm:
         return self._driven[id(plan)][1]
 
     def excess(self, plan: Plan, measured: Drive) -> float:
-        """Heat of a cycle, by measured currents and joint torques, over that which the arm expects of the plan, less 1.
+        """Rise of the hottest motor by measured currents and joint torques, over that by those of the plan, less 1.
 
-        Both by the copper losses that it knows; of the joint that differs most, over the heat of the most loaded one.
+        Both after `CYCLES_S` of cycles, by the network and motors that the arm knows.
         """
         _, motors = self.beliefs
-        expected = drive(plan.cycle.profile, motors)
-        more_sq, more_friction_w = measured.current_sq - expected.current_sq, measured.friction_w - expected.friction_w
-        more_w = motors.copper_w_per_a2 * more_sq + more_friction_w
-        most_w = float((motors.copper_w_per_a2 * expected.current_sq + expected.friction_w).max())
-        return float(more_w[np.abs(more_w).argmax()]) / most_w if most_w > 0 else 0.0
+        expected_k, measured_k = (
+            (self._rise_by_heat @ node_heat(motors.copper_w_per_a2 * load.current_sq, load.friction_w))[WINDING].max()
+            for load in (drive(plan.cycle.profile, motors), measured)
+        )
+        return float(measured_k / expected_k) - 1.0 if expected_k > 0 else 0.0
+
+    @cached_property
+    def _rise_by_heat(self) -> Array:
+        """Rise by constant heat for `CYCLES_S` in the network that the arm knows, K/W, [node, node]."""
+        return self.beliefs[0].step_matrices(CYCLES_S)[1]
 
     def rest_drive(self, motors: Motors | None = None) -> Drive:
         """Mean heat drive of standing at home, each [joint]; of other motors if given."""

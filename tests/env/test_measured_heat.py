@@ -5,6 +5,7 @@ from typing import Any  # what scipy's stubs do not tell
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, minimize_scalar
 
 from agents.schedules import Schedules
@@ -14,11 +15,12 @@ from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.batch import Engine, RewardWeights, empty_parts
 from fleet.engine.shift import shifts_of
 from fleet.engine.tables import tables_of
+from fleet.engine.world import CYCLES_S
 from fleet.env.lookahead import CellSimulator
 from fleet.env.vector import BatchEnv, Library
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import ThermalModel, gen3_network, temperature_steps, thermal_model
-from fleet.motion import static_drive
+from fleet.motion import Drive, drive, static_drive
 from fleet.observation import Layout
 from fleet.robot import JOINTS
 from fleet.telemetry import WORKING
@@ -78,6 +80,27 @@ def test_a_measured_excess_raises_the_predictions_for_that_work_of_all_arms(smal
     assert job_c == pytest.approx(hotter, abs=0.01)
     # Five jobs are left: rack, bench, rack, bench, rack.
     assert peaks(env, obs)[:, :5] == pytest.approx(np.tile([30.0, hotter, 30.0, hotter, 30.0], (3, 1)), abs=0.01)
+
+
+def test_the_excess_is_of_the_hottest_motor(small) -> None:
+    """Friction heats the housing, so its watts count less than those of copper; a cooler joint does not count."""
+    arm = replace(small.arm(0, [small.work("bench", small.WARM)]), known=(thermal_model(gen3_network()), gen3_motors()))
+    (plan,), (thermal, motors) = next(iter(arm.plans.values())), arm.known
+    planned = drive(plan.cycle.profile, motors)
+
+    def rise_k(load: Drive) -> np.ndarray:
+        watts = np.concatenate([motors.copper_w_per_a2 * load.current_sq, load.friction_w])
+
+        def warming(_, rise):
+            return (watts - thermal.laplacian @ rise) / thermal.capacity
+
+        return solve_ivp(warming, (0.0, CYCLES_S), np.zeros(2 * JOINTS), rtol=1e-9, atol=1e-9).y[:JOINTS, -1]
+
+    hottest, coolest = rise_k(planned).argmax(), rise_k(planned).argmin()
+    for joint, watts in ((hottest, 2.0), (coolest, 0.5)):
+        rubs = replace(planned, friction_w=planned.friction_w + watts * np.eye(JOINTS)[joint])
+        assert arm.excess(plan, rubs) == pytest.approx(rise_k(rubs).max() / rise_k(planned).max() - 1.0, abs=1e-6)
+        assert (arm.excess(plan, rubs) > 0.01) == (joint == hottest)
 
 
 def test_an_arm_believes_its_own_measurement_and_the_others_their_mean(small) -> None:
