@@ -25,6 +25,9 @@ demo: $(DEMO_STAMP)
 leaderboard: $(STAMP)
 	@$(BIN)/thermofleet leaderboard
 
+# Of each of two workers; more threads would wait for each other on two cores.
+test test-ci-slow coverage: export OMP_NUM_THREADS := 1
+
 test: $(STAMP)
 	@$(BIN)/python -m pytest -n 2 --dist worksteal
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from scenarios.run.shift import run as run
     from scenarios.spec.load import load as load
     from scenarios.spec.schema import Scenario as Scenario
+    from twin.thermal.forecast import forecast as forecast
     from twin.thermal.identify import identify as identify
 
 _HOMES = {
@@ -33,6 +34,7 @@ _HOMES = {
     "Policy": "agents.policy",
     "Scenario": "scenarios.spec.schema",
     "compare": "scenarios.evaluate.comparison",
+    "forecast": "twin.thermal.forecast",
     "identify": "twin.thermal.identify",
     "load": "scenarios.spec.load",
     "make_batch": "scenarios.prepare.batch",

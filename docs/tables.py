@@ -584,6 +584,7 @@ PAPER = {
     "forms": ("forms",),
     "surprises": ("surprises",),
     "questions": ("questions_25s", "questions_6s"),
+    "forecast": ("forecast",),
     "sweep": ("sweep",),
     "parsimony": ("parsimony",),
     "transfer": ("transfer_errors", "transfer_savings"),

@@ -14,7 +14,7 @@ MODULES = {
     "parsimony": "sweep:PARSIMONY",
     "surprises": "reliability:SURPRISES",
     "questions": "real_logs:QUESTIONS_OF_LOGS",
-    "identification": "real_logs:IDENTIFICATION",
+    "forecast": "real_logs:FORECAST",
     "transfer": "transfer:TRANSFER",
     "features": "features:FEATURES",
     "augmentation": "features:AUGMENTATION",

@@ -1,16 +1,18 @@
-"""Studies on logs of a real arm: `questions` and `identification`.
+"""Studies on logs of a real arm: `questions` and `forecast`.
 
 `questions` ranks the windows of a log by whether joint 2 is hot or becomes hot, by d, RMS torque and other scores. It
 is cross-validated by file: every file is judged by a twin that was trained on cool files of other folds. Windows of one
-file are much alike, so the intervals are bootstraps over files. `identification` predicts the files of one half by a
-thermal network that is identified on the other half.
+file are much alike, so the intervals are bootstraps over files. `forecast` predicts the second half of each file from
+its first.
 """
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
+from typing import Any  # values of a row
 
 import msgspec
 import numpy as np
@@ -21,16 +23,15 @@ from benchmarks.paper.harness import Experiment, Unit, content_key, one_row, tab
 from benchmarks.paper.subjects import CARRIER
 from fleet.errors import FleetError, LogError
 from fleet.files import cache_folder
-from fleet.heat.thermal import HOUSING, WINDING
 from fleet.motion import CHANNELS
-from fleet.robot import JOINTS
 from scenarios.evaluate.statistics import Interval, percentile_interval
 from scenarios.json_rows import Row
 from scenarios.prepare.twins import LOG_INPUT, train_or_load
 from scenarios.table import Table
 from twin.logs.reader import read_folder
-from twin.logs.recording import READINGS, Recording, Stretch, cool_stretches, heat_logs, stretches
-from twin.thermal.identify import HeatModel, Noise, ParameterVector, Problem, identify
+from twin.logs.recording import READINGS, Recording, Stretch, cool_stretches, stretches
+from twin.thermal.forecast import forecast
+from twin.thermal.identify import identify
 from twin.vae.config import TwinConfig
 from twin.vae.measures import Calibration
 from twin.vae.twin import Twin
@@ -342,56 +343,74 @@ QUESTIONS_OF_LOGS = Experiment(
 )
 
 
-AMBIENT_C = 22.0
-"""Assumed ambient temperature of the logs."""
+LEAST_S = 120.0
+"""Shorter recordings have no half from which to forecast."""
 
 
-def held_out_errors(arm: HeatModel, recording: Recording) -> Array:
-    """Simulated minus measured motor temperatures, K, [time, joint].
+def forecast_row(recordings: Sequence[Recording], part: int) -> Row:
+    """Forecasts of the second half of each file of one half of the files, made from its first half.
 
-    Only the temperatures at the start of each stretch are fitted. Resistance and magnets follow the simulated
-    temperatures, which three rounds settle.
+    Returns:
+        By network, nominal or identified from the other half of the files, [file, joint]: errors of the median at the
+        end, and how far the ends of the 95 % intervals are from the measured temperature, K; and of each file its
+        length and how far its temperatures changed.
     """
-    logs = heat_logs(recording, arm.motors, "current", step_s=0.0)
-    layout = ParameterVector(arm)
-    problem = Problem(logs, AMBIENT_C, 0.0, layout, Noise(np.full(JOINTS, 0.01), np.ones(JOINTS)))
-    temps = problem.temperatures(layout.mean)
-    for _ in range(2):
-        middle = [(temp[1:] + temp[:-1]) / 2.0 for temp in temps]
-        problem.winding_c = [each[:, WINDING] for each in middle]
-        problem.housing_c = [each[:, HOUSING] for each in middle]
-        temps = problem.temperatures(layout.mean)
-    return np.concatenate([temp[:, WINDING] - log.temp_c for temp, log in zip(temps, logs, strict=True)])
+    files = [each for each in recordings[1 - part :: 2] if each.duration_s >= LEAST_S]
+    networks = {"nominal": None, "identified": identify(recordings[part::2])}
+    row: dict[str, Any] = {"seconds": [], "change_k": [], **{name: [] for name in networks}}
+    for recording in files:
+        middle = int(np.searchsorted(recording.time_s, (recording.time_s[0] + recording.time_s[-1]) / 2.0))
+        first, second = recording.part(slice(None, middle + 1)), recording.part(slice(middle, None))
+        assert first.temp_c is not None, "identify refuses logs without temperatures"
+        assert second.temp_c is not None, "as the first"
+        row["seconds"].append(recording.duration_s)
+        row["change_k"].append(np.round(second.temp_c[-1] - first.temp_c[-1], 3).tolist())
+        for name, network in networks.items():
+            ends = [each[-1] - second.temp_c[-1] for each in forecast(first, second, network=network).interval()]
+            row[name].append(np.round(ends, 3).tolist())
+    return row
 
 
-def fold_row(recordings: Sequence[Recording], part: int) -> Row:
-    """RMS error of each file of the other half by a network of this half, K, [joint] by file."""
-    arm = identify(recordings[part::2]).heat_model
-    errors_k = {r.name: held_out_errors(arm, r) for r in recordings[1 - part :: 2]}
-    return {"rms_k": {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in errors_k.items()}}
+def forecast_tables(rows: Sequence[Row]) -> dict[str, Table]:
+    """Errors at the end of joint 2 and of the worst joint beside persistence, by network and length of the file."""
+
+    def stacked(name: str) -> Array:
+        return np.concatenate([np.array(row[name]) for row in rows])
+
+    order = np.argsort(stacked("seconds"))
+    parts = {"all": order} | dict(zip(LENGTHS, np.array_split(order, 3), strict=True))
+    ends = {f"{name} network": stacked(name) for name in ("nominal", "identified")}
+    errors = {name: each[:, 1] for name, each in ends.items()} | {"as it is now": stacked("change_k")}
+    lines: list[tuple[str, ...]] = []
+    for (length, part), (name, error) in product(parts.items(), errors.items()):
+        of_files = np.abs(error[part])
+        cells = (
+            f"{q:.2f}" for each in (of_files[:, 1], of_files.max(axis=1)) for q in np.percentile(each, (50, 95, 100))
+        )
+        low, high = (ends[name][part][:, i] if name in ends else None for i in (0, 2))
+        inside = "" if low is None or high is None else f"{((low <= 0) & (high >= 0)).mean():.1%}"
+        lines.append((f"{length} ({len(part)})", name, *cells, inside))
+    heads = (
+        "files",
+        "forecast",
+        *(f"{what}, {q}" for what in ("joint 2", "worst joint") for q in ("median", "p95", "worst")),
+    )
+    return {"forecast": table_of((*heads, "in the interval"), lines)}
 
 
-def identification_tables(rows: Sequence[Row]) -> dict[str, Table]:
-    """Median and worst error of joints in held-out files."""
-    table = np.array([values for row in rows for values in row["rms_k"].values()])
-    lines = [
-        (f"{len(table)} files, two folds: median of joints", f"{np.median(table):.2f}"),
-        ("worst joint of a file", f"{table.max():.2f}"),
-    ]
-    caption = "Error of predicted temperatures of held-out files, only initial temperatures fitted"
-    return {"identification": table_of(("", "RMS, K"), lines, caption)}
+LENGTHS = ("shortest third", "middle third", "longest third")
 
 
-def identification_units(given: Namespace) -> list[Unit]:
-    """A unit for each half."""
+def forecast_units(given: Namespace) -> list[Unit]:
+    """A unit for each half of the files."""
     recordings, logs = recordings_given(given)
-    return [one_row(f"fold {part}/{logs}", partial(fold_row, recordings, part)) for part in range(2)]
+    return [one_row(f"fold {part}/{logs}", partial(forecast_row, recordings, part)) for part in range(2)]
 
 
-IDENTIFICATION = Experiment(
-    help="Predict half of the logs of an arm by a thermal network that is identified on the other half.\n\n"
-    "Some minutes.",
+FORECAST = Experiment(
+    help="Forecast the second half of each log of an arm from its first half, by a nominal thermal network and by one "
+    "that is identified from half of the other logs.\n\nTwo minutes.",
     options=lambda parser: log_options(parser, seeds=0),
-    units=identification_units,
-    tables=identification_tables,
+    units=forecast_units,
+    tables=forecast_tables,
 )

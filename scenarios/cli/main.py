@@ -81,6 +81,7 @@ COMMANDS = {
     "twin train": LazyCommand(_TWIN, "twin:train_command", "Train the twins of a scenario, or one from logs."),
     "twin score": LazyCommand(_TWIN, "twin:score_command", "Score and judge every job of a scenario, or a log."),
     "twin identify": LazyCommand(_TWIN, "twin:identify_command", "Identify an arm's thermal network."),
+    "twin forecast": LazyCommand(_TWIN, "twin:forecast_command", "Predict motor temperatures of a planned motion."),
     "twin generate": LazyCommand(_TWIN, "twin:generate_command", "Generate new cool motion."),
     "twin recover": LazyCommand(_TWIN, "twin:recover_command", "Find a posture with less load for a warm arm."),
     "twin export": LazyCommand(_TWIN, "twin:export_command", "Export a twin as ONNX."),
@@ -197,6 +198,8 @@ def _given(error: typer.TyperException, words: Sequence[str]) -> str | None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line. Exit codes: 2 for an error that the user can correct, with one sentence; 130 for Ctrl-C."""
     _log_warnings()
+    # The matrices of an arm are small: threads of NumPy's library would only wait for each other. Torch has its own.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = app(args=list(argv) if argv is not None else None, prog_name="thermofleet", standalone_mode=False)
     except Interrupted as interrupted:

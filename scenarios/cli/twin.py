@@ -22,6 +22,7 @@ from scenarios.terminal import echo, out_console, print_json, print_wide, progre
 from twin.vae.config import TwinConfig
 
 if TYPE_CHECKING:
+    from twin.logs.recording import Recording
     from twin.thermal.identify import Identified
     from twin.vae.twin import Twin
 
@@ -86,6 +87,81 @@ def parameter_table(network: "Identified") -> Table:
     )
     head = ("parameter", "joint", "value", "95 % from", "to", "prior", "informed")
     return Table(head=head, rows=rows, notes=(caption,))
+
+
+def forecast_command(
+    log: Path = option("A log with motor temperatures up to now; half an hour is better than minutes.", MISSING),
+    plan: str = option(
+        "One repetition of the motion to come: a log, of which temperatures are not read; or SCENARIO/JOB, a job of a "
+        "scenario.",
+        MISSING,
+    ),
+    network: Path | None = option(
+        "A folder that `thermofleet twin identify` wrote. Default: a nominal Gen3, with the spread of arms.", None
+    ),
+    repeat: int = option("Number of repetitions.", 1, low=1, high=1_000_000),
+    ambient: float | None = option(
+        "Ambient temperature, °C; default: as in the identification, or 22.", None, low=-40, high=60
+    ),
+    arm: str | None = option("Arm of a log or scenario with several; default: the first.", None),
+    out: Path | None = option("A page with a chart that ends in .html.", None),
+    skip_damaged: bool = options.SKIP_DAMAGED,
+    overwrite: bool = options.OVERWRITE,
+    as_json: bool = options.JSON,
+) -> None:
+    """Predict the motor temperatures of a planned motion that begins when a log ends.
+
+    Temperatures have 95 % intervals. The output also has the time to 40, 60 and
+    75 °C, the longest safe run, and the highest safe start temperature.
+    """
+    if out is not None:
+        check_file(out, (".html",), overwrite)
+    from scenarios.prepare.planned_motion import motion_of
+    from scenarios.show import forecast_page
+    from twin.thermal.checkpoint import load
+    from twin.thermal.forecast import forecast
+
+    identified = None if network is None else load(network)
+    so_far = one_of(options.recordings_of(log, skip_damaged), arm, log)
+    path = Path(plan)
+    if path.exists():
+        motion = one_of(options.recordings_of(path, skip_damaged), None, path)
+    else:
+        with progress_bar() as progress:
+            motion = motion_of(plan, arm, progress)
+    found = forecast(so_far, motion, repeat, network=identified, ambient_c=ambient)
+    if out is not None:
+        origin = {
+            "log": so_far.name,
+            "plan": motion.name,
+            "network": "nominal Gen3" if identified is None else f"{identified.arm}, version {identified.version}",
+            "ambient temperature": f"{found.ambient_c:g} °C",
+        }
+        with new_file(out) as draft:
+            draft.write_text(forecast_page.page(found, so_far, repeat, origin), encoding="utf-8")
+    if as_json:
+        print_json({"out": None if out is None else str(out), **forecast_page.card(found, so_far)})
+        return
+    for sentence in forecast_page.summary(found, so_far, repeat):
+        say(sentence, out_console)
+    print_wide(forecast_page.limit_table(found))
+    print_wide(forecast_page.joint_table(found, so_far))
+    if identified is None:
+        say("Network: a nominal Gen3. One identified from the arm's logs (`thermofleet twin identify`) narrows this.")
+    say("No page was written; --out FILE.html writes one." if out is None else f"Open {out} in a browser.", out_console)
+
+
+def one_of(recordings: "list[Recording]", arm: str | None, path: Path) -> "Recording":
+    """The recording of an arm, or the only one.
+
+    Raises:
+        FleetError: there is none, or several and no arm is named.
+    """
+    chosen = [each for each in recordings if arm is None or len(recordings) == 1 or each.name.endswith(arm)]
+    if len(chosen) == 1:
+        return chosen[0]
+    names = ", ".join(each.name for each in recordings[:8])
+    raise FleetError(f"'{path}' has {len(recordings)} recordings ({names}): give one file, or name the arm with --arm.")
 
 
 def generate_command(

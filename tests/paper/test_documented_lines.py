@@ -26,7 +26,7 @@ TINY = {
     "parsimony": "--scenarios heat_wave --train 6 --test 60",
     "surprises": "--sources oracle --cells 1",
     "questions": "--seeds 1 --epochs 4",
-    "identification": "",
+    "forecast": "",
     "transfer": "--seeds 1 --jobs 2 4 --source-jobs 6 --source-steps 4 --held-out 4 --test 9 "
     "--steps 4 --further-steps 2",
     "features": "--seeds 1 --labels 10 --train 4 --steps 4",
@@ -86,12 +86,3 @@ def test_a_tiny_run_writes_its_rows_and_prints_its_tables(name, tmp_path, capsys
     assert len(rows) == printed.err.count(" rows, ") > 0
     main([*words, "--show"])
     assert capsys.readouterr().out == printed.out
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not LOGS.is_dir(), reason="the Gen3 logs are not beside this checkout")
-def test_files_of_a_real_arm_predict_its_other_files(tmp_path):
-    main(["identification", "--log", str(LOGS), "--skip-damaged", "--out", str(tmp_path / "rows.jsonl")])
-    first, second = Rows(tmp_path / "rows.jsonl").by_key.values()
-    rms_k = sorted(value for row in (first, second) for values in row["rms_k"].values() for value in values)
-    assert rms_k[len(rms_k) // 2] <= 0.15

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import shutil
 
 import numpy as np
@@ -245,3 +246,30 @@ def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_co
     assert "difficulty" in told["failed"]
     assert "epochs" not in told["failed"]
     assert (out / "report.html").read_text(encoding="utf-8").count("Not computed: ") == len(told["failed"])
+
+
+def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_path):
+    log, plan, page = tmp_path / "today.csv", tmp_path / "plan.csv", tmp_path / "forecast.html"
+    log.write_text(log_csv(300, celsius=35.0), encoding="utf-8")
+    plan.write_text(log_csv(40, celsius=0.0, seed=1), encoding="utf-8")
+    said = thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--repeat", 15, "--out", page)
+    assert said.code == 0
+    assert re.search(r"After 15 repetitions, 10 min, joint \d is the hottest: [\d.]+ °C \(95 % interval", said.out)
+    assert "P(a motor reaches 60 °C) < 0.005; P(75 °C) < 0.005." in said.out
+    assert "Longest run in which P(60 °C) is at most 2.5 %: " in said.out
+    assert 'id="forecast_chart"' in page.read_text(encoding="utf-8")
+    card = json.loads(thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--json").out)
+    assert card["now_c"][1] == pytest.approx(35.0, abs=0.1)
+    assert [limit["limit_c"] for limit in card["limits"]] == [40.0, 60.0, 75.0]
+    assert len(card["time_s"]) == len(card["median_c"]) == len(card["low_c"])
+    assert card["run_s"] == pytest.approx(39.5)
+    of_job = thermofleet("twin", "forecast", "--log", log, "--plan", f"{small_toml}/hold", "--repeat", 3)
+    assert of_job.code == 0, of_job.err
+    for word, sentence in (
+        ("quickstart/nothing", "'quickstart' has no job 'nothing'. Allowed: hold_part"),
+        ("nothing", "--plan must be a file, or SCENARIO/JOB as quickstart/hold_part (got 'nothing')."),
+    ):
+        refused = thermofleet("twin", "forecast", "--log", log, "--plan", word)
+        assert (refused.code, sentence in refused.err) == (2, True), refused.err
+    refused = thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--out", page)
+    assert "--overwrite" in refused.err

@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import norm
 from sklearn.metrics import brier_score_loss
 
-from benchmarks.paper.real_logs import held_out_errors
 from benchmarks.paper.reliability import calibration_error
 from fleet.difficulty import KNOWN, SETTLING_S, known_temperatures
 from fleet.errors import CheckpointError, IdentificationError
@@ -381,7 +380,11 @@ def test_the_course_in_modes_is_that_of_a_fine_euler_step(rng):
 
 def test_the_true_arm_simulates_a_recording_down_to_the_sensor_noise(rng):
     body = prior_draw(rng)
-    errors = held_out_errors(body, logged(body, rng, 15.0)[0])
+    layout = ParameterVector(body)
+    logs = heat_logs(logged(body, rng, 15.0)[0], body.motors, "current", step_s=0.0)
+    errors = np.concatenate(
+        Problem(logs, AIR_C, 0.0, layout, Noise(np.full(JOINTS, 0.01), np.ones(JOINTS))).unexplained(layout.mean)
+    )
     np.testing.assert_allclose(np.sqrt(np.mean(errors**2, axis=0)), body.motors.sensor_noise_k, rtol=0.2)
 
 

@@ -261,6 +261,8 @@ class _Unknowns:
     wanted: Array
     basis: Array
     """Orthonormal basis of the matrix, [row, unknown]."""
+    upper: Array
+    """Its coordinates in this basis, upper triangular, [unknown, unknown]."""
     solution: Array
     """Node temperatures at the start, °C, and the ambient offset, K, [unknown]."""
 
@@ -302,10 +304,18 @@ class Problem:
             parts.append(rows - unknowns.basis @ (unknowns.basis.T @ rows))
         return np.concatenate([*parts, np.diag(1.0 / self.vector.sd)])
 
-    def temperatures(self, x: Array) -> list[Array]:
-        """All node temperatures with the best unknowns of each log, °C, [step + 1, node] per log."""
+    def temperatures(self, x: Array, rng: np.random.Generator | None = None) -> list[Array]:
+        """All node temperatures with the best unknowns of each log, °C, [step + 1, node] per log.
+
+        Args:
+            rng: Samples the unknowns from their posterior distribution instead.
+        """
         model, values = self.vector.models(x[None]), self.vector.values(x[None])
-        return [self._temperatures(i, model, values, each.solution)[0] for i, each in enumerate(self._unknowns(x))]
+        out = []
+        for i, each in enumerate(self._unknowns(x)):
+            change = 0.0 if rng is None else np.linalg.solve(each.upper, rng.standard_normal(len(each.upper)))
+            out.append(self._temperatures(i, model, values, each.solution + change)[0])
+        return out
 
     def unexplained(self, x: Array) -> list[Array]:
         """Simulated minus measured motor temperatures, K, [step + 1, joint] per log."""
@@ -347,7 +357,7 @@ class Problem:
         matrix = np.concatenate([(effect * self.noise.weight[:, None]).reshape(-1, unknowns), prior])
         wanted = np.concatenate([missing.reshape(-1), likely])
         basis, upper = np.linalg.qr(matrix)
-        return _Unknowns(matrix, wanted, basis, np.linalg.solve(upper, basis.T @ wanted))
+        return _Unknowns(matrix, wanted, basis, upper, np.linalg.solve(upper, basis.T @ wanted))
 
 
 AMBIENT_C = 22.0
@@ -437,8 +447,8 @@ LEAST_CHANGE_K = 0.3
 LEAST_CURRENT_A = 0.2
 _SIGMA_95 = 1.96
 _MORE_ROUNDS = 2
-_FIRST_SD_K, _FIRST_MEMORY_S = 0.1, 600.0
-"""Noise of the first round: residuals of a good fit to real logs, correlated for a quarter of a housing's time."""
+RESIDUAL_K, RESIDUAL_S = 0.1, 600.0
+"""Residuals of a good fit to real logs, correlated for a quarter of a housing's time: the noise of the first round."""
 
 
 def identify(
@@ -490,18 +500,23 @@ def identify(
 
 def _fit(logs: Sequence[HeatLog], ambient_c: float, sd_k: float, vector: ParameterVector) -> tuple[Problem, Array]:
     """The problem with the noise of its own residuals, and its solution."""
-    steps = max(_FIRST_MEMORY_S / _step(logs), 1.0)
-    problem = Problem(logs, ambient_c, sd_k, vector, Noise(np.full(JOINTS, _FIRST_SD_K), np.full(JOINTS, steps)))
-    x = _solve(problem, vector.mean)
+    problem = Problem(logs, ambient_c, sd_k, vector, usual_noise(logs))
+    x = solve(problem, vector.mean)
     for _ in range(_MORE_ROUNDS):
         temp_c, noise = problem.temperatures(x), noise_of(problem.unexplained(x), vector.nominal.motors.sensor_noise_k)
         problem = Problem(logs, ambient_c, sd_k, vector, noise)
         problem.housing_c = [(temp[1:, HOUSING] + temp[:-1, HOUSING]) / 2.0 for temp in temp_c]
-        x = _solve(problem, x)
+        x = solve(problem, x)
     return problem, x
 
 
-def _solve(problem: Problem, x: Array) -> Array:
+def usual_noise(logs: Sequence[HeatLog]) -> Noise:
+    """Residuals of a good fit to real logs."""
+    return Noise(np.full(JOINTS, RESIDUAL_K), np.full(JOINTS, max(RESIDUAL_S / _step(logs), 1.0)))
+
+
+def solve(problem: Problem, x: Array) -> Array:
+    """The most probable logarithms, [parameter], from a first guess."""
     jacobian: Any = problem.jacobian  # scipy-stubs accept only the names of SciPy's own difference schemes.
     sd = problem.vector.sd
     return least_squares(problem.residual, x, jacobian, x_scale=sd, ftol=1e-6, xtol=1e-5, max_nfev=60).x

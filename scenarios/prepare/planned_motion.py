@@ -1,0 +1,37 @@
+"""The planned motion of a scenario's job as a recording."""
+
+import numpy as np
+
+from fleet.errors import FleetError, nearest
+from fleet.motion import RATE_HZ
+from scenarios.prepare.fleet import prepare_arm
+from scenarios.progress import Progress, quiet
+from scenarios.spec.jobs import works_of
+from scenarios.spec.load import load
+from twin.logs.recording import Recording
+
+
+def motion_of(job: str, arm: str | None = None, progress: Progress = quiet) -> Recording:
+    """One cycle of the arm's first plan for a job stream of a scenario.
+
+    Args:
+        job: SCENARIO/JOB.
+        arm: Default: the first arm of the scenario.
+
+    Raises:
+        FleetError: there is no such scenario, job or arm, or the arm cannot do the job.
+    """
+    name, slash, stream = job.rpartition("/")
+    if not slash:
+        raise FleetError(f"--plan must be a file, or SCENARIO/JOB as quickstart/hold_part (got '{job}').")
+    scenario = load(name)
+    streams = {each.name: each for each in scenario.jobs}
+    if stream not in streams:
+        raise FleetError(f"'{name}' has no job '{stream}'{nearest(stream, streams)}")
+    robot = prepare_arm(scenario, arm or scenario.arms[0].name, difficulty="blind", progress=progress)
+    plans = [plan for work in works_of(scenario, streams[stream]) for plan in robot.plans.get(work, ())]
+    if not plans:
+        raise FleetError(f"Arm '{robot.robot.name}' has no plan for '{stream}': `thermofleet layout {name}` shows why.")
+    profile = np.asarray(plans[0].cycle.profile, dtype=float)
+    q, qd, tau = profile.transpose(1, 0, 2)
+    return Recording(name=job, time_s=np.arange(len(profile)) / RATE_HZ, q=q, qd=qd, tau=tau)

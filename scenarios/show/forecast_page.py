@@ -1,0 +1,206 @@
+"""A thermal forecast as text, numbers and a page with a chart."""
+
+import math
+from collections.abc import Mapping
+from typing import Any  # values of JSON and of Plotly's schema
+
+import numpy as np
+
+from fleet.robot import JOINTS, ThermalLimits
+from scenarios.show.comparison_page import COLOURS
+from scenarios.show.page import AXIS, GRID, INK, LAYOUT, Chart, Page, Section
+from scenarios.show.words import duration
+from scenarios.table import Column, Table
+from twin.logs.recording import Recording
+from twin.thermal.forecast import LONGEST_S, RISK, SAMPLES, ThermalForecast
+
+Array = np.ndarray
+
+LIMITS_C = (40.0, ThermalLimits().warning_c, ThermalLimits().error_c)
+"""Temperatures of which a forecast tells when they are reached."""
+MOST_POINTS = 400
+"""Points of a curve."""
+MINUTE_S = 60.0
+
+
+def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list[str]:
+    """What a forecast says, in sentences."""
+    low, middle, high = (each[-1] for each in found.interval())
+    hottest = int(middle.argmax())
+    warning_c, error_c = LIMITS_C[1:]
+    sentences = [
+        f"After {_times(repetitions)}, {duration(found.run_s)}, joint {hottest + 1} is the hottest: "
+        f"{middle[hottest]:.1f} °C (95 % interval {low[hottest]:.1f} to {high[hottest]:.1f}), now "
+        f"{so_far_c(so_far)[hottest]:.1f} °C.",
+        f"P(a motor reaches {warning_c:g} °C) {_p(found.probability(warning_c))}; "
+        f"P({error_c:g} °C) {_p(found.probability(error_c))}.",
+    ]
+    longest_s, warmer_k = found.longest_s(warning_c), found.safe_start_k(warning_c)
+    run = f"more than {duration(LONGEST_S)}" if math.isinf(longest_s) else _run(longest_s, found.cycle_s)
+    sentences.append(f"Longest run in which P({warning_c:g} °C) is at most {100 * RISK:g} %: {run}.")
+    start_c = float(so_far_c(so_far).max()) + warmer_k
+    than = f"{abs(warmer_k):.1f} K {'warmer' if warmer_k >= 0 else 'cooler'} than now"
+    sentences.append(
+        f"Highest safe start of the planned run: hottest motor at {start_c:.1f} °C, if all motors and housings are "
+        f"{than}."
+    )
+    return sentences
+
+
+def so_far_c(so_far: Recording) -> Array:
+    """Last motor temperatures of a log, °C, [joint]."""
+    assert so_far.temp_c is not None, "a forecast starts from temperatures"
+    return so_far.temp_c[-1]
+
+
+def _p(probability: float) -> str:
+    least = 1.0 / SAMPLES
+    return f"< {least:g}" if probability < least else f"{probability:.2f}"
+
+
+def _run(longest_s: float, cycle_s: float) -> str:
+    if longest_s == 0:
+        return "none, a motor is already there"
+    return f"{duration(longest_s)}, {_times(int(longest_s / cycle_s))}"
+
+
+def _times(repetitions: int) -> str:
+    return "1 repetition" if repetitions == 1 else f"{repetitions} repetitions"
+
+
+def joint_table(found: ThermalForecast, so_far: Recording) -> Table:
+    """Temperatures now and at the end of the run, and the highest in it, for each joint."""
+    low, middle, high = found.interval()
+    rows = [
+        (
+            str(j + 1),
+            f"{so_far_c(so_far)[j]:.1f}",
+            f"{middle[-1, j]:.1f}",
+            f"{low[-1, j]:.1f} … {high[-1, j]:.1f}",
+            f"{middle[:, j].max():.1f}",
+            f"{high[:, j].max():.1f}",
+        )
+        for j in range(JOINTS)
+    ]
+    head = ("joint", "now, °C", "end, °C", "95 % interval", "highest, °C", "97.5 %, °C")
+    return Table(head=head, rows=tuple(rows))
+
+
+def limit_table(found: ThermalForecast) -> Table:
+    """Probability and time of reaching each limit in the run, and the longest run below it."""
+    rows = []
+    for limit_c in LIMITS_C:
+        early_s, middle_s, _ = found.reached_s(limit_c)
+        longest_s = found.longest_s(limit_c)
+        rows.append(
+            (
+                f"{limit_c:g} °C",
+                _p(found.probability(limit_c)),
+                *("–" if math.isinf(s) else duration(s) for s in (early_s, middle_s)),
+                f"> {duration(LONGEST_S)}" if math.isinf(longest_s) else duration(longest_s),
+            )
+        )
+    head = ("limit", "P in the run", Column("earliest", words=True), Column("median", words=True), "longest run")
+    note = f"Earliest time and longest run: a motor is at the limit before with a probability of {100 * RISK:g} %."
+    return Table(head=head, rows=tuple(rows), notes=(note,))
+
+
+def card(found: ThermalForecast, so_far: Recording) -> dict[str, Any]:
+    """The numbers of a forecast as JSON."""
+    low, middle, high = found.interval()
+
+    def finite(value: float) -> float | None:
+        return None if math.isinf(value) else value
+
+    limits = [
+        {
+            "limit_c": limit_c,
+            "p": found.probability(limit_c),
+            "reached_s": dict(zip(("early", "median", "late"), map(finite, found.reached_s(limit_c)), strict=True)),
+            "longest_s": finite(found.longest_s(limit_c)),
+            "safe_start_k": found.safe_start_k(limit_c),
+        }
+        for limit_c in LIMITS_C
+    ]
+    courses = {"low_c": low, "median_c": middle, "high_c": high}
+    return {
+        "run_s": found.run_s,
+        "cycle_s": found.cycle_s,
+        "now_c": so_far_c(so_far).tolist(),
+        "limits": limits,
+        "time_s": found.time_s[found.in_run].tolist(),
+        **{name: np.round(values, 3).tolist() for name, values in courses.items()},
+    }
+
+
+def page(found: ThermalForecast, so_far: Recording, repetitions: int, origin: Mapping[str, str]) -> str:
+    """The page as HTML, which opens offline."""
+    section = Section(
+        key="forecast",
+        title="Motor temperatures",
+        sentences=tuple(summary(found, so_far, repetitions)),
+        how="Curves are measured temperatures before 0 min and medians of the forecast after it. The shaded band is "
+        "the 95 % interval of the hottest motor.",
+        charts=(_chart(found, so_far),),
+        tables=(limit_table(found), joint_table(found, so_far)),
+    )
+    facts = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
+    content = {"lead": (), "sections": [section], "failed": [], "origin": facts}
+    title = f"Thermal forecast after {so_far.name}"
+    return Page(title=title, template="sections.html", content=content, charts=section.charts, narrow=True).html()
+
+
+def _chart(found: ThermalForecast, so_far: Recording) -> Chart:
+    """Measured temperatures, and the forecast with the interval of the hottest motor, over minutes from now."""
+    low, middle, high = found.interval()
+    hottest = int(middle[-1].argmax())
+    measured = so_far.part(so_far.time_s >= so_far.time_s[-1] - max(found.run_s, 30 * MINUTE_S))
+    before = np.unique(np.linspace(0, len(measured.time_s) - 1, MOST_POINTS).round().astype(int))
+    after = np.unique(np.linspace(0, len(middle) - 1, MOST_POINTS).round().astype(int))
+    past = (measured.time_s[before] - so_far.time_s[-1]) / MINUTE_S
+    ahead = found.time_s[found.in_run][after] / MINUTE_S
+    assert measured.temp_c is not None, "a forecast starts from temperatures"
+    band = {
+        "type": "scatter",
+        "x": [*ahead.tolist(), *ahead[::-1].tolist()],
+        "y": [*high[after, hottest].tolist(), *low[after, hottest][::-1].tolist()],
+        "fill": "toself",
+        "fillcolor": f"{COLOURS[hottest]}33",
+        "line": {"width": 0},
+        "hoverinfo": "skip",
+        "name": f"95 % interval of joint {hottest + 1}",
+    }
+    lines = [
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": f"joint {j + 1}",
+            "x": [*past.tolist(), *ahead.tolist()],
+            "y": np.round([*measured.temp_c[before, j], *middle[after, j]], 2).tolist(),
+            "line": {"color": COLOURS[j], "width": 2.5 if j == hottest else 1.3},
+        }
+        for j in range(JOINTS)
+    ]
+    most_c = max(float(high.max()), float(measured.temp_c.max()))
+    shown_c = [limit_c for limit_c in LIMITS_C[1:] if limit_c < most_c + 15.0]
+    layout = LAYOUT | {
+        "height": 430,
+        "margin": {"l": 55, "r": 15, "t": 60, "b": 50},
+        "legend": {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"},
+        "xaxis": AXIS | {"title": {"text": "minutes from the end of the log"}},
+        "yaxis": AXIS | {"title": {"text": "motor temperature, °C"}},
+        "shapes": [*(_rule("x", "y", c, "#b00020") for c in shown_c), _rule("y", "x", 0.0, GRID)],
+        "annotations": [
+            {"xref": "paper", "x": 1, "xanchor": "right", "y": c, "yanchor": "bottom", "showarrow": False}
+            | {"text": f"{c:g} °C", "font": {"color": INK}}
+            for c in shown_c
+        ],
+    }
+    alt = f"Motor temperatures before and in the run; joint {hottest + 1} ends at {middle[-1, hottest]:.1f} °C"
+    return Chart(key="forecast_chart", figure={"data": [band, *lines], "layout": layout}, alt=alt)
+
+
+def _rule(across: str, axis: str, value: float, colour: str) -> dict[str, Any]:
+    """A straight line through the whole chart at a value of an axis."""
+    ends = {f"{across}ref": "paper", f"{across}0": 0, f"{across}1": 1, f"{axis}0": value, f"{axis}1": value}
+    return {"type": "line", "line": {"color": colour, "dash": "dash", "width": 1.3}, **ends}

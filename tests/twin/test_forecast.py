@@ -1,0 +1,131 @@
+"""Forecasts of motor temperatures from the log of an arm, against the simulator's law with the arm's true numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.errors import FleetError
+from fleet.heat.thermal import NODES
+from fleet.robot import JOINTS
+from tests.twin.test_identify import AIR_C, FULL_REACH_NM, own_arm, working
+from twin.logs.recording import Recording
+from twin.thermal.forecast import MOST_S, RISK, SAMPLES, ThermalForecast, forecast
+from twin.thermal.identify import identify
+from twin.thermal.thermal_twin import RcTwin
+
+CYCLE_S = 40.0
+
+
+def held(tau: np.ndarray, seconds: float = CYCLE_S) -> Recording:
+    """A posture held, 2 samples a second."""
+    time_s = np.arange(0.0, seconds + 0.25, 0.5)
+    still = np.zeros((len(time_s), JOINTS))
+    return Recording(name="hold", time_s=time_s, q=still, qd=still, tau=still + tau)
+
+
+def true_arm(seed: int) -> RcTwin:
+    return RcTwin(arm="own", heat_model=own_arm(seed)[1], ambient_c=AIR_C, base="true")
+
+
+def course(arm: RcTwin, start_c: np.ndarray, tau: np.ndarray, seconds: float) -> np.ndarray:
+    """Temperatures after each ten seconds of a hold, °C, [time, node]."""
+    from fleet.motion import static_drive
+
+    drive = static_drive(tau, arm.motors)
+    each = replace(drive, current_sq=drive.current_sq[None], friction_w=drive.friction_w[None])
+    nodes = arm.simulate(each, np.array([seconds]), start_c)[:, 0]
+    at = np.linspace(0.0, seconds, len(nodes))
+    wanted = np.arange(0.0, seconds + 1.0, 10.0)
+    return np.stack([np.interp(wanted, at, nodes[:, n]) for n in range(NODES)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def hour() -> tuple[RcTwin, Recording, np.ndarray, ThermalForecast]:
+    """A nominal arm after an hour of work, its true temperatures, and the forecast of twenty minutes of holding."""
+    arm = RcTwin.nominal()
+    log, nodes = working(arm, 60.0, np.random.default_rng(1))
+    return arm, log, nodes[-1], forecast(log, held(FULL_REACH_NM), 30, ambient_c=AIR_C)
+
+
+def test_arms_unlike_the_nominal_one_end_in_the_intervals_near_the_median() -> None:
+    inside, error_k, change_k = [], [], []
+    for seed in range(6):
+        arm = true_arm(seed)
+        log, nodes = working(arm, 40.0, np.random.default_rng(seed))
+        low, median, high = (each[-1] for each in forecast(log, held(FULL_REACH_NM), 30).interval())
+        end_c = course(arm, nodes[-1], FULL_REACH_NM, 30 * CYCLE_S)[-1, :JOINTS]
+        inside += [*((low <= end_c) & (end_c <= high))]
+        error_k.append(abs(median - end_c)[1])
+        change_k.append(abs(end_c - nodes[-1, :JOINTS])[1])
+    assert np.mean(inside) >= 0.9
+    assert max(error_k) < 0.15 * np.median(change_k)
+
+
+def test_an_identified_network_narrows_the_interval() -> None:
+    arm, rng = true_arm(3), np.random.default_rng(3)
+    logs = [replace(working(arm, 40.0, rng)[0], name=f"{i}") for i in range(3)]
+    short = logs[2].part(slice(0, 600))
+    widths = [
+        np.ptp([each[-1, 1] for each in forecast(short, held(FULL_REACH_NM), 30, network=network).interval()])
+        for network in (None, identify(logs[:2], ambient_sd_k=0.0, step_s=20.0))
+    ]
+    assert widths[1] < 0.7 * widths[0]
+
+
+def test_limits_are_reached_when_the_simulator_reaches_them(hour) -> None:
+    arm, _, start_c, found = hour
+    joint_2 = course(arm, start_c, FULL_REACH_NM, found.run_s)[:, 1]
+    limit_c = float(joint_2[0] + 0.7 * (joint_2[-1] - joint_2[0]))
+    true_s = np.interp(limit_c, joint_2, 10.0 * np.arange(len(joint_2)))
+    early_s, median_s, late_s = found.reached_s(limit_c)
+    assert early_s <= true_s <= late_s
+    assert median_s == pytest.approx(true_s, rel=0.1)
+    assert found.probability(limit_c) == 1.0
+    assert found.probability(float(joint_2[-1]) + 10.0) == 0.0
+    assert found.reached_s(float(joint_2[-1]) + 10.0) == (np.inf,) * 3
+
+
+def test_the_longest_run_is_that_whose_own_forecast_is_just_safe(hour) -> None:
+    _, log, _, found = hour
+    limit_c = float(found.interval()[1].max()) + 1.0
+    longest_s = found.longest_s(limit_c)
+    count = int(longest_s / CYCLE_S)
+    just, beyond = (forecast(log, held(FULL_REACH_NM), n, ambient_c=AIR_C) for n in (count - 1, count + 2))
+    assert just.probability(limit_c) <= RISK + 1.0 / SAMPLES < beyond.probability(limit_c) + 2.0 / SAMPLES
+    assert found.longest_s(200.0) == np.inf
+
+
+def test_an_arm_that_starts_warmer_by_the_safe_change_just_stays_below_the_limit(hour) -> None:
+    arm, _, start_c, found = hour
+    limit_c = float(found.interval()[1].max()) + 3.0
+    more_k = found.safe_start_k(limit_c)
+    peak_c = [course(arm, start_c + k, FULL_REACH_NM, found.run_s)[:, :JOINTS].max() for k in (more_k, more_k + 3.0)]
+    assert peak_c[0] < limit_c < peak_c[1]
+
+
+def test_the_same_seed_gives_the_same_forecast_and_short_cycles_that_of_long_ones(hour) -> None:
+    _, log, _, found = hour
+    again = forecast(log, held(FULL_REACH_NM), 30, ambient_c=AIR_C)
+    np.testing.assert_array_equal(again.sampled_c, found.sampled_c)
+    short = forecast(log, held(FULL_REACH_NM, 2.0), 600, ambient_c=AIR_C)
+    assert short.run_s == found.run_s
+    np.testing.assert_allclose(short.interval()[1][-1], found.interval()[1][-1], atol=0.02)
+
+
+def test_a_forecast_needs_temperatures_time_and_a_whole_plan(hour) -> None:
+    _, log, _, _ = hour
+    plan = held(FULL_REACH_NM)
+    with pytest.raises(FleetError, match="'work' has no motor temperatures"):
+        forecast(replace(log, temp_c=None), plan)
+    with pytest.raises(FleetError, match="less than 60 s since its start or its last gap"):
+        forecast(log.part(slice(0, 30)), plan)
+    with pytest.raises(FleetError, match="'hold' has fewer than three samples, or a gap of more than 10 s"):
+        forecast(log, plan.part(np.array([0, 1, 2, 70])))
+    six = {name: getattr(plan, name)[:, :6] for name in ("q", "qd", "tau")}
+    with pytest.raises(FleetError, match="6 joints, the thermal network 7"):
+        forecast(log, replace(plan, **six))
+    with pytest.raises(FleetError, match="at most 168 h can be forecast"):
+        forecast(log, plan, int(MOST_S / CYCLE_S) + 1)
+    with pytest.raises(ValueError, match="repetitions must be >= 1"):
+        forecast(log, plan, 0)

@@ -1,0 +1,255 @@
+"""Temperatures of an arm's motors in a planned motion, with intervals, from the log of what it has done so far.
+
+The log updates the network: its parameters are the most probable ones by the log and by a prior, which is the earlier
+identification of the arm or the spread of arms. Housings have no sensor; their temperatures follow from the same least
+squares (`twin.thermal.identify`). Samples of the posterior distribution of both (Laplace approximation), simulated
+through the plan, give all intervals.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import cycle, islice
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from fleet.errors import FleetError
+from fleet.heat.motor import Motors, magnet_factor
+from fleet.heat.thermal import HOUSING, WINDING, temperature_steps
+from fleet.motion import Drive
+from fleet.robot import JOINTS
+from twin.logs.recording import HEAT_GAP_S, STEP_S, HeatLog, Recording, heat_logs, source_of
+from twin.thermal.identify import (
+    AMBIENT_C,
+    Identified,
+    ParameterVector,
+    Problem,
+    nominal_heat_model,
+    solve,
+    usual_noise,
+)
+
+Array = np.ndarray
+
+SAMPLES = 200
+"""Samples of network and start: a probability is a multiple of 1/200."""
+RISK = 0.025
+"""Probability of a limit that counts as safe, and of either side beyond an interval."""
+MEMORY_S = 2 * 3600.0
+"""Length of the log that is used: three time constants of a housing."""
+LEAST_S = 60.0
+"""Least length of the log."""
+LONGEST_S = 4 * 3600.0
+"""Time for which longer runs of the same motion are simulated: temperatures are steady by then."""
+MOST_S = 7 * 86400.0
+"""Longest run."""
+MOST_STEPS = 180
+"""Steps of the log."""
+MOST_POINTS = 3000
+"""Steps of a long run."""
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalForecast:
+    """Sampled courses of the motor temperatures from the end of a log."""
+
+    time_s: Array
+    """Since the end of the log, [time]."""
+    sampled_c: Array
+    """Motor temperatures, float32 [sample, time, joint]."""
+    slope: Array
+    """Change by a start that is 1 K warmer everywhere, [time, joint]."""
+    run_s: float
+    """Length of the planned run; later times show longer runs."""
+    cycle_s: float
+    """Length of one repetition."""
+    ambient_c: float
+    """Assumed ambient temperature."""
+
+    @cached_property
+    def _planned(self) -> Array:
+        """Motor temperatures in the planned run, [sample, time, joint]."""
+        return self.sampled_c[:, self.in_run]
+
+    @cached_property
+    def in_run(self) -> Array:
+        """Which times belong to the planned run, bool [time]."""
+        return self.time_s <= self.run_s + 1e-6
+
+    def interval(self) -> tuple[Array, Array, Array]:
+        """Lower end, median and upper end of the 95 % intervals in the planned run, °C, each [time, joint]."""
+        low, middle, high = np.quantile(self._planned, (RISK, 0.5, 1.0 - RISK), axis=0)
+        return low, middle, high
+
+    def probability(self, limit_c: float) -> float:
+        """P(some motor reaches a temperature in the planned run)."""
+        return float((self._planned.max(axis=(1, 2)) >= limit_c).mean())
+
+    def reached_s(self, limit_c: float) -> tuple[float, float, float]:
+        """Earliest, median and latest time at which a motor reaches a temperature in the planned run; inf: it does not.
+
+        Earliest and latest are the ends of the 95 % interval.
+        """
+        first_s = self._first_s(limit_c)
+        first_s = np.sort(np.where(first_s <= self.run_s, first_s, np.inf))
+        early, middle, late = first_s[[round(q * (len(first_s) - 1)) for q in (RISK, 0.5, 1.0 - RISK)]]
+        return float(early), float(middle), float(late)
+
+    def longest_s(self, limit_c: float) -> float:
+        """Longest run of this motion in which a motor reaches a temperature with a probability of `RISK` at most.
+
+        Returns:
+            inf if it is longer than the simulated time.
+        """
+        return float(np.sort(self._first_s(limit_c))[int(RISK * len(self.sampled_c))])
+
+    def safe_start_k(self, limit_c: float) -> float:
+        """By how much all motors may be warmer at the start, K; negative: they must be cooler. To first order.
+
+        The probability of reaching the temperature in the planned run is then `RISK`.
+        """
+        room_k = (limit_c - self._planned) / np.maximum(self.slope[self.in_run], 1e-3)
+        return float(np.sort(room_k.min(axis=(1, 2)))[int(RISK * len(room_k))])
+
+    def _first_s(self, limit_c: float) -> Array:
+        """First time at which a motor reaches a temperature, inf for never, [sample]."""
+        hot = self.sampled_c.max(axis=2) >= limit_c
+        return np.where(hot.any(axis=1), self.time_s[hot.argmax(axis=1)], np.inf)
+
+
+def forecast(
+    so_far: Recording,
+    plan: Recording,
+    repetitions: int = 1,
+    *,
+    network: Identified | None = None,
+    ambient_c: float | None = None,
+    seed: int = 0,
+) -> ThermalForecast:
+    """Temperatures of the motors if the arm repeats a motion right after a log.
+
+    Args:
+        so_far: With motor temperatures; its last two hours are used.
+        plan: One repetition; its temperatures are not read.
+        network: Of this arm; default: a nominal Gen3 in still air, with the spread of arms.
+        ambient_c: Default: that of the identification.
+
+    Raises:
+        FleetError: the log has no temperatures, or less than a minute since its last gap; the plan has a gap; there are
+            other than seven joints; or the run is longer than a week.
+        ValueError: repetitions < 1.
+    """
+    if repetitions < 1:
+        raise ValueError(f"repetitions must be >= 1 (got {repetitions}).")
+    vector = _parameters(network)
+    ambient_c = (AMBIENT_C if network is None else network.ambient_c) if ambient_c is None else ambient_c
+    motors = vector.nominal.motors
+    (log, last_c), cycle_log = _end_of(so_far, motors), _cycle_of(plan, motors)
+    cycle_s = plan.duration_s
+    run_s = repetitions * cycle_s
+    if run_s > MOST_S:
+        raise FleetError(f"The run takes {run_s / 3600:.0f} h; at most {MOST_S / 3600:.0f} h can be forecast.")
+    problem = Problem([log], ambient_c, 0.0, vector, usual_noise([log]))
+    likely = solve(problem, vector.mean)
+    jacobian, rng = problem.jacobian(likely), np.random.default_rng(np.random.SeedSequence(seed))
+    spread = np.linalg.cholesky(np.linalg.inv(jacobian.T @ jacobian))
+    x = likely + rng.standard_normal((SAMPLES, len(spread))) @ spread.T
+    start_c = np.stack([problem.temperatures(each, rng)[0][-1] for each in x])
+    likely_c = problem.temperatures(likely)[0][-1]
+    # Two more with the likely network, of which one starts 1 K warmer.
+    x = np.concatenate([x, likely[None], likely[None]])
+    start_c = np.concatenate([start_c, likely_c[None], likely_c[None]])
+    start_c[:, WINDING] = last_c
+    start_c[-1] += 1.0
+    step_s = max(STEP_S, run_s / MOST_POINTS)
+    steps = max(round(cycle_s / step_s), 1)
+    dt_s = cycle_s / steps if steps > 1 else run_s / max(round(run_s / step_s), 1)
+    values = vector.values(x)
+    loads = _loads(cycle_log, motors, steps, values, start_c)
+    count = math.ceil(max(run_s, LONGEST_S) / dt_s - 1e-9)
+    course = temperature_steps(
+        islice(cycle(loads), count),
+        dt_s,
+        motors=replace(motors, **{name: values[name] for name in values if hasattr(motors, name)}),
+        thermal=vector.models(x),
+        start_c=start_c,
+        ambient_c=np.full(len(x), ambient_c),
+    )
+    temp_c = np.stack([each[:, WINDING] for each in course], axis=1)
+    return ThermalForecast(
+        time_s=dt_s * np.arange(count + 1),
+        sampled_c=temp_c[:SAMPLES].astype(np.float32),
+        slope=temp_c[-1] - temp_c[-2],
+        run_s=run_s,
+        cycle_s=cycle_s,
+        ambient_c=ambient_c,
+    )
+
+
+def _parameters(network: Identified | None) -> ParameterVector:
+    """The parameters of an arm with their standard deviations; those of any Gen3 without a network."""
+    if network is None:
+        return ParameterVector(nominal_heat_model())
+    vector = ParameterVector(network.heat_model, tuple(dict.fromkeys(p.name for p in network.parameters)))
+    sd = {(p.name, None if p.joint is None else p.joint - 1): p.sd for p in network.parameters}
+    vector.sd = np.array([sd[name] for name in vector.names])
+    return vector
+
+
+def _end_of(so_far: Recording, motors: Motors) -> tuple[HeatLog, Array]:
+    """The last stretch of a log without a gap, in at most `MOST_STEPS` steps, and its last motor temperatures."""
+    check_seven_joints(so_far)
+    if so_far.temp_c is None:
+        raise FleetError(f"The log '{so_far.name}' has no motor temperatures, from which a forecast starts.")
+    late = so_far.part(so_far.time_s >= so_far.time_s[-1] - MEMORY_S)
+    logs = heat_logs(late, motors, source_of([late]), step_s=max(STEP_S, late.duration_s / MOST_STEPS))
+    if not logs or logs[-1].time_s[-1] < late.time_s[-1] - LEAST_S or np.ptp(logs[-1].time_s) < LEAST_S:
+        raise FleetError(
+            f"The log '{so_far.name}' has less than {LEAST_S:.0f} s since its start or its last gap. Housings have no "
+            "sensor: record some minutes before the forecast, better half an hour."
+        )
+    return logs[-1], so_far.temp_c[-1]
+
+
+def check_seven_joints(recording: Recording) -> None:
+    """Raise a FleetError unless a recording has the joints of the thermal network."""
+    if recording.joints != JOINTS:
+        raise FleetError(f"'{recording.name}' has {recording.joints} joints, the thermal network {JOINTS}.")
+
+
+def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:
+    """The heat of a repetition, in every interval between samples."""
+    check_seven_joints(plan)
+    silent = replace(plan, temp_c=np.zeros_like(plan.q))  # of no use here
+    logs = heat_logs(silent, motors, source_of([plan]), step_s=0.0)
+    if len(logs) != 1 or len(logs[0].time_s) != len(plan.time_s):
+        raise FleetError(
+            f"The plan '{plan.name}' has fewer than three samples, or a gap of more than {HEAT_GAP_S:g} s."
+        )
+    return logs[0]
+
+
+def _loads(cycle_log: HeatLog, motors: Motors, steps: int, values: Mapping[str, Array], start_c: Array) -> list[Drive]:
+    """Mean drives of a repetition in equal steps, each [sample, joint]."""
+    time_s = cycle_log.time_s
+    edges_s = np.linspace(time_s[0], time_s[-1], steps + 1)
+    log = replace(
+        cycle_log,
+        time_s=edges_s,
+        current_terms=_means(time_s, cycle_log.current_terms, edges_s),
+        friction_terms=_means(time_s, cycle_log.friction_terms, edges_s),
+    )
+    current_sq = log.current_sq(values["coulomb_nm"], values["viscous_nms_per_rad"])
+    if log.source == "current":  # of warm magnets
+        current_sq = current_sq * magnet_factor(start_c[:, None, HOUSING], motors) ** 2
+    friction_w = log.friction_w(values["coulomb_nm"], values["viscous_nms_per_rad"])
+    return [Drive(current_sq[:, i], friction_w[:, i]) for i in range(steps)]
+
+
+def _means(time_s: Array, values: Array, edges_s: Array) -> Array:
+    """Time means between edges of values that are constant between samples."""
+    total = np.cumsum(values * np.diff(time_s)[:, None, None], axis=0)
+    integral = make_interp_spline(time_s, np.concatenate([np.zeros_like(total[:1]), total]), k=1)
+    return np.diff(integral(edges_s), axis=0) / np.diff(edges_s)[:, None, None]
