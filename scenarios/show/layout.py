@@ -361,4 +361,5 @@ def _arrivals(stream: JobStream) -> str:
             again = f", again every {spec.every_s:g} s" if spec.every_s else ""
             return f"{spec.count} at {spec.start_s:g} s{again}{after}"
         case "trace":
-            return f"a trace of {len(spec.times_s or ())}{after}"
+            times_s = spec.times_s or ()
+            return f"a trace of {len(times_s)}{after}" if stream.numbered else f"one at {sum(times_s):g} s{after}"
