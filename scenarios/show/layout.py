@@ -13,8 +13,8 @@ from fleet.arm.space import SpaceTable
 from fleet.files import cache_folder
 from fleet.motion import Plan
 from scenarios.cell_layout import cell_of
-from scenarios.prepare.arms import PlannedArm, plan_arms, problems_of
-from scenarios.prepare.fleet import ShiftFactory, prepare, space_of
+from scenarios.prepare.arms import PlannedArm, plan_arms
+from scenarios.prepare.fleet import ShiftFactory, cell_problems, prepare, space_of
 from scenarios.prepare.load_factor import load_factor
 from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import all_works, alternatives_of, fault_price, works_of
@@ -87,7 +87,7 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
     """The layout of a scenario's cell. Plans the scenario's work (cached); problems are part of the result."""
     folder = cache_folder()
     arms = plan_arms(scenario, range(len(scenario.arms)), all_works(scenario), folder, progress)
-    problems = problems_of(scenario, arms, folder)
+    problems = cell_problems(scenario, arms, folder)
     plans = [plan for arm in arms for plan in arm.all_plans]
     space = space_of(scenario, [arm.hardware.robot for arm in arms], plans, folder, progress)
     exclusions = _exclusions(scenario, plans, space)
