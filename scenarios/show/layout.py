@@ -253,6 +253,8 @@ REGIMES = {
 """Sentences of the regimes of `LoadFactor`."""
 MOST_REASONS = 20
 """Reasons that are shown why an arm cannot do a job."""
+MOST_STREAMS = 64
+"""Streams of jobs, or rows of a table, in a description."""
 
 
 def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str]:
@@ -329,9 +331,11 @@ def _jobs(scenario: Scenario) -> Table:
     """One row per stream, as sentences that fit any terminal."""
     rows = tuple(
         (s.name, f"{_work(s)}\nworth {s.value:g}, due after {s.due_s / 60:g} min; {_arrivals(s)}")
-        for s in scenario.jobs
+        for s in scenario.jobs[:MOST_STREAMS]
     )
-    return Table(head=("jobs", ""), rows=rows, numbers=False)
+    more = len(scenario.jobs) - MOST_STREAMS
+    notes = (f"… and {more} more.",) if more > 0 else ()
+    return Table(head=("jobs", ""), rows=rows, numbers=False, notes=notes)
 
 
 def _work(stream: JobStream) -> str:

@@ -18,7 +18,7 @@ from importlib import import_module
 from math import inf, isfinite, nextafter
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 from fleet.bus.protocol.auction import JobSpec
 from fleet.errors import ScenarioError, check_names, nearest, printable
@@ -27,7 +27,7 @@ from scenarios.spec.units import question
 
 SUFFIXES = (".csv", ".tsv", ".parquet", ".xlsx")
 """Of job tables; other files of jobs are JSON."""
-MOST_ROWS, MOST_BYTES, MOST_SENTENCES = 10_000, 20_000_000, 10_000
+MOST_ROWS, MOST_BYTES = 10_000, 20_000_000
 MOST_NUMBERS = 5
 """Row numbers in one sentence."""
 DAY_S = 86_400.0
@@ -47,85 +47,79 @@ class Row(SimpleNamespace):
     """Values of one row by field of `JobSpec`; the default where a cell is empty or wrong."""
 
 
-class CellReader:
-    """Converts the cells of one table; every method raises a ValueError with what is allowed.
+class _Dialect(NamedTuple):
+    begin: datetime | None
+    """Of the shift, with its zone; None for unknown."""
+    decimal_comma: bool
+    """Whether a comma in a number is the decimal point."""
 
-    Args:
-        begin: Of the shift, with its zone; None for unknown.
-        decimal_comma: Whether a comma is a decimal point.
-    """
 
-    def __init__(self, begin: datetime | None, decimal_comma: bool) -> None:
-        self._begin, self._decimal_comma = begin, decimal_comma
+def _number(cell: Cell, dialect: _Dialect) -> float:
+    if isinstance(cell, str) and dialect.decimal_comma and "." not in cell:
+        cell = cell.replace(",", ".")
+    with suppress(TypeError, ValueError, OverflowError):
+        if not isinstance(cell, bool) and isfinite(number := float(cell)):
+            return number
+    raise ValueError(f"expected a number (got {_shown(cell)})")
 
-    def number(self, cell: Cell) -> float:
-        """A finite number."""
-        if isinstance(cell, str) and self._decimal_comma and "." not in cell:
-            cell = cell.replace(",", ".")
-        with suppress(TypeError, ValueError, OverflowError):
-            if not isinstance(cell, bool) and isfinite(number := float(cell)):
-                return number
-        raise ValueError(f"expected a number (got {_shown(cell)})")
 
-    def count(self, cell: Cell) -> int:
-        """A whole number."""
-        number = self.number(cell)
-        if number != int(number):
-            raise ValueError(f"expected a whole number (got {_shown(cell)})")
-        return int(number)
+def _count(cell: Cell, dialect: _Dialect) -> int:
+    if (number := _number(cell, dialect)) != int(number):
+        raise ValueError(f"expected a whole number (got {_shown(cell)})")
+    return int(number)
 
-    def seconds(self, cell: Cell) -> float:
-        """Time from the begin of the shift, s."""
-        if isinstance(cell, timedelta):
-            return cell.total_seconds()
-        text = _text(cell.isoformat() if isinstance(cell, time | datetime) else cell)
-        if clock := _CLOCK.fullmatch(text):
-            hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
-            return self._of_clock(text, 3600 * hours + 60 * minutes + seconds)
-        with suppress(ValueError):
-            return self.number(cell)
-        try:
-            date = datetime.fromisoformat(text)
-        except ValueError:
-            raise ValueError(f"expected seconds, h:mm, h:mm:ss, or {DATE} (got {_shown(cell)})") from None
-        if self._begin is None:
-            raise ValueError(f"a date needs shift_begin, the begin of the shift (got {_shown(cell)})")
-        return ((date if date.tzinfo else date.replace(tzinfo=self._begin.tzinfo)) - self._begin).total_seconds()
 
-    def _of_clock(self, text: str, given_s: float) -> float:
-        if self._begin is None:
+def _seconds(cell: Cell, dialect: _Dialect) -> float:
+    """Time from the begin of the shift, s."""
+    if isinstance(cell, timedelta):
+        return cell.total_seconds()
+    text, begin = _text(cell.isoformat() if isinstance(cell, time | datetime) else cell), dialect.begin
+    if clock := _CLOCK.fullmatch(text):
+        hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
+        given_s = 3600 * hours + 60 * minutes + seconds
+        if begin is None:
             return given_s
         if given_s >= DAY_S:
             raise ValueError(f"with shift_begin, h:mm is a time of day, before 24:00 (got '{text}')")
-        midnight = self._begin.replace(hour=0, minute=0, second=0, microsecond=0)
-        return (given_s - (self._begin - midnight).total_seconds()) % DAY_S
+        return (given_s - (begin - begin.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()) % DAY_S
+    with suppress(ValueError):
+        return _number(cell, dialect)
+    try:
+        date = datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError(f"expected seconds, h:mm, h:mm:ss, or {DATE} (got {_shown(cell)})") from None
+    if begin is None:
+        raise ValueError(f"a date needs shift_begin, the begin of the shift (got {_shown(cell)})")
+    return ((date if date.tzinfo else date.replace(tzinfo=begin.tzinfo)) - begin).total_seconds()
 
-    def name(self, cell: Cell) -> str:
-        """Name of a job."""
-        return _NOT_IN_NAMES.sub(lambda found: f"%{ord(found[0]):02X}", _text(cell))
 
-    def names(self, cell: Cell) -> tuple[str, ...]:
-        """Names of jobs."""
-        parts = cell if isinstance(cell, list) else _OR.split(_text(cell))
-        return tuple(self.name(part) for part in parts if _text(part))
+def _name(cell: Cell, _: object = None) -> str:
+    return _NOT_IN_NAMES.sub(lambda found: f"%{ord(found[0]):02X}", _text(cell))
 
-    def kind(self, cell: Cell) -> str:
-        """Kind of job."""
-        if (text := _text(cell)) not in KINDS:
-            raise ValueError(f"'{printable(text)}' is no kind of job{nearest(text, KINDS)}")
-        return text
 
-    def places(self, cell: Cell) -> tuple[tuple[str, ...], ...]:
-        """Places of each alternative."""
-        if isinstance(cell, list):
-            return tuple(tuple(each) for each in (cell if isinstance(cell[0], list) else [cell]))
-        return tuple(tuple(_ARROW.split(each.strip())) for each in _text(cell).split("|"))
+def _names(cell: Cell, _: object) -> tuple[str, ...]:
+    parts = cell if isinstance(cell, list) else _OR.split(_text(cell))
+    return tuple(_name(part) for part in parts if _text(part))
 
-    def flag(self, cell: Cell) -> bool:
-        """True or false."""
-        if (text := _text(cell).lower()) not in _FLAGS:
-            raise ValueError(f"expected yes or no (got {_shown(cell)})")
-        return _FLAGS[text]
+
+def _kind(cell: Cell, _: object) -> str:
+    if (text := _text(cell)) not in KINDS:
+        raise ValueError(f"'{printable(text)}' is no kind of job{nearest(text, KINDS)}")
+    return text
+
+
+def _places(cell: Cell, _: object) -> tuple[tuple[str, ...], ...]:
+    """Places of each alternative."""
+    if isinstance(cell, list):
+        lists = cell if all(isinstance(each, list) for each in cell) else [cell]
+        return tuple(tuple(map(_text, each)) for each in lists)
+    return tuple(tuple(_ARROW.split(each.strip())) for each in _text(cell).split("|"))
+
+
+def _flag(cell: Cell, _: object) -> bool:
+    if (text := _text(cell).lower()) not in _FLAGS:
+        raise ValueError(f"expected yes or no (got {_shown(cell)})")
+    return _FLAGS[text]
 
 
 def _text(cell: Cell) -> str:
@@ -140,19 +134,19 @@ def _is_empty(cell: Cell) -> bool:
     return cell is None or cell != cell or cell == [] or (isinstance(cell, str) and not cell.strip())  # also NaN
 
 
-_COLUMNS: Mapping[str, tuple[str, Callable[[CellReader, Cell], object], object]] = {
-    "name": ("name", CellReader.name, ""),
-    "kind": ("kind", CellReader.kind, ""),
-    "places": ("every_places", CellReader.places, ()),
-    "payload": ("payload_kg", CellReader.number, 0.0),
-    "repetitions": ("repetitions", CellReader.count, 1),
-    "release": ("release_s", CellReader.seconds, 0.0),
-    "due": ("due_s", CellReader.seconds, None),
-    "hard": ("expires", CellReader.flag, False),
-    "value": ("value", CellReader.number, 1.0),
-    "after": ("after", CellReader.names, ()),
-    "dwell": ("dwell_s", CellReader.number, DWELL_S),
-    "force": ("force_n", CellReader.number, 0.0),
+_COLUMNS: Mapping[str, tuple[str, Callable[[Cell, _Dialect], object], object]] = {
+    "name": ("name", _name, ""),
+    "kind": ("kind", _kind, ""),
+    "places": ("every_places", _places, ()),
+    "payload": ("payload_kg", _number, 0.0),
+    "repetitions": ("repetitions", _count, 1),
+    "release": ("release_s", _seconds, 0.0),
+    "due": ("due_s", _seconds, None),
+    "hard": ("expires", _flag, False),
+    "value": ("value", _number, 1.0),
+    "after": ("after", _names, ()),
+    "dwell": ("dwell_s", _number, DWELL_S),
+    "force": ("force_n", _number, 0.0),
 }
 """Field of a row, its conversion and its default, by column."""
 _NEEDED = ("name", "kind", "places")
@@ -181,8 +175,6 @@ class _Faults(dict[tuple[str, str], list[int]]):
             more = f" and {len(rows) - MOST_NUMBERS} more" if len(rows) > MOST_NUMBERS else ""
             numbers = f"row{'s' * (len(rows) > 1)} {', '.join(map(str, rows[:MOST_NUMBERS]))}{more}"
             lines.append(f"  {numbers}{f', column {column}' if column else ''}: {sentence}.")
-        if len(lines) > MOST_SENTENCES:
-            lines[MOST_SENTENCES:] = [f"  and {len(lines) - MOST_SENTENCES} more."]
         raise ScenarioError("\n".join([f"{where} has {total} fault{'s' * (total > 1)}:", *lines]))
 
 
@@ -203,7 +195,7 @@ def read_job_table(
     where, faults, jobs = where or str(path), _Faults(), list[JobSpec]()
     lines, decimal_comma = _rows(path, where)
     number, head = next(lines, (1, ()))
-    columns, reader = _read_head(number, head, faults), CellReader(begin, decimal_comma)
+    columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma)
     faults.raise_any(where)
     no_place = cache(lambda name: f"no place '{printable(name)}'{nearest(name, places or ())}")
     rows: dict[str, tuple[int, Row]] = {}
@@ -211,17 +203,16 @@ def read_job_table(
         if count == MOST_ROWS:
             raise ScenarioError(f"{where} has too many rows; a job table has at most {MOST_ROWS}.")
         if len(cells) > len(head) and not all(map(_is_empty, cells[len(head) :])):
-            reason = f"{len(cells)} cells, but the head has {len(head)}; quote cells that contain a separator"
-            faults.add(number, "", reason)
+            faults.add(number, "", f"{len(cells)} cells, but the head has {len(head)}; quote cells with separators")
             continue
-        row, wrong = _read_row(number, cells, columns, reader, faults)
+        row, wrong = _read_row(number, cells, columns, dialect, faults)
         for field, sentence in _problems(row, wrong):
             faults.add(number, _COLUMN_OF[field], sentence)
             wrong.add(field)
         for name in dict.fromkeys(row.places) if places is not None and "every_places" not in wrong else ():
             if name not in places:
                 faults.add(number, "places", no_place(name))
-        if row.name in rows:
+        if row.name and row.name in rows:
             faults.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
         elif not wrong:
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
@@ -258,7 +249,7 @@ def _read_head(number: int, head: Sequence[Cell], faults: _Faults) -> dict[int, 
 
 
 def _read_row(
-    number: int, cells: Sequence[Cell], columns: Mapping[int, tuple[str, float]], reader: CellReader, faults: _Faults
+    number: int, cells: Sequence[Cell], columns: Mapping[int, tuple[str, float]], dialect: _Dialect, faults: _Faults
 ) -> tuple[Row, set[str]]:
     """Values of a row, and the fields whose cells cannot be read."""
     row, wrong = Row(**{field: default for field, _, default in _COLUMNS.values()}), set[str]()
@@ -267,7 +258,7 @@ def _read_row(
         field, convert, _ = _COLUMNS[column]
         try:
             if not _is_empty(cell):
-                value = convert(reader, cell)
+                value = convert(cell, dialect)
                 setattr(row, field, factor * value if factor != 1.0 and isinstance(value, float) else value)
             elif column in _NEEDED:
                 raise ValueError("is empty; every job needs one")
@@ -410,18 +401,13 @@ def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:
     gap_s = max(0.0, (horizon_s if job.due_s is None else job.due_s) - job.release_s)
     close = (gap_s, nextafter(gap_s, inf), nextafter(gap_s, 0.0))  # of which one gives exactly the due date
     return {
-        "name": job.name,
-        "kind": job.kind,
-        "places": [list(names) for names in job.every_places],
+        **{name: getattr(job, name) for name in ("name", "kind", "dwell_s", "force_n", "value", "after")},
+        "places": job.every_places,
         "arrivals": {"kind": "trace", "times_s": [job.release_s]},
         "payload_kg": [job.payload_kg],
         "repetitions": [job.repetitions, job.repetitions],
-        "dwell_s": job.dwell_s,
-        "force_n": job.force_n,
-        "value": job.value,
         "due_s": next((each for each in close if job.release_s + each == job.due_s), gap_s),
         "due": "hard" if job.expires else "soft",
-        "after": list(job.after),
         "numbered": False,
     }
 

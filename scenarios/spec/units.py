@@ -17,35 +17,29 @@ FEW = 3
 """Times of which it cannot be said that they are minutes."""
 
 
-class Mistake(NamedTuple):
-    """Another unit that a number may be in."""
-
+class _Mistake(NamedTuple):
     unit: str
+    """Probably meant."""
     low: float
     high: float
     """Magnitudes that are taken for this unit; they are not sensible in the right one."""
-    meant: Callable[[float], str]
-    """The number in the right unit."""
-    right: str
-    """The right unit."""
 
 
-_KELVIN = Mistake("kelvin", 263.15, 473.15, lambda k: f"{k:g} K is {k - 273.15:.1f} °C", "°C")
-_GRAMS = Mistake("grams", 20.0, 20_000.0, lambda g: f"{g:g} g is {g / 1000:g} kg", "kg")
-
-
-def _millimetres(low: float) -> Mistake:
-    return Mistake("millimetres", low, 20_000.0, lambda mm: f"{mm:g} mm is {mm / 1000:g} m", "m")
-
-
-_MISTAKES: Mapping[str, Mistake] = {
-    **dict.fromkeys(("warning_c", "error_c", "restart_c", "lower_c", "cool_c", "ambient_c", "air_c"), _KELVIN),
-    **dict.fromkeys(("payload_kg", "tool_kg", "payload_limit_kg"), _GRAMS),
-    "size_m": _millimetres(20.0),
-    "retreat_m": _millimetres(2.0),
-    "clearance_m": _millimetres(0.5),
+_MISTAKES: Mapping[str, _Mistake] = {
+    **dict.fromkeys(("warning_c", "error_c", "restart_c", "lower_c"), _Mistake("kelvin", 263.15, 473.15)),
+    **dict.fromkeys(("cool_c", "ambient_c", "air_c"), _Mistake("kelvin", 263.15, 473.15)),
+    "points": _Mistake("kelvin", 263.15, 333.15),  # of the ambient temperature, which is at most 60 °C
+    **dict.fromkeys(("payload_kg", "tool_kg", "payload_limit_kg"), _Mistake("grams", 20.0, 20_000.0)),
+    "size_m": _Mistake("millimetres", 20.0, 20_000.0),
+    "retreat_m": _Mistake("millimetres", 2.0, 20_000.0),
+    "clearance_m": _Mistake("millimetres", 0.5, 20_000.0),
 }
 """By key, at any depth of a file."""
+_MEANT: Mapping[str, Callable[[float], str]] = {
+    "kelvin": lambda k: f"{k:g} K is {k - 273.15:.1f} °C. Give °C.",
+    "grams": lambda g: f"{g:g} g is {g / 1000:g} kg. Give kg.",
+    "millimetres": lambda mm: f"{mm:g} mm is {mm / 1000:g} m. Give m.",
+}
 _ANGLES = ("tilt_deg", "tool_deg")
 _TURNS = {
     round(pi * k / n, d) for n in (2, 3, 4, 6) for k in range(1, 2 * n + 1) for d in range(2 if n == 2 else 3, 17)
@@ -71,15 +65,10 @@ def question(key: str, numbers: Sequence[float]) -> str:
         turns = [abs(each) for each in numbers if abs(each) in _TURNS]
         if turns and all(not each or abs(each) in _TURNS for each in numbers):
             return f"is this radians? {turns[0]:g} rad is {degrees(turns[0]):.0f}°. Give degrees."
-    if mistake := _MISTAKES.get(key):
-        worst = max(numbers, key=abs)
-    elif key == "points":
-        mistake, worst = _KELVIN._replace(high=333.15), max(numbers)  # the highest ambient temperature is 60 °C
-    else:
+    mistake, worst = _MISTAKES.get(key), max(numbers, key=abs)
+    if mistake is None or not mistake.low <= abs(worst) <= mistake.high:
         return ""
-    if not mistake.low <= abs(worst) <= mistake.high:
-        return ""
-    return f"is this {mistake.unit}? {mistake.meant(worst)}. Give {mistake.right}."
+    return f"is this {mistake.unit}? {_MEANT[mistake.unit](worst)}"
 
 
 def _numbers(raw: object, place: str = "", key: str = "") -> Iterator[tuple[str, str, list[float]]]:

@@ -213,7 +213,7 @@ FAULTS = {
     "x,hold,bench,,,,,,-1,": "column value: must be between 0 and 1000000 (got -1.0).",
     "x,hold,bench,,,,,,,y": "column after: there is no job 'y' in this table.",
     "x,hold,bench,,,,,,,x": "column after: jobs wait for each other in a cycle: x → x.",
-    "x,hold,bench,,,,,,,,,9": ": 12 cells, but the head has 10; quote cells that contain a separator.",
+    "x,hold,bench,,,,,,,,,9": ": 12 cells, but the head has 10; quote cells with separators.",
 }
 
 

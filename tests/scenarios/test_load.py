@@ -200,11 +200,9 @@ KELVIN = {"warning_c": 333, "error_c": 348, "restart_c": 323}
 OVEN = {"name": "oven", "position_m": [0, 0, 1], "size_m": [800, 600, 20]}
 WRONG += [
     (put("limits", KELVIN), "limits.warning_c = 333: is this kelvin? 333 K is 59.9 °C. Give °C."),
-    (put("limits", "restart_c", 323), "limits.restart_c = 323: is this kelvin? 323 K is 49.9 °C."),
     (put("ambient", "points", [[0, 298.15]]), "ambient.points = 298.15: is this kelvin? 298.15 K is 25.0 °C."),
     (put("twin", "cool_c", 313), "twin.cool_c = 313: is this kelvin? 313 K is 39.9 °C."),
     (put("twin", "air_c", [293, 303]), "twin.air_c = [293, 303]: is this kelvin? 303 K is 29.9 °C."),
-    (put("arms", 0, "ambient_offset_k", 298), "arms[0].ambient_offset_k must be between -50 and 50 (got 298.0)."),
     (
         put("arms", 0, "tilt_deg", [1.5708, 0, 0]),
         "arms[0].tilt_deg = [1.5708, 0, 0]: is this radians? 1.5708 rad is 90°.",
@@ -222,17 +220,12 @@ WRONG += [
     (put("horizon_s", "2h"), "horizon_s: expected a number, got a text ('2h')."),
     (put("job", []), "unknown key 'job'; did you mean 'jobs'? Allowed: ambient, arms,"),
     (put("jobs", [{"tabel": "monday.csv"}]), "jobs[0]: unknown key 'tabel'; did you mean 'table'? Allowed: after,"),
-    (put("jobs", 0, "due", "Hard"), "jobs[0].due: 'Hard' is not allowed; did you mean 'hard'? Allowed: hard, soft."),
     (put("jobs", 0, "due_s", "0:30"), "jobs[0].due_s: expected a number, got a text ('0:30')."),
-    (put("jobs", 0, "repetitions", [20]), "jobs[0].repetitions: expected 2 values, got 1."),
-    (put("jobs", 0, "after", "hold"), "jobs[0].after: expected a list, got a text ('hold')."),
-    (put("jobs", 1, "arrivals", "every_s", 0), "jobs[1].arrivals.every_s must be > 0 and finite (got 0.0)."),
     (put("jobs", 1, "arrivals", "kind", "poison"), "'poison' is not allowed; did you mean 'poisson'? Allowed: batch,"),
     (put("jobs", 1, "dwell_s", 500), "jobs[1].dwell_s of a sort must be at most 180 s, the time to open or close the "),
     (put("jobs", 0, "numbered", False), "jobs[0].numbered = false is for streams of one job: arrivals with one time"),
     (put("planning", "speeds", [60]), "planning.speeds must be between 0.05 and 1 (got [60.0])."),
     (put("bus", {"loss": 5}), "bus.loss must be 0 to 1 (got 5)."),
-    (put("start", "warm"), "start: 'warm' is not allowed; did you mean 'idle_warm'? Allowed: cold, idle_warm."),
     (put("surprises", [{"kind": "fan", "arm": "left"}]), "'left' has no fan; its cooling must be forced_air."),
     (
         put("shift_begin", "6:00"),
