@@ -137,6 +137,8 @@ def _shown(value: object) -> str:
     return ""
 
 
+MOST_S = 1e9
+"""Longest shift with a job table."""
 MOST_JOBS = 100_000
 """Largest number of expected jobs in a shift: a mistyped gap would give billions."""
 APART_M = 0.2
@@ -189,8 +191,10 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
     jobs, places, horizon_s = raw.get("jobs"), raw.get("places"), raw.get("horizon_s")
     if not isinstance(jobs, list) or not any(isinstance(each, Mapping) and "table" in each for each in jobs):
         return raw
-    names = [p["name"] for p in places if isinstance(p, Mapping) and "name" in p] if isinstance(places, list) else []
-    horizon_s = float(horizon_s) if isinstance(horizon_s, int | float) else 0.0
+    tables = [place for place in places if isinstance(place, Mapping)] if isinstance(places, list) else []
+    names = [place["name"] for place in tables if isinstance(place.get("name"), str)]
+    # Their own faults are reported when the scenario is made.
+    horizon_s = float(horizon_s) if isinstance(horizon_s, int | float) and 0 < horizon_s < MOST_S else 0.0
     streams: list[object] = []
     for i, each in enumerate(jobs):
         if not isinstance(each, Mapping) or "table" not in each:
@@ -293,9 +297,10 @@ def _check(scenario: Scenario, path: Path) -> None:
                 raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
     if cycle := cycle_of({stream.name: stream.after for stream in scenario.jobs}):
         raise ScenarioError(f"{file}: jobs: jobs wait for each other in a cycle: {' → '.join(cycle)}.")
-    for name in {stream.name for stream in scenario.jobs if not stream.numbered}:
+    numbered = {stream.name for stream in scenario.jobs if stream.numbered}
+    for name in streams if numbered else ():
         stream, _, number = name.rpartition("-")
-        if stream in known_streams and len(number) >= 3 and number.isdecimal():
+        if name not in numbered and stream in numbered and len(number) >= 3 and number.isdecimal():
             raise ScenarioError(f"{file}: jobs: '{name}' is also a job of the stream '{stream}'; rename one of them.")
     try:
         scenario.bus.channel().check([arm.name for arm in scenario.arms])

@@ -144,6 +144,21 @@ def test_names_keep_spaces_and_have_slashes_percent_encoded_as_on_keys(tmp_path)
     assert (first.name, second.after) == ("A 1%2F2", ("A 1%2F2",))
 
 
+def test_names_may_continue_those_of_other_rows(tmp_path):
+    jobs = drawn(small_table(tmp_path, "name,kind,places\n4711,hold,bench\n4711-100,hold,bench\n"), 0)
+    assert [job.name for job in jobs] == ["4711", "4711-100"]
+
+
+@pytest.mark.parametrize("line", ["horizon_s = 1_0E999", "horizon_s = nan", 'horizon_s = "x"', "places = 3"])
+def test_a_wrong_scenario_around_a_table_is_told(tmp_path, line):
+    text = (
+        SMALL.replace("horizon_s = 180", line) if "horizon" in line else f"{line}\n{SMALL.replace('places]]', 'x]]')}"
+    )
+    (tmp_path / "jobs.csv").write_text("name,kind,places\na,hold,bench\n", encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"^cell\.toml: "):
+        with_table(tmp_path / "cell.toml", text, "jobs.csv")
+
+
 def test_rows_may_wait_for_rows_below_them(tmp_path):
     jobs = drawn(small_table(tmp_path, f"{SHORT}\na,hold,bench,,,0,,,,b\nb,hold,shelf,,,5,,,,\n"), 0)
     assert [(job.name, job.after) for job in jobs] == [("a", ("b",)), ("b", ())]
