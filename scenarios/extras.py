@@ -18,6 +18,7 @@ EXTRAS = {
     "onnx": ("onnx", "onnxruntime"),
     "ray": ("ray",),
     "ros2": ("rosbags",),
+    "xlsx": ("openpyxl",),
 }
 """Top-level modules of the libraries of each extra."""
 

@@ -21,12 +21,13 @@ BY = option("Name of the requester, kept in the journal. Default: the user's nam
 
 
 def submit_command(
-    file: str = argument("Jobs as JSON: a list, or one job per line; - reads standard input.", ""),
+    file: str = argument("Jobs: a table as .csv, .tsv, .parquet or .xlsx, or JSON; - reads JSON from stdin.", ""),
     wait: bool = option("Follow the jobs to their end; exit code 1 if one stays unfinished.", False),
     quote: bool = option("Submit nothing; print every arm's quote for each of its plans, or why it has none.", False),
     timeout: float = option("--quote: real seconds to wait for arms.", 5.0, low=0, high=600, above=True),
     as_json: bool = option("--quote: print JSON.", False, flag="--json"),
     by: str = option("Name of the submitter, kept in the journal.", ""),
+    shift_begin: str = option("Date, time and zone of fleet time 0, for a table, as 2026-11-23T06:00+01:00.", ""),
     kind: str = option("pick_place, hold, press or sort.", "", panel=_ONE),
     name: str = option("Name of the job. Default: its kind.", "", panel=_ONE),
     place: list[str] | None = option("Place of the cell; twice for pick_place and sort.", None, panel=_ONE),
@@ -56,6 +57,8 @@ def submit_command(
     if bool(file) == bool(kind):
         given = "both" if file else "neither"
         raise FleetError(f"Give either a FILE of jobs or one job by --kind and --place (got {given}).")
+    if shift_begin and not file:
+        raise FleetError("--shift-begin is for a FILE of jobs: leave it out.")
     if wait and quote:
         raise FleetError("--quote submits nothing: leave --wait out.")
     if as_json and not quote:
@@ -63,7 +66,7 @@ def submit_command(
     from scenarios.live.requests import job_of, quote_jobs, read_jobs, submit_jobs
 
     if file:
-        jobs = read_jobs(file)
+        jobs = read_jobs(file, shift_begin)
     else:
         fields = {"name": name or kind, "kind": kind, "places": place or [], "repetitions": repetitions}
         jobs = [job_of({**fields, "payload_kg": payload, "dwell_s": dwell, "force_n": force})]

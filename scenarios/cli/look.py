@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import sys
 import time
 from dataclasses import asdict
@@ -98,6 +99,32 @@ def show_command(
             parts = describe(chosen, progress)
         for part in parts:
             out_console.print(part)
+
+
+def new_command(
+    file: Path = argument("File to write; its name ends in .toml."),
+    source: str = option(
+        "Scenario of the library to copy. Default: a small cell that explains its fields.", "", flag="--from"
+    ),
+) -> None:
+    """Write a scenario file to change: a small cell with comments, or a copy of a scenario of the library."""
+    from importlib.resources import files
+
+    from fleet.errors import nearest
+    from scenarios.spec.load import library
+
+    known = library()
+    if source and source not in known:
+        raise FleetError(f"--from: no scenario '{source}'{nearest(source, known)}")
+    if file.suffix != ".toml":
+        raise FleetError(f"The name of a scenario file ends in .toml (got '{file.name}').")
+    content = (known[source] if source else files("scenarios.spec").joinpath("new.toml")).read_bytes()
+    try:
+        with file.open("xb") as new:
+            new.write(content)
+    except FileExistsError as error:
+        raise FleetError(f"'{file}' exists. Give another name, or remove it.") from error
+    say(f"Wrote {file}. Change it, then check it with: thermofleet layout {shlex.quote(str(file))}", out_console)
 
 
 def _list_cells(as_json: bool) -> None:

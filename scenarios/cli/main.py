@@ -52,6 +52,7 @@ COMMANDS = {
     "demo": LazyCommand(_LOOK, "run:demo_command", "Run the quickstart shift under two policies."),
     "run": LazyCommand(_LOOK, "run:run_command", "Run one shift of a scenario and record it."),
     "show": LazyCommand(_LOOK, "look:show_command", "List the scenarios or the suite, or show one scenario."),
+    "new": LazyCommand(_LOOK, "look:new_command", "Write a commented scenario file to change."),
     "layout": LazyCommand(_LOOK, "look:layout_command", "Show reach, space and problems of a cell."),
     "view": LazyCommand(_LOOK, "look:view_command", "Play a shift in MuJoCo's viewer, or write it as a film or scene."),
     "report": LazyCommand(_LOOK, "look:report_command", "Write the page of a run or recording, or trace an event."),

@@ -60,6 +60,7 @@ def run_command(
     from scenarios.policy_loader import label, policy_of
     from scenarios.result_folder import check_free
     from scenarios.run.log import RUN
+    from scenarios.spec.jobs import check_some_jobs
     from scenarios.spec.load import load, own_seed
 
     chosen = load(scenario)
@@ -70,6 +71,7 @@ def run_command(
         raise FleetError(f"--listen needs --bus zenoh (got {listen} and {spec.bus}).")
     where = out or Path("runs") / f"{chosen.name}-{label(spec.policy).replace(':', '-')}-{spec.seed}"
     check_free(where, RUN, overwrite=overwrite)
+    check_some_jobs(chosen, spec.seed)
     with ExitStack() as open_until_end:
         endpoint = None
         if listen:  # before the fleet connects, so that listeners miss no message

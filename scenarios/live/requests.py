@@ -41,6 +41,7 @@ from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import the_fleet
 from scenarios.signals import until_stopped
+from scenarios.spec.job_table import SUFFIXES, read_job_table, shift_begin
 from scenarios.table import Column, Table
 from scenarios.terminal import echo, out_console, print_json, say
 
@@ -139,12 +140,20 @@ def _is_unplanned(answers: Replies[Quote]) -> bool:
     return any(estimate.reason == NOT_PLANNED for estimate in estimates)
 
 
-def read_jobs(file: str) -> list[JobSpec]:
-    """Read the jobs of a file, or of standard input for `-`.
+def read_jobs(file: str, begin: str = "") -> list[JobSpec]:
+    """Read the jobs of a file of JSON, or of standard input for `-`, or of a job table by its suffix.
+
+    Args:
+        begin: Date, time and zone of fleet time 0, for the dates in a job table.
 
     Raises:
-        FleetError: a job is invalid; names the line, or the index in the list.
+        FleetError: a job is invalid; names the line, or the index in the list. Of a job table all faults are named.
     """
+    shift = shift_begin(begin, "--shift-begin")
+    if file.lower().endswith(SUFFIXES):
+        return read_job_table(Path(file), begin=shift)
+    if shift:
+        raise FleetError(f"--shift-begin is for a job table, a file that ends in {', '.join(SUFFIXES)} (got {file}).")
     name = "standard input" if file == "-" else file
     try:
         raw = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()

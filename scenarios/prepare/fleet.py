@@ -29,7 +29,7 @@ from fleet.robot import Robot
 from fleet.seeding import shift_seeds
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
-from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms, problems_of
+from scenarios.prepare.arms import REASONS, PlannedArm, air_offsets, plan_arms, problems_of
 from scenarios.prepare.randomisation import Randomisation, ShiftConditions, randomisation_of
 from scenarios.prepare.shipped import is_shipped
 from scenarios.prepare.surprise import arms_with_surprises
@@ -92,8 +92,8 @@ def prepare(
         like: Prepared from a scenario with the same arms, cell and task types; its plans and space table are reused.
 
     Raises:
-        ScenarioError: no such scenario, no arm can do some work, arms at home are too close to each other, or a
-            variant is no fleet of the same arms and jobs.
+        ScenarioError: no such scenario, no arm can do some work, an arm can do none, arms at home are too close to each
+            other, or a variant is no fleet of the same arms and jobs.
         MissingExtra: twins must be trained, and the libraries for it are not installed.
     """
     randomise = randomisation_of(randomise)
@@ -179,7 +179,7 @@ def _arms(
     asked = all_works(scenario)
     works = rehearsal_works(scenario) if difficulty == "twin" else asked
     planned = like.planned if like else plan_arms(scenario, indices, works, folder, progress)
-    if problems := problems_of(scenario, planned if every_work else (), folder):
+    if problems := cell_problems(scenario, planned if every_work else (), folder):
         raise ScenarioError("\n".join(problems))
     arms = [arm.before or arm for arm in like.arms] if like else [_blind_arm(arm, asked, folder) for arm in planned]
     if difficulty == "twin":
@@ -198,6 +198,21 @@ def _arms(
     elif difficulty == "oracle":
         return [_with_oracle(scenario, arm) for arm in arms_with_surprises(scenario, arms)], planned
     return list(arms_with_surprises(scenario, arms)), planned
+
+
+def cell_problems(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
+    """As `problems_of`; without such problems, a sentence for each arm that can do no job of the scenario."""
+    if problems := problems_of(scenario, arms, folder):
+        return problems
+    for arm in arms:
+        if not any(work in arm.plans for work in all_works(scenario)):
+            name, reasons = arm.hardware.robot.name, dict.fromkeys(f"{e.place}: {e.reason}" for e in arm.infeasible)
+            more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
+            problems.append(
+                f"{scenario.name}.toml: arms[{arm.index}]: '{name}' can do no job ({'; '.join(list(reasons)[:REASONS])}"
+                f"{more}); move the arm or the places, give it jobs, or leave it out."
+            )
+    return problems
 
 
 def _blind_arm(planned: PlannedArm, works: Sequence[Work], folder: Path) -> Arm:

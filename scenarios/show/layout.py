@@ -13,8 +13,8 @@ from fleet.arm.space import SpaceTable
 from fleet.files import cache_folder
 from fleet.motion import Plan
 from scenarios.cell_layout import cell_of
-from scenarios.prepare.arms import PlannedArm, plan_arms, problems_of
-from scenarios.prepare.fleet import ShiftFactory, prepare, space_of
+from scenarios.prepare.arms import PlannedArm, plan_arms
+from scenarios.prepare.fleet import ShiftFactory, cell_problems, prepare, space_of
 from scenarios.prepare.load_factor import load_factor
 from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import all_works, alternatives_of, fault_price, works_of
@@ -87,7 +87,7 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
     """The layout of a scenario's cell. Plans the scenario's work (cached); problems are part of the result."""
     folder = cache_folder()
     arms = plan_arms(scenario, range(len(scenario.arms)), all_works(scenario), folder, progress)
-    problems = problems_of(scenario, arms, folder)
+    problems = cell_problems(scenario, arms, folder)
     plans = [plan for arm in arms for plan in arm.all_plans]
     space = space_of(scenario, [arm.hardware.robot for arm in arms], plans, folder, progress)
     exclusions = _exclusions(scenario, plans, space)
@@ -253,6 +253,8 @@ REGIMES = {
 """Sentences of the regimes of `LoadFactor`."""
 MOST_REASONS = 20
 """Reasons that are shown why an arm cannot do a job."""
+MOST_STREAMS = 64
+"""Streams of jobs, or rows of a table, in a description."""
 
 
 def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str]:
@@ -329,9 +331,11 @@ def _jobs(scenario: Scenario) -> Table:
     """One row per stream, as sentences that fit any terminal."""
     rows = tuple(
         (s.name, f"{_work(s)}\nworth {s.value:g}, due after {s.due_s / 60:g} min; {_arrivals(s)}")
-        for s in scenario.jobs
+        for s in scenario.jobs[:MOST_STREAMS]
     )
-    return Table(head=("jobs", ""), rows=rows, numbers=False)
+    more = len(scenario.jobs) - MOST_STREAMS
+    notes = (f"… and {more} more.",) if more > 0 else ()
+    return Table(head=("jobs", ""), rows=rows, numbers=False, notes=notes)
 
 
 def _work(stream: JobStream) -> str:
@@ -361,4 +365,5 @@ def _arrivals(stream: JobStream) -> str:
             again = f", again every {spec.every_s:g} s" if spec.every_s else ""
             return f"{spec.count} at {spec.start_s:g} s{again}{after}"
         case "trace":
-            return f"a trace of {len(spec.times_s or ())}{after}"
+            times_s = spec.times_s or ()
+            return f"a trace of {len(times_s)}{after}" if stream.numbered else f"one at {sum(times_s):g} s{after}"

@@ -16,12 +16,13 @@ import numpy as np
 
 from fleet.arrivals import ArrivalTable, arrival_table, sample_arrivals, scale_rate
 from fleet.engine.batch import FaultPrice, RewardWeights
+from fleet.errors import ScenarioError
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, WINDING, gen3_network, node_heat, thermal_model
 from fleet.jit import kernel
 from fleet.job import Job, Work
 from fleet.robot import JOINTS, ThermalLimits
-from fleet.seeding import random_uniform, random_word
+from fleet.seeding import random_uniform, random_word, shift_seeds
 from scenarios.spec.schema import JobStream, Scenario
 
 Array = np.ndarray
@@ -176,7 +177,7 @@ class JobSampler:
             getattr(sampled, name).tolist() for name in ("stream", "number", "payload", "release_s")
         )
         repetitions = (self.fewest[sampled.stream] + sampled.extra).tolist()
-        names = [f"{streams[i].name}-{n + 1:03d}" for i, n in zip(stream, number, strict=True)]
+        names = [job_name(streams[i], n) for i, n in zip(stream, number, strict=True)]
         return tuple(
             Job(
                 name=names[j],
@@ -193,9 +194,29 @@ class JobSampler:
         )
 
 
+def job_name(stream: JobStream, number: int) -> str:
+    """Name of a job of a stream; `number` counts from 0."""
+    return f"{stream.name}-{number + 1:03d}" if stream.numbered else stream.name
+
+
 def draw_jobs(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Job, ...]:
     """The jobs of one shift in order of release."""
     return JobSampler(scenario).jobs(seed)
+
+
+def check_some_jobs(scenario: Scenario, seed: int) -> None:
+    """Check that the shift of a seed has a job.
+
+    Raises:
+        ScenarioError: it has none; names the expected number of each stream.
+    """
+    if draw_jobs(scenario, shift_seeds(np.random.SeedSequence(seed))[0]):
+        return
+    expected = ", ".join(f"'{each.name}' {each.arrivals.expected(scenario.horizon_s):g}" for each in scenario.jobs)
+    raise ScenarioError(
+        f"{scenario.name}, seed {seed}: no job arrives in this shift of {scenario.horizon_s:g} s. Expected numbers: "
+        f"{expected}. Change the arrivals or horizon_s, or give another --seed."
+    )
 
 
 def rehearsal_works(scenario: Scenario) -> tuple[Work, ...]:

@@ -11,6 +11,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
 from itertools import chain, combinations, pairwise
 from math import dist, isfinite
 from pathlib import Path
@@ -21,7 +22,9 @@ import msgspec
 import numpy as np
 
 from fleet.errors import ScenarioError, nearest, printable
-from scenarios.spec.schema import Scenario
+from scenarios.spec.job_table import cycle_of, decode_text, read_job_table, shift_begin, stream_fields
+from scenarios.spec.schema import JobStream, Scenario
+from scenarios.spec.units import check_times, check_units
 
 _WORDS = {
     "float": "a number",
@@ -134,6 +137,8 @@ def _shown(value: object) -> str:
     return ""
 
 
+MOST_S = 1e9
+"""Longest shift with a job table."""
 MOST_JOBS = 100_000
 """Largest number of expected jobs in a shift: a mistyped gap would give billions."""
 APART_M = 0.2
@@ -154,15 +159,22 @@ def parse_toml(content: bytes, path: Path) -> Scenario:
         except ValueError as error:  # also an integer with too many digits
             reason = str(error).partition(";")[0]
             raise ScenarioError(f"{path.name}: not valid TOML: {printable(reason)}.") from error
-        return parse_scenario({"name": path.stem, **raw}, path)
+        scenario = parse_scenario({"name": path.stem, **raw}, path)
     except RecursionError as error:
         raise ScenarioError(f"{path.name}: its tables are nested too deeply; a scenario needs 4 levels.") from error
+    for i, stream in enumerate(scenario.jobs):
+        if stream.numbered and stream.arrivals.times_s is not None:
+            times = [time + stream.arrivals.start_s for time in stream.arrivals.times_s]
+            check_times(times, scenario.horizon_s, f"{path.name}: jobs[{i}].arrivals of '{stream.name}'")
+    return scenario
 
 
 def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
     """The scenario of a parsed TOML file; `path` names the file in errors and locates the files it refers to."""
+    raw = _with_tables(raw, path)
     _known_keys(raw, Scenario, path.name, "")
     check_finite(raw, path.name)
+    check_units(raw, path.name)
     raw = {"arms": (), "places": (), "jobs": (), **raw}  # an absent list and an empty one give the same error
     try:
         scenario = msgspec.convert(raw, Scenario, strict=True)
@@ -170,6 +182,32 @@ def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
         raise ScenarioError(f"{path.name}: {readable_error(error, raw, Scenario)}") from error
     _check(scenario, path)
     return _with_traces(scenario, path)
+
+
+def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
+    """The parsed file with a stream for each row of its job tables, and with the begin of the shift as a text."""
+    begin = shift_begin(raw.get("shift_begin"), f"{path.name}: shift_begin")
+    raw = {**raw, "shift_begin": begin and begin.isoformat()}
+    jobs, places, horizon_s = raw.get("jobs"), raw.get("places"), raw.get("horizon_s")
+    if not isinstance(jobs, list) or not any(isinstance(each, Mapping) and "table" in each for each in jobs):
+        return raw
+    tables = [place for place in places if isinstance(place, Mapping)] if isinstance(places, list) else []
+    names = [place["name"] for place in tables if isinstance(place.get("name"), str)]
+    # Their own faults are reported when the scenario is made.
+    horizon_s = float(horizon_s) if isinstance(horizon_s, int | float) and 0 < horizon_s < MOST_S else 0.0
+    streams: list[object] = []
+    for i, each in enumerate(jobs):
+        if not isinstance(each, Mapping) or "table" not in each:
+            streams.append(each)
+            continue
+        where = f"{path.name}: jobs[{i}]"
+        if len(each) > 1 or not isinstance(each["table"], str):
+            raise ScenarioError(f'{where}: a job table is table = "FILE", without other keys (got {", ".join(each)}).')
+        file = path.parent / each["table"]
+        rows = read_job_table(file, f"{where}.table: '{file.name}'", begin=begin, places=names)
+        check_times([row.release_s for row in rows], horizon_s, f"{where}.table: '{file.name}'")
+        streams += [stream_fields(row, horizon_s) for row in rows]
+    return {**raw, "jobs": streams}
 
 
 def override(scenario: Scenario, **changes: object) -> Scenario:
@@ -210,13 +248,20 @@ def _known_keys(raw: object, kind: Any, file: str, place: str) -> None:
             _known_keys(item, get_args(kind)[0], file, f"{place}[{i}]")
     if not dataclasses.is_dataclass(kind) or not isinstance(raw, Mapping):
         return
-    hints = get_type_hints(kind)
-    allowed = [f.name for f in dataclasses.fields(kind)]
+    hints = _hints(kind)
+    allowed = [*hints, "table"] if kind is JobStream else list(hints)
     for key, value in raw.items():
         if key not in allowed:
             where = f"{file}: {place}" if place else file
             raise ScenarioError(f"{where}: unknown key '{key}'{nearest(key, allowed)}")
         _known_keys(value, hints[key], file, f"{place}.{key}" if place else key)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    """Type of each field of a dataclass (Any: Python has no type of annotations)."""
+    hints = get_type_hints(kind)
+    return {f.name: hints[f.name] for f in dataclasses.fields(kind)}
 
 
 def _check(scenario: Scenario, path: Path) -> None:
@@ -227,10 +272,11 @@ def _check(scenario: Scenario, path: Path) -> None:
     if not scenario.jobs:
         raise ScenarioError(f"{file}: jobs: there are no jobs; give at least one [[jobs]].")
     for kind in ("arms", "places", "jobs", "fixtures"):
-        names = [item.name for item in getattr(scenario, kind)]
-        for i, name in enumerate(names):
-            if name in names[:i]:
+        names = set[str]()
+        for i, item in enumerate(getattr(scenario, kind)):
+            if (name := item.name) in names:
                 raise ScenarioError(f"{file}: {kind}[{i}].name: '{name}' is given twice; names must be unique.")
+            names.add(name)
     for (i, one), (j, other) in combinations(enumerate(scenario.arms), 2):
         apart = dist(one.position_m, other.position_m)
         if apart < APART_M:
@@ -240,14 +286,22 @@ def _check(scenario: Scenario, path: Path) -> None:
             )
     places = [place.name for place in scenario.places]
     streams = [stream.name for stream in scenario.jobs]
+    known_streams = frozenset(streams)
     for i, stream in enumerate(scenario.jobs):
         for name in chain.from_iterable(stream.alternatives):
             if name not in places:
                 raise ScenarioError(f"{file}: jobs[{i}].places: no place '{name}'{nearest(name, places)}")
         for name in stream.after:
-            if name not in streams[:i]:
+            if name not in (streams[:i] if stream.numbered else known_streams):
                 known = nearest(name, streams[:i]) if i else "."
                 raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
+    if cycle := cycle_of({stream.name: stream.after for stream in scenario.jobs}):
+        raise ScenarioError(f"{file}: jobs: jobs wait for each other in a cycle: {' → '.join(cycle)}.")
+    numbered = {stream.name for stream in scenario.jobs if stream.numbered}
+    for name in streams if numbered else ():
+        stream, _, number = name.rpartition("-")
+        if name not in numbered and stream in numbered and len(number) >= 3 and number.isdecimal():
+            raise ScenarioError(f"{file}: jobs: '{name}' is also a job of the stream '{stream}'; rename one of them.")
     try:
         scenario.bus.channel().check([arm.name for arm in scenario.arms])
     except ValueError as error:
@@ -284,13 +338,11 @@ def _with_traces(scenario: Scenario, path: Path) -> Scenario:
 
 def _trace(where: Path, place: str) -> tuple[float, ...]:
     try:
-        lines = where.read_text(encoding="utf-8").splitlines()
+        lines = decode_text(where.read_bytes(), f"{place}: '{where.name}'").splitlines()
     except FileNotFoundError as error:
         raise ScenarioError(f"{place}: there is no file '{where}'.") from error
     except OSError as error:
         raise ScenarioError(f"{place}: cannot read '{where}': {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{place}: '{where.name}' is not a UTF-8 text file.") from error
     times: list[float] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):

@@ -92,6 +92,8 @@ class JobStream:
     """soft: a later finish is tardy. hard: a job that waits then expires, begun before or not."""
     after: tuple[str, ...] = ()
     """Streams whose job of the same number must finish first."""
+    numbered: bool = True
+    """Whether the names of its jobs have a number after that of the stream. False for a row of a job table."""
 
     @property
     def alternatives(self) -> tuple[tuple[str, ...], ...]:
@@ -113,6 +115,8 @@ class JobStream:
         check_duration(self, self.dwell_s, high)
         if self.force_n and self.kind != "press":
             raise ValueError(f"JobStream.force_n: only a press has a contact force (got {self.force_n} N)")
+        if not self.numbered and len(self.arrivals.times_s or ()) != 1:
+            raise ValueError("JobStream.numbered = false is for streams of one job: arrivals with one time in times_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,13 +315,16 @@ class Scenario:
     spread: Spread = field(default_factory=Spread)
     bus: BusSpec = field(default_factory=BusSpec)
     surprises: tuple[Surprise, ...] = ()
+    shift_begin: str | None = None
+    """Date, time and zone of the begin of the shift, to which the times of a job table refer."""
 
     def __post_init__(self) -> None:
         check_positive(self, "horizon_s", "decision_interval_s", "telemetry_interval_s")
         if self.decision_interval_s > self.horizon_s:
+            hours = f"; is horizon_s in hours? {self.horizon_s:g} h is {3600 * self.horizon_s:g} s"
             raise ValueError(
                 "Scenario.decision_interval_s must not exceed horizon_s "
-                f"(got {self.decision_interval_s}, {self.horizon_s})"
+                f"(got {self.decision_interval_s}, {self.horizon_s}){hours if self.horizon_s <= 24 else ''}"
             )
         if self.telemetry_interval_s > self.decision_interval_s:
             raise ValueError(
@@ -343,7 +350,7 @@ class Scenario:
         for each in (*self.arms, *self.places, *self.fixtures, *self.jobs):
             check_names(each, "name")
         for stream in self.jobs:
-            if len(stream.name) > MAX_NAME - _NUMBER:
+            if stream.numbered and len(stream.name) > MAX_NAME - _NUMBER:
                 raise ValueError(
                     f"JobStream.name must have at most {MAX_NAME - _NUMBER} characters, as its jobs have a number "
                     f"after it (got {len(stream.name)})"

@@ -1,4 +1,4 @@
-"""Every tutorial runs: commands, files and programs in order, with the outputs that the page shows.
+"""Every tutorial runs, and the page on job tables: commands, files and programs in order, with the outputs of the page.
 
 A block of `sh` is run in a shell, one of `python` by Python; with a title it is a file instead. A block of `text` is
 the output of the block before it, where … matches anything. After `<!-- background -->` a command keeps running.
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = sorted((DOCS / "tutorials").glob("*.md"))
+PAGES = [*sorted((DOCS / "tutorials").glob("*.md")), DOCS / "how_to" / "job_table.md"]
 _BLOCK = re.compile(
     r'^(?P<behind><!-- background -->\n)?```(?P<kind>\w+)(?: title="(?P<title>[\w.]+)")?\n(?P<text>.*?)^```$',
     re.DOTALL | re.MULTILINE,

@@ -519,3 +519,34 @@ def test_every_option_of_a_command_is_read():
                 ignored = [name for name in names if not name.startswith("_") and name not in read | {"self"}]
                 unread += [f"{path.name}: {node.name}({name})" for name in ignored]
     assert unread == []
+
+
+def test_a_new_scenario_runs_and_its_comments_are_allowed_choices(thermofleet, tmp_path):
+    file, out = tmp_path / "my_cell.toml", tmp_path / "run"
+    said = thermofleet("new", file)
+    assert (said.code, f"thermofleet layout {file}" in said.out) == (0, True)
+    assert thermofleet("layout", file).code == 0
+    assert thermofleet("run", file, *QUICK, "--out", out).code == 0
+    metrics = run_json(out)["metrics"]
+    assert 5 < metrics["finished"] == metrics["jobs"]
+    text = file.read_text(encoding="utf-8")
+    file.write_text(re.sub(r"^# (?=\[+\w+\]|\w+ = )", "", text, flags=re.MULTILINE), encoding="utf-8")
+    (tmp_path / "monday.csv").write_text("name,kind,places,release\nfirst,hold,clamp,6:30\n", encoding="utf-8")
+    commented = load(file)
+    assert commented.limits == load(library()["quickstart"]).limits == ThermalLimits()
+    assert len(commented.fixtures) == 1
+    assert commented.jobs[-1].arrivals.times_s == (1800.0,)
+
+
+def test_a_new_scenario_may_be_a_copy_and_replaces_no_file(thermofleet, tmp_path):
+    file = tmp_path / "mine.toml"
+    assert thermofleet("new", file, "--from", "quickstart").code == 0
+    assert file.read_bytes() == library()["quickstart"].read_bytes()
+    for words, reason in (
+        ((file,), f"'{file}' exists. Give another name, or remove it."),
+        ((tmp_path / "x.toml", "--from", "quikstart"), "no scenario 'quikstart'; did you mean 'quickstart'? Allowed: "),
+        ((tmp_path / "x.csv",), "The name of a scenario file ends in .toml (got 'x.csv')."),
+        ((tmp_path / "no" / "x.toml",), "No such file or directory."),
+    ):
+        said = thermofleet("new", *words)
+        assert (said.code, reason in said.err) == (2, True), said.err

@@ -2,11 +2,13 @@
 
 import datetime
 import json
+import logging
 import math
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import resources
+from io import StringIO
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -194,6 +196,44 @@ WRONG = [
 ]
 
 
+KELVIN = {"warning_c": 333, "error_c": 348, "restart_c": 323}
+OVEN = {"name": "oven", "position_m": [0, 0, 1], "size_m": [800, 600, 20]}
+WRONG += [
+    (put("limits", KELVIN), "limits.warning_c = 333: is this kelvin? 333 K is 59.9 °C. Give °C."),
+    (put("ambient", "points", [[0, 298.15]]), "ambient.points = 298.15: is this kelvin? 298.15 K is 25.0 °C."),
+    (put("twin", "cool_c", 313), "twin.cool_c = 313: is this kelvin? 313 K is 39.9 °C."),
+    (put("twin", "air_c", [293, 303]), "twin.air_c = [293, 303]: is this kelvin? 303 K is 29.9 °C."),
+    (
+        put("arms", 0, "tilt_deg", [1.5708, 0, 0]),
+        "arms[0].tilt_deg = [1.5708, 0, 0]: is this radians? 1.5708 rad is 90°.",
+    ),
+    (put("arms", 1, "tilt_deg", [0, 0, -3.14]), "arms[1].tilt_deg = [0, 0, -3.14]: is this radians? 3.14 rad is 180°."),
+    (put("places", 0, "tool_deg", [math.pi, 0, 0]), "places[0].tool_deg = [3.14159, 0, 0]: is this radians?"),
+    (put("jobs", 0, "payload_kg", [500, 1500]), "jobs[0].payload_kg = [500, 1500]: is this grams? 1500 g is 1.5 kg."),
+    (put("arms", 0, "tool_kg", 900), "arms[0].tool_kg = 900: is this grams? 900 g is 0.9 kg. Give kg."),
+    (put("arms", 0, "payload_limit_kg", 4000), "arms[0].payload_limit_kg = 4000: is this grams? 4000 g is 4 kg."),
+    (put("fixtures", [OVEN]), "fixtures[0].size_m = [800, 600, 20]: is this millimetres? 800 mm is 0.8 m."),
+    (put("places", 0, "position_m", [400, 50, 200]), "(got 400.0, 50.0, 200.0); were millimetres meant?"),
+    (put("places", 0, "retreat_m", 80), "places[0].retreat_m = 80: is this millimetres? 80 mm is 0.08 m."),
+    (put("clearance_m", 20), "clearance_m = 20: is this millimetres? 20 mm is 0.02 m."),
+    (put("horizon_s", 8), "(got 10.0, 8.0); is horizon_s in hours? 8 h is 28800 s."),
+    (put("horizon_s", "2h"), "horizon_s: expected a number, got a text ('2h')."),
+    (put("job", []), "unknown key 'job'; did you mean 'jobs'? Allowed: ambient, arms,"),
+    (put("jobs", [{"tabel": "monday.csv"}]), "jobs[0]: unknown key 'tabel'; did you mean 'table'? Allowed: after,"),
+    (put("jobs", 0, "due_s", "0:30"), "jobs[0].due_s: expected a number, got a text ('0:30')."),
+    (put("jobs", 1, "arrivals", "kind", "poison"), "'poison' is not allowed; did you mean 'poisson'? Allowed: batch,"),
+    (put("jobs", 1, "dwell_s", 500), "jobs[1].dwell_s of a sort must be at most 180 s, the time to open or close the "),
+    (put("jobs", 0, "numbered", False), "jobs[0].numbered = false is for streams of one job: arrivals with one time"),
+    (put("planning", "speeds", [60]), "planning.speeds must be between 0.05 and 1 (got [60.0])."),
+    (put("bus", {"loss": 5}), "bus.loss must be 0 to 1 (got 5)."),
+    (put("surprises", [{"kind": "fan", "arm": "left"}]), "'left' has no fan; its cooling must be forced_air."),
+    (
+        put("shift_begin", "6:00"),
+        "shift_begin must be a date with time and zone, as 2026-11-23T06:00+01:00 (got 6:00).",
+    ),
+]
+
+
 @pytest.mark.parametrize(("edit", "sentence"), WRONG, ids=[sentence[:50] for _, sentence in WRONG])
 def test_a_wrong_entry_is_told_by_file_place_value_and_what_is_allowed(edit, sentence):
     message = told(edit)
@@ -302,6 +342,75 @@ def test_a_trace_file_lies_beside_its_scenario(tmp_path):
     assert parse_scenario(raw, tmp_path / "heat.toml").jobs[0].arrivals.times_s == (0.0, 12.5)
 
 
+def with_trace(folder: Path, content: bytes, horizon_s: float = 7200.0) -> Scenario:
+    """The small scenario with a second stream that arrives as a file says."""
+    (folder / "times.txt").write_bytes(content)
+    text = (Path(__file__).parent / "conftest.py").read_text(encoding="utf-8").split('SMALL = """')[1].split('"""')[0]
+    text = text.replace('kind = "poisson", every_s = 30', 'kind = "trace", file = "times.txt"')
+    (folder / "cell.toml").write_text(text.replace("horizon_s = 180", f"horizon_s = {horizon_s}"), encoding="utf-8")
+    return load(folder / "cell.toml")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_of_a_trace_does_no_harm(tmp_path, encoding):
+    assert with_trace(tmp_path, "0\n12.5\n".encode(encoding)).jobs[1].arrivals.times_s == (0.0, 12.5)
+
+
+OUTSIDE = [
+    ([1_790_000_000, 1_790_000_060], "Are these seconds since 1970? The first is 2026-09-21 14:13:20 UTC. Subtract"),
+    ([1_790_000_000_000], "its only time is outside the shift, which ends at horizon_s = 7200 (got 1790000000000 to"),
+    ([1_790_000_000_000], "Are these milliseconds since 1970? The first is 2026-09-21 14:13:20 UTC."),
+    ([90_000, 900_000], "Are these milliseconds? 900000 ms is 900 s. Give seconds."),
+    (
+        [7200, 7300],
+        "all 2 times are outside the shift, which ends at horizon_s = 7200 (got 7200 to 7300 s). Give seconds",
+    ),
+]
+
+
+@pytest.mark.parametrize(("times_s", "sentence"), OUTSIDE)
+def test_a_trace_outside_the_shift_is_refused_with_what_is_probably_meant(tmp_path, times_s, sentence):
+    with pytest.raises(ScenarioError) as error:
+        with_trace(tmp_path, "\n".join(map(str, times_s)).encode())
+    assert str(error.value).startswith("cell.toml: jobs[1].arrivals of 'sort' gives no job: ")
+    assert sentence in str(error.value)
+
+
+@given(inside=st.lists(st.floats(0, 7199), min_size=3), outside=st.lists(st.floats(7200, 9000)))
+def test_the_warning_counts_the_times_that_lie_outside(tmp_path_factory, inside, outside):
+    times = sorted([0.0, *inside, 7199.0, *outside])
+    with StringIO() as text:
+        handler = logging.StreamHandler(text)
+        logging.getLogger("scenarios.spec").addHandler(handler)
+        with_trace(tmp_path_factory.mktemp("trace"), "\n".join(map(repr, times)).encode())
+        logging.getLogger("scenarios.spec").removeHandler(handler)
+        expected = f"{len(outside)} of {len(times)} times are outside the shift" if outside else ""
+        assert text.getvalue().partition(": ")[2].partition(": ")[2].startswith(expected)
+        assert bool(text.getvalue()) == bool(outside)
+
+
+def test_a_trace_in_minutes_or_partly_in_milliseconds_is_asked_about(tmp_path, caplog):
+    with_trace(tmp_path, b"0\n60\n118\n")
+    assert "all 3 times are within 118 s of a shift of 7200 s. Are these minutes? 118 min is 7080 s." in caplog.text
+    with_trace(tmp_path, b"0\n60000\n118000\n")
+    assert "2 of 3 times are outside the shift" in caplog.text
+    assert "Are these milliseconds? 118000 ms is 118 s." in caplog.text
+
+
+def test_a_run_without_a_job_ends_with_the_reason(thermofleet, small_toml, tmp_path):
+    text = small_toml.read_text(encoding="utf-8").replace("every_s = 30", "every_s = 1e6")
+    small_toml.write_text(text.replace("count = 2", "count = 2, start_s = 200"), encoding="utf-8")
+    said = thermofleet("run", small_toml, "--out", tmp_path / "run")
+    assert said.code == 2
+    assert "Error: heat, seed 0: no job arrives in this shift of 180 s. Expected numbers: 'hold' 0, 'sort'" in said.err
+    assert not (tmp_path / "run").exists()
+    small_toml.write_text(
+        text.replace('kind = "batch", count = 2', 'kind = "trace", times_s = [999]'), encoding="utf-8"
+    )
+    said = thermofleet("run", small_toml, "--out", tmp_path / "run")
+    assert (said.code, "jobs[0].arrivals of 'hold' gives no job: its only time is outside" in said.err) == (2, True)
+
+
 def test_an_override_changes_that_field_and_no_other():
     base = parse_scenario(small(), FILE)
     changed = override(base, horizon_s=60, ambient={"points": [(0, 30)]})
@@ -365,6 +474,7 @@ def arm(name, x, y, yaw=0.0, **more):
 APART = (arm("west", -0.6, 0.0, home="retract"), arm("east", 0.6, 0.0, 180.0, home="retract"))
 TOGETHER = (arm("west", -0.45, 0.0), arm("east", 0.45, 0.0, 180.0), arm("north", 0.0, 0.45, 270.0))
 LIBRARY = [pytest.param(name, marks=pytest.mark.slow if name == "scale_64" else ()) for name in sorted(library())]
+BESIDE = {"left": (-0.9, 0.3, 0.25), "right": (0.9, 0.3, 0.25)}
 PLACES = {"middle": (0.0, 0.0, 0.25), "left": (-0.9, 0.3, 0.25), "moon": (9.0, 0.0, 0.2)}
 
 
@@ -408,10 +518,10 @@ def test_an_arm_alone_has_the_plans_it_has_in_the_fleet(cache):
 
 def test_a_work_that_comes_too_close_to_a_home_is_infeasible_and_says_so(cache):
     beside = arm("beside", 0.05, -0.5, 90.0)
-    places = {"middle": PLACES["middle"]}
+    places = {"middle": PLACES["middle"], "left": PLACES["left"]}
     fleet = prepare(cell(APART[0], beside, places=places), difficulty="blind", cache=cache)
-    (error,) = fleet.infeasible
-    assert (error.arm, error.place) == ("west", "middle")
+    (error,) = (each for each in fleet.infeasible if each.arm == "west")
+    assert error.place == "middle"
     assert "beside (" in error.reason
     assert error.reason.endswith(") at home")
     alone = prepare(cell(APART[0], places=places), difficulty="blind", cache=cache)
@@ -482,19 +592,31 @@ def test_stations_side_by_side_are_for_one_arm_at_a_time(cache):
     assert len(report.at_once) == 1
     (pair, *_) = [pair for pair in report.exclusions if not pair.same_place]
     assert (set(pair.jobs), pair.share) == ({"hold_middle", "hold_beside"}, 1.0)
-    apart = layout_report(cell(*APART, places={"left": (-0.9, 0.3, 0.25), "right": (0.9, 0.3, 0.25)}))
+    apart = layout_report(cell(*APART, places=BESIDE))
     assert (len(apart.at_once), apart.excluded_share, apart.exclusions) == (2, 0.0, ())
 
 
 def test_an_arm_that_never_settles_at_home_is_a_problem_of_the_cell(cache):
-    unventilated = cell(APART[0] | {"cooling_factor": 0.01}, APART[1], places={"left": (-0.9, 0.3, 0.25)})
+    unventilated = cell(APART[0] | {"cooling_factor": 0.01}, APART[1], places=BESIDE)
     (problem,) = layout_report(unventilated).problems
     assert problem.startswith("cell.toml: arms[0]: Arm 'west' has no steady state when idle at home")
     assert layout_report(replace(unventilated, start="cold")).problems == ()
 
 
+def test_an_arm_that_can_do_no_job_is_a_problem_with_its_reasons(cache):
+    alone = cell(*APART, places={"left": BESIDE["left"]})
+    problem = (
+        "cell.toml: arms[1]: 'east' can do no job (left: reach: 1.55 m from the base of the arm); move the arm or the "
+        "places, give it jobs, or leave it out."
+    )
+    assert layout_report(alone).problems == (problem,)
+    with pytest.raises(ScenarioError) as error:
+        prepare(alone, difficulty="blind", cache=cache)
+    assert str(error.value) == problem
+
+
 def test_a_shift_that_begins_below_the_lower_limit_is_a_problem_of_the_cell(cache):
-    cold = replace(cell(*APART, places={"left": (-0.9, 0.3, 0.25)}), ambient=Ambient(points=((0.0, -5.0),)))
+    cold = replace(cell(*APART, places=BESIDE), ambient=Ambient(points=((0.0, -5.0),)))
     first, second = layout_report(replace(cold, start="cold")).problems
     assert first.startswith("cell.toml: arms[0]: a motor of 'west' begins at -")
     assert "°C, below limits.lower_c (0 °C); give it warmer air, or begin with" in first

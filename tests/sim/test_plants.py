@@ -508,7 +508,7 @@ def test_a_scenario_chooses_its_plant(cell, tmp_path):
         name="two",
         description="",
         horizon_s=60.0,
-        arms=(ArmSpec(name="one"), ArmSpec(name="two", position_m=(2.0, 0.0, 0.0))),
+        arms=(ArmSpec(name="one"),),
         places=cell.places,
         jobs=(
             JobStream(

@@ -1,0 +1,427 @@
+"""Job tables: the jobs of a shift from a CSV, Parquet or XLSX file, one row a job.
+
+Columns are those of `fleet.bus.protocol.auction.JobSpec`. `places` has `from > to`, with `|` between alternatives;
+`after` has names, with `|` between them. Times are seconds or `h:mm[:ss]` from the begin of the shift, or dates. If the
+begin of the shift is known as a date, `h:mm` is a time of day, and a date without a zone has that of the begin.
+"""
+
+import csv
+import io
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime, time, timedelta
+from difflib import get_close_matches
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
+from math import inf, isfinite, nextafter
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+from fleet.bus.protocol.auction import JobSpec
+from fleet.errors import ScenarioError, check_names, nearest, printable
+from fleet.job import BOUNDS, DWELL_S, KINDS, check_alternatives, check_bounds, check_duration, check_dwell
+from scenarios.spec.units import question
+
+SUFFIXES = (".csv", ".tsv", ".parquet", ".xlsx")
+"""Of job tables; other files of jobs are JSON."""
+MOST_ROWS, MOST_BYTES = 10_000, 20_000_000
+MOST_NUMBERS = 5
+"""Row numbers in one sentence."""
+DAY_S = 86_400.0
+DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
+_CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
+_NOT_IN_NAMES = re.compile(r"[/\\\[\]]")
+"""Percent-encoded, as in keys of the bus."""
+_ARROW, _OR = re.compile(r"\s*(?:->|→|>|,|;)\s*"), re.compile(r"\s*[|;,]\s*")
+_FLAGS = {"yes": True, "true": True, "1": True, "hard": True, "no": False, "false": False, "0": False, "soft": False}
+Cell = Any
+"""A text, number, date, list or None, according to the file."""
+Rows = Iterator[tuple[int, Sequence[Cell]]]
+"""Cells of each row with its number in the file, from 1; first those of the head."""
+
+
+class Row(SimpleNamespace):
+    """Values of one row by field of `JobSpec`; the default where a cell is empty or wrong."""
+
+
+class _Dialect(NamedTuple):
+    begin: datetime | None
+    """Of the shift, with its zone; None for unknown."""
+    decimal_comma: bool
+    """Whether a comma in a number is the decimal point."""
+
+
+def _number(cell: Cell, dialect: _Dialect) -> float:
+    if isinstance(cell, str) and dialect.decimal_comma and "." not in cell:
+        cell = cell.replace(",", ".")
+    with suppress(TypeError, ValueError, OverflowError):
+        if not isinstance(cell, bool) and isfinite(number := float(cell)):
+            return number
+    raise ValueError(f"expected a number (got {_shown(cell)})")
+
+
+def _count(cell: Cell, dialect: _Dialect) -> int:
+    if (number := _number(cell, dialect)) != int(number):
+        raise ValueError(f"expected a whole number (got {_shown(cell)})")
+    return int(number)
+
+
+def _seconds(cell: Cell, dialect: _Dialect) -> float:
+    """Time from the begin of the shift, s."""
+    if isinstance(cell, timedelta):
+        return cell.total_seconds()
+    text, begin = _text(cell.isoformat() if isinstance(cell, time | datetime) else cell), dialect.begin
+    if clock := _CLOCK.fullmatch(text):
+        hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
+        given_s = 3600 * hours + 60 * minutes + seconds
+        if begin is None:
+            return given_s
+        if given_s >= DAY_S:
+            raise ValueError(f"with shift_begin, h:mm is a time of day, before 24:00 (got '{text}')")
+        return (given_s - (begin - begin.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()) % DAY_S
+    with suppress(ValueError):
+        return _number(cell, dialect)
+    try:
+        date = datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError(f"expected seconds, h:mm, h:mm:ss, or {DATE} (got {_shown(cell)})") from None
+    if begin is None:
+        raise ValueError(f"a date needs shift_begin, the begin of the shift (got {_shown(cell)})")
+    return ((date if date.tzinfo else date.replace(tzinfo=begin.tzinfo)) - begin).total_seconds()
+
+
+def _name(cell: Cell, _: object = None) -> str:
+    return _NOT_IN_NAMES.sub(lambda found: f"%{ord(found[0]):02X}", _text(cell))
+
+
+def _names(cell: Cell, _: object) -> tuple[str, ...]:
+    parts = cell if isinstance(cell, list) else _OR.split(_text(cell))
+    return tuple(_name(part) for part in parts if _text(part))
+
+
+def _kind(cell: Cell, _: object) -> str:
+    if (text := _text(cell)) not in KINDS:
+        raise ValueError(f"'{printable(text)}' is no kind of job{nearest(text, KINDS)}")
+    return text
+
+
+def _places(cell: Cell, _: object) -> tuple[tuple[str, ...], ...]:
+    """Places of each alternative."""
+    if isinstance(cell, list):
+        lists = cell if all(isinstance(each, list) for each in cell) else [cell]
+        return tuple(tuple(map(_text, each)) for each in lists)
+    return tuple(tuple(_ARROW.split(each.strip())) for each in _text(cell).split("|"))
+
+
+def _flag(cell: Cell, _: object) -> bool:
+    if (text := _text(cell).lower()) not in _FLAGS:
+        raise ValueError(f"expected yes or no (got {_shown(cell)})")
+    return _FLAGS[text]
+
+
+def _text(cell: Cell) -> str:
+    return f"{cell:.15g}" if isinstance(cell, float) else str(cell).strip()
+
+
+def _shown(cell: Cell) -> str:
+    return f"'{printable(str(cell), 60)}'"
+
+
+def _is_empty(cell: Cell) -> bool:
+    return cell is None or cell != cell or cell == [] or (isinstance(cell, str) and not cell.strip())  # also NaN
+
+
+_COLUMNS: Mapping[str, tuple[str, Callable[[Cell, _Dialect], object], object]] = {
+    "name": ("name", _name, ""),
+    "kind": ("kind", _kind, ""),
+    "places": ("every_places", _places, ()),
+    "payload": ("payload_kg", _number, 0.0),
+    "repetitions": ("repetitions", _count, 1),
+    "release": ("release_s", _seconds, 0.0),
+    "due": ("due_s", _seconds, None),
+    "hard": ("expires", _flag, False),
+    "value": ("value", _number, 1.0),
+    "after": ("after", _names, ()),
+    "dwell": ("dwell_s", _number, DWELL_S),
+    "force": ("force_n", _number, 0.0),
+}
+"""Field of a row, its conversion and its default, by column."""
+_NEEDED = ("name", "kind", "places")
+_COLUMN_OF = {field: column for column, (field, _, _) in _COLUMNS.items()}
+_SPELLINGS = {
+    **{column: (column, 1.0) for column in _COLUMNS},
+    **{"expires": ("hard", 1.0), "payload_kg": ("payload", 1.0), "payload_g": ("payload", 0.001)},
+    **{"force_n": ("force", 1.0), "dwell_s": ("dwell", 1.0)},
+    **{f"{each}_{unit}": (each, s) for each in ("release", "due") for unit, s in (("s", 1.0), ("min", 60.0))},
+}
+"""Column and factor of a heading in lower case, without spaces and brackets."""
+
+
+class _Faults(dict[tuple[str, str], list[int]]):
+    """Rows of each fault, by column and sentence."""
+
+    def add(self, row: int, column: str, sentence: str) -> None:
+        self.setdefault((column, sentence.rstrip(".")), []).append(row)
+
+    def raise_any(self, where: str) -> None:
+        """Raise a ScenarioError with all faults, if there are any."""
+        if not self:
+            return
+        total, lines = sum(map(len, self.values())), list[str]()
+        for (column, sentence), rows in self.items():
+            more = f" and {len(rows) - MOST_NUMBERS} more" if len(rows) > MOST_NUMBERS else ""
+            numbers = f"row{'s' * (len(rows) > 1)} {', '.join(map(str, rows[:MOST_NUMBERS]))}{more}"
+            lines.append(f"  {numbers}{f', column {column}' if column else ''}: {sentence}.")
+        raise ScenarioError("\n".join([f"{where} has {total} fault{'s' * (total > 1)}:", *lines]))
+
+
+def read_job_table(
+    path: Path, where: str = "", *, begin: datetime | None = None, places: Collection[str] | None = None
+) -> list[JobSpec]:
+    """The jobs of a table in the order of its rows; times count from the begin of the shift.
+
+    Args:
+        where: Name of the table in errors; by default the path.
+        begin: Of the shift, with its zone; needed for dates.
+        places: Places of the cell; `places` must name some of them, and `after` rows of the table. None: not checked.
+
+    Raises:
+        ScenarioError: the file cannot be read, or rows are wrong: all faults, each with its row and column.
+        MissingExtra: the library for an XLSX file is not installed.
+    """
+    where, faults, jobs = where or str(path), _Faults(), list[JobSpec]()
+    lines, decimal_comma = _rows(path, where)
+    number, head = next(lines, (1, ()))
+    columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma)
+    faults.raise_any(where)
+    no_place = cache(lambda name: f"no place '{printable(name)}'{nearest(name, places or ())}")
+    rows: dict[str, tuple[int, Row]] = {}
+    for count, (number, cells) in enumerate(lines):
+        if count == MOST_ROWS:
+            raise ScenarioError(f"{where} has too many rows; a job table has at most {MOST_ROWS}.")
+        if len(cells) > len(head) and not all(map(_is_empty, cells[len(head) :])):
+            faults.add(number, "", f"{len(cells)} cells, but the head has {len(head)}; quote cells with separators")
+            continue
+        row, wrong = _read_row(number, cells, columns, dialect, faults)
+        for field, sentence in _problems(row, wrong):
+            faults.add(number, _COLUMN_OF[field], sentence)
+            wrong.add(field)
+        for name in dict.fromkeys(row.places) if places is not None and "every_places" not in wrong else ():
+            if name not in places:
+                faults.add(number, "places", no_place(name))
+        if row.name and row.name in rows:
+            faults.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
+        elif not wrong:
+            fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
+            jobs.append(JobSpec(**{name: value for name, value in fields.items() if name != "every_places"}))
+        rows.setdefault(row.name, (number, row))
+    if places is not None:
+        _check_after(rows, faults)
+    faults.raise_any(where)
+    if not jobs:
+        raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
+    return jobs
+
+
+def _read_head(number: int, head: Sequence[Cell], faults: _Faults) -> dict[int, tuple[str, float]]:
+    """Column and factor of its unit by index; a heading that begins with # is left out."""
+    columns: dict[int, tuple[str, float]] = {}
+    for i, heading in enumerate(head):
+        text = "" if _is_empty(heading) else printable(str(heading).strip())
+        if not text or text.startswith("#"):
+            continue
+        key = re.sub(r"[^a-z]+", "_", text.lower()).strip("_")
+        column, factor = _SPELLINGS.get(key, ("", 1.0))
+        if not column:
+            close = get_close_matches(key, _SPELLINGS, n=1)
+            hint = f"; did you mean '{close[0]}'?" if close else "."
+            faults.add(number, text, f"unknown{hint} Allowed: {', '.join(_COLUMNS)}. Put # before it to ignore it")
+        elif column in (known for known, _ in columns.values()):
+            faults.add(number, text, f"there is another column '{column}'; keep one")
+        else:
+            columns[i] = column, factor
+    if missing := [name for name in _NEEDED if name not in {column for column, _ in columns.values()}]:
+        faults.add(number, "", f"no column {' and no column '.join(missing)}; every job needs {', '.join(_NEEDED)}")
+    return columns
+
+
+def _read_row(
+    number: int, cells: Sequence[Cell], columns: Mapping[int, tuple[str, float]], dialect: _Dialect, faults: _Faults
+) -> tuple[Row, set[str]]:
+    """Values of a row, and the fields whose cells cannot be read."""
+    row, wrong = Row(**{field: default for field, _, default in _COLUMNS.values()}), set[str]()
+    for i, (column, factor) in columns.items():
+        cell = cells[i] if i < len(cells) else None
+        field, convert, _ = _COLUMNS[column]
+        try:
+            if not _is_empty(cell):
+                value = convert(cell, dialect)
+                setattr(row, field, factor * value if factor != 1.0 and isinstance(value, float) else value)
+            elif column in _NEEDED:
+                raise ValueError("is empty; every job needs one")
+        except ValueError as error:
+            faults.add(number, column, str(error))
+            wrong.add(field)
+    row.places = tuple(name for names in row.every_places for name in names)
+    return row, wrong
+
+
+def _problems(row: Row, wrong: Collection[str]) -> Iterator[tuple[str, str]]:
+    """Field and sentence of each fault in the values of a row, at most one a field."""
+    checks: list[tuple[str, Callable[[], None]]] = [
+        *((field, lambda field=field: check_bounds(row, field)) for field in BOUNDS if hasattr(row, field)),
+        *((field, lambda field=field: check_names(row, field)) for field in ("name", "after")),
+        ("every_places", lambda: check_names(row, "places")),
+        ("every_places", lambda: check_alternatives(row, row.kind, row.every_places) if row.kind else None),
+        ("dwell_s", lambda: check_dwell(row, row.kind, row.dwell_s)),
+        ("repetitions", lambda: check_duration(row, row.dwell_s, row.repetitions)),
+        ("due_s", lambda: _check_due(row)),
+        ("force_n", lambda: _check_force(row)),
+    ]
+    bad = set(wrong)
+    for field, check in checks:
+        try:
+            if field not in bad:
+                check()
+        except ValueError as error:
+            bad.add(field)
+            asked = question(field, [row.payload_kg]) if field == "payload_kg" else ""
+            yield field, re.sub(r"^Row\.\w+ ", "", str(error)).rstrip(".") + (asked and f"; {asked}")
+
+
+def _check_due(row: Row) -> None:
+    if row.due_s is not None and row.due_s < row.release_s:
+        raise ValueError(f"must not be before the release at {row.release_s:.15g} s (got {row.due_s:.15g} s)")
+    if row.expires and row.due_s is None:
+        raise ValueError("a hard due date needs a time")
+
+
+def _check_force(row: Row) -> None:
+    if row.force_n and row.kind not in ("", "press"):
+        raise ValueError(f"only a press has a contact force (got {row.force_n:g} N for a {row.kind})")
+
+
+def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults) -> None:
+    for number, row in rows.values():
+        for name in row.after:
+            if name not in rows:
+                faults.add(number, "after", f"there is no job '{printable(name)}' in this table")
+    if cycle := cycle_of({name: row.after for name, (_, row) in rows.items()}):
+        faults.add(rows[cycle[0]][0], "after", f"jobs wait for each other in a cycle: {' → '.join(cycle)}")
+
+
+def cycle_of(after: Mapping[str, Sequence[str]]) -> list[str]:
+    """Names that wait for each other in a cycle; empty if there is none."""
+    try:
+        TopologicalSorter(after).prepare()
+    except CycleError as error:
+        return error.args[1][::-1]
+    return []
+
+
+def _rows(path: Path, where: str) -> tuple[Rows, bool]:
+    """Rows of a file that are not empty, and whether a comma in them may be a decimal point."""
+    try:
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise ScenarioError(f"{where} has {size} bytes; a job table has at most {MOST_BYTES}.")
+        match path.suffix.lower():
+            case ".parquet":
+                rows, decimal_comma = _parquet_rows(path, where), False
+            case ".xlsx":
+                rows, decimal_comma = _xlsx_rows(path, where), False
+            case _:
+                rows, decimal_comma = _csv_rows(path.read_bytes(), where)
+    except FileNotFoundError as error:
+        raise ScenarioError(f"{where}: there is no file '{path}'.") from error
+    except OSError as error:
+        raise ScenarioError(f"{where}: cannot read '{path}': {error.strerror}.") from error
+    return ((number, cells) for number, cells in rows if not all(map(_is_empty, cells))), decimal_comma
+
+
+def _csv_rows(content: bytes, where: str) -> tuple[Rows, bool]:
+    text, skipped, delimiter = decode_text(content, where), 0, ""
+    first, _, rest = text.partition("\n")
+    if declared := re.fullmatch(r"sep=(.)", first.strip('"\r')):  # written by Excel
+        text, skipped, delimiter = rest, 1, declared[1]
+    head = re.sub(r'"[^"]*"', "", text.partition("\n")[0])
+    delimiter = delimiter or max(",;\t|", key=head.count)
+
+    def rows() -> Rows:
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+        try:
+            yield from enumerate(reader, start=1 + skipped)
+        except csv.Error as error:
+            raise ScenarioError(f"{where}, line {reader.line_num}: not a line of CSV ({error}).") from error
+
+    return rows(), delimiter != ","
+
+
+def decode_text(content: bytes, where: str) -> str:
+    """The text of a file: UTF-16 with a byte order mark, UTF-8, or else Windows-1252, which old spreadsheets write.
+
+    Raises:
+        ScenarioError: it has another encoding.
+    """
+    is_utf16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
+    for encoding in ("utf-16",) if is_utf16 else () if b"\x00" in content else ("utf-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            return content.decode(encoding)
+    raise ScenarioError(f"{where} is not a UTF-8 text file. Save it as UTF-8.")
+
+
+def _parquet_rows(path: Path, where: str) -> Rows:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path)
+    except pa.ArrowInvalid as error:
+        raise ScenarioError(f"{where} is not a Parquet file ({str(error).splitlines()[0]}).") from error
+    yield 0, table.column_names
+    yield from enumerate(zip(*(column.to_pylist() for column in table.columns), strict=True), start=1)
+
+
+def _xlsx_rows(path: Path, where: str) -> Rows:
+    from scenarios.extras import require_extra
+
+    require_extra("xlsx")
+    openpyxl = import_module("openpyxl")
+    try:
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+    except Exception as error:  # also those of zipfile and of an XML parser
+        raise ScenarioError(f"{where} is not an XLSX file ({error}).") from error
+    yield from enumerate(book.active.iter_rows(values_only=True), start=1)
+
+
+def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:
+    """The job as fields of a `JobStream` with one arrival; without a due date it is due at the end of the shift."""
+    gap_s = max(0.0, (horizon_s if job.due_s is None else job.due_s) - job.release_s)
+    close = (gap_s, nextafter(gap_s, inf), nextafter(gap_s, 0.0))  # of which one gives exactly the due date
+    return {
+        **{name: getattr(job, name) for name in ("name", "kind", "dwell_s", "force_n", "value", "after")},
+        "places": job.every_places,
+        "arrivals": {"kind": "trace", "times_s": [job.release_s]},
+        "payload_kg": [job.payload_kg],
+        "repetitions": [job.repetitions, job.repetitions],
+        "due_s": next((each for each in close if job.release_s + each == job.due_s), gap_s),
+        "due": "hard" if job.expires else "soft",
+        "numbered": False,
+    }
+
+
+def shift_begin(given: object, where: str) -> datetime | None:
+    """The begin of a shift from an ISO date with a zone; None without one.
+
+    Raises:
+        ScenarioError: it is no such date.
+    """
+    begin = given
+    if isinstance(given, str) and given:
+        with suppress(ValueError):
+            begin = datetime.fromisoformat(given)
+    if begin in (None, "") or (isinstance(begin, datetime) and begin.tzinfo):
+        return begin or None
+    raise ScenarioError(f"{where} must be {DATE} (got {given}).")

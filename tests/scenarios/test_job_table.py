@@ -1,0 +1,309 @@
+"""A job table gives the jobs of its rows, in any common file format, or all its faults with row and column."""
+
+import csv
+import io
+import time
+from datetime import UTC, datetime, timedelta, timezone
+from datetime import time as clock
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.errors import FleetError, ScenarioError
+from fleet.job import Job
+from fleet.seeding import shift_seeds
+from scenarios.extras import MissingExtra
+from scenarios.live.auctioneer import job_spec
+from scenarios.live.requests import read_jobs
+from scenarios.prepare.fleet import prepare
+from scenarios.run.shift import run
+from scenarios.spec.job_table import read_job_table
+from scenarios.spec.jobs import draw_jobs
+from scenarios.spec.load import library, load
+from scenarios.spec.schema import Scenario
+from tests.scenarios.conftest import SMALL
+
+SHORT = "name,kind,places,payload,repetitions,release,due,hard,value,after"
+HEAD = (*SHORT.split(","), "dwell", "force")
+ROWS = ["load 1,sort,shelf > bench,0.2,3,0,60,yes,2,", "hold 1,hold,bench | shelf,2,1,0:01,,,,load 1"]
+
+
+def cells_of(job: Job) -> tuple[str, ...]:
+    """The row of a job, as a person would write it."""
+    works = " | ".join(" > ".join(place.name for place in work.places) for work in job.works)
+    work, hard = job.work, "yes" if job.expires else "no"
+    numbers = (work.payload_kg, job.repetitions, job.release_s, job.due_s)
+    rest = (hard, repr(job.value), " | ".join(job.after), repr(work.dwell_s), repr(work.force_n))
+    return (job.name, work.kind, works, *map(repr, numbers), *rest)
+
+
+def write(path: Path, rows: list[tuple[str, ...]], delimiter: str = ",", encoding: str = "utf-8") -> None:
+    if delimiter != ",":
+        rows = [tuple(cell.replace(".", ",") if cell[:1].isdigit() else cell for cell in row) for row in rows]
+    text = io.StringIO()
+    csv.writer(text, delimiter=delimiter).writerows([HEAD, *rows])
+    path.write_bytes(text.getvalue().encode(encoding))
+
+
+def with_table(path: Path, scenario: str, table: str, more: str = "") -> Scenario:
+    """The scenario of a text, with a table instead of its streams."""
+    streams = scenario.split("[[jobs]]")
+    tail = "\n[planning]" + scenario.split("[planning]")[1] if "[planning]" in scenario else ""
+    path.write_text(f'{more}\n{streams[0]}\n[[jobs]]\ntable = "{table}"\n{tail}', encoding="utf-8")
+    return load(path)
+
+
+def small_table(folder: Path, text: str, more: str = "") -> Scenario:
+    (folder / "jobs.csv").write_text(text, encoding="utf-8")
+    return with_table(folder / "cell.toml", SMALL, "jobs.csv", more)
+
+
+def drawn(scenario: Scenario, seed: int) -> tuple[Job, ...]:
+    return draw_jobs(scenario, np.random.SeedSequence(seed))
+
+
+def faults_of(folder: Path, text: str, more: str = "") -> str:
+    with pytest.raises(ScenarioError) as error:
+        small_table(folder, text, more)
+    return str(error.value)
+
+
+FORMATS = [(",", "utf-8"), (";", "utf-8-sig"), ("\t", "utf-16"), ("|", "utf-16"), (";", "cp1252")]
+
+
+@given(seed=st.integers(0, 2**32), name=st.sampled_from(["quickstart", "assembly"]), form=st.sampled_from(FORMATS))
+def test_a_table_written_from_the_jobs_of_streams_gives_the_same_jobs(tmp_path_factory, seed, name, form):
+    folder = tmp_path_factory.mktemp("table")
+    jobs = drawn(load(name), seed)
+    if form[0] == "|" and any("|" in cell for job in jobs for cell in cells_of(job)):
+        form = FORMATS[0]
+    write(folder / "jobs.csv", [cells_of(job) for job in jobs], *form)
+    text = library()[name].read_text(encoding="utf-8")
+    assert drawn(with_table(folder / "cell.toml", text, "jobs.csv"), seed + 1) == jobs
+
+
+def test_a_table_gives_the_shift_of_the_streams_that_it_was_written_from(tmp_path, small_toml, plans):
+    streams = load(small_toml)
+    jobs = draw_jobs(streams, shift_seeds(np.random.SeedSequence(3))[0])
+    write(tmp_path / "jobs.csv", [cells_of(job) for job in jobs])
+    logs = []
+    for scenario in (streams, with_table(tmp_path / "cell.toml", SMALL, "jobs.csv")):
+        fleet = prepare(scenario, difficulty="blind", cache=plans)
+        logs.append(run(fleet, policy="edd", difficulty="blind", seed=3))
+    assert len(logs[0].jobs) == len(jobs) > 3
+    assert logs[0].jobs == logs[1].jobs
+    assert repr(logs[0].events) == repr(logs[1].events)
+    np.testing.assert_array_equal(logs[0].readings.temp_c, logs[1].readings.temp_c)
+
+
+BEGIN = datetime(2026, 11, 23, 6, 0, tzinfo=timezone(timedelta(hours=1)))
+
+
+@given(seconds=st.integers(0, 86_399), hours=st.integers(-12, 12))
+def test_seconds_clock_times_and_dates_in_any_zone_name_one_moment(tmp_path_factory, seconds, hours):
+    folder = tmp_path_factory.mktemp("times")
+    moment = BEGIN + timedelta(seconds=seconds)
+    forms = [
+        str(seconds),
+        moment.strftime("%H:%M:%S"),
+        moment.replace(tzinfo=None).isoformat(),
+        moment.astimezone(timezone(timedelta(hours=hours))).isoformat(),
+        moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+    ]
+    rows = [f"job {i},hold,here,,,{form},,,," for i, form in enumerate(forms)]
+    (folder / "jobs.csv").write_text("\n".join([SHORT, *rows]), encoding="utf-8")
+    assert {job.release_s for job in read_job_table(folder / "jobs.csv", begin=BEGIN)} == {float(seconds)}
+
+
+def test_without_a_date_of_the_begin_clock_times_count_from_it(tmp_path):
+    text = f"{SHORT}\na,hold,bench,,,0:02,,,,\nb,hold,bench,,,0:01:30.5,,,,\n"
+    assert [job.release_s for job in drawn(small_table(tmp_path, text), 0)] == [90.5, 120.0]
+
+
+def test_the_begin_of_the_shift_is_a_date_of_toml_or_a_text(tmp_path):
+    text = f"{SHORT}\na,hold,bench,,,2026-11-23T05:01Z,,,,\n"
+    for begin in ("2026-11-23T06:00:00+01:00", '"2026-11-23T06:00+01:00"'):
+        assert drawn(small_table(tmp_path, text, f"shift_begin = {begin}"), 0)[0].release_s == 60.0
+    for begin in ("2026-11-23T06:00:00", '"Monday"', "6"):
+        told = faults_of(tmp_path, text, f"shift_begin = {begin}")
+        assert "cell.toml: shift_begin must be a date with time and zone, as 2026-11-23T06:00+01:00 (got" in told
+
+
+def test_a_row_without_due_date_is_due_at_the_end_of_the_shift_and_defaults_are_those_of_a_job(tmp_path):
+    (job,) = drawn(small_table(tmp_path, "name,kind,places\na,hold,bench\n"), 0)
+    assert (job.due_s, job.value, job.repetitions, job.release_s, job.expires) == (180.0, 1.0, 1, 0.0, False)
+
+
+def test_names_keep_spaces_and_have_slashes_percent_encoded_as_on_keys(tmp_path):
+    first, second = drawn(small_table(tmp_path, f"{SHORT}\nA 1/2,hold,bench,,,,,,,\nb,hold,shelf,,,,,,,A 1/2\n"), 0)
+    assert (first.name, second.after) == ("A 1%2F2", ("A 1%2F2",))
+
+
+def test_names_may_continue_those_of_other_rows(tmp_path):
+    jobs = drawn(small_table(tmp_path, "name,kind,places\n4711,hold,bench\n4711-100,hold,bench\n"), 0)
+    assert [job.name for job in jobs] == ["4711", "4711-100"]
+
+
+@pytest.mark.parametrize("line", ["horizon_s = 1_0E999", "horizon_s = nan", 'horizon_s = "x"', "places = 3"])
+def test_a_wrong_scenario_around_a_table_is_told(tmp_path, line):
+    text = (
+        SMALL.replace("horizon_s = 180", line) if "horizon" in line else f"{line}\n{SMALL.replace('places]]', 'x]]')}"
+    )
+    (tmp_path / "jobs.csv").write_text("name,kind,places\na,hold,bench\n", encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"^cell\.toml: "):
+        with_table(tmp_path / "cell.toml", text, "jobs.csv")
+
+
+def test_rows_may_wait_for_rows_below_them(tmp_path):
+    jobs = drawn(small_table(tmp_path, f"{SHORT}\na,hold,bench,,,0,,,,b\nb,hold,shelf,,,5,,,,\n"), 0)
+    assert [(job.name, job.after) for job in jobs] == [("a", ("b",)), ("b", ())]
+
+
+def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path):
+    csv_file = tmp_path / "jobs.csv"
+    csv_file.write_text("\n".join([SHORT, *ROWS]), encoding="utf-8")
+    jobs = read_job_table(csv_file)
+    columns = {
+        "name": ["load 1", "hold 1"], "kind": ["sort", "hold"],
+        "places": [[["shelf", "bench"]], [["bench"], ["shelf"]]],
+        "payload": [0.2, 2.0], "repetitions": [3, 1], "release_min": [0.0, 1.0], "due_s": [60, None],
+        "hard": [True, None], "value": [2.0, None], "after": [[], ["load 1"]], "# customer": ["x", "y"],
+    }  # fmt: skip
+    pq.write_table(pa.table(columns), tmp_path / "jobs.parquet")
+    assert read_job_table(tmp_path / "jobs.parquet") == jobs
+    try:
+        from openpyxl import Workbook
+    except ModuleNotFoundError:
+        (tmp_path / "jobs.xlsx").touch()
+        with pytest.raises(MissingExtra, match=r"'openpyxl', which is not installed: .*\[xlsx\]"):
+            read_job_table(tmp_path / "jobs.xlsx")
+        return
+    book = Workbook()
+    for row in csv.reader([SHORT, *ROWS]):
+        book.active.append([time_of(cell) if ":" in cell else cell for cell in row])
+    book.save(tmp_path / "jobs.xlsx")
+    assert read_job_table(tmp_path / "jobs.xlsx") == jobs
+
+
+def time_of(cell: str) -> clock:
+    return clock.fromisoformat(cell.zfill(5))
+
+
+def test_a_submitted_table_gives_the_jobs_of_the_scenario(tmp_path):
+    scenario = small_table(
+        tmp_path, "\n".join([SHORT, "a,sort,shelf > bench,0.2,3,0:01,90,yes,2,", "b,hold,bench,2,,,99,,,a"])
+    )
+    jobs = {job.name: job for job in read_jobs(str(tmp_path / "jobs.csv"))}
+    assert jobs == {job.name: job_spec(job) for job in drawn(scenario, 0)}
+    with pytest.raises(FleetError, match=r"--shift-begin is for a job table, a file that ends in \.csv, .*got x\.json"):
+        read_jobs("x.json", "2026-11-23T06:00Z")
+
+
+GOOD = "good,hold,bench,2,1,0,60,no,1,"
+FAULTS = {
+    "x,hold,bnch,,,,,,,": "column places: no place 'bnch'; did you mean 'bench'? Allowed: bench, shelf.",
+    "x,hld,bench,,,,,,,": "column kind: 'hld' is no kind of job; did you mean 'hold'? Allowed: hold, pick_place, ",
+    "x,hold,bench > shelf,,,,,,,": "column places: must be one place for a hold (got bench, shelf).",
+    "x,sort,bench,,,,,,,": "column places: must be two different places, from and to, for a sort (got bench).",
+    "x,hold,,,,,,,,": "column places: is empty; every job needs one.",
+    ",hold,bench,,,,,,,": "column name: is empty; every job needs one.",
+    "good,hold,bench,,,,,,,": "column name: 'good' is the name of row 2, too; names are unique.",
+    "x,hold,bench,500,,,,,,": "column payload: must be between 0 and 10 kg (got 500.0); is this grams? 500 g is",
+    "x,hold,bench,heavy,,,,,,": "column payload: expected a number (got 'heavy').",
+    "x,hold,bench,nan,,,,,,": "column payload: expected a number (got 'nan').",
+    "x,hold,bench,,2.5,,,,,": "column repetitions: expected a whole number (got '2.5').",
+    "x,hold,bench,,0,,,,,": "column repetitions: must be between 1 and 100000 (got 0).",
+    "x,hold,bench,,,-1,,,,": "column release: must be between 0 and 1000000000 s (got -1.0).",
+    "x,hold,bench,,,soon,,,,": "column release: expected seconds, h:mm, h:mm:ss, or a date with time and zone, as 2026",
+    "x,hold,bench,,,6:75,,,,": "column release: expected seconds, h:mm, h:mm:ss, or a date with time and",
+    "x,hold,bench,,,2026-11-23,,,,": "column release: a date needs shift_begin, the begin of the shift (got '",
+    "x,hold,bench,,,60,30,,,": "column due: must not be before the release at 60 s (got 30 s).",
+    "x,hold,bench,,,,,yes,,": "column due: a hard due date needs a time.",
+    "x,hold,bench,,,,,maybe,,": "column hard: expected yes or no (got 'maybe').",
+    "x,hold,bench,,,,,,-1,": "column value: must be between 0 and 1000000 (got -1.0).",
+    "x,hold,bench,,,,,,,y": "column after: there is no job 'y' in this table.",
+    "x,hold,bench,,,,,,,x": "column after: jobs wait for each other in a cycle: x → x.",
+    "x,hold,bench,,,,,,,,,9": ": 12 cells, but the head has 10; quote cells with separators.",
+}
+
+
+@pytest.mark.parametrize(("row", "sentence"), FAULTS.items(), ids=FAULTS)
+def test_a_fault_is_told_with_row_column_value_and_what_is_allowed(tmp_path, row, sentence):
+    told = faults_of(tmp_path, "\n".join([SHORT, GOOD, row]))
+    assert told.startswith("cell.toml: jobs[0].table: 'jobs.csv' has 1 fault:\n  row 3")
+    assert sentence in told
+
+
+def test_all_faults_are_told_at_once_and_equal_ones_together(tmp_path):
+    planted = [row for row in FAULTS if row[0] == "x" and row[-1] not in "xy"]
+    rows = [row.replace("x", f"x{i}", 1) for i, row in enumerate(planted)]
+    told = faults_of(tmp_path, "\n".join([SHORT, GOOD, *rows, "z,hold,bnch,,,,,,,"]))
+    assert f"has {len(rows) + 1} faults:" in told
+    assert "rows 3, " in told
+    for i, row in enumerate(planted):
+        assert FAULTS[row] in told, row
+        assert f"row {i + 3}" in told or not i
+
+
+HEADS = {
+    "name,kind,places,paylod": "column paylod: unknown; did you mean 'payload'? Allowed: name, kind, places",
+    "name,kind": "row 1: no column places; every job needs name, kind, places.",
+    "name,kind,places,due,due_s": "column due_s: there is another column 'due'; keep one.",
+    "": "has 1 fault:\n  row 1: no column name and no column kind and no column places",
+    "name,kind,places": "'jobs.csv' has no jobs; give a row of headings, then one row for each job.",
+}
+
+
+@pytest.mark.parametrize(("head", "sentence"), HEADS.items(), ids=HEADS)
+def test_a_wrong_head_is_told(tmp_path, head, sentence):
+    assert sentence in faults_of(tmp_path, head + "\n")
+
+
+def test_a_file_that_is_no_table_is_told(tmp_path):
+    for name, content, sentence in (
+        ("jobs.parquet", b"PAR1", "'jobs.parquet' is not a Parquet file ("),
+        ("jobs.csv", b"\x00\x01", "'jobs.csv' is not a UTF-8 text file. Save it as UTF-8."),
+        ("none.csv", None, "'none.csv': there is no file '"),
+    ):
+        if content:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(ScenarioError) as error:
+            with_table(tmp_path / "cell.toml", SMALL, name)
+        assert sentence in str(error.value)
+    with pytest.raises(ScenarioError, match=r'jobs\[0\]: a job table is table = "FILE", without other keys'):
+        with_table(tmp_path / "cell.toml", SMALL, 'x"\nname = "y')
+
+
+def test_excel_may_name_its_separator_in_the_first_row(tmp_path):
+    text = "sep=;\nName;Kind;Places;Payload (kg);Release [min]\nä;hold;bench;1,5;0,5\n"
+    (tmp_path / "jobs.csv").write_bytes(text.encode("cp1252"))
+    (job,) = read_job_table(tmp_path / "jobs.csv")
+    assert (job.name, job.payload_kg, job.release_s) == ("ä", 1.5, 30.0)
+
+
+def test_a_thousand_rows_are_read_and_all_their_faults_told_within_a_second(tmp_path):
+    kinds = [f"j{i},hld,bnch{i},{20 + i},0.5,soon,-1,maybe,-2,k{i}" for i in range(1000)]
+    begin_s = time.perf_counter()
+    told = faults_of(tmp_path, "\n".join([SHORT, *kinds]))
+    assert time.perf_counter() - begin_s < 1.0
+    assert f"has {9 * 1000} faults" in told
+    rows = [f"j{i},hold,bench | shelf,2,1,{i % 180},{i + 1000},yes,1,{f'j{i - 1}' * (i > 0)}" for i in range(1000)]
+    begin_s = time.perf_counter()
+    assert len(small_table(tmp_path, "\n".join([SHORT, *rows])).jobs) == 1000
+    assert time.perf_counter() - begin_s < 1.0
+
+
+def test_rows_outside_the_shift_are_counted_and_a_name_of_a_streams_job_is_refused(tmp_path, caplog):
+    rows = [f"j{i},hold,bench,,,{i * 60},,,," for i in range(5)]
+    small_table(tmp_path, "\n".join([SHORT, *rows]))
+    assert "'jobs.csv': 2 of 5 times are outside the shift, which ends at horizon_s = 180" in caplog.text
+    assert "gives no job: its only time is outside" in faults_of(tmp_path, f"{SHORT}\na,hold,bench,,,180,,,,\n")
+    (tmp_path / "jobs.csv").write_text(f"{SHORT}\nsort-001,hold,bench,,,,,,,\n", encoding="utf-8")
+    (tmp_path / "both.toml").write_text(f'{SMALL}\n[[jobs]]\ntable = "jobs.csv"\n', encoding="utf-8")
+    with pytest.raises(ScenarioError, match="'sort-001' is also a job of the stream 'sort'; rename one of them"):
+        load(tmp_path / "both.toml")
