@@ -339,6 +339,11 @@ def knowledge(folder: Path) -> str:
         f"{len(values.instances)} instances in {len(set(values.cells))} cells; heat binds in {int(hot.sum())}, "
         f"{int(surprised.sum())} of them with a surprise."
     )
+    own, alone = values.only(hot), "trained-alone"
+    others = {"torque-alone": "squared torque", "untrained-alone": "errors of the untrained twin"}
+    gains = [f"less {what} {shown(own.difference(alone, name))}" for name, what in others.items() if name in found]
+    if alone in found and gains:
+        count += f" There, without thermometers, errors of the twin {' and '.join(gains)}."
     return table((*heads, "share, surprise", "faults"), rows) + f"\n\n{count}"
 
 
