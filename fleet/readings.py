@@ -42,11 +42,11 @@ LEAST_MOTION_RAD, LEAST_TORQUE_NM = 0.5, 3.0
 """Motion and RMS torque of a joint from which readings are compared."""
 AGREES = 4.0
 """Factor between velocity and change of position that sampling explains; the public logs have 0.86 to 1.12."""
-AMP_PER_NM = (0.02, 0.5)
+AMP_PER_NM = (0.01, 0.5)
 """Range of motor current over torque, A/(N·m); the public logs have 0.04 to 0.17."""
 UPRIGHT_NM = 11.0
 """Most torque that gravity causes while all angles are within 2π degrees of zero, with 4.5 kg, N·m."""
-MISFIT = 0.3
+MISFIT = 0.2
 """Share of the squared torque that gravity leaves unexplained in a wrong log; at most 0.10 in the public logs."""
 BETTER = 4.0
 """Factor by which another reading of the log must reduce that share before it is named."""
@@ -135,10 +135,10 @@ def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measur
     ]
 
 
-def runs(mask: Array) -> Iterator[tuple[int, int]]:
-    """First index and end of every run of true values, [n]."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+def runs(mask: Array, least: int = 1) -> list[tuple[int, int]]:
+    """First index and end of every run of at least `least` true values, [n]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))).reshape(-1, 2)
+    return [(a, b) for a, b in edges[edges[:, 1] - edges[:, 0] >= least].tolist()]
 
 
 def repeats(time_s: Array, readings: Mapping[str, Array], least_s: float) -> list[tuple[int, int]]:
@@ -245,12 +245,12 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
             continue
         changes = np.diff(readings[channel], axis=0) != 0
         for j in range(JOINTS):
-            for a, b in runs(~changes[:, j]):
+            for a, b in runs(~changes[:, j], min(STUCK_ROWS, len(changes))):
                 value, span_s = readings[channel][a, j] + 0.0, time_s[b] - time_s[a]
                 never = b - a == len(changes) and value == 0.0 and channel == "temp_c"
                 alive = np.delete(changes[a:b], j, axis=1).mean() >= 0.5
                 alive |= channel != "temp_c" and moved[a:b].sum() > LEAST_MOTION_RAD
-                if not never and not (alive and span_s >= STUCK_S and b - a >= STUCK_ROWS):
+                if not never and not (alive and span_s >= STUCK_S):
                     continue
                 what = f"{_NAMES[channel]} of joint {j + 1} is {value:.5g} for {span_s:.4g} s"
                 remedy = "Is its sensor dead? Leave out what was not measured."
@@ -293,11 +293,10 @@ def _motion(time_s: Array, readings: Mapping[str, Array], degrees: bool) -> Iter
     usual = np.abs(moved) < 1.0  # rad: beyond, sampling may hide turns
     for j in range(JOINTS):
         by_angle, by_speed = moved[usual[:, j], j], expected[usual[:, j], j]
-        paths = np.abs(by_angle).sum(), np.abs(by_speed).sum()
-        if max(paths) < LEAST_MOTION_RAD:
+        if not len(by_angle) or max(np.ptp(np.cumsum(way)) for way in (by_angle, by_speed)) < LEAST_MOTION_RAD:
             continue
-        if 0.0 in paths:
-            still, other = ("angle", "velocity") if paths[0] == 0.0 else ("velocity", "angle")
+        if not (by_angle.any() and by_speed.any()):
+            still, other = ("velocity", "angle") if by_angle.any() else ("angle", "velocity")
             yield BadReading(f"{still} of joint {j + 1} never changes, but its {other} does", "Is the channel dead?")
             continue
         product = float((by_angle * by_speed).sum())
@@ -342,12 +341,10 @@ def _currents(readings: Mapping[str, Array]) -> Iterator[BadReading]:
 
 def _upright(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadReading]:
     """Angles within ±2π that would be those of an upright arm, with torques that it does not need."""
-    q, tau_nm = readings["q"], readings["tau"]
-    turn = np.deg2rad(2 * np.pi)
-    if degrees and len(q) and np.abs(q).max() <= turn and np.median(np.abs(tau_nm).max(axis=1)) > UPRIGHT_NM:
-        most_deg = np.rad2deg(np.abs(q).max())
-        what = f"all angles are within ±{most_deg:.3g}°, where an arm stands upright, but its torques are not small"
-        yield BadReading(what, "Are these radians? Give degrees.")
+    raw, tau_nm = np.abs(np.rad2deg(readings["q"])).max(), np.abs(readings["tau"]).max(axis=1)
+    if degrees and 1.0 < raw < 2 * np.pi and np.median(tau_nm) > UPRIGHT_NM:
+        what = f"all angles are within ±{raw:.3g}°, where an arm stands upright, but its torques are not small"
+        yield BadReading(what, "Are these radians? Give degrees, or write a plain log in rad.")
 
 
 @cache
