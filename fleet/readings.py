@@ -80,10 +80,63 @@ def most_temp_change_k(dt_s: Array | float) -> Array:
     Args:
         dt_s: s, [...].
     """
+    return TEMP_STEP_K + 2.0 * _warming_k_per_s() * np.asarray(dt_s)[..., None]
+
+
+@cache
+def _warming_k_per_s() -> Array:
     motors, limit_c = gen3_motors(), ThermalLimits().error_c
     hot = 1.0 + motors.alpha_cu_per_k * (limit_c - motors.reference_c)
-    rate = motors.copper_w_per_a2 * hot * motors.current_max_a**2 / np.array(thermal_data()["winding_j_per_k"])
-    return TEMP_STEP_K + 2.0 * rate * np.asarray(dt_s)[..., None]
+    return motors.copper_w_per_a2 * hot * motors.current_max_a**2 / np.array(thermal_data()["winding_j_per_k"])
+
+
+class TemperatureFilter:
+    """Last possible motor temperatures of a live arm; other readings are of a bad sensor.
+
+    A reading is impossible outside `TEMP_RANGE_C`, at exactly 0.0 as the first one, where no motor is below `COOL_C`,
+    or after a change that no motor can make; and until it changes like that again.
+
+    Attributes:
+        temp_c: Last possible temperature by joint, °C.
+        bad: Sentence on the impossible readings of a joint, by joint.
+    """
+
+    def __init__(self) -> None:
+        self.temp_c: dict[int, float] = {}
+        self.bad: dict[int, str] = {}
+        self._good_s: dict[int, float] = {}
+        self._last: dict[int, tuple[float, float]] = {}
+
+    def update(self, time_s: float, temp_c: Mapping[int, float]) -> None:
+        """Apply temperatures by joint, °C; a time that goes back is of an arm that started again."""
+        if time_s < max((at_s for at_s, _ in self._last.values()), default=time_s):
+            TemperatureFilter.__init__(self)
+        unit = min(temp_c.values(), default=0.0) > COOL_C and len(temp_c) > 1
+        for joint, now_c in temp_c.items():
+            self._judge(joint, time_s, now_c, unit)
+
+    def doubt_k(self, time_s: float) -> float:
+        """Largest change that a motor with a bad sensor can have made since its last possible reading, K; else 0."""
+        return max((_change_k(time_s - self._good_s[j]) for j in self.bad if j in self._good_s), default=0.0)
+
+    def _judge(self, joint: int, time_s: float, now_c: float, unit: bool) -> None:
+        good_c, good_s = self.temp_c.get(joint), self._good_s.get(joint, time_s)
+        last_s, last_c = self._last.get(joint, (time_s, now_c))
+        self._last[joint] = time_s, now_c
+        jump = "" if good_c is None else f", after {good_c:.1f} °C {time_s - good_s:.1f} s before"
+        possible = not unit and TEMP_RANGE_C[0] <= now_c <= TEMP_RANGE_C[1]
+        possible &= now_c != 0.0 if good_c is None else abs(now_c - good_c) <= _change_k(time_s - good_s)
+        if joint in self.bad and good_c is not None:
+            possible &= abs(now_c - last_c) > _change_k(time_s - last_s)
+        if possible:
+            self.temp_c[joint], self._good_s[joint] = now_c, time_s
+            self.bad.pop(joint, None)
+        else:
+            self.bad[joint] = f"joint {joint + 1} reads {now_c:.1f} °C{jump}; its sensor is bad, or this is not in °C"
+
+
+def _change_k(dt_s: float) -> float:
+    return float(most_temp_change_k(max(dt_s, 0.0)).max())
 
 
 def judge_time(time_s: Array) -> list[BadReading]:
