@@ -153,6 +153,7 @@ def judge_time(time_s: Array) -> list[BadReading]:
     return [BadReading(what, f"{guess}Give seconds, with at most {MOST_STEP_S:g} s between samples.")]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of numbers that only a damaged file has
 def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measured: bool = True) -> list[BadReading]:
     """Readings that no Gen3 can have.
 
@@ -160,12 +161,15 @@ def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measur
         time_s: Strictly increasing, [row].
         readings: `q` rad, `qd` rad/s, `tau` N·m; `current_a` A and `temp_c` °C if there are any, [row, joint].
         degrees: Whether the source has degrees, for the guess at what was meant.
-        measured: Whether sensors made them; readings of a simulation may repeat and have no noise.
+        measured: Whether sensors made them; those of a simulation may repeat, and only their ranges are judged.
     """
-    bad = list(_out_of_range(readings, degrees)) if len(time_s) else []
-    if not measured or len(time_s) < 2:
+    if not len(time_s):
+        return []
+    bad = list(_out_of_range(readings, degrees))
+    if not measured:
         return bad
-    bad += judge_time(time_s)
+    unit = _wrong_unit(readings["temp_c"]) if "temp_c" in readings else ()
+    bad = [*judge_time(time_s), *unit, *bad]
     if any(found.whole for found in bad):
         return bad
     bad += _stuck(time_s, readings)
@@ -252,14 +256,16 @@ def _out_of_range(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadR
             yield from _limited(readings[channel], limit, readings[channel], unit, what, guess)
     if "temp_c" in readings:
         temp_c = readings["temp_c"]
-        usual_c = np.median(temp_c, axis=0)
-        if usual_c.min() > COOL_C or usual_c.max() > HOT_C:
-            joint = int(usual_c.argmax())
-            what = f"temperature of joint {joint + 1} is {usual_c[joint]:.5g} °C at half of the time, as no Gen3 has"
-            yield BadReading(what, _unit_of(usual_c[usual_c > COOL_C]), np.arange(len(temp_c)), most=True)
-        else:
-            middle_c, half_k = np.mean(TEMP_RANGE_C), np.ptp(TEMP_RANGE_C) / 2
-            yield from _limited(temp_c - middle_c, half_k, temp_c, "", "not a motor temperature in °C", "")
+        middle_c, half_k = np.mean(TEMP_RANGE_C), np.ptp(TEMP_RANGE_C) / 2
+        yield from _limited(temp_c - middle_c, half_k, temp_c, "", "not a motor temperature in °C", "")
+
+
+def _wrong_unit(temp_c: Array) -> Iterator[BadReading]:
+    usual_c = np.median(temp_c, axis=0)
+    if usual_c.min() > COOL_C or usual_c.max() > HOT_C:
+        joint = int(usual_c.argmax())
+        what = f"temperature of joint {joint + 1} is {usual_c[joint]:.5g} °C at half of the time, as no Gen3 has"
+        yield BadReading(what, _unit_of(usual_c[usual_c > COOL_C]))
 
 
 _NAMES = {"q": "angle", "qd": "velocity", "tau": "torque", "current_a": "current", "temp_c": "temperature"}
@@ -291,7 +297,11 @@ def _unit_of(temp_c: Array) -> str:
 
 
 def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]:
-    """Sensors that repeat one reading while those of the other joints change, or while the arm moves."""
+    """Sensors that repeat one reading while those of the other joints change, or while the arm moves.
+
+    The temperatures of all joints may repeat for some minutes, as sensors with whole degrees do.
+    """
+    works = (np.diff(readings["tau"], axis=0) != 0).any(axis=1)
     moved = np.abs(_steps(readings["q"])).sum(axis=1)
     for channel in ("tau", "current_a", "temp_c"):
         if channel not in readings:
@@ -302,7 +312,10 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                 value, span_s = readings[channel][a, j] + 0.0, time_s[b] - time_s[a]
                 never = b - a == len(changes) and value == 0.0 and channel == "temp_c"
                 alive = np.delete(changes[a:b], j, axis=1).mean() >= 0.5
-                alive |= channel != "temp_c" and moved[a:b].sum() > LEAST_MOTION_RAD
+                if channel != "temp_c":
+                    alive |= moved[a:b].sum() > LEAST_MOTION_RAD
+                elif span_s >= 5 * STUCK_S:
+                    alive |= value % 1 != 0 and not changes[a:b].any() and works[a:b].mean() >= 0.5
                 if not never and not (alive and span_s >= STUCK_S):
                     continue
                 what = f"{_NAMES[channel]} of joint {j + 1} is {value:.5g} for {span_s:.4g} s"

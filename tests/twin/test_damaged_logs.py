@@ -135,6 +135,11 @@ def header(*names: str) -> Callable[[], str]:
     return lambda: ",".join(names) + "\n" + "\n".join(["1," * (len(names) - 1) + "1"] * 30) + "\n"
 
 
+def stood(log: Log) -> str:
+    log.groups["Temp"][:] = log.groups["Temp"][50]
+    return log.text()
+
+
 SWAP = [0, 3, 2, 1, 4, 5, 6]
 TURN = 180 / np.pi
 WHOLE = {
@@ -174,6 +179,18 @@ WHOLE = {
     ),
     "torque that dies midway": (changed("Torque", held, 2), "torque of joint 3 is .* sensor dead"),
     "sensor that dies midway": (changed("Temp", held, 1), "temperature of joint 2 is .* sensor dead"),
+    "all temperatures stand": (
+        lambda: stood(sound(rows=800)),
+        "temperature of joint 1 is 3.* sensor dead",
+    ),
+    "newest line first": (
+        lambda: "\n".join([",".join(NAMES), *sound().text().splitlines()[:0:-1], ""]),
+        "newest line the first. Sort",
+    ),
+    "tabs and decimal commas": (
+        lambda: sound().text().replace(",", "\t").replace(".", ","),
+        "no good line of numbers.*decimal comma",
+    ),
     "no temperatures": (changed("Temp", np.zeros_like), "temperature of joint 1 is 0 for 14"),
     "degrees as rad": (plainly(scaled("Pos", TURN)), "Are these degrees"),
     "°/s as rad/s": (plainly(scaled("Velocity", TURN)), "Are (these|the velocities in) °/s"),
@@ -288,6 +305,7 @@ HARMLESS: dict[str, Callable[[str], bytes]] = {
         f"{n - 1 if n else 'Unnamed: 0'},{line}\n" for n, line in enumerate(text.splitlines())
     ).encode(),
     "a comma at the end": lambda text: text.replace("\n", ",\n").encode(),
+    "quoted numbers": lambda text: ('"' + text.replace(",", '","').replace("\n", '"\n"')[:-1]).encode(),
     "quoted names": lambda text: ('"' + text.replace(",", '","', 35).replace("\n", '"\n', 1)).encode(),
 }
 

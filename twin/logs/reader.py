@@ -78,6 +78,8 @@ def time_damage(time_s: Array, where: Array) -> list[Damage]:
     for kept, group in groupby(range(len(time_s)), key=keep.__getitem__):
         rows = [] if kept else list(group)
         if len(rows) > STRAY_ROWS:
+            if np.mean(np.diff(time_s) < 0) > 0.5:
+                raise ValueError("time runs backwards: is the newest line the first? Sort the lines by time.")
             start = next(row for row in range(1, len(time_s)) if time_s[row] <= time_s[row - 1])
             raise ValueError(
                 f"time starts again at line {where[start]} ({time_s[start - 1]:.10g} s, then {time_s[start]:.10g} s): "
@@ -223,7 +225,7 @@ def _numbers(raw: bytes, names: Sequence[str], separator: str) -> list[float]:
         ValueError: the line has no such numbers; the reason.
     """
     try:
-        cells = raw.decode("utf-8").split(separator)
+        cells = raw.decode("utf-8").replace('"', "").split(separator)
     except UnicodeDecodeError as error:
         raise ValueError(f"is not text in UTF-8 (byte {error.start} of the line)") from error
     if len(cells) != len(names):
@@ -233,9 +235,10 @@ def _numbers(raw: bytes, names: Sequence[str], separator: str) -> list[float]:
         try:
             numbers.append(float(cell) if name else 0.0)
         except ValueError:
-            if name not in (GEN3.time, PLAIN.time):
-                raise ValueError(f"field {column}, '{cell.strip()[:24]}', is not a number") from None
-            numbers.append(_seconds(column, cell.strip().strip('"')))
+            if name not in (GEN3.time, PLAIN.time) or "," in cell:
+                hint = ", as it has a decimal comma" if "," in cell else ""
+                raise ValueError(f"field {column}, '{cell.strip()[:24]}', is not a number{hint}") from None
+            numbers.append(_seconds(column, cell.strip()))
         if not isfinite(numbers[-1]):
             raise ValueError(f"field {column} is {cell.strip()}, not a finite number")
     return numbers
@@ -504,13 +507,14 @@ def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Reco
         raise LogError(str(path), None, str(error)) from error
     rows = np.flatnonzero(~np.isin(table.where, [d.line for d in damage]))
     good = {channel: values[rows] for channel, values in readings.items()}
+    dropped_lines = {d.line for d in damage}
     bad = judge(time_s[rows], good, degrees=layout.turns, measured=is_csv)
     for found in sorted(bad, key=lambda found: not found.whole):
         lines = table.where[rows[found.rows]].tolist()
         if found.whole:
             raise LogError(str(path), lines[0] if lines else None, f"{found.what}. {found.remedy}".strip())
-        known = {d.line for d in damage}
-        damage += [Damage(line, found.what, found.remedy) for line in lines if line not in known]
+        damage += [Damage(line, found.what, found.remedy) for line in lines if line not in dropped_lines]
+        dropped_lines.update(lines)
     broken = table.broken
     if unknown:
         broken = (*broken, f"its columns {', '.join(unknown)} are unknown to a {layout.name}")
