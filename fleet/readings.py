@@ -94,7 +94,8 @@ class TemperatureFilter:
     """Last possible motor temperatures of a live arm; other readings are of a bad sensor.
 
     A reading is impossible outside `TEMP_RANGE_C`, at exactly 0.0 as the first one, where no motor is below `COOL_C`,
-    or after a change that no motor can make; and until it changes like that again.
+    or after a change that no motor can make; and until it changes like that again. As in a log, the longer side of such
+    a change counts: readings that go on for `STUCK_S` longer than those before it are possible, unless they repeat.
 
     Attributes:
         temp_c: Last possible temperature by joint, °C.
@@ -105,12 +106,14 @@ class TemperatureFilter:
         self.temp_c: dict[int, float] = {}
         self.bad: dict[int, str] = {}
         self._good_s: dict[int, float] = {}
+        self._since_s: dict[int, tuple[float, float]] = {}
+        """Begin of the possible readings without such a change, and of the impossible ones after it."""
         self._last: dict[int, tuple[float, float]] = {}
 
     def update(self, time_s: float, temp_c: Mapping[int, float]) -> None:
         """Apply temperatures by joint, °C; a time that goes back is of an arm that started again."""
         if time_s < max((at_s for at_s, _ in self._last.values()), default=time_s):
-            TemperatureFilter.__init__(self)
+            self.__init__()
         unit = min(temp_c.values(), default=0.0) > COOL_C and len(temp_c) > 1
         for joint, now_c in temp_c.items():
             self._judge(joint, time_s, now_c, unit)
@@ -126,8 +129,16 @@ class TemperatureFilter:
         jump = "" if good_c is None else f", after {good_c:.1f} °C {time_s - good_s:.1f} s before"
         possible = not unit and TEMP_RANGE_C[0] <= now_c <= TEMP_RANGE_C[1]
         possible &= now_c != 0.0 if good_c is None else abs(now_c - good_c) <= _change_k(time_s - good_s)
+        good_since_s, bad_since_s = self._since_s.get(joint, (time_s, time_s))
         if joint in self.bad and good_c is not None:
-            possible &= abs(now_c - last_c) > _change_k(time_s - last_s)
+            goes_on = abs(now_c - last_c) <= _change_k(time_s - last_s)
+            bad_since_s = bad_since_s if goes_on and now_c != last_c else time_s
+            longer = time_s - bad_since_s > good_s - good_since_s + STUCK_S and not unit and 0.0 < now_c < HOT_C
+            possible = longer or (possible and not goes_on)
+            good_since_s = bad_since_s if longer else good_since_s
+        elif possible:
+            bad_since_s = time_s
+        self._since_s[joint] = good_since_s, bad_since_s
         if possible:
             self.temp_c[joint], self._good_s[joint] = now_c, time_s
             self.bad.pop(joint, None)

@@ -62,6 +62,21 @@ def test_an_arm_that_starts_again_may_have_another_temperature():
         assert sensors.check(restarted) is restarted
 
 
+def test_the_longer_side_of_a_jump_counts_unless_it_repeats():
+    for noise, bad in ((0.01, False), (0.0, True)):
+        sensors = ArmSensors()
+        sensors.check(state(1, 55.0))  # one wrong reading at the start
+        for tick in range(2, 700):
+            sensors.check(state(tick, 33.0 + noise * (tick % 3)))
+            assert sensors.fault or tick > 600
+        assert bool(sensors.fault) == bad
+    long = ArmSensors()
+    for tick in range(1, 3000):
+        long.check(state(tick, 41.0))
+    for tick in range(3000, 4000):
+        assert long.check(state(tick, 12.0 + 0.01 * (tick % 3))).temp_c[1] == 41.0
+
+
 def test_people_see_the_bad_sensor():
     view = FleetView("f")
     view.set_token("arm", "arm", True)
