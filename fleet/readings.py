@@ -10,11 +10,15 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fleet.heat.motor import gen3_motors, thermal_data
 from fleet.robot import JOINTS, ThermalLimits
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 
@@ -425,29 +429,21 @@ def _upright(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadReadin
 
 
 @cache
-def _links() -> tuple[tuple[Array, Array, Array, float], ...]:
+def _links() -> "list[tuple[Array, Rotation, Array, float]]":
     """Of each link from joint 1 on: position and rotation in the link before, center of mass in it, and mass."""
+    from scipy.spatial.transform import Rotation  # SciPy takes longer to load than all else that watches a fleet
+
     text = resources.files("fleet").joinpath("arm/assets/gen3.xml").read_text(encoding="utf-8")
-    links = list[tuple[Array, Array, Array, float]]()
+    links = list[tuple[Array, Rotation, Array, float]]()
     for body in ElementTree.fromstring(text).iter("body"):
         inertial = body.find("inertial")
-        if body.find("joint") is None or inertial is None:
-            continue
-        w, x, y, z = _floats(body.attrib.get("quat", "1 0 0 0"))
-        turn = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        mass_kg = float(inertial.attrib["mass"])
-        links.append((_floats(body.attrib["pos"]), turn, _floats(inertial.attrib["pos"]), mass_kg))
-    return tuple(links)
-
-
-def _floats(text: str) -> Array:
-    return np.array(text.split(), dtype=float)
+        if body.find("joint") is not None and inertial is not None:
+            offset, (w, *xyz), center = (
+                np.array(numbers.split(), dtype=float)
+                for numbers in (body.attrib["pos"], body.attrib.get("quat", "1 0 0 0"), inertial.attrib["pos"])
+            )
+            links.append((offset, Rotation.from_quat([*xyz, w]), center, float(inertial.attrib["mass"])))
+    return links
 
 
 def gravity_terms(q: Array) -> Array:
@@ -458,23 +454,22 @@ def gravity_terms(q: Array) -> Array:
     Args:
         q: rad, [row, joint].
     """
-    turn, at = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
-    axes, pivots, centers, masses = list[Array](), list[Array](), list[Array](), list[float]()
+    from scipy.spatial.transform import Rotation
+
+    turn, at = Rotation.from_rotvec(np.zeros((len(q), 3))), np.zeros((len(q), 3))
+    axes, pivots, moments = list[Array](), list[Array](), list[Array]()  # moments: mass times position, and mass
     for (offset, fixed, center, mass_kg), angle in zip(_links(), q.T, strict=True):
-        at = at + turn @ offset
-        zero, one = np.zeros_like(angle), np.ones_like(angle)
-        about_z = [[np.cos(angle), -np.sin(angle), zero], [np.sin(angle), np.cos(angle), zero], [zero, zero, one]]
-        turn = turn @ fixed @ np.moveaxis(np.array(about_z), -1, 0)
-        axes.append(turn[:, :, 2])
+        at = at + turn.apply(offset)
+        turn = turn * fixed * Rotation.from_rotvec(np.outer(angle, (0.0, 0.0, 1.0)))
+        axes.append(turn.apply((0.0, 0.0, 1.0)))
         pivots.append(at)
-        centers.append(at + turn @ center)
-        masses.append(mass_kg)
-    flange = at + turn @ np.array([0.0, 0.0, -0.061525])
+        moments.append(mass_kg * np.column_stack([at + turn.apply(center), np.ones(len(q))]))
+    flange = at + turn.apply((0.0, 0.0, -0.061525))
     terms = np.zeros((len(q), JOINTS, 6))
-    for j in range(JOINTS):
-        moment = sum((masses[i] * (centers[i] - pivots[j]) for i in range(j, JOINTS)), np.zeros((len(q), 3)))
-        terms[:, j, :3] = 9.81 * np.cross(axes[j], moment)
-        terms[:, j, 3:] = 9.81 * np.cross(axes[j], flange - pivots[j])
+    for j, (axis, pivot) in enumerate(zip(axes, pivots, strict=True)):
+        beyond = np.sum(moments[j:], axis=0)
+        terms[:, j, :3] = 9.81 * np.cross(axis, beyond[:, :3] - beyond[:, 3:] * pivot)
+        terms[:, j, 3:] = 9.81 * np.cross(axis, flange - pivot)
     return terms
 
 
