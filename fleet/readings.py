@@ -38,13 +38,15 @@ MOST_STEP_S = 10.0
 """Most usual time between two samples, s: across a longer one neither motion nor heat is known."""
 STALE_S = 8.0
 """Rows that repeat for longer are stale, s. Public logs repeat rows for up to 6.6 s, when their logger was late."""
-STUCK_S, STUCK_ROWS = 60.0, 20
+STUCK_S, STUCK_ROWS = 30.0, 20
 """One sensor that repeats its reading for so long, in so many rows, is dead if those of the other joints change."""
 LEAST_ROWS = 20
 """Rows from which angles, velocities, torques and currents are compared."""
+DRIVES_RAD_S = 0.05
+"""Mean measured speed with which an angle cannot stand still."""
 LEAST_MOTION_RAD, LEAST_TORQUE_NM = 0.5, 3.0
 """Motion and RMS torque of a joint from which readings are compared."""
-AGREES = 4.0
+AGREES = 1.6
 """Factor between velocity and change of position that sampling explains; the public logs have 0.86 to 1.12."""
 AMP_PER_NM = (0.01, 0.5)
 """Range of motor current over torque, A/(N·m); the public logs have 0.04 to 0.17."""
@@ -318,7 +320,7 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
     """
     works = (np.diff(readings["tau"], axis=0) != 0).any(axis=1)
     moved = np.abs(_steps(readings["q"])).sum(axis=1)
-    for channel in ("tau", "current_a", "temp_c"):
+    for channel in ("q", "tau", "current_a", "temp_c"):
         if channel not in readings:
             continue
         changes = np.diff(readings[channel], axis=0) != 0
@@ -327,15 +329,18 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                 value, span_s = readings[channel][a, j] + 0.0, time_s[b] - time_s[a]
                 never = b - a == len(changes) and value == 0.0 and channel == "temp_c"
                 alive = np.delete(changes[a:b], j, axis=1).mean() >= 0.5
-                if channel != "temp_c":
+                if channel == "q":
+                    alive = np.abs(readings["qd"][a:b, j]).mean() > DRIVES_RAD_S
+                elif channel != "temp_c":
                     alive |= moved[a:b].sum() > LEAST_MOTION_RAD
-                elif span_s >= 5 * STUCK_S:
+                elif span_s >= 10 * STUCK_S:
                     alive |= value % 1 != 0 and not changes[a:b].any() and works[a:b].mean() >= 0.5
                 if not never and not (alive and span_s >= STUCK_S):
                     continue
-                what = f"{_NAMES[channel]} of joint {j + 1} is {value:.5g} for {span_s:.4g} s"
+                stands = "never changes, but its velocity does" if channel == "q" else f"is {value:.5g}"
+                what = f"{_NAMES[channel]} of joint {j + 1} {stands}, for {span_s:.4g} s"
                 remedy = "Is its sensor dead? Leave out what was not measured."
-                if value == 0.0 and j == JOINTS - 1:
+                if value == 0.0 and j == JOINTS - 1 and channel != "q":
                     remedy = "Is this an arm with six joints, padded with zeros? Only logs of a Gen3 (seven) are read."
                 yield BadReading(what, remedy, np.arange(a if value == 0.0 else a + 1, b + 1))
 
@@ -371,18 +376,26 @@ def _motion(time_s: Array, readings: Mapping[str, Array], degrees: bool) -> Iter
     # A repeated row hides the motion until the next one.
     usable = new & np.concatenate([[True], new[:-1]]) & (dt_s <= 1.5 * np.median(dt_s))
     moved, expected = moved[usable], ((qd[1:] + qd[:-1]) / 2.0 * dt_s[:, None])[usable]
-    usual = np.abs(moved) < 1.0  # rad: beyond, sampling may hide turns
-    for j in range(JOINTS):
-        by_angle, by_speed = moved[usual[:, j], j], expected[usual[:, j], j]
-        if not len(by_angle) or max(np.ptp(np.cumsum(way)) for way in (by_angle, by_speed)) < LEAST_MOTION_RAD:
-            continue
+    usual = (np.abs(moved) < 1.0).all(axis=1)  # rad: beyond, sampling may hide turns
+    moved, expected = moved[usual], expected[usual]
+    if len(moved) < LEAST_ROWS / 2:
+        return
+    path_rad = np.maximum(*(np.ptp(np.cumsum(steps, axis=0), axis=0) for steps in (moved, expected)))
+    norms = np.sqrt(np.outer((moved**2).sum(axis=0), (expected**2).sum(axis=0)))
+    alike = np.abs(moved.T @ expected) / np.maximum(norms, 1e-12)  # [joint of the angle, joint of the velocity]
+    for j in np.flatnonzero(path_rad > LEAST_MOTION_RAD / 5):
+        by_angle, by_speed = moved[:, j], expected[:, j]
         if not (by_angle.any() and by_speed.any()):
+            if path_rad[j] < LEAST_MOTION_RAD:
+                continue
             still, other = ("velocity", "angle") if by_angle.any() else ("angle", "velocity")
             yield BadReading(f"{still} of joint {j + 1} never changes, but its {other} does", "Is the channel dead?")
             continue
-        product = float((by_angle * by_speed).sum())
-        ratio = product / float((by_speed**2).sum())
-        if product**2 < 0.64 * float((by_speed**2).sum() * (by_angle**2).sum()) or 1 / AGREES < ratio < AGREES:
+        if alike[j, j] < 0.8 and alike[j].max() > 0.97:
+            what = f"the angle of joint {j + 1} follows the velocity of joint {alike[j].argmax() + 1}, not its own"
+            yield BadReading(what, "Are the columns in another order?")
+        ratio = float((by_angle * by_speed).sum() / (by_speed**2).sum())
+        if alike[j, j] < 0.8 or 1 / AGREES < ratio < AGREES:
             continue
         what = f"velocity and change of position of joint {j + 1} disagree: the angle moves {ratio:.3g} times as far"
         yield BadReading(what, _unit_of_motion(ratio, degrees))
@@ -396,6 +409,8 @@ def _unit_of_motion(ratio: float, degrees: bool) -> str:
         (turn, f"{speeds}rad/s" if degrees else f"{angles}degrees"),
         (1 / turn, f"{angles}radians" if degrees else f"{speeds}°/s"),
         (60.0, "Is time in minutes"),
+        (3600.0, "Is time in hours"),
+        (86400.0, "Is time in days"),
         (1e-3, "Is time in milliseconds"),
         (6.0 if degrees else np.pi / 30, f"{speeds}revolutions per minute"),
     )

@@ -68,7 +68,7 @@ def test_the_longer_side_of_a_jump_counts_unless_it_repeats():
         sensors.check(state(1, 55.0))  # one wrong reading at the start
         for tick in range(2, 700):
             sensors.check(state(tick, 33.0 + noise * (tick % 3)))
-            assert sensors.fault or tick > 600
+            assert sensors.fault or tick > 300
         assert bool(sensors.fault) == bad
     long = ArmSensors()
     for tick in range(1, 3000):

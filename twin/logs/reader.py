@@ -78,6 +78,8 @@ def time_damage(time_s: Array, where: Array) -> list[Damage]:
     for kept, group in groupby(range(len(time_s)), key=keep.__getitem__):
         rows = [] if kept else list(group)
         if len(rows) > STRAY_ROWS:
+            if np.ptp(time_s) == 0:
+                raise ValueError(f"time is always {time_s[0]:.10g} s: had the recorder no clock?")
             if np.mean(np.diff(time_s) < 0) > 0.5:
                 raise ValueError("time runs backwards: is the newest line the first? Sort the lines by time.")
             start = next(row for row in range(1, len(time_s)) if time_s[row] <= time_s[row - 1])
@@ -325,7 +327,11 @@ def format_of(names: Sequence[str]) -> Format:
     for pattern, what in OTHER_FORMATS:
         if named := next((name for name in names if re.match(pattern, name)), None):
             raise ValueError(f"looks like {what}, by its column '{named}'. {WANTED}")
-    hint = " Columns are separated by commas, numbers have a decimal point." if any(";" in n for n in names) else ""
+    hint = (
+        " Columns are separated by commas, numbers have a decimal point."
+        if any(";" in n or GEN3.time in n or PLAIN.time in n for n in names)
+        else ""
+    )
     raise ValueError(
         f"is not a log: its first line begins with '{','.join(names)[:40]}', where a Gen3 log has '{GEN3.time}' "
         f"and a plain one '{PLAIN.time}'.{hint}"
