@@ -144,7 +144,7 @@ def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_D
         cells = [
             *_name_and_mode(arm),
             heat_bar(arm),
-            "—" if arm.hottest_c is None else f"{arm.hottest_c:.1f} J{arm.joint}",
+            "—" if arm.hottest_c is None else f"{arm.hottest_c:.1f} J{arm.joint}{'?' * bool(arm.bad_sensor)}",
             Text("—" if arm.headroom_k is None else f"{arm.headroom_k:.1f}", style=_headroom_style(arm.headroom_k)),
             arm.job,
             f"{bar(done[arm.arm], JOB_CELLS)} {brief(arm.busy_s)}" if arm.arm in done else "",
@@ -236,6 +236,7 @@ def arm_line(arm: ArmSnapshot, *, joints: bool = False) -> str:
         f"open jobs: {scores}" if scores else "",
         f"state {format_age(arm.state_age_s)}",
         "" if arm.token else "no token",
+        f"bad sensor: {arm.bad_sensor}" if arm.bad_sensor else "",
     ]
     return "  ".join(filter(None, parts))
 

@@ -113,6 +113,7 @@ BY_HAND = {
     ("docs/concepts/cooling.md", "°C"): "published limits",
     ("docs/concepts/cooling.md", "contact"): "published limits",
     ("docs/faults.md", "fault"): "`make chaos` prints it: half an hour of real processes",
+    ("docs/logs.md", "finding"): "limits in `fleet/readings.py`",
     ("docs/performance.md", ""): "times of one machine; the commands beside the tables print them",
     ("docs/performance.md", "what"): "times of one machine; the commands in the table print them",
     ("docs/ros2.md", "ROS 2"): "settings",

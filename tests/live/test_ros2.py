@@ -231,9 +231,44 @@ def test_unmeasured_values_are_empty():
 def test_a_moving_arm_is_working(speed, mode):
     qd = (0.0, 0.0, speed, 0.0, 0.0, 0.0, 0.0)
     assert state_of(known(qd=qd)).mode == mode
-    moved = known()  # without velocities: from two positions, a tenth of a second apart
-    moved.update_joints(Joints(1.1, NAMES, tuple(q + 0.1 * v for q, v in zip(Q, qd, strict=True))), 0.1)
-    assert state_of(moved).mode == mode
+    moved = known()  # without velocities: from positions over a second
+    replay(moved, [tuple(q + 0.1 * i * v for q, v in zip(Q, qd, strict=True)) for i in range(1, 11)])
+    assert state_of(moved, 1.0).mode == mode
+
+
+def replay(reality, positions, stamp_s=0.1):
+    """Ten positions a second, with stamps that increase by `stamp_s`."""
+    for i, q in enumerate(positions, start=1):
+        reality.update_joints(Joints(1.0 + stamp_s * i, NAMES, q), 0.1 * i)
+
+
+def test_neither_another_turn_nor_noise_is_work_but_motion_without_a_clock_is():
+    rng = np.random.default_rng(0)
+    flips = [(*Q[:2], math.copysign(math.pi, 21.5 - i), *Q[3:]) for i in range(25)]
+    noise = [tuple(q + 0.002 * e for q, e in zip(Q, rng.uniform(-1, 1, 7), strict=True)) for _ in range(25)]
+    motion = [tuple(q + 0.005 * i for q in Q) for i in range(10)]
+    for positions, stamp_s, mode in ((flips, 0.1, "idle"), (noise, 0.1, "idle"), (noise, 0.0, "idle")):
+        still = known()
+        replay(still, positions, stamp_s)
+        assert state_of(still, 2.5).mode == mode
+    for stamp_s in (0.1, 0.0, -0.1):
+        moved = known()
+        replay(moved, motion, stamp_s)
+        assert state_of(moved, 1.0).mode == "working"
+
+
+@pytest.mark.parametrize("wrong_c", [0.0, 318.6, 177.1, 12.0])
+def test_an_impossible_temperature_neither_heats_nor_cools_the_headroom(wrong_c):
+    reality = known()
+    for now_s in (0.5, 1.0, 30.0):
+        reality.update_joints(Joints(1.0 + now_s, NAMES, Q), now_s)
+        reality.update_temperatures({"joint_2": wrong_c}, now_s)
+        if now_s < 10:
+            assert state_of(reality, now_s).headroom_k == 60.0 - 45.5
+        assert reality.sensors.bad[1].startswith(f"joint 2 reads {wrong_c:.1f} °C")
+    assert reality.sensors.doubt_k(30.0) > reality.sensors.doubt_k(1.0) > 2.0
+    reality.update_temperatures({"joint_2": 44.0}, 30.5)
+    assert (reality.sensors.bad, reality.sensors.doubt_k(30.5)) == ({}, 0.0)
 
 
 class Place:

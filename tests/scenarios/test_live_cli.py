@@ -57,10 +57,12 @@ TIME_S = np.arange(0.0, 4.0, 0.1)
 
 @pytest.fixture
 def log(tmp_path):
-    """A plain log in which every channel of joint k rises by k a second from its own start."""
-    starts = dict(zip(READINGS, (0.0, 1.0, 2.0, 3.0, 30.0), strict=True))
+    """A plain log in which every channel of joint k but the velocity rises by k a second from its own start."""
+    starts = dict(zip(READINGS, (0.0, 0.0, 30.0, 3.0, 30.0), strict=True))
     rise = TIME_S[:, None] * np.arange(1, 8) / 100
-    columns = np.hstack([TIME_S[:, None] + 50.0, *(start + rise for start in starts.values())])
+    channels = {channel: start + rise for channel, start in starts.items()}
+    channels["qd"] = np.full_like(rise, np.arange(1, 8) / 100)
+    columns = np.hstack([TIME_S[:, None] + 50.0, *channels.values()])
     header = ",".join(["time_s", *(f"{channel}_{k}" for channel in READINGS for k in range(1, 8))])
     path = tmp_path / "real.csv"
     np.savetxt(path, columns, delimiter=",", header=header, comments="", fmt="%.12g")
@@ -194,7 +196,7 @@ def test_a_log_is_replayed_as_an_arm(small_toml, plans, log, tmp_path):
         into_s = (state.temp_c[0] - 30.0) * 100  # time by the first joint; the others must agree
         np.testing.assert_allclose(state.temp_c, 30.0 + into_s * rise, atol=1e-9)
         np.testing.assert_allclose(state.q, into_s * rise, atol=1e-9)
-        np.testing.assert_allclose(state.tau, 2.0 + into_s * rise, atol=1e-9)
+        np.testing.assert_allclose(state.tau, 30.0 + into_s * rise, atol=1e-9)
         np.testing.assert_allclose(state.current_a, 3.0 + into_s * rise, atol=1e-9)
     seen = [round((state.temp_c[0] - 30.0) * 100, 6) for state in states]
     assert seen == sorted(seen)

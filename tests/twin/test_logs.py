@@ -33,16 +33,16 @@ TIME_S = (0.0, 0.5, 1.1, 1.5)
 
 
 def gen3_row(time_s: float) -> list[str]:
-    """Joint k (1..7) at k degrees below zero, 20 + k °C, k N·m on the joint, −k A, k °/s."""
+    """Joint k (1..7) at k degrees below zero, 20 + k °C, k N·m on the joint with some noise, −k/10 A, k/100 °/s."""
     k = np.arange(1, 8)
-    numbers = [time_s, *(360.0 - k), *(20.0 + k), *(1.0 * k), *(-1.0 * k), *(1.0 * k)]
+    numbers = [time_s, *(360.0 - k), *(20.0 + k), *((1 + 1e-9 * time_s) * k), *(-0.1 * k), *(0.01 * k)]
     return [repr(float(n)) for n in numbers]
 
 
 def plain_row(time_s: float) -> list[str]:
     """The same in SI with our signs."""
     k = np.arange(1, 8)
-    numbers = [time_s, *np.deg2rad(-k), *np.deg2rad(k), *(-1.0 * k), *(-1.0 * k), *(20.0 + k)]
+    numbers = [time_s, *np.deg2rad(-k), *np.deg2rad(0.01 * k), *(-1.0 * k), *(-0.1 * k), *(20.0 + k)]
     return [repr(float(n)) for n in numbers]
 
 
@@ -82,7 +82,7 @@ def test_all_formats_say_the_same_in_si(tmp_path: Path, gen3: Callable[..., Path
         (recording,) = read(path)
         assert (recording.name, recording.dropped) == (name, ())
         np.testing.assert_allclose(recording.time_s, TIME_S)
-        expected = {"q": np.deg2rad(-k), "qd": np.deg2rad(k), "tau": -k, "current_a": -k, "temp_c": 20 + k}
+        expected = {"q": np.deg2rad(-k), "qd": np.deg2rad(k / 100), "tau": -k, "current_a": -k / 10, "temp_c": 20 + k}
         for channel, values in expected.items():
             np.testing.assert_allclose(getattr(recording, channel), values, atol=1e-12)
 
@@ -197,8 +197,13 @@ def test_as_many_samples_stay_as_can(times):
         (text([n for n in PLAIN if n != "temp_c_3"], []).encode(), 1, "lacks the column temp_c_3 of a plain log"),
         (text([*PLAIN[:15], *(f"torque_{j}" for j in range(1, 8))], []).encode(), 1, "lacks the columns tau_1, tau_2"),
         (text([*GEN3, "Pos_0"], []).encode(), 1, "names the column 'Pos_0' twice"),
-        (text(GEN3, map(gen3_row, TIME_S)).encode("utf-16"), 1, "is not text in UTF-8"),
-        (text(PLAIN, [["0", *["89.5"] * 7, *["0"] * 28]]).encode(), 2, "joint 2 at 89.5 is beyond its stops; q is in"),
+        (text(GEN3, map(gen3_row, TIME_S)).encode("utf-16-le"), 1, "holds NUL bytes; is it UTF-16"),
+        (text(GEN3, map(gen3_row, TIME_S)).encode("latin-1").replace(b"T", b"\xb5"), 1, "is not text in UTF-8"),
+        (
+            text(PLAIN, [["0", *["89.5"] * 7, *["0"] * 28]]).encode(),
+            2,
+            "joint 2 at 89.5 rad is beyond its stops, .* Are these degrees",
+        ),
     ],
 )
 def test_a_file_that_is_no_log_says_why(tmp_path: Path, content: bytes, line: int | None, match: str):
@@ -307,7 +312,7 @@ def test_the_recorder_in_the_documentation_writes_a_gen3_log(tmp_path: Path):
     exec(code, space)
     k = iter(range(1, 8))
     actuators = [
-        SimpleNamespace(position=360.0 - i, temperature_motor=20.0 + i, torque=i, current_motor=-i, velocity=i)
+        SimpleNamespace(position=360.0 - i, temperature_motor=20.0 + i, torque=i, current_motor=-0.1 * i, velocity=i)
         for i in k
     ]
     arm = SimpleNamespace(RefreshFeedback=lambda: SimpleNamespace(actuators=actuators))

@@ -1,12 +1,15 @@
 """Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet."""
 
+import codecs
 import gzip
 import logging
+import re
 import zlib
 from bisect import bisect_left
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import groupby
 from math import isfinite
 from pathlib import Path
@@ -17,13 +20,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet.errors import LogError
+from fleet.readings import judge, repeats
 from fleet.robot import JOINTS
-from twin.logs.recording import CONTINUOUS, READINGS, Recording
+from twin.logs.recording import GAP_S, READINGS, Recording
 
 Array = np.ndarray
 
 MOST_SENTENCES = 20
 """Most sentences about one file; further ones are counted."""
+EPOCH_S = 1e8
+"""Times from here on are since 1970, s, and are counted from the first."""
 STRAY_ROWS = 3
 """Longest run of rows with wrong times; a longer one is a clock that was reset."""
 
@@ -35,6 +41,8 @@ class Damage:
     line: int
     """From 1."""
     reason: str
+    remedy: str = ""
+    """Sentences; may be empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +78,10 @@ def time_damage(time_s: Array, where: Array) -> list[Damage]:
     for kept, group in groupby(range(len(time_s)), key=keep.__getitem__):
         rows = [] if kept else list(group)
         if len(rows) > STRAY_ROWS:
+            if np.ptp(time_s) == 0:
+                raise ValueError(f"time is always {time_s[0]:.10g} s: had the recorder no clock?")
+            if np.mean(np.diff(time_s) < 0) > 0.5:
+                raise ValueError("time runs backwards: is the newest line the first? Sort the lines by time.")
             start = next(row for row in range(1, len(time_s)) if time_s[row] <= time_s[row - 1])
             raise ValueError(
                 f"time starts again at line {where[start]} ({time_s[start - 1]:.10g} s, then {time_s[start]:.10g} s): "
@@ -141,24 +153,41 @@ def read_csv(path: Path) -> LogTable:
         raise LogError(str(path), None, "ends in .gz but holds no gzip data; was it unpacked or downloaded as a page?")
     if not data.strip():
         raise LogError(str(path), None, f"holds no text ({broken})." if broken else "is empty.")
-    header, *lines = data.split(b"\n")
-    names = _header(path, header)
+    lines = _as_utf8(data).split(b"\n")
+    first = next((i for i, raw in enumerate(lines) if not _IGNORED.fullmatch(raw)), 0)
+    names, separator = _header(path, first + 1, lines[first])
     rows: list[list[float]] = []
     where: list[int] = []
     damage: list[Damage] = []
-    for line, raw in enumerate(lines, start=2):
-        if not raw.strip():
+    for line, raw in enumerate(lines[first + 1 :], start=first + 2):
+        if _IGNORED.fullmatch(raw):
             continue
         try:
-            if line == len(lines) + 1:
+            if b"\0" in raw:
+                raise ValueError("holds NUL bytes, as after a power failure")
+            if line == len(lines):
                 # The last number may have lost digits even if all fields are present.
                 raise ValueError(f"the {'gzip data end' if broken else 'file ends'} in the middle of this line")
-            rows.append(_numbers(raw, len(names)))
+            rows.append(_numbers(raw, names, separator))
             where.append(line)
         except ValueError as error:
             damage.append(Damage(line, str(error)))
     values = np.array(rows, dtype=float).reshape(-1, len(names))
-    return LogTable(names, values, np.array(where, dtype=int), tuple(damage), (broken,) if broken else ())
+    # An index column has no name, or the one that pandas gives it.
+    named = [i for i, name in enumerate(names) if name and not name.startswith("Unnamed: ")]
+    kept = tuple(names[i] for i in named)
+    return LogTable(kept, values[:, named], np.array(where, dtype=int), tuple(damage), (broken,) if broken else ())
+
+
+_IGNORED = re.compile(rb"\s*(#[^\0]*|sep=.\s*)?")
+"""Blank lines, comments, and the line with the separator for Excel; also before the header."""
+
+
+def _as_utf8(data: bytes) -> bytes:
+    """The text in UTF-8 without a byte order mark, if it begins with a mark of UTF-16 or UTF-8."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", errors="replace").encode()
+    return data.removeprefix(codecs.BOM_UTF8)
 
 
 def _decompress(data: bytes) -> tuple[bytes, str | None]:
@@ -175,38 +204,57 @@ def _decompress(data: bytes) -> tuple[bytes, str | None]:
     return b"".join(parts), f"the gzip data are {reason}"
 
 
-def _header(path: Path, line: bytes) -> tuple[str, ...]:
+def _header(path: Path, line: int, raw: bytes) -> tuple[tuple[str, ...], str]:
+    """The column names, "" for one without a name, and the separator."""
     try:
-        names = tuple(name.strip().strip('"') for name in line.decode("utf-8-sig").split(","))
+        text = raw.decode("utf-8")
     except UnicodeDecodeError as error:
         reason = f"is not text in UTF-8 (byte {error.start}); save it as CSV in UTF-8."
-        raise LogError(str(path), 1, reason) from error
-    if double := sorted({name for name in names if names.count(name) > 1}):
-        raise LogError(str(path), 1, f"names the column '{double[0]}' twice.")
-    return names
+        raise LogError(str(path), line, reason) from error
+    if "\0" in text:
+        raise LogError(str(path), line, "holds NUL bytes; is it UTF-16? Save it as CSV in UTF-8.")
+    separator = "\t" if "\t" in text else ","
+    names = tuple(name.strip().strip('"') for name in text.split(separator))
+    if double := sorted({name for name in names if name and names.count(name) > 1}):
+        raise LogError(str(path), line, f"names the column '{double[0]}' twice.")
+    return names, separator
 
 
-def _numbers(raw: bytes, columns: int) -> list[float]:
-    """Raises ValueError with the reason if the line has no such numbers."""
+def _numbers(raw: bytes, names: Sequence[str], separator: str) -> list[float]:
+    """The numbers of a line, 0 in columns without a name; a date is in seconds since 1970.
+
+    Raises:
+        ValueError: the line has no such numbers; the reason.
+    """
     try:
-        cells = raw.decode("utf-8").split(",")
+        cells = raw.decode("utf-8").replace('"', "").split(separator)
     except UnicodeDecodeError as error:
         raise ValueError(f"is not text in UTF-8 (byte {error.start} of the line)") from error
-    if len(cells) != columns:
-        raise ValueError(f"{len(cells)} fields where the header has {columns}")
+    if len(cells) != len(names):
+        raise ValueError(f"{len(cells)} fields where the header has {len(names)}")
     numbers: list[float] = []
-    for column, cell in enumerate(cells, start=1):
+    for column, (cell, name) in enumerate(zip(cells, names, strict=True), start=1):
         try:
-            numbers.append(float(cell))
+            numbers.append(float(cell) if name else 0.0)
         except ValueError:
-            raise ValueError(f"field {column}, '{cell.strip()[:24]}', is not a number") from None
+            if name not in (GEN3.time, PLAIN.time) or "," in cell:
+                hint = ", as it has a decimal comma" if "," in cell else ""
+                raise ValueError(f"field {column}, '{cell.strip()[:24]}', is not a number{hint}") from None
+            numbers.append(_seconds(column, cell.strip()))
         if not isfinite(numbers[-1]):
             raise ValueError(f"field {column} is {cell.strip()}, not a finite number")
     return numbers
 
 
-TEMP_RANGE_C = (-40.0, 200.0)
-"""Range of a motor's temperature sensor; values outside are faults or kelvin."""
+def _seconds(column: int, text: str) -> float:
+    """Seconds since 1970 of a date with time in ISO 8601; without a zone it is UTC."""
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError(
+            f"field {column}, '{text[:24]}', is not a number; time is in seconds, or as 2026-01-05T06:00:00.5+00:00"
+        ) from None
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,20 +301,61 @@ PLAIN = Format(
 )
 
 
+OTHER_FORMATS = (
+    (r"(actual|target)_(q|qd|current|TCP_pose)|joint_temperatures", "a log of a Universal Robots arm (RTDE)"),
+    (r"\$(AXIS|TORQUE|VEL|CURR|MOT)_|AIPos|AxisActual|MotorTemp", "a log of a KUKA arm"),
+    (r"%time|field\.|header\.stamp|/joint_states|(position|effort)\[?\d*\]?$", "a list of ROS messages"),
+    (r"O_T_EE|tau_J|dq?_d_", "a log of a Franka arm"),
+    (r"actuators", "feedback of the Kortex API"),
+)
+"""Column names by which formats of other programs are recognised."""
+WANTED = "Write columns time_s, q_1 … q_7 (rad), qd_k (rad/s), tau_k (N·m) of a Gen3; docs/logs.md has the formats."
+
+
 def format_of(names: Sequence[str]) -> Format:
     """The format with this time column.
 
     Raises:
-        ValueError: there is no time column of a known format.
+        ValueError: there is no time column of a known format; the format or the names that were recognised.
     """
     for layout in (GEN3, PLAIN):
         if layout.time in names:
             return layout
-    hint = " Columns are separated by commas, numbers have a decimal point." if any(";" in n for n in names) else ""
+    for layout in (GEN3, PLAIN):
+        if misnamed := _misnamed(layout, names):
+            raise ValueError(misnamed)
+    for pattern, what in OTHER_FORMATS:
+        if named := next((name for name in names if re.match(pattern, name)), None):
+            raise ValueError(f"looks like {what}, by its column '{named}'. {WANTED}")
+    hint = (
+        " Columns are separated by commas, numbers have a decimal point."
+        if any(";" in n or GEN3.time in n or PLAIN.time in n for n in names)
+        else ""
+    )
     raise ValueError(
         f"is not a log: its first line begins with '{','.join(names)[:40]}', where a Gen3 log has '{GEN3.time}' "
         f"and a plain one '{PLAIN.time}'.{hint}"
     )
+
+
+def _misnamed(layout: Format, names: Sequence[str]) -> str:
+    """Sentence on columns that are those of a format but for units, case, or the number of the first joint."""
+    required = layout.groups[: layout.required]
+    wanted = [layout.time, *(column for group in required for column in layout.columns(group))]
+    for shift, how in ((0, "with units or in another spelling"), (1, "counted from 1"), (-1, "counted from 0")):
+        plain = {_plain(name, shift): name for name in names}
+        known = [(plain[_plain(column)], column) for column in wanted if _plain(column) in plain]
+        other = next(((name, column) for name, column in known if name != column), None)
+        if other and len(known) > 0.9 * len(wanted):
+            return f"has the columns of a {layout.name}, but {how}: rename '{other[0]}' to '{other[1]}', and so on."
+    return ""
+
+
+def _plain(name: str, shift: int = 0) -> str:
+    """A column name in lower case without its unit, and with the number of its joint reduced by `shift`."""
+    name = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*?[\])]", "", name).lower()).strip("_")
+    stem, _, joint = name.rpartition("_")
+    return f"{stem}_{int(joint) - shift}" if stem and joint.isdecimal() else name
 
 
 def check_columns(layout: Format, names: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -279,6 +368,8 @@ def check_columns(layout: Format, names: Sequence[str]) -> tuple[list[str], list
     counts = {group: of_group.count(group) for group in layout.groups}
     groups = [g for i, g in enumerate(layout.groups) if i < layout.required or counts[g]]
     joints = {counts[g] if set(layout.columns(g, counts[g])) <= set(names) else 0 for g in groups}
+    if misnamed := _misnamed(layout, names):
+        raise ValueError(misnamed)
     if len(joints) == 1 and joints not in ({JOINTS}, {0}):
         raise ValueError(f"has {joints.pop()} joints; only logs of a Gen3, which has {JOINTS}, can be read.")
     wanted = [layout.time, *(column for g in groups for column in layout.columns(g))]
@@ -298,30 +389,6 @@ def channels(layout: Format, groups: Sequence[str], table: LogTable) -> dict[str
     if layout.turns:
         readings["q"] = (readings["q"] + np.pi) % (2 * np.pi) - np.pi
     return readings
-
-
-def implausible_readings(layout: Format, readings: dict[str, Array], where: Array) -> list[Damage]:
-    """Rows with readings that no Gen3 can have, mostly because of another unit.
-
-    Args:
-        readings: Channels in SI, [row, joint].
-        where: Line of each row, [row].
-    """
-    damage: list[Damage] = []
-
-    def check_range(values: Array, low: float, high: float, reason: str) -> None:
-        outside = (values < low) | (values > high)
-        for row in np.flatnonzero(outside.any(axis=1)):
-            joint = int(outside[row].argmax())
-            damage.append(Damage(int(where[row]), f"joint {joint + 1} at {values[row, joint]:.5g} is {reason}"))
-
-    if not layout.turns:
-        # Beyond half a turn a joint with end stops has passed them.
-        q = np.where(np.isin(np.arange(JOINTS), CONTINUOUS), 0.0, readings["q"])
-        check_range(q, -np.pi, np.pi, "beyond its stops; q is in rad")
-    if "temp_c" in readings:
-        check_range(readings["temp_c"], *TEMP_RANGE_C, "not a motor temperature in °C")
-    return damage
 
 
 ARM, MODE = "arm", "mode"
@@ -439,27 +506,45 @@ def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Reco
     except ValueError as error:
         raise LogError(str(path), 1 if is_csv else None, str(error)) from error
     readings = channels(layout, groups, table)
-    damage = [*table.damage, *implausible_readings(layout, readings, table.where)]
-    good = ~np.isin(table.where, [d.line for d in damage])
-    time_s = table.values[:, table.names.index(layout.time)]
+    time_s, damage = table.values[:, table.names.index(layout.time)], list(table.damage)
     try:
-        damage += time_damage(time_s[good], table.where[good])
+        damage += time_damage(time_s, table.where)
     except ValueError as error:
         raise LogError(str(path), None, str(error)) from error
+    rows = np.flatnonzero(~np.isin(table.where, [d.line for d in damage]))
+    good = {channel: values[rows] for channel, values in readings.items()}
+    dropped_lines = {d.line for d in damage}
+    bad = judge(time_s[rows], good, degrees=layout.turns, measured=is_csv)
+    for found in sorted(bad, key=lambda found: not found.whole):
+        lines = table.where[rows[found.rows]].tolist()
+        if found.whole:
+            raise LogError(str(path), lines[0] if lines else None, f"{found.what}. {found.remedy}".strip())
+        damage += [Damage(line, found.what, found.remedy) for line in lines if line not in dropped_lines]
+        dropped_lines.update(lines)
     broken = table.broken
     if unknown:
         broken = (*broken, f"its columns {', '.join(unknown)} are unknown to a {layout.name}")
-    if damaged == "refuse" and (broken or damage):
+    keep = ~np.isin(table.where, [d.line for d in damage])
+    dropped = (*broken, *damage_summary(damage))
+    if not keep.any():
+        raise LogError(str(path), None, f"holds no good line of numbers{': ' if dropped else '.'}{'; '.join(dropped)}")
+    if damaged == "refuse" and dropped:
         others = len(broken) + len(damage) - 1
         more = f", and {others} more damaged place{'s' * (others > 1)}" if others else ""
         first = min(damage, key=lambda d: d.line, default=Damage(0, ""))
         line, reason = (None, broken[0]) if broken else (first.line, first.reason)
-        raise LogError(str(path), line, f'{reason}{more}. Use damaged="skip" to read the undamaged lines.')
-    keep = ~np.isin(table.where, [d.line for d in damage])
-    dropped = (*broken, *damage_summary(damage))
+        remedy = "" if broken or not first.remedy else f"{first.remedy} "
+        raise LogError(str(path), line, f'{reason}{more}. {remedy}Use damaged="skip" to read the undamaged lines.')
     for sentence in dropped:
         log.warning("%s: dropped: %s", path, sentence)
-    if not keep.any():
-        raise LogError(str(path), None, f"holds no good line of numbers{': ' if dropped else '.'}{'; '.join(dropped)}")
     kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
-    return Recording(name=name, time_s=time_s[keep], **kept, dropped=dropped)
+    time_s = time_s[keep]
+    if is_csv and (held := repeats(time_s, kept, GAP_S)):
+        share = sum(end - start for start, end in held) / len(time_s)
+        log.warning(
+            "%s: %.0f %% of its lines repeat the one before, for more than %g s: motion in them is unknown.",
+            *(path, 100 * share, GAP_S),
+        )
+    if len(time_s) and time_s[0] >= EPOCH_S:
+        time_s = time_s - time_s[0]
+    return Recording(name=name, time_s=time_s, **kept, dropped=dropped)

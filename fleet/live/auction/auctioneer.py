@@ -359,7 +359,7 @@ class Auctioneer:
         self._take_space(arm, {state.space} - {""})
         if before is not None and before.space and not state.space:
             self.rounds.retry_now()
-        self.rounds.states[arm] = state
+        self.rounds.states[arm] = self.rounds.sensors[arm].check(state)
 
     def clear(self, request: ClearRequest, present: frozenset[str], time_s: float) -> Cleared:
         """Free the space of an absent arm and end its awards: a person has seen that it is at home, or removed.

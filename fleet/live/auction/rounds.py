@@ -11,7 +11,7 @@ Rounds of an auction: which jobs are offered when, to whom, and what is awarded.
 
 import logging
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -41,6 +41,7 @@ from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted, JobChange, Operated
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, SpaceCleared, SpaceTaken
+from fleet.live.sensors import ArmSensors
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
 
 _LOG = logging.getLogger(__name__)
@@ -518,7 +519,8 @@ class Rounds:
     Attributes:
         open: The round that is open for bids; None between two rounds.
         allocate: The allocation rule.
-        states: The last state of each arm.
+        states: The last state of each arm, with its last possible temperatures.
+        sensors: The motor sensors of each arm.
         present: Arms that are present.
     """
 
@@ -528,6 +530,7 @@ class Rounds:
         """Start; arguments as of `fleet.live.auction.auctioneer.Auctioneer`."""
         self.open: Round | None = None
         self.states: dict[str, State] = {}
+        self.sensors: defaultdict[str, ArmSensors] = defaultdict(ArmSensors)
         self.present: frozenset[str] = frozenset()
         self._name, self._writer, self.allocate = name, writer, allocate
         self._timing, self._excludes, self._boot = timing, excludes, boot
@@ -606,7 +609,11 @@ class Rounds:
         entries = [self._writer.ledger.jobs[job.name] for job in closing.jobs]
         entries = [e for e, job in zip(entries, closing.jobs, strict=True) if e.state == "waiting" and e.spec == job]
         jobs = tuple(entry.spec for entry in entries)
-        quotes = {arm: quote for arm, quote in closing.quotes.items() if self._may_work(arm, closing)}
+        quotes = {
+            arm: self.sensors[arm].check_quote(quote)
+            for arm, quote in closing.quotes.items()
+            if self._may_work(arm, closing)
+        }
         bidding = Bidding(
             closing.auction,
             time_s,

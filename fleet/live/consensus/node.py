@@ -333,7 +333,7 @@ class ConsensusNode:
         link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._describe_cell)
         link.reply_to(keys.of_clock(fleet), ClockRequest, self._clock)
         link.subscribe(keys.of_every_arm(fleet, "bid"), Bid, self._apply_bid, history=True)
-        link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.states.__setitem__)
+        link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.apply_state)
         link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._apply_token)
 
     def _apply_bid(self, arm: str, bid: Bid) -> None:

@@ -19,7 +19,7 @@ job: where messages are lost two arms may claim one, and the one without a major
 
 import logging
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Container, Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from random import Random
@@ -41,6 +41,7 @@ from fleet.live.auction.rounds import Bidding, Choice, Timing, no_arm_can, resol
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
 from fleet.live.consensus.jobs import MAX_AWARDS, MAX_NOTES, Register
 from fleet.live.monitor.snapshot import FRESH_S
+from fleet.live.sensors import ArmSensors
 from fleet.live.space import Excludes, no_conflicts
 from fleet.observation import Observation
 
@@ -296,7 +297,7 @@ class Participant:
         known: All jobs that it knows.
         claimant: Its claims.
         granter: Its grants.
-        states: The last state of each arm; the driver puts them in.
+        states: The last state of each arm, with its last possible temperatures.
         out: Bids, claims and requests of people that were carried out; the driver sends them.
         rounds: Number of choices of its policy.
         changed_s: Real second of the last change of a bid or choice.
@@ -314,6 +315,7 @@ class Participant:
         self.claimant = Claimant(arm.executor, granter, arm.answer_award, arm.space_of, boot=boot, timing=self._timing)
         self.known = KnownJobs(granter)
         self.states: dict[str, State] = {}
+        self._sensors: defaultdict[str, ArmSensors] = defaultdict(ArmSensors)
         self.out: deque[Bid | Claim | Operation] = deque()
         self.rounds = 0
         self._arm, self._fleet, self._policy = arm, membership.fleet, membership.choose
@@ -350,6 +352,10 @@ class Participant:
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
         self._present = present & self.granter.roster
+
+    def apply_state(self, arm: str, state: State) -> None:
+        """Apply the state of an arm, a peer or this one."""
+        self.states[arm] = self._sensors[arm].check(state)
 
     def apply_bid(self, bid: Bid, real_s: float) -> None:
         """Apply a bid, of a peer or its own."""
@@ -566,7 +572,7 @@ class Participant:
 
     def _bidding(self, bids: dict[str, Bid], names: Iterable[str], real_s: float) -> Bidding:
         """Return the bids for some jobs as in a round of an auctioneer."""
-        quotes = {arm: _quote(bid, self.states.get(arm)) for arm, bid in bids.items()}
+        quotes = {arm: self._sensors[arm].check_quote(_quote(bid, self.states.get(arm))) for arm, bid in bids.items()}
         register = self.granter.register
         return Bidding(
             auction="consensus",

@@ -159,6 +159,8 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
     findings = [Finding("fault", f"{arm.arm} {problem}")] if problem else []
     if arm.mode == "faulted":
         findings.append(Finding("warning", f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."))
+    if arm.bad_sensor:
+        findings.append(Finding("warning", f"{arm.arm} has impossible temperatures: {arm.bad_sensor}."))
     if offset_s is not None and abs(offset_s) > OFFSET_S:
         offset = f"{abs(offset_s):.1f} s {'ahead of' if offset_s > 0 else 'behind'} fleet time"
         findings.append(Finding("fault", f"{arm.arm} is {offset}: its machine may be overloaded, or its process hang."))

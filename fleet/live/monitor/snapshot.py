@@ -33,6 +33,7 @@ from fleet.bus.protocol.keys import PUBLISHED
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
 from fleet.bus.protocol.operator import ALL_ARMS, ControlRequest, Operation, Pause, Resume
 from fleet.errors import BusError
+from fleet.live.sensors import ArmSensors
 from fleet.telemetry import Mode
 
 _LOG = logging.getLogger(__name__)
@@ -94,7 +95,9 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """The hottest motor, 1..7."""
     headroom_k: float | None = None
     temp_c: tuple[float, ...] = ()
-    """[joint]."""
+    """Last possible temperature, [joint]."""
+    bad_sensor: str = ""
+    """Sentence on motors whose last temperatures are impossible."""
     job: str = ""
     busy_s: float = 0.0
     """Fleet seconds until it is home with its current job done."""
@@ -144,6 +147,7 @@ class _Arm:
     token: bool = False
     messages: dict[type, tuple[msgspec.Struct, float]] = field(default_factory=dict[type, tuple[msgspec.Struct, float]])
     """The last message of each type, and the real second it came."""
+    sensors: ArmSensors = field(default_factory=ArmSensors)
 
     def last(self, kind: type[Message]) -> tuple[Message | None, float]:
         message, at_s = self.messages.get(kind, (None, 0.0))
@@ -195,7 +199,10 @@ class FleetView:
         elif isinstance(message, Operation):
             if message.time_s >= max((known.time_s for known in self._auctioneers.values()), default=-math.inf):
                 self._pause(message.request)
-        elif isinstance(message, State | DifficultyScores | Info | ArmEvent):
+        elif isinstance(message, State):
+            arm = self._arm(name)
+            arm.messages[State] = arm.sensors.check(message), now_s
+        elif isinstance(message, DifficultyScores | Info | ArmEvent):
             self._arm(name).messages[type(message)] = message, now_s
 
     def update_jobs(self, reply: Status, now_s: float) -> None:
@@ -379,6 +386,7 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         joint=None if hottest_c is None else temps_c.index(hottest_c) + 1,
         headroom_k=state.headroom_k if state else None,
         temp_c=temps_c,
+        bad_sensor=arm.sensors.fault,
         job=state.job if state else "",
         busy_s=state.busy_s if state else 0.0,
         away=bool(state and state.space),

@@ -164,7 +164,7 @@ function startPage() {
     Object.assign(fleet, { name: snapshot.fleet, counts: snapshot.counts, paused: snapshot.paused, speed: snapshot.speed, auctioneers: snapshot.auctioneers });
     for (const one of snapshot.arms) {
       const arm = armOf(one.arm);
-      arm.token = one.token;
+      Object.assign(arm, { token: one.token, badSensor: one.bad_sensor, possibleC: one.temp_c });
       if (one.state_age_s !== null) arm.atMs = Math.max(arm.atMs, nowMs - 1000 * one.state_age_s);
       arm.difficultyMs = one.difficulty_age_s === null ? null : nowMs - 1000 * one.difficulty_age_s;
     }
@@ -179,6 +179,8 @@ function startPage() {
   const arms = makeTable(element("arms"), 8), jobs = makeTable(element("jobs"), 6), settled = makeTable(element("settled"), 5);
   const offered = makeTable(element("offers"), 3), present = new Map();
 
+  const temperatures = (arm) => (arm.badSensor ? arm.possibleC : arm.state.temp_c);
+
   function drawCell() {
     if (!view || !changed.size) return;
     for (const name of changed) {
@@ -187,7 +189,7 @@ function startPage() {
       const mode = isPresent(arm) ? Math.max(0, ["idle", "working", "faulted"].indexOf(arm.state.mode)) : -1;
       if (present.get(name) !== mode) view.setMode(i, mode);
       present.set(name, mode);
-      if (arm.state.temp_c.length === 7) view.setHeat(i, arm.state.temp_c);
+      if (temperatures(arm).length === 7) view.setHeat(i, temperatures(arm));
       if ((arm.state.q || []).length === 7) view.setPose(i, arm.state.q, 0);
     }
     changed.clear();
@@ -211,10 +213,10 @@ function startPage() {
     const word = here ? MODES[state.mode] : "◌ absent";
     setText(mode, pause ? `${word}, ❚❚ paused` : word);
     setClass(row, here ? state.mode : "absent");
-    const temps = state ? state.temp_c : [], tempC = Math.max(...temps), of = state && fleet.jobs.get(state.job);
+    const temps = state ? temperatures(arm) : [], tempC = Math.max(...temps), of = state && fleet.jobs.get(state.job);
     const [bar, text] = hot.children;
     if (temps.length) {
-      const warning = heat ? tempC >= heat.error_c ? " above the limit" : tempC >= heat.warning_c ? " warm" : "" : "";
+      const warning = arm.badSensor ? ", bad sensor" : heat ? tempC >= heat.error_c ? " above the limit" : tempC >= heat.warning_c ? " warm" : "" : "";
       setText(text, `${tempC.toFixed(1)} °C, joint ${temps.indexOf(tempC) + 1}${warning}`);
       const share = heat ? (tempC - heat.marks_c[0]) / (heat.error_c - heat.marks_c[0]) : tempC / 80;
       bar.firstChild.style.width = `${Math.round(100 * Math.min(1, Math.max(0, share)))}%`;
@@ -278,8 +280,9 @@ function startPage() {
       const absent = all.filter((arm) => !isPresent(arm)).map((arm) => arm.name), faulted = all.filter((arm) => isPresent(arm) && arm.state.mode === "faulted");
       for (const arm of faulted) add(`faulted/${arm.name}`, "fault", `${arm.name} is faulted.`);
       if (absent.length) add(`absent/${absent}`, "fault", `Absent: ${some(absent)}.`);
-      const warm = all.filter((arm) => heat && isPresent(arm) && Math.max(...arm.state.temp_c) >= heat.warning_c)
-        .map((arm) => `${arm.name} (joint ${arm.state.temp_c.indexOf(Math.max(...arm.state.temp_c)) + 1})`);
+      const warm = all.filter((arm) => heat && isPresent(arm) && Math.max(...temperatures(arm)) >= heat.warning_c)
+        .map((arm) => `${arm.name} (joint ${temperatures(arm).indexOf(Math.max(...temperatures(arm))) + 1})`);
+      for (const arm of all) if (arm.badSensor) add(`sensor/${arm.name}/${arm.badSensor.slice(0, 7)}`, "warning", `${arm.name} has impossible temperatures: ${arm.badSensor}.`);
       if (warm.length) add(`warm/${warm}`, "warning", `Above the warning limit: ${some(warm)}.`);
     }
     for (const [arm, by] of Object.entries(fleet.paused)) add(`paused/${arm}/${by}`, "pause", `${arm === "*" ? "All arms are" : `${arm} is`} paused${by ? ` by ${by}` : ""}.`);
