@@ -15,6 +15,7 @@ MODULES = {
     "surprises": "reliability:SURPRISES",
     "questions": "real_logs:QUESTIONS_OF_LOGS",
     "forecast": "real_logs:FORECAST",
+    "amounts": "amounts:AMOUNTS",
     "transfer": "transfer:TRANSFER",
     "features": "features:FEATURES",
     "augmentation": "features:AUGMENTATION",
