@@ -75,6 +75,33 @@ def draw_knowledge(picture: Path) -> None:
     figure.savefig(picture, dpi=130)
 
 
+def draw_amounts(picture: Path) -> None:
+    """Error of an identified network by the length of the arm's own logs, beside that of a nominal one."""
+    from matplotlib.figure import Figure
+
+    from benchmarks.paper.harness import mean_by_group
+    from scenarios.json_rows import Rows
+
+    rows = [*Rows(ROOT / "docs" / "results" / "paper" / "amounts.jsonl").by_key.values()]
+    errors = {
+        float(minutes): mean_by_group([(str(i), row["error_k"][minutes]) for i, row in enumerate(rows)], least=0.0)
+        for minutes in rows[0]["error_k"]
+    }
+    nominal, own = errors.pop(0.0), [*errors.values()]
+    figure = Figure(figsize=(6.0, 2.7), layout="constrained")
+    axes = figure.subplots()
+    axes.axhline(nominal.mean, color="#888888", linestyle="--", label="nominal network")
+    axes.axhspan(nominal.low, nominal.high, color="#888888", alpha=0.15)
+    reach = [[each.mean - each.low for each in own], [each.high - each.mean for each in own]]
+    axes.errorbar([*errors], [each.mean for each in own], yerr=reach, marker="o", capsize=3, label="identified network")
+    axes.set(xscale="log", xlabel="own logs, min", ylabel="error of the peak, K", ylim=(0.0, None))
+    axes.set_xticks([*errors], [f"{minutes:g}" for minutes in errors])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(picture, dpi=130)
+
+
 def main() -> None:
     """Make the pictures; prints the size of each."""
     with TemporaryDirectory() as folder:
@@ -88,6 +115,7 @@ def main() -> None:
     trainings = sorted((ROOT / "docs" / "results" / "learned").glob("train-pairs-*"))
     draw_curves(trainings, PICTURES / "learning_pairs.png", "normalised score")
     draw_knowledge(PICTURES / "knowledge.png")
+    draw_amounts(PICTURES / "amounts.png")
     for picture in sorted(PICTURES.rglob("*.*")):
         print(f"{picture.relative_to(ROOT)}: {picture.stat().st_size / 1e6:.2f} MB")
 

@@ -590,6 +590,7 @@ PAPER = {
     "surprises": ("surprises",),
     "questions": ("questions_25s", "questions_6s"),
     "forecast": ("forecast",),
+    "amounts": ("amounts",),
     "sweep": ("sweep",),
     "parsimony": ("parsimony",),
     "transfer": ("transfer_errors", "transfer_savings"),

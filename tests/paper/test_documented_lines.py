@@ -27,6 +27,7 @@ TINY = {
     "surprises": "--sources oracle --cells 1",
     "questions": "--seeds 1 --epochs 4",
     "forecast": "",
+    "amounts": "--arms 2",
     "transfer": "--seeds 1 --jobs 2 4 --source-jobs 6 --source-steps 4 --held-out 4 --test 9 "
     "--steps 4 --further-steps 2",
     "features": "--seeds 1 --labels 10 --train 4 --steps 4",
