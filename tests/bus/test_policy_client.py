@@ -4,6 +4,7 @@ import json
 import queue
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -220,6 +221,10 @@ def test_what_goes_to_others_is_not_larger_than_before(router):
         open_client(router.endpoint, timeout_s=PATIENCE_S) as other,
     ):
         server = Server(one, "{}", key="thermofleet/v4/f/arm/arm_0/quote")
+        matches, querier = threading.Event(), other.declare_querier(keys.of_arm("f", "arm_0", "quote"))
+        listener = querier.declare_matching_listener(lambda status: matches.set() if status.matching else None)
+        assert querier.matching_status.matching or matches.wait(PATIENCE_S)
+        listener.undeclare()
         for size in (MOST_BYTES + 1, MOST_BYTES):
             for key in (keys.of_arm("f", "arm_0", "quote"), keys.of_every_arm("f", "quote")):
                 list(other.get(key, payload=b"x" * size, timeout=PATIENCE_S))

@@ -251,7 +251,7 @@ def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_co
 def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_path):
     log, plan, page = tmp_path / "today.csv", tmp_path / "plan.csv", tmp_path / "forecast.html"
     log.write_text(log_csv(300, celsius=35.0), encoding="utf-8")
-    plan.write_text(log_csv(40, celsius=0.0, seed=1), encoding="utf-8")
+    plan.write_text(log_csv(40, celsius=30.0, seed=1), encoding="utf-8")
     said = thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--repeat", 15, "--out", page)
     assert said.code == 0
     assert re.search(r"After 15 repetitions, 10 min, joint \d is the hottest: [\d.]+ °C \(95 % interval", said.out)
