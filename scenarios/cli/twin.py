@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, nearest
 from fleet.fields import MAX_SEED, argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES
@@ -68,8 +68,8 @@ def identify_command(
     worst = sorted(max(rms) for rms in network.rms_k.values())
     residual = f"median {worst[len(worst) // 2]:.2f} K, largest {worst[-1]:.2f} K"
     say(f"Residual at the worst joint of a recording: {residual}.", out_console)
-    advice = "" if ambient is not None else "; give another one with --ambient"
-    say(f"Ambient temperature assumed: {ambient_c:g} °C{advice}.", out_console)
+    advice = "" if ambient is not None else ", assumed; give another one with --ambient"
+    say(f"Ambient temperature: {ambient_c:g} °C{advice}.", out_console)
     say("Nothing was written; --out FOLDER keeps it." if out is None else f"Written to {out}.", out_console)
 
 
@@ -103,7 +103,9 @@ def forecast_command(
     ambient: float | None = option(
         "Ambient temperature, °C; default: as in the identification, or 22.", None, low=-40, high=60
     ),
-    arm: str | None = option("Arm of a log or scenario with several; default: the first.", None),
+    arm: str | None = option(
+        "Arm of a log with several; of a scenario, by default the first that can do the job.", None
+    ),
     out: Path | None = option("A page with a chart that ends in .html.", None),
     skip_damaged: bool = options.SKIP_DAMAGED,
     overwrite: bool = options.OVERWRITE,
@@ -118,36 +120,37 @@ def forecast_command(
         check_file(out, (".html",), overwrite)
     from scenarios.prepare.planned_motion import motion_of
     from scenarios.show import forecast_page
-    from twin.thermal.checkpoint import load
+    from twin.thermal.checkpoint import CARD, load
     from twin.thermal.forecast import forecast
 
-    identified = None if network is None else load(network)
+    identified = None if network is None else load(network.parent if network.name == CARD else network)
     so_far = one_of(options.recordings_of(log, skip_damaged), arm, log)
     path = Path(plan)
     if path.exists():
-        motion = one_of(options.recordings_of(path, skip_damaged), None, path)
+        motion = one_of(options.recordings_of(path, skip_damaged), arm, path)
     else:
         with progress_bar() as progress:
             motion = motion_of(plan, arm, progress)
     found = forecast(so_far, motion, repeat, network=identified, ambient_c=ambient)
+    origin = {
+        "log": so_far.name,
+        "plan": f"{motion.name}, {found.cycle_s:.4g} s",
+        "network": "nominal Gen3" if identified is None else f"{identified.arm}, version {identified.version}",
+        "ambient temperature": f"{found.ambient_c:g} °C",
+    }
     if out is not None:
-        origin = {
-            "log": so_far.name,
-            "plan": motion.name,
-            "network": "nominal Gen3" if identified is None else f"{identified.arm}, version {identified.version}",
-            "ambient temperature": f"{found.ambient_c:g} °C",
-        }
         with new_file(out) as draft:
             draft.write_text(forecast_page.page(found, so_far, repeat, origin), encoding="utf-8")
     if as_json:
-        print_json({"out": None if out is None else str(out), **forecast_page.card(found, so_far)})
+        print_json({"out": None if out is None else str(out), **forecast_page.card(found, so_far, origin)})
         return
+    say("; ".join(f"{name}: {value}" for name, value in origin.items()) + ".", out_console)
     for sentence in forecast_page.summary(found, so_far, repeat):
         say(sentence, out_console)
     print_wide(forecast_page.limit_table(found))
     print_wide(forecast_page.joint_table(found, so_far))
     if identified is None:
-        say("Network: a nominal Gen3. One identified from the arm's logs (`thermofleet twin identify`) narrows this.")
+        say("A network identified from the arm's logs (thermofleet twin identify) narrows the intervals.", out_console)
     say("No page was written; --out FILE.html writes one." if out is None else f"Open {out} in a browser.", out_console)
 
 
@@ -157,11 +160,16 @@ def one_of(recordings: "list[Recording]", arm: str | None, path: Path) -> "Recor
     Raises:
         FleetError: there is none, or several and no arm is named.
     """
-    chosen = [each for each in recordings if arm is None or len(recordings) == 1 or each.name.endswith(arm)]
-    if len(chosen) == 1:
-        return chosen[0]
-    names = ", ".join(each.name for each in recordings[:8])
-    raise FleetError(f"'{path}' has {len(recordings)} recordings ({names}): give one file, or name the arm with --arm.")
+    arms = {each.name.rpartition("/")[2]: each for each in recordings}
+    if len(recordings) == 1:
+        return recordings[0]
+    if arm in arms:
+        return arms[arm]
+    if path.is_dir():
+        raise FleetError(f"'{path}' is a folder with {len(recordings)} logs: give one of its files.")
+    if arm is None:
+        raise FleetError(f"'{path}' has {len(recordings)} arms ({', '.join(arms)}): name one with --arm.")
+    raise FleetError(f"'{path}' has no arm '{arm}'{nearest(arm, arms)}")
 
 
 def generate_command(

@@ -12,11 +12,11 @@ from twin.logs.recording import Recording
 
 
 def motion_of(job: str, arm: str | None = None, progress: Progress = quiet) -> Recording:
-    """One cycle of the arm's first plan for a job stream of a scenario.
+    """One cycle of the arm's first plan for a job stream of a scenario, with its first payload.
 
     Args:
         job: SCENARIO/JOB.
-        arm: Default: the first arm of the scenario.
+        arm: Default: the first arm of the scenario that can do the job.
 
     Raises:
         FleetError: there is no such scenario, job or arm, or the arm cannot do the job.
@@ -28,10 +28,16 @@ def motion_of(job: str, arm: str | None = None, progress: Progress = quiet) -> R
     streams = {each.name: each for each in scenario.jobs}
     if stream not in streams:
         raise FleetError(f"'{name}' has no job '{stream}'{nearest(stream, streams)}")
-    robot = prepare_arm(scenario, arm or scenario.arms[0].name, difficulty="blind", progress=progress)
-    plans = [plan for work in works_of(scenario, streams[stream]) for plan in robot.plans.get(work, ())]
-    if not plans:
-        raise FleetError(f"Arm '{robot.robot.name}' has no plan for '{stream}': `thermofleet layout {name}` shows why.")
-    profile = np.asarray(plans[0].cycle.profile, dtype=float)
+    works, tried = works_of(scenario, streams[stream]), [each.name for each in scenario.arms] if arm is None else [arm]
+    for each in tried:
+        robot = prepare_arm(scenario, each, difficulty="blind", progress=progress)
+        plans = [plan for work in works for plan in robot.plans.get(work, ())]
+        if plans:
+            break
+    else:
+        raise FleetError(f"No plan of {', '.join(tried)} for '{stream}': `thermofleet layout {name}` shows why.")
+    work, profile = plans[0].work, np.asarray(plans[0].cycle.profile, dtype=float)
     q, qd, tau = profile.transpose(1, 0, 2)
-    return Recording(name=job, time_s=np.arange(len(profile)) / RATE_HZ, q=q, qd=qd, tau=tau)
+    places = " → ".join(place.name for place in work.places)
+    title = f"{job} by {robot.robot.name}: {work.kind} {work.payload_kg:g} kg at {places}"
+    return Recording(name=title, time_s=np.arange(len(profile)) / RATE_HZ, q=q, qd=qd, tau=tau)

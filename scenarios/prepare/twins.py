@@ -31,7 +31,7 @@ from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario, TwinSpec
-from twin.logs.recording import NothingCool, Recording, Stretch, cool_stretches
+from twin.logs.recording import NothingCool, Recording, Stretch, check_recordings, cool_stretches
 from twin.vae.config import TwinConfig, training_key
 from twin.vae.measures import Features
 from twin.vae.twin import CARD as TWIN_CARD
@@ -329,6 +329,7 @@ def train_log(
     Raises:
         FleetError: a recording has no temperatures, nothing stayed cool, or the latent space of a joint collapsed.
     """
+    check_recordings(recordings)
     blind = [recording.name for recording in recordings if recording.temp_c is None]
     if blind:
         raise FleetError(

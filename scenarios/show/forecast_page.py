@@ -12,7 +12,7 @@ from scenarios.show.page import AXIS, GRID, INK, LAYOUT, Chart, Page, Section
 from scenarios.show.words import duration
 from scenarios.table import Column, Table
 from twin.logs.recording import Recording
-from twin.thermal.forecast import LONGEST_S, RISK, SAMPLES, ThermalForecast
+from twin.thermal.forecast import RISK, SAMPLES, ThermalForecast
 
 Array = np.ndarray
 
@@ -36,9 +36,16 @@ def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list
         f"P({error_c:g} °C) {_p(found.probability(error_c))}.",
     ]
     longest_s, warmer_k = found.longest_s(warning_c), found.safe_start_k(warning_c)
-    run = f"more than {duration(LONGEST_S)}" if math.isinf(longest_s) else _run(longest_s, found.cycle_s)
+    simulated = duration(float(found.time_s[-1]))
+    run = f"more than {simulated}" if math.isinf(longest_s) else _run(longest_s, found.cycle_s)
     sentences.append(f"Longest run in which P({warning_c:g} °C) is at most {100 * RISK:g} %: {run}.")
-    start_c = float(so_far_c(so_far).max()) + warmer_k
+    if math.isinf(warmer_k):
+        sentences.append(
+            f"No start is safe: also an arm at the ambient temperature, {found.ambient_c:g} °C, gets there."
+        )
+        return sentences
+    # Rounded down, so that it is below the limit.
+    start_c = math.floor(10.0 * (float(so_far_c(so_far).max()) + warmer_k) - 1e-6) / 10.0
     than = f"{abs(warmer_k):.1f} K {'warmer' if warmer_k >= 0 else 'cooler'} than now"
     sentences.append(
         f"Highest safe start of the planned run: hottest motor at {start_c:.1f} °C, if all motors and housings are "
@@ -97,7 +104,7 @@ def limit_table(found: ThermalForecast) -> Table:
                 f"{limit_c:g} °C",
                 _p(found.probability(limit_c)),
                 *("–" if math.isinf(s) else duration(s) for s in (early_s, middle_s)),
-                f"> {duration(LONGEST_S)}" if math.isinf(longest_s) else duration(longest_s),
+                f"> {duration(float(found.time_s[-1]))}" if math.isinf(longest_s) else duration(longest_s),
             )
         )
     head = ("limit", "P in the run", Column("earliest", words=True), Column("median", words=True), "longest run")
@@ -105,8 +112,8 @@ def limit_table(found: ThermalForecast) -> Table:
     return Table(head=head, rows=tuple(rows), notes=(note,))
 
 
-def card(found: ThermalForecast, so_far: Recording) -> dict[str, Any]:
-    """The numbers of a forecast as JSON."""
+def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -> dict[str, Any]:
+    """The numbers of a forecast as JSON, and from what they were made."""
     low, middle, high = found.interval()
 
     def finite(value: float) -> float | None:
@@ -118,12 +125,13 @@ def card(found: ThermalForecast, so_far: Recording) -> dict[str, Any]:
             "p": found.probability(limit_c),
             "reached_s": dict(zip(("early", "median", "late"), map(finite, found.reached_s(limit_c)), strict=True)),
             "longest_s": finite(found.longest_s(limit_c)),
-            "safe_start_k": found.safe_start_k(limit_c),
+            "safe_start_k": finite(found.safe_start_k(limit_c)),
         }
         for limit_c in LIMITS_C
     ]
     courses = {"low_c": low, "median_c": middle, "high_c": high}
     return {
+        "origin": dict(origin),
         "run_s": found.run_s,
         "cycle_s": found.cycle_s,
         "now_c": so_far_c(so_far).tolist(),

@@ -36,7 +36,12 @@ _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
 _NOT_IN_NAMES = re.compile(r"[/\\\[\]]")
 """Percent-encoded, as in keys of the bus."""
 _ARROW, _OR = re.compile(r"\s*(?:->|→|>|,|;)\s*"), re.compile(r"\s*[|;,]\s*")
-_FLAGS = {"yes": True, "true": True, "1": True, "hard": True, "no": False, "false": False, "0": False, "soft": False}
+_THOUSANDS = re.compile(r"[1-9]\d{0,2}(\.\d{3})+")
+_GERMAN_DATE = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}) +(\d{1,2}:\d{2}.*)")
+_FLAGS = {
+    **dict.fromkeys(("yes", "true", "1", "hard", "ja", "wahr"), True),
+    **dict.fromkeys(("no", "false", "0", "soft", "nein", "falsch"), False),
+}
 Cell = Any
 """A text, number, date, list or None, according to the file."""
 Rows = Iterator[tuple[int, Sequence[Cell]]]
@@ -52,11 +57,16 @@ class _Dialect(NamedTuple):
     """Of the shift, with its zone; None for unknown."""
     decimal_comma: bool
     """Whether a comma in a number is the decimal point."""
+    horizon_s: float
+    """Length of the shift; inf for unknown."""
 
 
 def _number(cell: Cell, dialect: _Dialect) -> float:
-    if isinstance(cell, str) and dialect.decimal_comma and "." not in cell:
-        cell = cell.replace(",", ".")
+    if isinstance(cell, str) and dialect.decimal_comma:
+        if _THOUSANDS.fullmatch(cell.strip()):
+            plain = cell.strip().replace(".", "")
+            raise ValueError(f"is this {plain}? Give numbers without separators of thousands (got {_shown(cell)})")
+        cell = cell.replace(",", ".") if "." not in cell else cell
     with suppress(TypeError, ValueError, OverflowError):
         if not isinstance(cell, bool) and isfinite(number := float(cell)):
             return number
@@ -81,9 +91,15 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
             return given_s
         if given_s >= DAY_S:
             raise ValueError(f"with shift_begin, h:mm is a time of day, before 24:00 (got '{text}')")
-        return (given_s - (begin - begin.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()) % DAY_S
+        since_s = given_s - (begin - begin.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
+        if since_s < 0 and since_s + DAY_S > dialect.horizon_s:
+            raise ValueError(f"'{text}' is before the begin of the shift, at {begin:%H:%M}, and after its end")
+        return since_s % DAY_S
     with suppress(ValueError):
         return _number(cell, dialect)
+    if german := _GERMAN_DATE.fullmatch(text):
+        day, month, year, clock_time = german.groups()
+        text = f"{year}-{month:0>2}-{day:0>2}T{clock_time:0>5}"
     try:
         date = datetime.fromisoformat(text)
     except ValueError:
@@ -179,13 +195,19 @@ class _Faults(dict[tuple[str, str], list[int]]):
 
 
 def read_job_table(
-    path: Path, where: str = "", *, begin: datetime | None = None, places: Collection[str] | None = None
+    path: Path,
+    where: str = "",
+    *,
+    begin: datetime | None = None,
+    horizon_s: float = inf,
+    places: Collection[str] | None = None,
 ) -> list[JobSpec]:
     """The jobs of a table in the order of its rows; times count from the begin of the shift.
 
     Args:
         where: Name of the table in errors; by default the path.
         begin: Of the shift, with its zone; needed for dates.
+        horizon_s: Length of the shift; a time of day before its begin must be within it on the next day.
         places: Places of the cell; `places` must name some of them, and `after` rows of the table. None: not checked.
 
     Raises:
@@ -195,7 +217,7 @@ def read_job_table(
     where, faults, jobs = where or str(path), _Faults(), list[JobSpec]()
     lines, decimal_comma = _rows(path, where)
     number, head = next(lines, (1, ()))
-    columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma)
+    columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma, horizon_s)
     faults.raise_any(where)
     no_place = cache(lambda name: f"no place '{printable(name)}'{nearest(name, places or ())}")
     rows: dict[str, tuple[int, Row]] = {}

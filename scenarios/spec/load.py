@@ -39,6 +39,8 @@ def load(name_or_path: str | Path) -> Scenario:
     Raises:
         ScenarioError: the scenario is unknown or invalid; the message names file, field and allowed values.
     """
+    if not isinstance(name_or_path, str | Path):
+        raise ScenarioError(f"A scenario is a name or a path (got {type(name_or_path).__name__} {name_or_path!r}).")
     if INSTANCE.fullmatch(str(name_or_path)):
         from scenarios.suite.splits import instance
 

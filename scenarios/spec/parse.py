@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from itertools import chain, combinations, pairwise
-from math import dist, isfinite
+from math import dist, inf, isfinite
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -204,7 +204,9 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
         if len(each) > 1 or not isinstance(each["table"], str):
             raise ScenarioError(f'{where}: a job table is table = "FILE", without other keys (got {", ".join(each)}).')
         file = path.parent / each["table"]
-        rows = read_job_table(file, f"{where}.table: '{file.name}'", begin=begin, places=names)
+        rows = read_job_table(
+            file, f"{where}.table: '{file.name}'", begin=begin, horizon_s=horizon_s or inf, places=names
+        )
         check_times([row.release_s for row in rows], horizon_s, f"{where}.table: '{file.name}'")
         streams += [stream_fields(row, horizon_s) for row in rows]
     return {**raw, "jobs": streams}

@@ -250,6 +250,19 @@ def test_all_faults_are_told_at_once_and_equal_ones_together(tmp_path):
         assert f"row {i + 3}" in told or not i
 
 
+def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
+    begin = "shift_begin = 2026-11-23T06:00:00+01:00"
+    text = SHORT.replace(",", ";") + "\na;hold;bench;0,5;2;23.11.2026 06:01;6:02;WAHR;;\nb;hold;bench;;;;;nein;;\n"
+    first, second = drawn(small_table(tmp_path, text, begin), 0)[::-1]
+    assert (first.release_s, first.due_s, first.expires, first.work.payload_kg) == (60.0, 120.0, True, 0.5)
+    assert not second.expires
+    for row, sentence in (
+        ("a;hold;bench;;1.000;;;;;", "column repetitions: is this 1000? Give numbers without separators of thousands"),
+        ("a;hold;bench;;;6:01;5:00;;;", "column due: '5:00' is before the begin of the shift, at 06:00, and after its"),
+    ):
+        assert sentence in faults_of(tmp_path, f"{SHORT.replace(',', ';')}\n{row}\n", begin)
+
+
 HEADS = {
     "name,kind,places,paylod": "column paylod: unknown; did you mean 'payload'? Allowed: name, kind, places",
     "name,kind": "row 1: no column places; every job needs name, kind, places.",

@@ -213,7 +213,7 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     assert "…" not in said.out  # also the longest name fits into 80 columns
     assert "winding_housing_k_per_w" in said.out
     assert (
-        f"Ambient temperature assumed: 22 °C; give another one with --ambient.\nWritten to {tmp_path / 'rc'}"
+        f"Ambient temperature: 22 °C, assumed; give another one with --ambient.\nWritten to {tmp_path / 'rc'}"
         in said.out
     )
     before = (tmp_path / "rc" / "rc.json").read_bytes()
@@ -222,7 +222,7 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     assert "rc.json' exists; give another --out, or --overwrite to replace it." in again.err
     assert (tmp_path / "rc" / "rc.json").read_bytes() == before
     replaced = thermofleet(*identify, "--ambient", 25, "--overwrite")
-    assert "Ambient temperature assumed: 25 °C.\n" in replaced.out
+    assert "Ambient temperature: 25 °C.\n" in replaced.out
     assert json.loads((tmp_path / "rc" / "rc.json").read_text(encoding="utf-8"))["ambient_c"] == 25.0
 
 
@@ -265,6 +265,7 @@ def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_p
     assert card["run_s"] == pytest.approx(39.5)
     of_job = thermofleet("twin", "forecast", "--log", log, "--plan", f"{small_toml}/hold", "--repeat", 3)
     assert of_job.code == 0, of_job.err
+    assert re.search(r"/hold by left: hold [\d.]+ kg at bench", of_job.out), of_job.out
     for word, sentence in (
         ("quickstart/nothing", "'quickstart' has no job 'nothing'. Allowed: hold_part"),
         ("nothing", "--plan must be a file, or SCENARIO/JOB as quickstart/hold_part (got 'nothing')."),

@@ -104,6 +104,12 @@ def test_an_arm_that_starts_warmer_by_the_safe_change_just_stays_below_the_limit
     assert peak_c[0] < limit_c < peak_c[1]
 
 
+def test_no_start_is_safe_if_a_cold_arm_gets_there_too(hour) -> None:
+    _, log, _, _ = hour
+    endless = forecast(log, held(2.0 * FULL_REACH_NM), 1000, ambient_c=AIR_C)
+    assert endless.safe_start_k(60.0) == -np.inf
+
+
 def test_the_same_seed_gives_the_same_forecast_and_short_cycles_that_of_long_ones(hour) -> None:
     _, log, _, found = hour
     again = forecast(log, held(FULL_REACH_NM), 30, ambient_c=AIR_C)
@@ -120,8 +126,12 @@ def test_a_forecast_needs_temperatures_time_and_a_whole_plan(hour) -> None:
         forecast(replace(log, temp_c=None), plan)
     with pytest.raises(FleetError, match="less than 60 s since its start or its last gap"):
         forecast(log.part(slice(0, 30)), plan)
-    with pytest.raises(FleetError, match="'hold' has fewer than three samples, or a gap of more than 10 s"):
+    with pytest.raises(FleetError, match="'hold' has a gap of 34 s after 1 s; at most 10 s"):
         forecast(log, plan.part(np.array([0, 1, 2, 70])))
+    with pytest.raises(FleetError, match="'hold' has 2 samples; at least 3"):
+        forecast(log, plan.part(np.array([0, 1])))
+    with pytest.raises(FleetError, match=r"a motor at .* below the ambient temperature of 50 °C"):
+        forecast(log, plan, ambient_c=50.0)
     six = {name: getattr(plan, name)[:, :6] for name in ("q", "qd", "tau")}
     with pytest.raises(FleetError, match="6 joints, the thermal network 7"):
         forecast(log, replace(plan, **six))
@@ -129,3 +139,6 @@ def test_a_forecast_needs_temperatures_time_and_a_whole_plan(hour) -> None:
         forecast(log, plan, int(MOST_S / CYCLE_S) + 1)
     with pytest.raises(ValueError, match="repetitions must be >= 1"):
         forecast(log, plan, 0)
+    for call in (lambda: forecast("x.csv", plan), lambda: identify("x.csv"), lambda: identify([3])):
+        with pytest.raises(TypeError, match=r"A recording is needed \(got .* twin\.logs\.reader\.read\(path\) returns"):
+            call()

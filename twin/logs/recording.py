@@ -83,6 +83,20 @@ class Recording:
         return replace(self, time_s=self.time_s[rows], **kept)
 
 
+def check_recordings(given: object) -> None:
+    """Check that a value is one or several recordings, and not for example the path of a log.
+
+    Raises:
+        TypeError: it is not; names how a log is read.
+    """
+    several = given if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    if wrong := [each for each in several if not isinstance(each, Recording)]:
+        raise TypeError(
+            f"A recording is needed (got {type(wrong[0]).__name__} {str(wrong[0])[:60]!r}). twin.logs.reader.read(path) "
+            "returns the recordings of a log."
+        )
+
+
 def interval_speed(recording: Recording) -> Array:
     """Mean speed over each interval between samples, rad/s, >= 0, [time − 1, joint].
 

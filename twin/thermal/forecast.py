@@ -20,7 +20,7 @@ from fleet.heat.motor import Motors, magnet_factor
 from fleet.heat.thermal import HOUSING, WINDING, temperature_steps
 from fleet.motion import Drive
 from fleet.robot import JOINTS
-from twin.logs.recording import HEAT_GAP_S, STEP_S, HeatLog, Recording, heat_logs, source_of
+from twin.logs.recording import HEAT_GAP_S, STEP_S, HeatLog, Recording, check_recordings, heat_logs, source_of
 from twin.thermal.identify import (
     AMBIENT_C,
     Identified,
@@ -39,8 +39,10 @@ RISK = 0.025
 """Probability of a limit that counts as safe, and of either side beyond an interval."""
 MEMORY_S = 2 * 3600.0
 """Length of the log that is used: three time constants of a housing."""
-LEAST_S = 60.0
-"""Least length of the log."""
+LEAST_S, LEAST_SAMPLES = 60.0, 3
+"""Least length of the log, and least samples of a plan."""
+BELOW_AMBIENT_K = 3.0
+"""By how much the coolest motor of a powered arm may read less than the ambient temperature."""
 LONGEST_S = 4 * 3600.0
 """Time for which longer runs of the same motion are simulated: temperatures are steady by then."""
 MOST_S = 7 * 86400.0
@@ -109,9 +111,13 @@ class ThermalForecast:
         """By how much all motors may be warmer at the start, K; negative: they must be cooler. To first order.
 
         The probability of reaching the temperature in the planned run is then `RISK`.
+
+        Returns:
+            -inf if the hottest motor had to be below the ambient temperature: no start of a powered arm is safe.
         """
         room_k = (limit_c - self._planned) / np.maximum(self.slope[self.in_run], 1e-3)
-        return float(np.sort(room_k.min(axis=(1, 2)))[int(RISK * len(room_k))])
+        change_k = float(np.sort(room_k.min(axis=(1, 2)))[int(RISK * len(room_k))])
+        return change_k if self.sampled_c[0, 0].max() + change_k >= self.ambient_c else -np.inf
 
     def _first_s(self, limit_c: float) -> Array:
         """First time at which a motor reaches a temperature, inf for never, [sample]."""
@@ -137,16 +143,18 @@ def forecast(
         ambient_c: Default: that of the identification.
 
     Raises:
-        FleetError: the log has no temperatures, or less than a minute since its last gap; the plan has a gap; there are
-            other than seven joints; or the run is longer than a week.
+        FleetError: the log has no temperatures, or less than a minute since its last gap; a motor is below the
+            ambient temperature; the plan has a gap or too few samples; there are other than seven joints; or the run is
+            longer than a week.
         ValueError: repetitions < 1.
     """
+    check_recordings((so_far, plan))
     if repetitions < 1:
         raise ValueError(f"repetitions must be >= 1 (got {repetitions}).")
     vector = _parameters(network)
     ambient_c = (AMBIENT_C if network is None else network.ambient_c) if ambient_c is None else ambient_c
     motors = vector.nominal.motors
-    (log, last_c), cycle_log = _end_of(so_far, motors), _cycle_of(plan, motors)
+    (log, last_c), cycle_log = _end_of(so_far, motors, ambient_c), _cycle_of(plan, motors)
     cycle_s = plan.duration_s
     run_s = repetitions * cycle_s
     if run_s > MOST_S:
@@ -198,7 +206,7 @@ def _parameters(network: Identified | None) -> ParameterVector:
     return vector
 
 
-def _end_of(so_far: Recording, motors: Motors) -> tuple[HeatLog, Array]:
+def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLog, Array]:
     """The last stretch of a log without a gap, in at most `MOST_STEPS` steps, and its last motor temperatures."""
     check_seven_joints(so_far)
     if so_far.temp_c is None:
@@ -209,6 +217,12 @@ def _end_of(so_far: Recording, motors: Motors) -> tuple[HeatLog, Array]:
         raise FleetError(
             f"The log '{so_far.name}' has less than {LEAST_S:.0f} s since its start or its last gap. Housings have no "
             "sensor: record some minutes before the forecast, better half an hour."
+        )
+    coolest_c = float(so_far.temp_c[-1].min())
+    if coolest_c < ambient_c - BELOW_AMBIENT_K:
+        raise FleetError(
+            f"The log '{so_far.name}' ends with a motor at {coolest_c:.1f} °C, below the ambient temperature of "
+            f"{ambient_c:g} °C, which no powered motor can be. State the ambient temperature of the log (--ambient)."
         )
     return logs[-1], so_far.temp_c[-1]
 
@@ -224,9 +238,16 @@ def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:
     check_seven_joints(plan)
     silent = replace(plan, temp_c=np.zeros_like(plan.q))  # of no use here
     logs = heat_logs(silent, motors, source_of([plan]), step_s=0.0)
+    if len(plan.time_s) < LEAST_SAMPLES:
+        raise FleetError(
+            f"The plan '{plan.name}' has {len(plan.time_s)} samples; at least {LEAST_SAMPLES} are needed, better 2 a "
+            "second."
+        )
+    gap = int(np.diff(plan.time_s).argmax())
     if len(logs) != 1 or len(logs[0].time_s) != len(plan.time_s):
         raise FleetError(
-            f"The plan '{plan.name}' has fewer than three samples, or a gap of more than {HEAT_GAP_S:g} s."
+            f"The plan '{plan.name}' has a gap of {plan.time_s[gap + 1] - plan.time_s[gap]:.4g} s after "
+            f"{plan.time_s[gap]:.6g} s; at most {HEAT_GAP_S:g} s are allowed, as its heat is unknown."
         )
     return logs[0]
 

@@ -36,7 +36,16 @@ from fleet.heat.thermal import (
     winding,
 )
 from fleet.robot import JOINTS, Cooling
-from twin.logs.recording import READINGS, STEP_S, CurrentSource, HeatLog, Recording, heat_logs, source_of
+from twin.logs.recording import (
+    READINGS,
+    STEP_S,
+    CurrentSource,
+    HeatLog,
+    Recording,
+    check_recordings,
+    heat_logs,
+    source_of,
+)
 
 Array = np.ndarray
 
@@ -474,6 +483,7 @@ def identify(
         IdentificationError: the recordings are insufficient: none, wrong number of joints, no temperatures, too
             short, no motor that warms or cools, no current.
     """
+    check_recordings(recordings)
     nominal = nominal or nominal_heat_model()
     sd_k = thermal_data()["spread"]["ambient_k"] if ambient_sd_k is None else ambient_sd_k
     if sd_k < 0:
