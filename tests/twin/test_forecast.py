@@ -1,6 +1,7 @@
 """Forecasts of motor temperatures from the log of an arm, against the simulator's law with the arm's true numbers."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,6 +140,7 @@ def test_a_forecast_needs_temperatures_time_and_a_whole_plan(hour) -> None:
         forecast(log, plan, int(MOST_S / CYCLE_S) + 1)
     with pytest.raises(ValueError, match="repetitions must be >= 1"):
         forecast(log, plan, 0)
-    for call in (lambda: forecast("x.csv", plan), lambda: identify("x.csv"), lambda: identify([3])):
+    path: Any = "x.csv"
+    for call in (lambda: forecast(path, plan), lambda: identify(path), lambda: identify([path])):
         with pytest.raises(TypeError, match=r"A recording is needed \(got .* twin\.logs\.reader\.read\(path\) returns"):
             call()

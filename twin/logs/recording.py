@@ -92,8 +92,8 @@ def check_recordings(given: object) -> None:
     several = given if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
     if wrong := [each for each in several if not isinstance(each, Recording)]:
         raise TypeError(
-            f"A recording is needed (got {type(wrong[0]).__name__} {str(wrong[0])[:60]!r}). twin.logs.reader.read(path) "
-            "returns the recordings of a log."
+            f"A recording is needed (got {type(wrong[0]).__name__} {str(wrong[0])[:60]!r}). "
+            "twin.logs.reader.read(path) returns the recordings of a log."
         )
 
 
