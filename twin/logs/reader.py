@@ -542,8 +542,8 @@ def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Reco
     if is_csv and (held := repeats(time_s, kept, GAP_S)):
         share = sum(end - start for start, end in held) / len(time_s)
         log.warning(
-            "%s: %.0f %% of its lines repeat the one before, for more than %g s, as those of a slow logger. They are used; "
-            "motion between them is unknown.",
+            "%s: %.0f %% of its lines repeat the one before, for more than %g s, as those of a slow logger. They are "
+            "used; motion between them is unknown.",
             *(path, 100 * share, GAP_S),
         )
     if len(time_s) and time_s[0] >= EPOCH_S:
