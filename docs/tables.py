@@ -341,7 +341,7 @@ def knowledge(folder: Path) -> str:
     )
     own, alone = values.only(hot), "trained-alone"
     others = {"torque-alone": "squared torque", "untrained-alone": "errors of the untrained twin"}
-    gains = [f"less {what} {shown(own.difference(alone, name))}" for name, what in others.items() if name in found]
+    gains = [f"less {what} {shown(own.difference(alone, name), 3)}" for name, what in others.items() if name in found]
     if alone in found and gains:
         count += f" There, without thermometers, errors of the twin {' and '.join(gains)}."
     return table((*heads, "share, surprise", "faults"), rows) + f"\n\n{count}"
@@ -518,9 +518,9 @@ def scored(folder: Path, split: str, source: str = "oracle") -> tuple[dict[str, 
     return found, scores_by_name(found, split)
 
 
-def shown(difference: Interval) -> str:
+def shown(difference: Interval, digits: int = 2) -> str:
     """A difference with its interval, bold if that excludes 0."""
-    return bold_if(difference.excludes_zero, difference.text())
+    return bold_if(difference.excludes_zero, difference.text(digits))
 
 
 def by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Array]]) -> str:

@@ -31,11 +31,12 @@ TORQUE_NM = 2 * np.array([105.0] * 4 + [52.0] * 3)
 TEMP_RANGE_C = (-40.0, 200.0)
 """Range of a motor's temperature sensor."""
 COOL_C, HOT_C = 65.0, ThermalLimits().error_c + 10.0
-"""Medians over a log that no Gen3 has, °C: of its coolest motor, as idle wrists have 45; of any, as it stops at 75."""
+"""Upper limits of median temperatures over a log, °C: of the coolest motor (an idle wrist has 45), and of any motor (it
+stops at 75)."""
 TEMP_STEP_K = 2.0
 """Change of a motor temperature by resolution and noise of the sensor; the public logs have up to 1 K."""
 MOST_STEP_S = 10.0
-"""Most usual time between two samples, s: across a longer one neither motion nor heat is known."""
+"""Largest median time between two samples, s: across a longer one neither motion nor heat is known."""
 STALE_S = 8.0
 """Rows that repeat for longer are stale, s. Public logs repeat rows for up to 6.6 s, when their logger was late."""
 STUCK_S, STUCK_ROWS = 30.0, 20
@@ -43,7 +44,7 @@ STUCK_S, STUCK_ROWS = 30.0, 20
 LEAST_ROWS = 20
 """Rows from which angles, velocities, torques and currents are compared."""
 DRIVES_RAD_S = 0.05
-"""Mean measured speed with which an angle cannot stand still."""
+"""Mean speed above which an angle that never changes is a dead channel."""
 LEAST_MOTION_RAD, LEAST_TORQUE_NM = 0.5, 3.0
 """Motion and RMS torque of a joint from which readings are compared."""
 AGREES = 1.6
@@ -99,9 +100,9 @@ def _warming_k_per_s() -> Array:
 class TemperatureFilter:
     """Last possible motor temperatures of a live arm; other readings are of a bad sensor.
 
-    A reading is impossible outside `TEMP_RANGE_C`, at exactly 0.0 as the first one, where no motor is below `COOL_C`,
-    or after a change that no motor can make; and until it changes like that again. As in a log, the longer side of such
-    a change counts: readings that go on for `STUCK_S` longer than those before it are possible, unless they repeat.
+    Rejected are readings outside `TEMP_RANGE_C`, a first reading of exactly 0.0, and all readings while no motor is
+    below `COOL_C`. After a change that no motor can make, readings are rejected until the next such change, or until
+    they have gone on for `STUCK_S` longer than those before it without repeating.
 
     Attributes:
         temp_c: Last possible temperature by joint, °C.
@@ -281,7 +282,8 @@ def _wrong_unit(temp_c: Array) -> Iterator[BadReading]:
     usual_c = np.median(temp_c, axis=0)
     if usual_c.min() > COOL_C or usual_c.max() > HOT_C:
         joint = int(usual_c.argmax())
-        what = f"temperature of joint {joint + 1} is {usual_c[joint]:.5g} °C at half of the time, as no Gen3 has"
+        what = f"above {HOT_C:g} °C" if usual_c.max() > HOT_C else f"and that of no joint is below {COOL_C:g} °C"
+        what = f"the median temperature of joint {joint + 1} is {usual_c[joint]:.5g}, {what}"
         yield BadReading(what, _unit_of(usual_c[usual_c > COOL_C]))
 
 
@@ -397,7 +399,7 @@ def _motion(time_s: Array, readings: Mapping[str, Array], degrees: bool) -> Iter
         ratio = float((by_angle * by_speed).sum() / (by_speed**2).sum())
         if alike[j, j] < 0.8 or 1 / AGREES < ratio < AGREES:
             continue
-        what = f"velocity and change of position of joint {j + 1} disagree: the angle moves {ratio:.3g} times as far"
+        what = f"joint {j + 1}: the angle changes {ratio:.3g} times as much as the integrated velocity"
         yield BadReading(what, _unit_of_motion(ratio, degrees))
 
 
@@ -500,7 +502,7 @@ def _gravity(readings: Mapping[str, Array]) -> Iterator[BadReading]:
     alternatives = [(_misfit(q_, tau_), meant) for q_, tau_, meant in _alternatives(q, tau)]
     least, meant = min(alternatives, key=lambda each: each[0])
     if least * BETTER < misfit:
-        what = f"the torques do not fit the angles: gravity leaves {misfit:.0%} of them unexplained"
+        what = f"the torques do not fit the angles: gravity leaves {misfit:.0%} of the squared torque unexplained"
         yield BadReading(what, f"With {meant} it would be {least:.0%}. Check the columns, signs and units.")
 
 

@@ -97,16 +97,16 @@ def forecast_command(
         MISSING,
     ),
     network: Path | None = option(
-        "A folder that `thermofleet twin identify` wrote. Default: a nominal Gen3, with the spread of arms.", None
+        "A folder that `thermofleet twin identify` wrote. Default: a nominal Gen3, with the spread of real ones.", None
     ),
     repeat: int = option("Number of repetitions.", 1, low=1, high=1_000_000),
     ambient: float | None = option(
         "Ambient temperature, °C; default: as in the identification, or 22.", None, low=-40, high=60
     ),
     arm: str | None = option(
-        "Arm of a log with several; of a scenario, by default the first that can do the job.", None
+        "Arm, if the log or scenario has several. Default in a scenario: the first that can do the job.", None
     ),
-    out: Path | None = option("A page with a chart that ends in .html.", None),
+    out: Path | None = option("HTML page to write, with a chart; its name ends in .html.", None),
     skip_damaged: bool = options.SKIP_DAMAGED,
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
@@ -150,7 +150,7 @@ def forecast_command(
     print_wide(forecast_page.limit_table(found))
     print_wide(forecast_page.joint_table(found, so_far))
     if identified is None:
-        say("A network identified from the arm's logs (thermofleet twin identify) narrows the intervals.", out_console)
+        say("For the arm's own network: thermofleet twin identify, then --network.", out_console)
     say("No page was written; --out FILE.html writes one." if out is None else f"Open {out} in a browser.", out_console)
 
 

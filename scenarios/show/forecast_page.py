@@ -32,17 +32,15 @@ def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list
         f"After {_times(repetitions)}, {duration(found.run_s)}, joint {hottest + 1} is the hottest: "
         f"{middle[hottest]:.1f} °C (95 % interval {low[hottest]:.1f} to {high[hottest]:.1f}), now "
         f"{so_far_c(so_far)[hottest]:.1f} °C.",
-        f"P(a motor reaches {warning_c:g} °C) {_p(found.probability(warning_c))}; "
-        f"P({error_c:g} °C) {_p(found.probability(error_c))}.",
+        f"P(a motor reaches {warning_c:g} °C) {_equals(found.probability(warning_c))}; "
+        f"P({error_c:g} °C) {_equals(found.probability(error_c))}.",
     ]
     longest_s, warmer_k = found.longest_s(warning_c), found.safe_start_k(warning_c)
     simulated = duration(float(found.time_s[-1]))
     run = f"more than {simulated}" if math.isinf(longest_s) else _run(longest_s, found.cycle_s)
     sentences.append(f"Longest run in which P({warning_c:g} °C) is at most {100 * RISK:g} %: {run}.")
     if math.isinf(warmer_k):
-        sentences.append(
-            f"No start is safe: also an arm at the ambient temperature, {found.ambient_c:g} °C, gets there."
-        )
+        sentences.append(f"No start is safe: P({warning_c:g} °C) is higher even from an arm at {found.ambient_c:g} °C.")
         return sentences
     # Rounded down, so that it is below the limit.
     start_c = math.floor(10.0 * (float(so_far_c(so_far).max()) + warmer_k) - 1e-6) / 10.0
@@ -63,6 +61,11 @@ def so_far_c(so_far: Recording) -> Array:
 def _p(probability: float) -> str:
     least = 1.0 / SAMPLES
     return f"< {least:g}" if probability < least else f"{probability:.2f}"
+
+
+def _equals(probability: float) -> str:
+    shown = _p(probability)
+    return shown if shown.startswith("<") else f"= {shown}"
 
 
 def _run(longest_s: float, cycle_s: float) -> str:
@@ -89,7 +92,7 @@ def joint_table(found: ThermalForecast, so_far: Recording) -> Table:
         )
         for j in range(JOINTS)
     ]
-    head = ("joint", "now, °C", "end, °C", "95 % interval", "highest, °C", "97.5 %, °C")
+    head = ("joint", "now, °C", "end, °C", "95 % interval", "max. in run, °C", "its 97.5 %, °C")
     return Table(head=head, rows=tuple(rows))
 
 
@@ -108,7 +111,7 @@ def limit_table(found: ThermalForecast) -> Table:
             )
         )
     head = ("limit", "P in the run", Column("earliest", words=True), Column("median", words=True), "longest run")
-    note = f"Earliest time and longest run: a motor is at the limit before with a probability of {100 * RISK:g} %."
+    note = f"Earliest: {100 * RISK:g} % quantile. Longest run: P(reaching the limit) is at most {100 * RISK:g} %."
     return Table(head=head, rows=tuple(rows), notes=(note,))
 
 

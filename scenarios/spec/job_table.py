@@ -93,7 +93,9 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
             raise ValueError(f"with shift_begin, h:mm is a time of day, before 24:00 (got '{text}')")
         since_s = given_s - (begin - begin.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
         if since_s < 0 and since_s + DAY_S > dialect.horizon_s:
-            raise ValueError(f"'{text}' is before the begin of the shift, at {begin:%H:%M}, and after its end")
+            raise ValueError(
+                f"'{text}' is outside the shift, which begins at {begin:%H:%M} and ends before {text} of the next day"
+            )
         return since_s % DAY_S
     with suppress(ValueError):
         return _number(cell, dialect)

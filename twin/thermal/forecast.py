@@ -36,7 +36,7 @@ Array = np.ndarray
 SAMPLES = 200
 """Samples of network and start: a probability is a multiple of 1/200."""
 RISK = 0.025
-"""Probability of a limit that counts as safe, and of either side beyond an interval."""
+"""Accepted probability of reaching a limit, and that of either tail of an interval."""
 MEMORY_S = 2 * 3600.0
 """Length of the log that is used: three time constants of a housing."""
 LEAST_S, LEAST_SAMPLES = 60.0, 3
