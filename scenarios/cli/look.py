@@ -163,7 +163,9 @@ def _list_library(as_json: bool) -> None:
 
 def layout_command(
     scenario: str = options.SCENARIO,
-    out: Path | None = option("Draw the cell from above as this PNG file.", None),
+    out: Path | None = option(
+        "Draw the plan of the cell as this PNG file: reach, places out of reach, and exclusions.", None
+    ),
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
 ) -> None:
@@ -173,7 +175,7 @@ def layout_command(
     at home. Exit code 2: there are problems.
     """
     from scenarios.result_folder import check_file, new_file
-    from scenarios.show.layout import layout_report, layout_scene, layout_tables
+    from scenarios.show.layout import layout_report, layout_tables
     from scenarios.spec.load import load
 
     chosen = load(scenario)
@@ -188,12 +190,10 @@ def layout_command(
         for part in (*tables, sentence):
             out_console.print(part)
     if out is not None:
-        from matplotlib.image import imsave
-
-        from fleet.env.render.picture import draw
+        from scenarios.show.plan import draw_plan
 
         with new_file(out) as file:
-            imsave(file, draw(layout_scene(chosen, report)), format="png")
+            draw_plan(file, chosen, report)
         say(f"Drew the cell: {out}.")
     for problem in report.problems:
         say(f"Error: {problem}")

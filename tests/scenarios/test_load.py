@@ -29,6 +29,7 @@ from scenarios.cli.run import metrics_table
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
 from scenarios.show.layout import layout_report
+from scenarios.show.plan import draw_plan
 from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.spec.load import library, load, own_seed
 from scenarios.spec.options import RunSpec
@@ -555,6 +556,16 @@ def test_problems_are_reported_all_at_once(cache):
     assert list(report.problems) == lines
     with pytest.raises(FleetError, match="at home 'west'"):
         prepare_arm(cell(*TOGETHER, places=PLACES), "west", difficulty="blind", cache=cache)
+
+
+def test_a_cell_that_does_not_work_is_drawn_with_the_distance_that_lacks(cache, tmp_path):
+    scenario = cell(*TOGETHER, places=PLACES)
+    report = layout_report(scenario)
+    lacks_m = {(each.arm, each.place): each.lacks_m for each in report.reach}
+    assert lacks_m["east", "moon"] == pytest.approx(np.hypot(9.0 - 0.45, 0.2 - 0.28481) - 0.902575)
+    assert lacks_m["west", "middle"] == 0.0
+    draw_plan(tmp_path / "cell.png", scenario, report)
+    assert (tmp_path / "cell.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.ci_slow
