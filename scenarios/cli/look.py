@@ -5,6 +5,7 @@ import re
 import shlex
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -346,8 +347,15 @@ def _size(asked: str) -> tuple[int, int]:
 
 
 def report_command(
-    folder: Path | None = argument("Folder of a run or of a recording. Default: the newest one in runs/.", None),
-    out: Path | None = option("The HTML file. Default: in the folder of a run, beside that of a recording.", None),
+    folders: list[Path] | None = argument(
+        "Folder of a run or of a recording; several runs are compared on one page. Default: the newest one in runs/.",
+        None,
+    ),
+    out: Path | None = option(
+        "The HTML file; of several runs also their table of figures, .csv or .xlsx. Default: report.html in the folder "
+        "of a run and beside that of a recording, compared.html beside several runs.",
+        None,
+    ),
     scenario: str | None = option("Of a recording: scenario of the fleet, if no auctioneer described its cell.", None),
     meshes: bool = option("Of a run: Kinova's shells; needs the extra `meshes`.", False),
     trace: str | None = option(
@@ -359,7 +367,7 @@ def report_command(
     ),
     as_json: bool = option("--trace: print JSON.", False, flag="--json"),
 ) -> None:
-    """Write the page of a run or recording, finished or not; with --trace, follow an event to its causes."""
+    """Write the page of a run or recording, finished or not, or of several runs; with --trace, explain an event."""
     from scenarios.live.recording_report import open_recording
     from scenarios.result_folder import new_file
     from scenarios.run.log import open_run
@@ -367,7 +375,12 @@ def report_command(
 
     if as_json and trace is None:
         raise FleetError("--json is for --trace: leave it out.")
-    folder = folder or last_folder(Path("runs"))
+    if folders and len(folders) > 1:
+        if trace is not None or scenario is not None or meshes:
+            raise FleetError("--trace, --scenario and --meshes are for one folder: leave them out, or give one folder.")
+        _compare_runs(folders, out)
+        return
+    folder = folders[0] if folders else last_folder(Path("runs"))
     if trace is not None:
         _print_trace(folder, trace, as_json)
         return
@@ -380,6 +393,31 @@ def report_command(
     with new_file(path) as draft:
         draft.write_text(html, encoding="utf-8")
     say(f"Open {path} in a browser.", out_console)
+
+
+def _compare_runs(folders: Sequence[Path], out: Path | None) -> None:
+    """Write the page of several runs, or their table."""
+    from scenarios.result_folder import new_file
+    from scenarios.run.log import open_run
+    from scenarios.show.runs_page import runs_page, runs_table
+
+    path = out or folders[0].parent / "compared.html"
+    options.check_table_file(path, (".html",))
+    if strange := [folder for folder in folders if not (folder / "run.json").exists()]:
+        raise FleetError(f"Of several folders each must be of `thermofleet run` (got '{strange[0]}'): leave it out.")
+    names = [folder.resolve().name for folder in folders]
+    logs = {
+        name if names.count(name) == 1 else str(folder): open_run(folder)
+        for name, folder in zip(names, folders, strict=True)
+    }
+    if len(logs) < len(folders):
+        raise FleetError("A run is given twice. Give each folder once.")
+    with new_file(path) as draft:
+        if path.suffix.lower() == ".html":
+            draft.write_text(runs_page(logs), encoding="utf-8")
+        else:
+            draft.write_bytes(runs_table(logs).content(path.suffix.lower()))
+    say(f"Written to {path}.", out_console)
 
 
 def _print_trace(folder: Path, event: str, as_json: bool) -> None:

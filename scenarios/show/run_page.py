@@ -302,11 +302,8 @@ KEY_FIGURES = (
 
 def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
     """The most important metrics; those without a number are left out."""
-    values, peaks = _numbers(metrics), _peaks(metrics)
+    values, peaks = numbers(metrics), _peaks(metrics)
     hottest = max(peaks, key=lambda arm: peaks[arm], default="")
-    for name, own in (("most_drift_mm", "tool_drift_mm"), ("most_insulation_ppb", "insulation_ppb")):
-        if metrics.get(own):
-            values[name] = max(metrics[own].values())
     tiles: list[Tile] = []
     for label, name, form, unit, whole in KEY_FIGURES:
         if name in values and (name != "contacts" or values[name] > 0):
@@ -320,10 +317,15 @@ def _peaks(metrics: Mapping[str, Any]) -> dict[str, float]:
     return {arm: c for arm, c in (metrics.get("peak_c") or {}).items() if c is not None and math.isfinite(c)}
 
 
-def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """The finite numbers among metrics, and the temperature of the hottest motor."""
+def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """The finite numbers among metrics, and of those that each arm has the highest."""
     values = {k: float(v) for k, v in metrics.items() if isinstance(v, int | float) and math.isfinite(v)}
-    return values | ({"hottest_c": max(peaks.values())} if (peaks := _peaks(metrics)) else {})
+    own = {
+        "hottest_c": _peaks(metrics),
+        "most_drift_mm": metrics.get("tool_drift_mm"),
+        "most_insulation_ppb": metrics.get("insulation_ppb"),
+    }
+    return values | {name: max(by_arm.values()) for name, by_arm in own.items() if by_arm}
 
 
 def _event_table(events: Sequence[Event]) -> Mapping[str, object] | None:
@@ -434,7 +436,7 @@ MAIN_FIGURES = (
 
 def pair_table(logs: Mapping[str, ShiftLog]) -> Table:
     """The main figures of two shifts by name, and the second minus the first; missing figures are left out."""
-    columns = [_numbers(log.card.get("metrics") or {}) for log in logs.values()]
+    columns = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
     rows = list[tuple[str, ...]]()
     for label, name, form in MAIN_FIGURES:
         values = [column[name] for column in columns if name in column]
