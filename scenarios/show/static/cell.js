@@ -9,7 +9,7 @@ function drawnBySoftware() {
   return Boolean(info) && /swiftshader|llvmpipe|software/i.test(gl.getParameter(info.UNMASKED_RENDERER_WEBGL));
 }
 
-const STANDING_M = 0.7, MARGIN_M = 0.15; // length of an arm along its mount in most postures; room round it
+const STANDING_M = 0.7, MARGIN_M = 0.2; // length of an arm along its mount in most postures; room round it
 
 // The colour scale of the motors, with its limits.
 function makeScale({ colours, marks_c, warning_c, error_c }) {
@@ -84,10 +84,17 @@ function makeCell(place, model) {
   const links = model.links.map((link) => ({
     parent: link.parent, turns: link.turns, local: pose(link),
     shapes: link.shapes.map((shape) => ({ local: pose(shape), mesh: instanced(geometry(shape), colourOf(shape.colour)) })),
-    motor: link.turns ? instanced(new THREE.SphereGeometry(1, 14, 9), "#ffffff") : null,
+    motor: link.turns ? instanced(new THREE.CylinderGeometry(1, 1, 1.6, 20).rotateX(Math.PI / 2), "#ffffff") : null, // a drum round the axis of the joint
   }));
   const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 14, 9), colourOf([0.36, 0.52, 0.7]));
   const mounts = model.arms.map((arm) => pose(arm));
+  // A plate under each base, and a post down to the floor, unless the arm hangs.
+  const plates = instanced(new THREE.BoxGeometry(0.16, 0.16, 0.02), "#9aa0a6"), posts = instanced(new THREE.BoxGeometry(0.1, 0.1, 1), "#b9bdc2");
+  mounts.forEach((mount, arm) => {
+    const below = new THREE.Vector3(0, 0, -0.07).applyMatrix4(mount), long = mount.elements[10] > -0.5 ? Math.max(1e-6, below.z) : 1e-6;
+    plates.setMatrixAt(arm, mount.clone().multiply(new THREE.Matrix4().makeTranslation(0, 0, -0.01)));
+    posts.setMatrixAt(arm, new THREE.Matrix4().makeTranslation(below.x, below.y, below.z - long / 2).scale(new THREE.Vector3(1, 1, long)));
+  });
 
   const points = mounts.flatMap((mount) => [0, STANDING_M].map((z) => new THREE.Vector3(0, 0, z).applyMatrix4(mount)));
   for (const one of model.places) {
