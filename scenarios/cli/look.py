@@ -6,13 +6,13 @@ import shlex
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import typer
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, ScenarioError
 from fleet.fields import argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING, Cooling
@@ -173,17 +173,32 @@ def layout_command(
     """Show each arm's reach, jobs that exclude each other in space, and the number of arms that can work at once.
 
     All problems of the cell are listed, for example two arms that are too close
-    at home. Exit code 2: there are problems.
+    at home. If the jobs are wrong, arms and places are shown with the error.
+    Exit code 2: there are problems.
     """
     from scenarios.result_folder import check_file, new_file
     from scenarios.show.layout import layout_report, layout_tables
     from scenarios.spec.load import load
+    from scenarios.spec.parse import parse_cell
 
-    chosen = load(scenario)
     if out is not None:
         check_file(out, (".png",), overwrite)
+    wrong = ""
+    try:
+        chosen = load(scenario)
+    except ScenarioError as error:
+        if not Path(scenario).is_file():
+            raise
+        wrong = f"{error} Only arms, places and fixtures are shown, with a hold at each place."
+        try:
+            chosen = parse_cell(Path(scenario).read_bytes(), Path(scenario))
+        except ScenarioError:
+            raise error from None
     with progress_bar() as progress:
         report = layout_report(chosen, progress)
+    if wrong:
+        own = f"{chosen.name}.toml: jobs["  # no jobs of the file
+        report = replace(report, problems=(wrong, *(each for each in report.problems if not each.startswith(own))))
     if as_json:
         print_json(report)
     else:
