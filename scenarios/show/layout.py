@@ -258,7 +258,7 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
-        f"{REGIMES[load.regime]}. Thermal load factor "
+        f"{REGIMES[load.regime]}\nthermal load factor "
         f"{load.thermal:.2f} for the best assignment that the arms have time for, {load.blind:.2f} for an equal split; "
         f"time load {load.time:.2f} (mean of {SEEDS} seeds; 1 is what the fleet can do)\n"
         f"{load.able:.0%} of the arms can do a job (mean over the jobs)\n"
