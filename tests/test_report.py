@@ -452,6 +452,9 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
         log_of(telemetry(1000), ("arm_a", "arm_b"), events, {"status": "finished"}),
         jobs=(record("long-1", 840.0), record("gone-1", 100.0, "expired"), record("open-1", 500.0, "waiting")),
     )
+    unread = replace(log, readings=Telemetry.empty(2), offers=(offered("open-1", 500.0, 9.0),), events=(
+        event(0.0, "release", job="open-1"), event(1000.0, "warning", job="")))  # fmt: skip
+    assert lateness_text(unread, late_jobs(unread)[:1]).endswith("what arm_a did meanwhile is not recorded.")
     told = verdict(log)
     assert (told.badge, told.good) == ("3 late jobs", False)
     assert [late.job for late in late_jobs(log)] == ["open-1", "long-1", "gone-1"]

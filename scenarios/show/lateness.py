@@ -82,6 +82,8 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
         return "no arm got a job of its kind"
     waits_s = _arm_time(log, able, begin_s, end_s)
     most = max(waits_s, key=lambda why: waits_s[why])
+    if not waits_s[most]:
+        return f"what {names_text(able)} did meanwhile is not recorded"
     return _passed(log, late, able, begin_s, end_s) if most == "" else f"{names_text(able)} {most}"
 
 
