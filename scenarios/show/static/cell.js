@@ -9,7 +9,7 @@ function drawnBySoftware() {
   return Boolean(info) && /swiftshader|llvmpipe|software/i.test(gl.getParameter(info.UNMASKED_RENDERER_WEBGL));
 }
 
-const STANDING_M = 0.7, MARGIN_M = 0.2; // length of an arm along its mount in most postures; room round it
+const STANDING_M = 0.7, MARGIN_M = 0.15; // length of an arm along its mount in most postures; room round it
 
 // The colour scale of the motors, with its limits.
 function makeScale({ colours, marks_c, warning_c, error_c }) {
@@ -153,6 +153,7 @@ function makeCell(place, model) {
 
   const radii = new Float32Array(arms * turning).fill(radius(marks[0]));
   const work = new THREE.Matrix4(), turn = new THREE.Matrix4();
+  const posed = new Uint8Array(arms);
   let changed = true;
 
   // Angles of an arm's joints, rad.
@@ -178,6 +179,10 @@ function makeCell(place, model) {
     load.setMatrixAt(arm, work.scale(new THREE.Vector3(held, held, held)));
     load.instanceMatrix.needsUpdate = true;
     changed = true;
+    if (posed[arm] < 2 && ++posed[arm] === 2) { // the first posture after that of `makeCell`: it belongs into the view
+      points.push(...at.map((link) => new THREE.Vector3().setFromMatrixPosition(link)));
+      if (!view.distance) look();
+    }
   }
 
   // Temperatures of an arm's motors, °C; shown with the next pose.
