@@ -5,9 +5,11 @@ HTML from the templates of this folder: every text is escaped, and control chara
 
 import csv
 import io
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from importlib import import_module
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
@@ -23,6 +25,11 @@ if TYPE_CHECKING:
 MOST_LABEL, LONGEST_WORD = 40, 12
 """Characters on the terminal: of a row's label, so that a long name leaves room for the figures; and of a word of
 another column, up to which it is not broken."""
+
+
+TABLE_FILES = (".csv", ".xlsx")
+"""Endings of files of tables for spreadsheets."""
+NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -178,13 +185,39 @@ class Table:
     def csv(self) -> str:
         """As comma-separated values, with the group of a row, if any, as its first column."""
         text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow((*(["group"] if self.groups else []), *self.headings))
+        csv.writer(text, lineterminator="\n").writerows(self._lines())
+        return text.getvalue()
+
+    def xlsx(self) -> bytes:
+        """As a workbook of one sheet, with the columns of `csv`; figures are numbers, and no text is a formula.
+
+        Raises:
+            MissingExtra: openpyxl is not installed.
+        """
+        from scenarios.extras import require_extra
+
+        require_extra("xlsx")
+        book = import_module("openpyxl").Workbook()
+        for row, cells in enumerate(self._lines(), start=1):
+            for column, text in enumerate(cells, start=1):
+                is_number = NUMBER.fullmatch(text) and row > 1
+                cell = book.active.cell(row, column, float(text) if is_number else visible(text, "\n"))
+                cell.data_type = "n" if is_number else "s"
+        file = io.BytesIO()
+        book.save(file)
+        return file.getvalue()
+
+    def content(self, ending: str) -> bytes:
+        """Content of a file with one of the endings `TABLE_FILES`; raises as `xlsx`."""
+        return self.xlsx() if ending == ".xlsx" else self.csv().encode()
+
+    def _lines(self) -> Iterator[tuple[str, ...]]:
+        """Yield the headings, then the rows, each after its group if there are groups."""
+        yield (*(["group"] if self.groups else []), *self.headings)
         group: list[str] = []
         for index, row in enumerate(self.rows):
             group = [self.groups[index]] if index in self.groups else group
-            writer.writerow((*group, *row))
-        return text.getvalue()
+            yield (*group, *row)
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -5,6 +5,7 @@ import copy
 import gzip
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import pairwise
 from typing import Any
@@ -20,8 +21,9 @@ from plotly.offline import get_plotlyjs
 from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
-from scenarios.run.records import ShiftLog
-from scenarios.show.run_page import ROWS, other_choices, pair_page, pair_table, report_html
+from scenarios.run.records import JobRecord, Offer, ShiftLog
+from scenarios.show.lateness import late_jobs, lateness_text
+from scenarios.show.run_page import ROWS, other_choices, pair_page, pair_table, report_html, verdict
 from scenarios.show.timeline import decimate, figure, stream_of
 
 ARMS = ("arm_0", "arm_1")
@@ -329,7 +331,7 @@ def test_each_side_says_what_happened_and_what_became_of_the_job_on_the_other():
     burned, spared = re.findall(r"<details>(.*?)</details>", page, re.S)
     assert re.findall(r'class="status (\w+)"[^>]*>([^<]*)<', page) == [
         ("bad", "round_robin: 1 fault"),
-        ("good", "wsept: No fault"),
+        ("good", "wsept: No fault, no late job"),
     ]
     assert "arm_a stopped during crate, out for 13 min: the motor of joint 2 passed 75 °C" in burned
     assert "Under wsept, arm_b finished crate at 0:05:00 without a fault." in burned
@@ -388,3 +390,75 @@ def test_names_stay_text():
     assert 'onerror="' not in page
     assert "\x1b" not in page
     assert len(re.findall(r'href="[^"<> ]+"', page)) == page.count("href=") == 2
+
+
+def record(job: str, due_s: float, state: str = "finished", value: float = 1.0) -> JobRecord:
+    done_s = due_s if state == "finished" else None
+    return JobRecord(
+        job=job, state=state, release_s=0.0, due_s=due_s, finished_s=done_s, value=value, payload_kg=0.0, cycles=1
+    )
+
+
+def done(job: str, begin_s: float, end_s: float, late_s: float = 0.0, arm: str = "arm_a") -> tuple[Event, ...]:
+    return (
+        event(begin_s, "award", arm, job),
+        event(end_s, "finish", arm, job, value=late_s),
+        event(end_s, "home", arm, job),
+    )
+
+
+def offered(job: str, time_s: float, length_s: float) -> Offer:
+    how = {"awarded": True, "state": "idle", "feasible": True, "free": True, "difficulty": None, "peak_c": None}
+    return Offer(time_s=time_s, job=job, arm="arm_a", p_saturation=None, duration_s=length_s, **how)  # pyright: ignore[reportArgumentType]
+
+
+FAULTED = (
+    event(100.0, "award", job="long-1"),
+    event(150.0, "fault", job="long-1", reason="joint 2 passed 75 °C"),
+    event(150.0, "return", job="long-1", value=0.0),
+    event(300.0, "recover", job=""),
+)
+OUT = (event(10.0, "fault", job="", reason="joint 2 passed 75 °C"), event(590.0, "recover", job=""))
+
+
+@pytest.mark.parametrize(
+    ("before", "temp_c", "reason"),
+    [
+        ((*done("short-1", 0, 200), *done("short-2", 200, 400), *done("long-2", 400, 590)), 30.0,
+         "3 other jobs went first on arm_a, 2 of them shorter"),
+        (done("long-2", -10, 590), 30.0, "arm_a was at work since before its release"),
+        (OUT, 30.0, "arm_a was out after a fault"),
+        (FAULTED, 30.0, "arm_a faulted during it at 0:02:30"),
+        ((), 62.0, "arm_a was idle above the warning limit"),
+        ((), 30.0, "arm_a was idle: its place was taken, or the policy let it wait"),
+    ],
+)  # fmt: skip
+def test_the_reason_of_a_late_job_is_what_took_most_of_its_wait(before, temp_c: float, reason: str) -> None:
+    readings = telemetry(1000)
+    readings = replace(readings, temp_c=np.full(readings.temp_c.shape, temp_c))
+    lengths_s = {"short-1": 200.0, "short-2": 200.0, "long-2": 400.0, "long-1": 300.0}
+    events = (event(0.0, "release", job="long-1"), *before, *done("long-1", 600, 900, 60.0))
+    log = replace(
+        log_of(readings, ("arm_a", "arm_b"), events),
+        jobs=tuple(record(job, 840.0) for job in lengths_s),
+        offers=tuple(offered(e.job, e.time_s, lengths_s[e.job]) for e in events if e.kind == "award"),
+    )
+    assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: {reason}."
+
+
+def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
+    events = (event(0.0, "release", job="long-1"), *done("long-1", 0, 900, 60.0))
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), events, {"status": "finished"}),
+        jobs=(record("long-1", 840.0), record("gone-1", 100.0, "expired"), record("open-1", 500.0, "waiting")),
+    )
+    unread = replace(log, readings=Telemetry.empty(2), offers=(offered("open-1", 500.0, 9.0),), events=(
+        event(0.0, "release", job="open-1"), event(1000.0, "warning", job="")))  # fmt: skip
+    assert lateness_text(unread, late_jobs(unread)[:1]).endswith("what arm_a did meanwhile is not recorded.")
+    told = verdict(log)
+    assert (told.badge, told.good) == ("3 late jobs", False)
+    assert [late.job for late in late_jobs(log)] == ["open-1", "long-1", "gone-1"]
+    assert told.moments[told.sentences[-1]].time_s == 500.0
+    assert lateness_text(log, late_jobs(log)[1:2]) == (
+        "long-1 finished 1 min late: its work takes 15 min, and it was due 14 min after its release."
+    )

@@ -15,8 +15,9 @@ from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, argument, option
 from scenarios.cli import options
 from scenarios.cli.from_fields import From, Given
-from scenarios.result_folder import disk_errors
+from scenarios.result_folder import disk_errors, new_file
 from scenarios.spec.options import Budget, RunSpec, StudySpec
+from scenarios.table import TABLE_FILES
 from scenarios.terminal import KEPT, echo, out_console, print_json, progress_bar, say
 
 if TYPE_CHECKING:
@@ -195,7 +196,7 @@ def compare_command(
     ),
     out: Path | None = option(
         "Folder of the results, one row per shift, and of their page, index.html. The same command continues "
-        "after an interruption.",
+        "after an interruption. Or a file of the table of figures: .csv or .xlsx.",
         None,
     ),
     workers: int | None = options.WORKERS,
@@ -209,7 +210,7 @@ def compare_command(
     The first failure of a policy is reported with instance, seed and traceback;
     the other policies and shifts continue.
     """
-    from scenarios.evaluate.comparison import check_baseline, comparisons, scores_over_all
+    from scenarios.evaluate.comparison import check_baseline, comparisons, figures_table, scores_over_all
     from scenarios.evaluate.runner import run_study
     from scenarios.evaluate.scores import references_of
     from scenarios.evaluate.study import Study, cases_of, suite_label, suite_of
@@ -225,6 +226,9 @@ def compare_command(
     if references is not None and varied:
         raise FleetError("Give either --references or --randomise: references are of shifts without randomisation.")
     out = out and out.resolve()  # a policy may change the folder of the process
+    file, out = (out, None) if out and out.suffix.lower() in TABLE_FILES else (None, out)
+    if file:
+        options.check_table_file(file)
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
     channels = [options.channel_of(case.scenario, **channel) for case in cases]
     study = Study(
@@ -248,6 +252,9 @@ def compare_command(
     if out:
         with disk_errors(out):
             (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")
+    if file:
+        with new_file(file) as draft:
+            draft.write_bytes(figures_table(results).content(file.suffix.lower()))
     if as_json:
         print_json(results[0] if len(results) == 1 else results)
         return
@@ -256,6 +263,8 @@ def compare_command(
     out_console.print("", *verdict(judged), sep="\n")
     if out:
         say(f"Written to {out}; open {out / PAGE}.")
+    if file:
+        say(f"Written to {file}.")
 
 
 def bounds_command(

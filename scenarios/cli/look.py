@@ -5,13 +5,14 @@ import re
 import shlex
 import sys
 import time
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import typer
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, ScenarioError
 from fleet.fields import argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING, Cooling
@@ -163,24 +164,41 @@ def _list_library(as_json: bool) -> None:
 
 def layout_command(
     scenario: str = options.SCENARIO,
-    out: Path | None = option("Draw the cell from above as this PNG file.", None),
+    out: Path | None = option(
+        "Draw the plan of the cell as this PNG file: reach, places out of reach, and exclusions.", None
+    ),
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
 ) -> None:
     """Show each arm's reach, jobs that exclude each other in space, and the number of arms that can work at once.
 
     All problems of the cell are listed, for example two arms that are too close
-    at home. Exit code 2: there are problems.
+    at home. If the jobs are wrong, arms and places are shown with the error.
+    Exit code 2: there are problems.
     """
     from scenarios.result_folder import check_file, new_file
-    from scenarios.show.layout import layout_report, layout_scene, layout_tables
+    from scenarios.show.layout import layout_report, layout_tables
     from scenarios.spec.load import load
+    from scenarios.spec.parse import parse_cell
 
-    chosen = load(scenario)
     if out is not None:
         check_file(out, (".png",), overwrite)
+    wrong = ""
+    try:
+        chosen = load(scenario)
+    except ScenarioError as error:
+        if not Path(scenario).is_file():
+            raise
+        wrong = f"{error} Only arms, places and fixtures are shown, with a hold at each place."
+        try:
+            chosen = parse_cell(Path(scenario).read_bytes(), Path(scenario))
+        except ScenarioError:
+            raise error from None
     with progress_bar() as progress:
         report = layout_report(chosen, progress)
+    if wrong:
+        own = f"{chosen.name}.toml: jobs["  # no jobs of the file
+        report = replace(report, problems=(wrong, *(each for each in report.problems if not each.startswith(own))))
     if as_json:
         print_json(report)
     else:
@@ -188,12 +206,10 @@ def layout_command(
         for part in (*tables, sentence):
             out_console.print(part)
     if out is not None:
-        from matplotlib.image import imsave
-
-        from fleet.env.render.picture import draw
+        from scenarios.show.plan import draw_plan
 
         with new_file(out) as file:
-            imsave(file, draw(layout_scene(chosen, report)), format="png")
+            draw_plan(file, chosen, report)
         say(f"Drew the cell: {out}.")
     for problem in report.problems:
         say(f"Error: {problem}")
@@ -346,8 +362,15 @@ def _size(asked: str) -> tuple[int, int]:
 
 
 def report_command(
-    folder: Path | None = argument("Folder of a run or of a recording. Default: the newest one in runs/.", None),
-    out: Path | None = option("The HTML file. Default: in the folder of a run, beside that of a recording.", None),
+    folders: list[Path] | None = argument(
+        "Folder of a run or of a recording; several runs are compared on one page. Default: the newest one in runs/.",
+        None,
+    ),
+    out: Path | None = option(
+        "The HTML file; of several runs also their table of figures, .csv or .xlsx. Default: report.html in the folder "
+        "of a run and beside that of a recording, compared.html beside several runs.",
+        None,
+    ),
     scenario: str | None = option("Of a recording: scenario of the fleet, if no auctioneer described its cell.", None),
     meshes: bool = option("Of a run: Kinova's shells; needs the extra `meshes`.", False),
     trace: str | None = option(
@@ -359,7 +382,7 @@ def report_command(
     ),
     as_json: bool = option("--trace: print JSON.", False, flag="--json"),
 ) -> None:
-    """Write the page of a run or recording, finished or not; with --trace, follow an event to its causes."""
+    """Write the page of a run or recording, finished or not, or of several runs; with --trace, explain an event."""
     from scenarios.live.recording_report import open_recording
     from scenarios.result_folder import new_file
     from scenarios.run.log import open_run
@@ -367,7 +390,12 @@ def report_command(
 
     if as_json and trace is None:
         raise FleetError("--json is for --trace: leave it out.")
-    folder = folder or last_folder(Path("runs"))
+    if folders and len(folders) > 1:
+        if trace is not None or scenario is not None or meshes:
+            raise FleetError("--trace, --scenario and --meshes are for one folder: leave them out, or give one folder.")
+        _compare_runs(folders, out)
+        return
+    folder = folders[0] if folders else last_folder(Path("runs"))
     if trace is not None:
         _print_trace(folder, trace, as_json)
         return
@@ -380,6 +408,31 @@ def report_command(
     with new_file(path) as draft:
         draft.write_text(html, encoding="utf-8")
     say(f"Open {path} in a browser.", out_console)
+
+
+def _compare_runs(folders: Sequence[Path], out: Path | None) -> None:
+    """Write the page of several runs, or their table."""
+    from scenarios.result_folder import new_file
+    from scenarios.run.log import open_run
+    from scenarios.show.runs_page import runs_page, runs_table
+
+    path = out or folders[0].parent / "compared.html"
+    options.check_table_file(path, (".html",))
+    if strange := [folder for folder in folders if not (folder / "run.json").exists()]:
+        raise FleetError(f"Of several folders each must be of `thermofleet run` (got '{strange[0]}'): leave it out.")
+    names = [folder.resolve().name for folder in folders]
+    logs = {
+        name if names.count(name) == 1 else str(folder): open_run(folder)
+        for name, folder in zip(names, folders, strict=True)
+    }
+    if len(logs) < len(folders):
+        raise FleetError("A run is given twice. Give each folder once.")
+    with new_file(path) as draft:
+        if path.suffix.lower() == ".html":
+            draft.write_text(runs_page(logs), encoding="utf-8")
+        else:
+            draft.write_bytes(runs_table(logs).content(path.suffix.lower()))
+    say(f"Written to {path}.", out_console)
 
 
 def _print_trace(folder: Path, event: str, as_json: bool) -> None:

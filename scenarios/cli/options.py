@@ -12,6 +12,7 @@ from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError, LogError, nearest, printable
 from fleet.fields import argument, option
 from scenarios.spec import options as spec_options
+from scenarios.table import TABLE_FILES
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.prepare.randomisation import Randomisation
@@ -32,6 +33,20 @@ def command_line(ctx: typer.Context) -> str:
             for each in value if isinstance(value, list | tuple) else [value]:
                 words += [parameter.opts[0], str(each)]
     return shlex.join(words)
+
+
+def check_table_file(out: Path, others: tuple[str, ...] = ()) -> None:
+    """Check the value of --out for a table, .csv or .xlsx, or a file with one of the other endings, before any work.
+
+    Raises:
+        FleetError: it has another ending, is a folder, or needs an extra that is not installed.
+    """
+    from scenarios.extras import require_extra
+    from scenarios.result_folder import check_file
+
+    check_file(out, (*others, *TABLE_FILES), overwrite=True)
+    if out.suffix.lower() == ".xlsx":
+        require_extra("xlsx")
 
 
 SCENARIO = argument("A library name (see `thermofleet show`), a .toml file, or an instance of the suite, as test/0017.")

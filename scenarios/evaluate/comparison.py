@@ -105,6 +105,21 @@ class Comparison:
         return str(self.table.html())
 
 
+def figures_table(results: Sequence[Comparison]) -> Table:
+    """Every figure of every policy as a number in its own cell, for a file of a spreadsheet; "" where there is none."""
+    names = ("mean", "low", "high", "difference", "difference_low", "difference_high", "p", "p_holm")
+    rows = [
+        (
+            *(result.scenario, kind.heading, label(policy), label(result.baseline)),
+            *("" if np.isnan(value := getattr(figures[name], each)) else f"{value:.6g}" for each in names),
+        )
+        for result in results
+        for name, kind in KINDS.items()
+        for policy, figures in result.figures.items()
+    ]
+    return Table(head=("scenario", "figure", "policy", "baseline", *names), rows=tuple(rows))
+
+
 def compare(
     scenario: str | Path | Scenario,
     policies: Sequence[str],

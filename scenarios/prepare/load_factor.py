@@ -11,7 +11,8 @@ over the shift of length T; 1 is the capacity of the fleet:
 - blind: the load of the hottest arm when every job is split equally among the arms that can do it.
 
 Above 1.2 for the best assignment no policy keeps the fleet below the limit. Below 0.6 for the blind one every policy
-does. In between the choice of arm decides.
+does. In between heat decides if the two differ. Otherwise every choice of arm heats alike, and time decides if the arms
+are busy.
 """
 
 from dataclasses import dataclass
@@ -26,6 +27,10 @@ from fleet.heat.thermal import WINDING, drive_heat
 Array = np.ndarray
 
 
+LITTLE, ALIKE = 0.6, 0.9
+"""Below this load no choice matters; the best assignment heats like an equal split if it has this share of its load."""
+
+
 @dataclass(frozen=True)
 class LoadFactor:
     """Loads of env 0 of a world; 1 is the capacity of the fleet."""
@@ -38,10 +43,12 @@ class LoadFactor:
 
     @property
     def regime(self) -> str:
-        """The regime: hopeless, heat decides or relaxed."""
+        """The regime: hopeless, heat decides, time decides or nothing decides."""
         if max(self.thermal, self.time) > 1.2:
             return "hopeless"
-        return "relaxed" if self.blind < 0.6 else "heat decides"
+        if self.blind >= LITTLE and self.thermal < ALIKE * self.blind:
+            return "heat decides"
+        return "time decides" if self.time >= LITTLE else "nothing decides"
 
 
 def load_factor(world: World) -> LoadFactor:

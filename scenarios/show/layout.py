@@ -3,27 +3,23 @@
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csr_array
 
+from fleet.arm.kinematics import REACH_M, SHOULDER_M
 from fleet.arm.space import SpaceTable
 from fleet.files import cache_folder
 from fleet.motion import Plan
-from scenarios.cell_layout import cell_of
+from fleet.robot import Robot
 from scenarios.prepare.arms import PlannedArm, plan_arms
 from scenarios.prepare.fleet import ShiftFactory, cell_problems, prepare, space_of
-from scenarios.prepare.load_factor import load_factor
+from scenarios.prepare.load_factor import LoadFactor, load_factor
 from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import all_works, alternatives_of, fault_price, works_of
 from scenarios.spec.schema import ArmSpec, JobStream, Scenario
 from scenarios.table import Table
-
-if TYPE_CHECKING:
-    from fleet.env.render.scene import Scene
-
 
 Array = np.ndarray
 SEARCH_S = 20.0
@@ -40,6 +36,8 @@ class Reach:
     place: str
     payload_kg: float | None
     """Heaviest payload of the scenario's jobs at this place that the arm can carry; None if it can do none."""
+    lacks_m: float
+    """How much longer the arm would have to be to touch the place; 0 within reach."""
     reason: str = ""
     """Why it cannot do some of them."""
 
@@ -107,33 +105,6 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
     )
 
 
-def layout_scene(scenario: Scenario, report: LayoutReport) -> "Scene":
-    """The cell with the arms that can work at once at their stations, for `fleet.env.render.picture.draw`."""
-    from fleet.env.render.scene import Scene
-    from fleet.telemetry import IDLE, WORKING
-
-    cell = cell_of(scenario)
-    busy = {work.arm: work for work in report.at_once}
-    start_c = float(scenario.ambient.at(np.zeros(1))[0])
-    return Scene(
-        cell=cell,
-        time_s=0.0,
-        horizon_s=scenario.horizon_s,
-        temp_c=np.full((len(cell.arms), 7), start_c),
-        warning_c=scenario.limits.warning_c,
-        error_c=scenario.limits.error_c,
-        mode=tuple(WORKING if arm in busy else IDLE for arm in cell.arms),
-        job=tuple(busy[arm].job if arm in busy else "" for arm in cell.arms),
-        progress=(0.0,) * len(cell.arms),
-        at=tuple(busy[arm].places if arm in busy else () for arm in cell.arms),
-        queue=(),
-        waiting=0,
-        finished=0,
-        faults=0,
-        title=f"{scenario.name}: {len(busy)} arms at work at once",
-    )
-
-
 def layout_tables(scenario: Scenario, report: LayoutReport) -> tuple[list[Table], str]:
     """Reach matrix, reasons and exclusions; and the most arms at work at once, in a sentence."""
     arms = [arm.name for arm in scenario.arms]
@@ -147,8 +118,12 @@ def layout_tables(scenario: Scenario, report: LayoutReport) -> tuple[list[Table]
         numbers=False,
     )
     reasons = Table(
-        head=("cannot do", "reason"),
-        rows=tuple((f"{entry.arm} at {entry.place}", entry.reason) for entry in report.reach if entry.reason),
+        head=("cannot do", "lacks, m", "reason"),
+        rows=tuple(
+            (f"{entry.arm} at {entry.place}", f"{entry.lacks_m:.2f}" if entry.lacks_m else "", entry.reason)
+            for entry in report.reach
+            if entry.reason
+        ),
         numbers=False,
     )
     shared = [pair for pair in report.exclusions if not pair.same_place]
@@ -182,7 +157,20 @@ def _reach(scenario: Scenario, arm: PlannedArm, place: str) -> Reach:
     name = arm.hardware.robot.name
     able = [work.payload_kg for work in all_works(scenario) if place in work.stations and work in arm.plans]
     reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place)
-    return Reach(arm=name, place=place, payload_kg=max(able, default=None), reason="; ".join(reasons))
+    position_m = next(each.position_m for each in scenario.places if each.name == place)
+    far_m = float(np.linalg.norm(np.subtract(position_m, shoulder_m(arm.hardware.robot))))
+    return Reach(
+        arm=name,
+        place=place,
+        payload_kg=max(able, default=None),
+        lacks_m=max(0.0, far_m - REACH_M),
+        reason="; ".join(reasons),
+    )
+
+
+def shoulder_m(robot: Robot) -> Array:
+    """Position of an arm's joint 2, the centre of its reach, m, [3]."""
+    return np.array(robot.mount.position_m) + SHOULDER_M * robot.mount.rotation()[:, 2]
 
 
 def _pairs_of_arms(plans: Sequence[Plan]) -> Array:
@@ -246,9 +234,10 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
 SEEDS = 5
 """Shifts over which the load factor is averaged."""
 REGIMES = {
-    "hopeless": "more than the fleet can do without overheating or being late",
-    "heat decides": "who does what decides whether motors overheat",
-    "relaxed": "no assignment overheats a motor",
+    "hopeless": "The shift is hopeless: more than the fleet can do without overheating or being late",
+    "heat decides": "Heat decides: who does what decides whether motors overheat",
+    "time decides": "Time decides: every choice of arm heats the motors alike, or too little to matter",
+    "nothing decides": "Nothing decides: the arms have time, and every choice heats the motors alike or too little",
 }
 """Sentences of the regimes of `LoadFactor`."""
 MOST_REASONS = 20
@@ -262,18 +251,17 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
     fleet = prepare(scenario, difficulty="blind", progress=progress)
     factory = ShiftFactory(fleet)
     factors = [load_factor(factory(np.random.SeedSequence(seed)).world) for seed in range(SEEDS)]
-    thermal, blind, time, able = np.mean([astuple(f) for f in factors], axis=0)
-    regimes = [f.regime for f in factors]
-    regime = max(set(regimes), key=regimes.count)
+    load = LoadFactor(*np.mean([astuple(f) for f in factors], axis=0).tolist())
     points = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
     ambient = ", ".join(points) if len(points) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
     people = scenario.people
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
-        f"thermal load factor {thermal:.2f} for the best assignment that the arms have time for, {blind:.2f} for an "
-        f"equal split, time load {time:.2f} (mean of {SEEDS} seeds; 1 is what the fleet can do): {REGIMES[regime]}\n"
-        f"{able:.0%} of the arms can do a job (mean over the jobs)\n"
+        f"{REGIMES[load.regime]}\nthermal load factor "
+        f"{load.thermal:.2f} for the best assignment that the arms have time for, {load.blind:.2f} for an equal split; "
+        f"time load {load.time:.2f} (mean of {SEEDS} seeds; 1 is what the fleet can do)\n"
+        f"{load.able:.0%} of the arms can do a job (mean over the jobs)\n"
         f"{_fault_cost(scenario)}\n"
         f"people touch an arm for up to {people.contact_s:g} s: a surface of {people.burn_c:g} °C or more burns"
     )

@@ -12,15 +12,14 @@ from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import JobSpan, Schedule
+from scenarios.show.lateness import late_jobs, lateness_text
 from scenarios.show.page import Chart, Page, Playback, packed
 from scenarios.show.timeline import figure, hottest_motors, time_unit
-from scenarios.show.words import CANNOT, clock, duration, kind_text, scores_text, value_text
+from scenarios.show.words import CANNOT, clock, duration, kind_text, names_text, scores_text, value_text
 from scenarios.table import Moment, Table, render
 
 MOST_FAULTS = 2
 """Faults described in a sentence each."""
-MOST_NAMED_ARMS = 6
-"""Arms that are named in one sentence."""
 MARGIN_K = 3.0
 """Another arm would have avoided a fault if its predicted peak was this much below the limit and below the peak of the
 arm that faulted."""
@@ -37,26 +36,25 @@ class Verdict:
     badge: str
     good: bool
     sentences: tuple[str, ...]
-    faults: Mapping[str, Event]
-    """That some of the sentences are about."""
+    moments: Mapping[str, Moment]
+    """Of some of the sentences."""
 
 
 def verdict(log: ShiftLog) -> Verdict:
-    """The outcome of a shift: its jobs, each fault with its cause, and what to look at.
+    """The outcome of a shift: its jobs, each fault and the latest job with the cause, and what to look at.
 
     Missing figures of its card are left out; without offers there is no sentence about other choices.
     """
     metrics, plan, offers, faults = log.card.get("metrics") or {}, log.plan, log.offers, log.faults
     contacts = sum(event.kind == "contact" for event in log.events)
     about = {_fault(fault, plan): fault for fault in faults[:MOST_FAULTS]}
+    moments = {sentence: _before(fault) for sentence, fault in about.items()}
     sentences = [*_jobs(metrics)]
     for sentence, fault in about.items():
         sentences += [sentence, *_cause(fault, plan, offers)]
     if len(faults) > MOST_FAULTS:
         arms = sorted({fault.arm for fault in faults})
-        more = f" and {len(arms) - MOST_NAMED_ARMS} more" if len(arms) > MOST_NAMED_ARMS else ""
-        named = ", ".join(arms[:MOST_NAMED_ARMS])
-        sentences.append(f"{len(faults)} faults in all, of {named}{more}: see the events below.")
+        sentences.append(f"{len(faults)} faults in all, of {names_text(arms)}: see the events below.")
     elif not faults:
         sentences.append(_hottest(metrics))
     if log.policy != WEIGHS_PEAK:
@@ -65,17 +63,18 @@ def verdict(log: ShiftLog) -> Verdict:
         sentences.append(
             f"Arms touched something {f'{contacts} times' if contacts > 1 else 'once'}: see the events below."
         )
+    if late := late_jobs(log):
+        sentences.append(lateness_text(log, late))
+        moments[sentences[-1]] = Moment(late[0].due_s)
     status = str(log.card.get("status", "unknown"))
     if status == "interrupted":
         badge = f"Interrupted after {duration(plan.horizon_s)}: everything here covers that part only"
-    elif faults:
-        badge = f"{len(faults)} fault{'s' * (len(faults) > 1)}"
-    elif contacts:
-        badge = "Contact"
     else:
-        badge = "No fault" if status == "finished" else f"Status: {status}"
-    good = status == "finished" and not faults and not contacts
-    return Verdict(badge=badge, good=good, sentences=tuple(sentences), faults=about)
+        counts = ((len(faults), "fault"), (contacts, "contact"), (len(late), "late job"))
+        badge = ", ".join(f"{count} {what}{'s' * (count > 1)}" for count, what in counts if count)
+        badge = badge or ("No fault, no late job" if status == "finished" else f"Status: {status}")
+    good = status == "finished" and not faults and not contacts and not late
+    return Verdict(badge=badge, good=good, sentences=tuple(sentences), moments=moments)
 
 
 def _jobs(metrics: Mapping[str, Any]) -> Iterable[str]:
@@ -239,11 +238,9 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
         replay = _playback([log], model)
     scenario = card.get("scenario", {})
     outcome = verdict(log)
-    moments = {sentence: _before(fault) for sentence, fault in outcome.faults.items()}
     content = {
         "verdict": outcome,
-        "moments": moments,
-        "first": next(iter(moments.values()), None),
+        "first": next(iter(outcome.moments.values()), None),
         "description": str(scenario.get("description") or ""),
         "how": " · ".join(_settings(card, log.arms)),
         "tiles": key_figures(card.get("metrics") or {}),
@@ -305,11 +302,8 @@ KEY_FIGURES = (
 
 def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
     """The most important metrics; those without a number are left out."""
-    values, peaks = _numbers(metrics), _peaks(metrics)
+    values, peaks = numbers(metrics), _peaks(metrics)
     hottest = max(peaks, key=lambda arm: peaks[arm], default="")
-    for name, own in (("most_drift_mm", "tool_drift_mm"), ("most_insulation_ppb", "insulation_ppb")):
-        if metrics.get(own):
-            values[name] = max(metrics[own].values())
     tiles: list[Tile] = []
     for label, name, form, unit, whole in KEY_FIGURES:
         if name in values and (name != "contacts" or values[name] > 0):
@@ -323,10 +317,15 @@ def _peaks(metrics: Mapping[str, Any]) -> dict[str, float]:
     return {arm: c for arm, c in (metrics.get("peak_c") or {}).items() if c is not None and math.isfinite(c)}
 
 
-def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """The finite numbers among metrics, and the temperature of the hottest motor."""
+def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """The finite numbers among metrics, and of those that each arm has the highest."""
     values = {k: float(v) for k, v in metrics.items() if isinstance(v, int | float) and math.isfinite(v)}
-    return values | ({"hottest_c": max(peaks.values())} if (peaks := _peaks(metrics)) else {})
+    own = {
+        "hottest_c": _peaks(metrics),
+        "most_drift_mm": metrics.get("tool_drift_mm"),
+        "most_insulation_ppb": metrics.get("insulation_ppb"),
+    }
+    return values | {name: max(by_arm.values()) for name, by_arm in own.items() if by_arm}
 
 
 def _event_table(events: Sequence[Event]) -> Mapping[str, object] | None:
@@ -437,7 +436,7 @@ MAIN_FIGURES = (
 
 def pair_table(logs: Mapping[str, ShiftLog]) -> Table:
     """The main figures of two shifts by name, and the second minus the first; missing figures are left out."""
-    columns = [_numbers(log.card.get("metrics") or {}) for log in logs.values()]
+    columns = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
     rows = list[tuple[str, ...]]()
     for label, name, form in MAIN_FIGURES:
         values = [column[name] for column in columns if name in column]

@@ -5,6 +5,7 @@ The figures are plain dicts in Plotly's schema, because Plotly's own objects tak
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
+from itertools import cycle
 from typing import Any, TypeVar  # Any: values of Plotly's schema
 
 import numpy as np
@@ -57,8 +58,15 @@ JOINT_LINES = (
 """Colour and dash of each joint. Each colour has a contrast above 3 on light and dark pages; the dashes tell apart what
 looks alike to people who see few colours."""
 
-POLICY_LINES = (("#0072b2", "solid"), ("#d55e00", "dash"))
-"""Colour and dash of each of two shifts."""
+POLICY_LINES = (
+    ("#0072b2", "solid"),
+    ("#d55e00", "dash"),
+    ("#009e73", "dot"),
+    ("#cc79a7", "longdash"),
+    ("#a07800", "dashdot"),
+    ("#7a5195", "longdashdot"),
+)
+"""Colour and dash of each of several shifts."""
 
 MARGIN = {"l": 90, "r": 84, "b": 52}
 NARROW_PX = 860
@@ -134,7 +142,7 @@ def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
     first = next(iter(logs.values()))
     unit, unit_s = time_unit(first.plan.horizon_s)
     traces, ends_c = list[Trace](), [first.limits.warning_c - 20.0, first.limits.error_c]
-    for (name, log), (colour, dash) in zip(logs.items(), POLICY_LINES, strict=False):
+    for (name, log), (colour, dash) in zip(logs.items(), cycle(POLICY_LINES), strict=False):
         temp_c = log.readings.temp_c.reshape(len(log.readings.time_s), -1)  # NaN of an absent arm
         motor = np.nan_to_num(temp_c, nan=-np.inf).argmax(axis=1)
         value = temp_c[np.arange(len(motor)), motor]

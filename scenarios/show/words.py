@@ -11,6 +11,8 @@ SEVERITY = {
     "fault": "error", "contact": "error", "illegal": "warning",
 }  # fmt: skip
 """Kinds of events that are more than information."""
+MOST_NAMES = 6
+"""Names in one sentence."""
 LABELS = {"lost": "claim lost", "return": "job returned", "recover": "recovered"}
 
 
@@ -26,6 +28,12 @@ def duration(time_s: float) -> str:
     if time_s < 60:
         return f"{time_s:.0f} s"
     return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min")) if n)
+
+
+def names_text(names: Sequence[str]) -> str:
+    """`arm_0, arm_1 and arm_2`; of many, the first ones and the number of the others."""
+    shown = [*names[:MOST_NAMES], *([f"{len(names) - MOST_NAMES} more"] if len(names) > MOST_NAMES else [])]
+    return " and ".join([*([", ".join(shown[:-1])] if shown[1:] else []), *shown[-1:]])
 
 
 def value_text(value: object) -> str:

@@ -169,6 +169,29 @@ def parse_toml(content: bytes, path: Path) -> Scenario:
     return scenario
 
 
+def parse_cell(content: bytes, path: Path) -> Scenario:
+    """Arms, places and fixtures of a scenario file, with one hold at each place in place of its jobs.
+
+    Raises:
+        ScenarioError: these parts are invalid, too.
+    """
+    try:
+        raw = tomllib.loads(content.decode("utf-8-sig"))
+        holds = [
+            {
+                "name": place["name"],
+                "kind": "hold",
+                "places": [place["name"]],
+                "arrivals": {"kind": "batch", "count": 1},
+            }
+            for place in raw["places"]
+        ]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ScenarioError(f"{path.name} has no valid places.") from error
+    cell = {key: raw[key] for key in ("arms", "places", "fixtures", "clearance_m") if key in raw}
+    return parse_scenario({"name": path.stem, "description": "", "horizon_s": 3600, **cell, "jobs": holds}, path)
+
+
 def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
     """The scenario of a parsed TOML file; `path` names the file in errors and locates the files it refers to."""
     raw = _with_tables(raw, path)

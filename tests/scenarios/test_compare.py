@@ -25,7 +25,7 @@ from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.evaluate import runner
-from scenarios.evaluate.comparison import Comparison, compare, comparisons, scores_over_all
+from scenarios.evaluate.comparison import Comparison, compare, comparisons, figures_table, scores_over_all
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Shift
 from scenarios.evaluate.sources import _Random, inverted
@@ -323,6 +323,19 @@ def test_a_comparison_is_one_table_in_every_form(study: Study):
     assert f"| wsept | {figure.mean:.1f} |" in markdown
     assert f"reward,wsept,{figure.mean:.1f}," in csv
     assert result._repr_html_() == html
+
+
+def test_an_exported_figure_is_a_number_and_a_name_is_no_formula(study: Study):
+    openpyxl = pytest.importorskip("openpyxl")
+    (result,) = judged(study, rows_of(study), {}).results
+    table = figures_table([result])
+    formula = replace(table, rows=(*table.rows, ("=1+1", *table.rows[0][1:])))
+    head, *rows = openpyxl.load_workbook(io.BytesIO(formula.content(".xlsx"))).active.iter_rows()
+    of = {(row[1].value, row[2].value): row for row in rows}
+    mean = dict(zip((cell.value for cell in head), of["reward", "wsept"], strict=True))["mean"].value
+    assert mean == pytest.approx(result.figures["wsept"]["reward"].mean, rel=1e-5)
+    assert (rows[-1][0].value, rows[-1][0].data_type) == ("=1+1", "s")
+    assert table.content(".csv").decode().count("\n") == 1 + len(table.rows)
 
 
 def test_the_command_line_has_what_is_no_default():

@@ -4,6 +4,7 @@ import datetime
 import json
 import logging
 import math
+import re
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,6 +30,7 @@ from scenarios.cli.run import metrics_table
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
 from scenarios.show.layout import layout_report
+from scenarios.show.plan import draw_plan
 from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.spec.load import library, load, own_seed
 from scenarios.spec.options import RunSpec
@@ -557,6 +559,16 @@ def test_problems_are_reported_all_at_once(cache):
         prepare_arm(cell(*TOGETHER, places=PLACES), "west", difficulty="blind", cache=cache)
 
 
+def test_a_cell_that_does_not_work_is_drawn_with_the_distance_that_lacks(cache, tmp_path):
+    scenario = cell(*TOGETHER, places=PLACES)
+    report = layout_report(scenario)
+    lacks_m = {(each.arm, each.place): each.lacks_m for each in report.reach}
+    assert lacks_m["east", "moon"] == pytest.approx(np.hypot(9.0 - 0.45, 0.2 - 0.28481) - 0.902575)
+    assert lacks_m["west", "middle"] == 0.0
+    draw_plan(tmp_path / "cell.png", scenario, report)
+    assert (tmp_path / "cell.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.ci_slow
 def test_the_command_shows_the_cell_and_fails_if_there_are_problems(cache, tmp_path, capsys):
     def call(*arguments):
@@ -584,6 +596,23 @@ def test_the_command_shows_the_cell_and_fails_if_there_are_problems(cache, tmp_p
     code, _, err = call(file)
     assert code == 2
     assert "Error: near.toml: arms: at home 'arm_0' (" in err
+
+
+def test_the_layout_of_a_file_with_wrong_jobs_shows_its_cell(cache, small_toml, tmp_path, capsys):
+    file, picture = tmp_path / "typo.toml", tmp_path / "cell.png"
+    text = small_toml.read_text(encoding="utf-8")
+    file.write_text(re.sub(r"^places = \[.*\]$", 'places = ["nowhere"]', text, count=1, flags=re.MULTILINE))
+    with pytest.raises(SystemExit) as stop:
+        main(["layout", str(file), "--out", str(picture)])
+    said = capsys.readouterr()
+    assert (stop.value.code, picture.exists()) == (2, True)
+    (line,) = said.err.split("Error: ")[1:]
+    assert "no place 'nowhere'" in line
+    assert line.rstrip().endswith("Only arms, places and fixtures are shown, with a hold at each place.")
+    file.write_text(re.sub(r"^position_m = .*$", 'position_m = "x"', text, count=1, flags=re.MULTILINE))
+    with pytest.raises(SystemExit):
+        main(["layout", str(file)])
+    assert "position_m: expected a list" in capsys.readouterr().err
 
 
 def test_stations_side_by_side_are_for_one_arm_at_a_time(cache):

@@ -120,8 +120,11 @@ def test_the_best_assignment_is_one_that_the_arms_have_time_for(small):
 @pytest.mark.parametrize(
     ("thermal", "blind", "time", "word"),
     [
-        (0.3, 0.5, 0.9, "relaxed"),
+        (0.3, 0.5, 0.9, "time decides"),
+        (0.3, 0.5, 0.5, "nothing decides"),
         (0.3, 0.8, 0.9, "heat decides"),
+        (0.78, 0.8, 0.9, "time decides"),
+        (0.78, 0.8, 0.3, "nothing decides"),
         (1.3, 1.5, 0.5, "hopeless"),
         (0.1, 0.1, 1.3, "hopeless"),
     ],

@@ -308,3 +308,24 @@ def test_a_file_that_cannot_be_is_refused(
         main(["view", str(run_folder), *options])
     assert ended.value.code == 2
     assert needed in " ".join(capsys.readouterr().err.split())
+
+
+def test_runs_side_by_side_are_one_page_and_one_table(run_folder: Path, thermofleet, tmp_path: Path, capsys) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    again = shutil.copytree(run_folder, tmp_path / "again")
+    for ending in ("html", "csv", "xlsx"):
+        thermofleet("report", run_folder, again, "--out", tmp_path / f"two.{ending}")
+    page = (tmp_path / "two.html").read_text(encoding="utf-8")
+    assert "2 runs of quickstart" in page
+    assert "The runs differ in nothing. All have the same jobs." in page
+    sheet = openpyxl.load_workbook(tmp_path / "two.xlsx").active
+    cells = {row[0]: row[1:] for row in sheet.iter_rows(values_only=True)}
+    lines = [line.split(",") for line in (tmp_path / "two.csv").read_text(encoding="utf-8").splitlines()]
+    assert cells[None] == ("run", "again")
+    metrics = open_run(run_folder).metrics
+    assert cells["jobs finished"] == (metrics.finished, metrics.finished)
+    assert ["jobs finished", str(metrics.finished), str(metrics.finished)] in lines
+    for wrong, told in ((tmp_path, "must be of `thermofleet run`"), (run_folder, "given twice")):
+        with pytest.raises(SystemExit):
+            main(["report", str(run_folder), str(wrong)])
+        assert told in capsys.readouterr().err

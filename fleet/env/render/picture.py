@@ -107,11 +107,11 @@ def floor_plan(cell: CellMap) -> FloorPlan:
     bases, stations = np.split(on_floor(points), [arms])
     centres = _spread_apart(bases, stations, (corner, other), reach, below)
     labels = _place_labels([name for name, _ in cell.stations], centres, stations, reach, below)
-    fixtures = tuple(on_floor(_outline(fixture)) for fixture in cell.fixtures)
+    fixtures = tuple(on_floor(outline(fixture)) for fixture in cell.fixtures)
     return FloorPlan(reach, bases, centres, stations, labels, fixtures)
 
 
-def _outline(fixture: Fixture) -> Array:
+def outline(fixture: Fixture) -> Array:
     """Corners of a fixture's shadow on the floor, m, [corner, 2]."""
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * fixture.size_m @ rotation(fixture.tilt_deg).T
     shadow = (corners + fixture.position_m)[:, :2]

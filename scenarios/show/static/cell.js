@@ -9,12 +9,31 @@ function drawnBySoftware() {
   return Boolean(info) && /swiftshader|llvmpipe|software/i.test(gl.getParameter(info.UNMASKED_RENDERER_WEBGL));
 }
 
+const STANDING_M = 0.7, MARGIN_M = 0.15; // length of an arm along its mount in most postures; room round it
+
+// The colour scale of the motors, with its limits.
+function makeScale({ colours, marks_c, warning_c, error_c }) {
+  const bar = document.createElement("div"), first = marks_c[0], all = marks_c[marks_c.length - 1] - first;
+  const share = (tempC) => `${(100 * (tempC - first)) / all}%`, names = { [warning_c]: "warning", [error_c]: "error" };
+  bar.className = "scale";
+  bar.style.background = `linear-gradient(to right, ${colours.map((colour, i) => `${colour} ${share(marks_c[i])}`).join(", ")})`;
+  for (const mark of marks_c.slice(0, -1)) {
+    const label = document.createElement("span");
+    label.textContent = mark === first ? `${mark} °C` : mark;
+    label.title = names[mark] || "";
+    label.style.left = share(mark);
+    bar.append(label);
+  }
+  bar.title = `Motor temperature: warning limit ${warning_c} °C, error limit ${error_c} °C`;
+  return bar;
+}
+
 function makeCell(place, model) {
   const arms = model.arms.length, turning = model.links.filter((link) => link.turns).length;
   const scene = new THREE.Scene(), renderer = new THREE.WebGLRenderer({ antialias: !drawnBySoftware() });
   const camera = new THREE.PerspectiveCamera(40, 1, 0.05, 200);
   camera.up.set(0, 0, 1);
-  place.append(renderer.domElement);
+  place.append(renderer.domElement, makeScale(model.heat));
   renderer.outputEncoding = THREE.sRGBEncoding;
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const ground = () => {
@@ -65,15 +84,21 @@ function makeCell(place, model) {
   const links = model.links.map((link) => ({
     parent: link.parent, turns: link.turns, local: pose(link),
     shapes: link.shapes.map((shape) => ({ local: pose(shape), mesh: instanced(geometry(shape), colourOf(shape.colour)) })),
-    motor: link.turns ? instanced(new THREE.SphereGeometry(1, 14, 9), "#ffffff") : null,
+    motor: link.turns ? instanced(new THREE.CylinderGeometry(1, 1, 1.6, 20).rotateX(Math.PI / 2), "#ffffff") : null, // a drum round the axis of the joint
   }));
   const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 14, 9), colourOf([0.36, 0.52, 0.7]));
   const mounts = model.arms.map((arm) => pose(arm));
+  // A plate under each base, and a post down to the floor, unless the arm hangs.
+  const plates = instanced(new THREE.BoxGeometry(0.16, 0.16, 0.02), "#9aa0a6"), posts = instanced(new THREE.BoxGeometry(0.1, 0.1, 1), "#b9bdc2");
+  mounts.forEach((mount, arm) => {
+    const below = new THREE.Vector3(0, 0, -0.07).applyMatrix4(mount), long = mount.elements[10] > -0.5 ? Math.max(1e-6, below.z) : 1e-6;
+    plates.setMatrixAt(arm, mount.clone().multiply(new THREE.Matrix4().makeTranslation(0, 0, -0.01)));
+    posts.setMatrixAt(arm, new THREE.Matrix4().makeTranslation(below.x, below.y, below.z - long / 2).scale(new THREE.Vector3(1, 1, long)));
+  });
 
-  const box = new THREE.Box3();
-  for (const arm of model.arms) box.expandByPoint(vector(arm.position));
+  const points = mounts.flatMap((mount) => [0, STANDING_M].map((z) => new THREE.Vector3(0, 0, z).applyMatrix4(mount)));
   for (const one of model.places) {
-    box.expandByPoint(vector(one.position));
+    points.push(vector(one.position));
     const mark = new THREE.Mesh(new THREE.OctahedronGeometry(0.03), material("#7a5ba6"));
     mark.applyMatrix4(pose(one));
     scene.add(mark);
@@ -81,9 +106,10 @@ function makeCell(place, model) {
   for (const one of model.fixtures) {
     const block = new THREE.Mesh(new THREE.BoxGeometry(...one.size), material("#8c8069"));
     block.applyMatrix4(pose(one));
-    box.expandByPoint(vector(one.position));
+    points.push(vector(one.position));
     scene.add(block);
   }
+  const box = new THREE.Box3().setFromPoints(points);
   const across = Math.max(1, ...box.getSize(new THREE.Vector3()).toArray());
   const floor = new THREE.GridHelper(Math.ceil(across + 3), Math.ceil(across + 3) * 2, "#9aa0a6", "#c3c7cb");
   floor.rotation.x = Math.PI / 2;
@@ -127,6 +153,7 @@ function makeCell(place, model) {
 
   const radii = new Float32Array(arms * turning).fill(radius(marks[0]));
   const work = new THREE.Matrix4(), turn = new THREE.Matrix4();
+  const posed = new Uint8Array(arms);
   let changed = true;
 
   // Angles of an arm's joints, rad.
@@ -152,6 +179,10 @@ function makeCell(place, model) {
     load.setMatrixAt(arm, work.scale(new THREE.Vector3(held, held, held)));
     load.instanceMatrix.needsUpdate = true;
     changed = true;
+    if (posed[arm] < 2 && ++posed[arm] === 2) { // the first posture after that of `makeCell`: it belongs into the view
+      points.push(...at.map((link) => new THREE.Vector3().setFromMatrixPosition(link)));
+      if (!view.distance) look();
+    }
   }
 
   // Temperatures of an arm's motors, °C; shown with the next pose.
@@ -175,13 +206,29 @@ function makeCell(place, model) {
   }
 
   // The camera goes round a target: drag to turn, shift-drag or two fingers to move, wheel or pinch to zoom.
-  const target = centre.clone().add(new THREE.Vector3(0, 0, 0.35));
-  const start = { azimuth: -0.9, height: 0.62, distance: 1.5 + 1.35 * across };
-  let view = { ...start }, fingers = new Map(), spread = 0;
+  const target = centre.clone(), start = { azimuth: -0.9, height: 0.5, distance: null }; // null: the whole cell fills the view
+  let view = { ...start }, distance = 1, fingers = new Map(), spread = 0;
+  // Distance from which the whole cell fills the view; moves the target to the middle of what the view shows.
+  function fit(towards) {
+    const side = new THREE.Vector3(0, 0, 1).cross(towards).normalize(), up = towards.clone().cross(side);
+    const high = Math.tan((camera.fov * Math.PI) / 360), wide = high * camera.aspect;
+    target.copy(centre);
+    for (let again = 0; again < 4; again++) {
+      const at = points.map((point) => point.clone().sub(target));
+      distance = Math.max(...at.map((each) => each.dot(towards)
+        + Math.max((Math.abs(each.dot(side)) + MARGIN_M) / wide, (Math.abs(each.dot(up)) + MARGIN_M) / high)));
+      for (const axis of [side, up]) {
+        const shown = at.map((each) => each.dot(axis) / (distance - each.dot(towards)));
+        target.addScaledVector(axis, ((Math.max(...shown) + Math.min(...shown)) / 2) * distance);
+      }
+    }
+  }
   function look() {
-    const { azimuth, height, distance } = view;
-    camera.position.set(Math.cos(azimuth) * Math.cos(height), Math.sin(azimuth) * Math.cos(height), Math.sin(height))
-      .multiplyScalar(distance * Math.max(1, 1.3 / camera.aspect)).add(target); // farther away on a narrow screen
+    const { azimuth, height } = view;
+    const towards = new THREE.Vector3(Math.cos(azimuth) * Math.cos(height), Math.sin(azimuth) * Math.cos(height), Math.sin(height));
+    if (view.distance) distance = view.distance;
+    else fit(towards);
+    camera.position.copy(towards).multiplyScalar(distance).add(target);
     camera.lookAt(target);
     changed = true;
   }
@@ -193,11 +240,11 @@ function makeCell(place, model) {
   function move(dx, dy) {
     const side = new THREE.Vector3().setFromMatrixColumn(camera.matrix, 0);
     const up = new THREE.Vector3().setFromMatrixColumn(camera.matrix, 1);
-    target.addScaledVector(side, (-dx * view.distance) / 700).addScaledVector(up, (dy * view.distance) / 700);
+    target.addScaledVector(side, (-dx * distance) / 700).addScaledVector(up, (dy * distance) / 700);
     look();
   }
   function zoom(factor) {
-    view.distance = Math.min(60, Math.max(0.4, view.distance * factor));
+    view.distance = Math.min(60, Math.max(0.4, distance * factor));
     look();
   }
   const canvas = renderer.domElement;
@@ -263,9 +310,8 @@ function makeCell(place, model) {
   }
   // Look at an arm; at the whole cell for -1.
   function focus(arm) {
-    const at = arm < 0 ? centre : vector(model.arms[arm].position);
-    target.copy(at).add(new THREE.Vector3(0, 0, 0.35));
-    view.distance = arm < 0 ? start.distance : Math.min(2.6, start.distance);
+    target.copy(arm < 0 ? centre : new THREE.Vector3(0, 0, STANDING_M / 2).applyMatrix4(mounts[arm]));
+    view.distance = arm < 0 ? start.distance : 2.6;
     look();
   }
   return { setPose, setHeat, setMode, focus, draw, heatColour };

@@ -33,20 +33,29 @@ async function drawFigure(element, options) {
   await Plotly.newPlot(element, drawn.data, drawn.layout, options);
   if (dark.matches) await Plotly.relayout(element, colours());
   dark.addEventListener("change", () => Plotly.relayout(element, colours()));
-  // The layout leaves room for a legend of a wide page; on a narrow one the figure begins lower.
-  const room = drawn.layout.margin.t;
+  // The layout leaves room for a legend of a wide page; on a narrow one the figure begins lower, and takes the width.
+  const room = drawn.layout.margin, aside = (drawn.layout.annotations || []).flatMap((each, i) => (each.x === 1 ? [[i, each]] : []));
   let last = 0;
+  // Margins, and the labels of limits: beside a wide figure, inside a narrow one.
+  function sides(narrow) {
+    const out = { "margin.l": narrow ? Math.min(room.l, 46) : room.l, "margin.r": narrow ? Math.min(room.r, 10) : room.r };
+    for (const [i, { xanchor, xshift, yanchor, yshift }] of aside)
+      Object.entries(narrow ? { xanchor: "right", xshift: 0, yanchor: "bottom", yshift: 1 } : { xanchor, xshift, yanchor, yshift })
+        .forEach(([name, value]) => { out[`annotations[${i}].${name}`] = value; });
+    return out;
+  }
   async function fit() {
     const legend = element.querySelector(".legend");
     if (!legend || element.clientWidth === last) return;
     last = element.clientWidth;
     const shift = drawn.layout.xaxis2; // of a shift: the time axis of the work has the title of the one below
-    const narrow = shift && last < 600;
-    const needed = legend.getBoundingClientRect().height + (shift ? 50 : 20);
-    const margin = Math.max(room, Math.ceil(needed));
-    if (narrow || Math.abs(margin - element.layout.margin.t) > 4)
+    const narrow = last < 600;
+    if (narrow || element.layout.margin.l !== room.l) await Plotly.relayout(element, sides(narrow));
+    const needed = element.querySelector(".legend").getBoundingClientRect().height + (shift ? 50 : 20);
+    const margin = Math.max(room.t, Math.ceil(needed));
+    if ((shift && narrow) || Math.abs(margin - element.layout.margin.t) > 4)
       await Plotly.relayout(element, {
-        "margin.t": margin, height: drawn.layout.height + margin - room,
+        "margin.t": margin, height: drawn.layout.height + margin - room.t,
         ...(shift && { "legend2.font.size": narrow ? 9 : 12, "xaxis.title.text": narrow ? "" : shift.title.text }),
       });
   }

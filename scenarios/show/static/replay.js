@@ -138,7 +138,7 @@ async function startReplay(unitS) {
     const arm = model.arms.findIndex((one) => one.name === row.dataset.arm);
     show(Number(row.dataset.time));
     if (arm >= 0) choose(arm);
-    shifts[0].place.scrollIntoView({ block: "center", behavior: "smooth" });
+    shifts[0].place.scrollIntoView({ block: "center" });
   }
   for (const one of document.querySelectorAll("[data-time]")) one.tabIndex = 0;
   document.addEventListener("click", goTo);

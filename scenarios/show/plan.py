@@ -1,0 +1,165 @@
+"""The cell of a scenario as a picture: plan in metres, reach of each arm, places out of reach, and exclusions."""
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # options of matplotlib
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+from matplotlib.transforms import IdentityTransform, ScaledTranslation
+
+from fleet.arm.kinematics import FOREARM_M, HAND_M, REACH_M, UPPER_ARM_M
+from fleet.env.render.picture import FAULT, INK, outline
+from fleet.env.render.scene import mount_kind
+from scenarios.show.comparison_page import COLOURS
+from scenarios.show.layout import LayoutReport, shoulder_m
+from scenarios.spec.schema import Scenario
+
+Array = np.ndarray
+MOST_NAMED, MOST_NUMBERS, MOST_ROWS = 16, 24, 40
+"""Arms whose mounts are described; rows of a matrix of exclusions with numbers; rows of the largest matrix drawn."""
+LETTERS = 170
+"""Of a line of problems, in a picture of full width."""
+
+
+def draw_plan(file: Path, scenario: Scenario, report: LayoutReport) -> None:
+    """Write the plan of a cell as PNG, also of one with problems, which stand below it."""
+    tasks = list(dict.fromkeys(task for e in report.exclusions for task in zip(e.arms, e.jobs, strict=True)))
+    tasks.sort(key=lambda task: [arm.name for arm in scenario.arms].index(task[0]))
+    matrix = 0 < len(tasks) <= MOST_ROWS
+    lines = [
+        line for each in report.problems for line in textwrap.wrap(f"✗ {each}", LETTERS if matrix else LETTERS // 2)
+    ]
+    figure = Figure(figsize=(13.0 if matrix else 8.0, 6.6 + 0.2 * len(lines)), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid: Any = figure.add_gridspec(1, 2 if matrix else 1, width_ratios=(7, 5) if matrix else (1,))
+    axes = figure.add_subplot(grid[0])
+    labels = _draw_cell(axes, scenario, report)
+    if matrix:
+        _draw_matrix(figure.add_subplot(grid[1]), tasks, report)
+    figure.supxlabel("\n".join(lines), x=0.01, ha="left", color=FAULT, fontsize=9)
+    figure.draw_without_rendering()  # decides the scale of the axes
+    figure.set_layout_engine("none")
+    _write_labels(axes, labels)
+    figure.savefig(file, format="png", bbox_inches="tight")
+
+
+@dataclass(frozen=True)
+class Label:
+    """Text beside a point of the cell."""
+
+    text: str
+    """"": the point only, not to be covered."""
+    at_m: Array
+    colour: str
+
+
+def _write_labels(axes: Axes, labels: Sequence[Label]) -> None:
+    """Write each label on the side of its point where it covers the least of the points and of earlier labels."""
+    points = axes.transData.transform([label.at_m for label in labels])
+    taken = [(x - 6, y - 6, x + 6, y + 6) for x, y in points]
+    for label, (x, y) in zip(labels, points, strict=True):
+        lines = label.text.split("\n")
+        wide, high = 6.0 * max(map(len, lines)), 13.0 * len(lines)
+        sides = [
+            (x + 9, y - high / 2),
+            (x - 9 - wide, y - high / 2),
+            (x - wide / 2, y - 9 - high),
+            (x - wide / 2, y + 9),
+        ]
+
+        def covered(corner: tuple[float, float], wide: float = wide, high: float = high) -> float:
+            """Area that a label at this lower left corner covers, px²."""
+            overlaps = (
+                (min(corner[0] + wide, right) - max(corner[0], left), min(corner[1] + high, top) - max(corner[1], low))
+                for left, low, right, top in taken
+            )
+            return sum(max(0.0, a) * max(0.0, b) for a, b in overlaps)
+
+        left, low = min(sides, key=covered)
+        taken.append((left, low, left + wide, low + high))
+        text = axes.text(
+            float(label.at_m[0]),
+            float(label.at_m[1]),
+            label.text,
+            color=label.colour,
+            fontsize=8,
+            ha="center",
+            va="center",
+            zorder=5,
+        )
+        text.set_transform(
+            axes.transData + ScaledTranslation(left + wide / 2 - x, low + high / 2 - y, IdentityTransform())
+        )
+
+
+def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Label]:
+    """The cell from above, x to the right and y up; returns the names of arms and places, to be written."""
+    labels = list[Label]()
+    height_m = float(np.mean([place.position_m[2] for place in scenario.places])) if scenario.places else 0.0
+    for fixture in scenario.fixtures:
+        axes.add_patch(Polygon(outline(fixture), facecolor="#e4e0d8", edgecolor="#c9c9c9", zorder=0))
+    at = {place.name: place.position_m for place in scenario.places}
+    for i, spec in enumerate(scenario.arms):
+        robot, colour = spec.robot(), COLOURS[i % len(COLOURS)]
+        base, shoulder, turn = np.array(spec.position_m), shoulder_m(robot), robot.mount.rotation()
+        for radius_m, above_m, look in (
+            (UPPER_ARM_M + FOREARM_M, HAND_M, {"facecolor": (colour, 0.10), "edgecolor": "none"}),
+            (REACH_M, 0.0, {"fill": False, "edgecolor": colour, "linestyle": "--"}),
+        ):
+            cut_m = np.sqrt(max(0.0, radius_m**2 - (height_m + above_m - shoulder[2]) ** 2))
+            axes.add_patch(Circle((shoulder[0], shoulder[1]), cut_m, zorder=1, **look))
+        axes.plot(*np.stack([base, shoulder])[:, :2].T, color=colour, linewidth=6, solid_capstyle="round", zorder=3)
+        axes.plot(*base[:2], marker="s", color=colour, markersize=9, zorder=3)
+        ahead = base + 0.18 * (turn[:, 0] if abs(turn[2, 0]) < 0.9 else turn[:, 2])
+        axes.annotate("", tuple(ahead[:2]), tuple(base[:2]), arrowprops={"arrowstyle": "-|>", "color": INK}, zorder=4)
+        able = any(each.payload_kg is not None for each in report.reach if each.arm == spec.name)
+        text = spec.name if able else f"{spec.name}: can do no job"
+        if len(scenario.arms) <= MOST_NAMED:
+            text += f"\n{mount_kind(robot.mount)}{f', {base[2]:g} m high' if base[2] else ''}"
+        labels += [
+            Label(text, base[:2], INK if able else FAULT),
+            Label("", ahead[:2], INK),
+            Label("", shoulder[:2], INK),
+        ]
+        for task in (task for task in report.at_once if task.arm == spec.name):
+            axes.plot(*np.stack([shoulder, *(at[name] for name in task.places)])[:, :2].T, color=colour, zorder=2)
+    for place in scenario.places:
+        own = [each for each in report.reach if each.place == place.name]
+        able = any(each.payload_kg is not None for each in own)
+        lacks_m = min((each.lacks_m for each in own), default=0.0)
+        why = f" lacks {lacks_m:.2f} m" if lacks_m else " no arm can work here"
+        colour = INK if able else FAULT
+        axes.plot(*place.position_m[:2], marker="D" if able else "X", color=colour, markersize=7, zorder=4)
+        labels.append(Label(place.name + ("" if able else f":{why}"), np.array(place.position_m[:2]), colour))
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.grid(color="#e6e6e6", zorder=-1)
+    legend = f"reach {height_m:.2f} m above the floor: dashed outstretched, filled with the tool pointing down"
+    axes.set(xlabel=f"x, m\n{legend}", ylabel="y, m")
+    axes.set_title(f"{scenario.name}: {len(report.at_once)} of {len(scenario.arms)} arms can work at once (lines)")
+    return labels
+
+
+def _draw_matrix(axes: Axes, tasks: Sequence[tuple[str, str]], report: LayoutReport) -> None:
+    """Share of the pairs of plans of two tasks that exclude each other."""
+    share = np.full((len(tasks), len(tasks)), np.nan)
+    for each in report.exclusions:
+        row, column = (tasks.index(task) for task in zip(each.arms, each.jobs, strict=True))
+        for a, b in ((row, column), (column, row)):
+            share[a, b] = each.share
+            if len(tasks) <= MOST_NUMBERS:
+                text = "place" if each.same_place else f"{100 * each.share:.0f}"
+                ink = "white" if each.share > 0.6 else INK
+                axes.text(b, a, text, ha="center", va="center", fontsize=7, color=ink)
+    axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0)
+    names = [f"{arm}: {job}" for arm, job in tasks]
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_title("Exclusions: % of the pairs of plans")
+    axes.set_xlabel("place: both need one place")
