@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.errors import FleetError, nearest
-from twin.logs.recording import Recording, Stretch, stretches
+from twin.log_windows import log_windows
+from twin.logs.recording import Recording
 from twin.vae.measures import READINGS, Calibration, Features, fewest
 from twin.vae.twin import Twin
 
@@ -79,29 +80,6 @@ class Rule:
 def word(anomalous: bool) -> str:
     """The verdict as a word."""
     return ANOMALOUS if anomalous else UNCRITICAL
-
-
-def log_windows(twin: Twin, recording: Recording) -> list[tuple[Stretch, Array, Features]]:
-    """Each stretch without gaps with the first samples of its windows, which do not overlap, and their features.
-
-    Raises:
-        FleetError: the recording has another number of joints than the twin, or no stretch of one window.
-    """
-    if recording.joints != twin.joints:
-        raise FleetError(f"'{recording.name}' has {recording.joints} joints, the twin of '{twin.arm}' {twin.joints}.")
-    config, parts = twin.config, list[tuple[Stretch, Array, Features]]()
-    for stretch in stretches(recording, config.rate_hz):
-        first = np.arange(0, len(stretch.profile) - config.window + 1, config.window)
-        if len(first):
-            inside = first[:, None] + np.arange(config.window)
-            windows = stretch.profile[inside].transpose(0, 1, 3, 2)
-            parts.append((stretch, first, twin.window_features(windows)))
-    if not parts:
-        raise FleetError(
-            f"'{recording.name}' has no stretch of {config.window / config.rate_hz:g} s without a gap, which one "
-            "window needs."
-        )
-    return parts
 
 
 def log_features(twin: Twin, recording: Recording) -> Features:

@@ -2,6 +2,8 @@
 
 import shlex
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -140,7 +142,14 @@ def recordings_of(log: Path, skip_damaged: bool) -> "list[Recording]":
     from twin.logs.reader import read, read_folder
 
     damaged = "skip" if skip_damaged else "refuse"
-    try:
+    with explain_damage():
         return read_folder(log, damaged=damaged) if log.is_dir() else read(log, damaged=damaged)
+
+
+@contextmanager
+def explain_damage() -> Iterator[None]:
+    """Name the option of the command line in errors of damaged logs."""
+    try:
+        yield
     except LogError as error:
         raise FleetError(str(error).replace('damaged="skip"', "--skip-damaged")) from error

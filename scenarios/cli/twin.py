@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 KNOWN_TWINS = option("A folder of twins. Default: those of the scenario, from the cache.", None, flag="--twins")
 SEED = option("Random seed.", 0, low=0, high=MAX_SEED)
 _VERDICT = "Verdicts"
+FOLLOW_S = 0.1
+"""Real seconds between two looks at a growing log."""
 
 
 def identify_command(
@@ -332,6 +334,7 @@ def score_command(
     log: Path | None = options.LOG,
     arm: str | None = options.TWIN_ARM,
     format_: Literal["table", "csv"] = option("table or csv.", "table", flag="--format"),
+    follow: bool = option("--log: score a CSV file while it grows, a line per window, until Ctrl-C.", False),
     skip_damaged: bool = options.SKIP_DAMAGED,
     as_json: bool = options.JSON,
     verdict: bool = option(
@@ -367,6 +370,11 @@ def score_command(
     given: Given = {name: value for name, value in (("alpha", alpha), ("reading", reading)) if value is not None}
     if not verdict and (given or map_ is not None):
         raise FleetError("--alpha, --reading and --map are for --verdict: leave them out.")
+    if follow:
+        if log is None or verdict:
+            raise FleetError("--follow needs --log FILE.csv, and does not go with --verdict, which judges a whole log.")
+        follow_log(twins, arm, log, "json" if as_json else format_, skip_damaged)
+        return
     if map_ is not None:
         check_file(map_, (".png",), overwrite, "--map")
     import numpy as np
@@ -407,6 +415,34 @@ def score_command(
         echo(shown, nl=False)
     else:
         print_wide(shown)
+
+
+def follow_log(twins: Path, arm: str | None, log: Path, how: str, skip_damaged: bool) -> None:
+    """Print a line for each window of a growing log, until Ctrl-C or SIGTERM."""
+    from scenarios.prepare.twins import open_twin
+    from scenarios.show.twin_scores import score_windows, window_text
+    from scenarios.signals import until_stopped
+    from twin.log_windows import WindowFeed
+    from twin.logs.reader import GrowingLog
+
+    twin, count = open_twin(twins, arm), 0
+    feed, damaged = WindowFeed(twin), "skip" if skip_damaged else "refuse"
+    first_s = twin.config.window / twin.config.rate_hz
+    with (
+        until_stopped() as stop,
+        options.explain_damage(),
+        GrowingLog(log, first_s=first_s, damaged=damaged) as growing,
+    ):
+        while not stop.is_set():
+            recording = growing.read(feed.due_s)
+            if recording is None:
+                stop.wait(FOLLOW_S)
+                continue
+            for row in score_windows(twin, feed.add(recording)):
+                text = window_text(row, how)
+                echo(text if how != "csv" or count == 0 else text.splitlines()[1])
+                count += 1
+    stop.leave(f"Scored {count} windows of {first_s:g} s.")
 
 
 def check_source(scenario: str | None, log: Path | None, arm: str | None = None) -> None:

@@ -12,16 +12,17 @@ from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import all_works
 from scenarios.spec.schema import Scenario
 from scenarios.table import Column, Table
+from twin.log_windows import LogWindows, log_windows
 from twin.logs.recording import Recording
 from twin.vae.measures import Features, Measures
 from twin.vae.twin import Twin
-from twin.verdict import Rule, log_features, log_windows, word
+from twin.verdict import Rule, log_features, word
 
 Array = np.ndarray
-ScoreRow = dict[str, str | float | None]
+ScoreRow = dict[str, str | float | int | None]
 LOADED = 2
 """Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
-OMITTED = ("twin", "data", "log", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+OMITTED = ("twin", "data", "log", "end_s", "hottest_joint", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
 OMITTED_WITH_VERDICT = (f"d_{LOADED}", "latent", "d_cal")
 """Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
 
@@ -90,22 +91,38 @@ def window_rows(twin: Twin, recording: Recording) -> list[ScoreRow]:
     Raises:
         FleetError: the recording has another number of joints than the twin, or is shorter than one window.
     """
+    return score_windows(twin, log_windows(twin, recording))
+
+
+def score_windows(twin: Twin, parts: LogWindows) -> list[ScoreRow]:
+    """One row per window."""
     window, rows = twin.config.window, list[ScoreRow]()
-    for stretch, first, features in log_windows(twin, recording):
+    for stretch, first, features in parts:
         measures = twin.measures_of(features)
         for number, i in enumerate(first.tolist()):
             start_s, end_s = stretch.time_s[[i, i + window - 1]].tolist()
-            hottest_c = None if stretch.temp_c is None else stretch.temp_c[i : i + window].max()
             begins: ScoreRow = {"log": stretch.recording, "start_s": start_s, "end_s": end_s}
-            rows.append(begins | _scores(twin, measures.of_job(number), hottest_c=hottest_c))
+            each_c = None if stretch.temp_c is None else stretch.temp_c[i : i + window].max(axis=0)
+            hottest_c, joint = (None, None) if each_c is None else (each_c.max(), int(each_c.argmax()) + 1)
+            rows.append(begins | _scores(twin, measures.of_job(number), hottest_c=hottest_c, hottest_joint=joint))
     return rows
 
 
-def _scores(twin: Twin, measures: Measures, **more: float | Array | None) -> ScoreRow:
+def window_text(row: ScoreRow, how: str) -> str:
+    """One window as a line of text, of JSON, or of CSV under the names of its columns."""
+    if how == "json":
+        return json.dumps(row, allow_nan=False)
+    if how == "csv":
+        return Table(head=tuple(row), rows=(tuple(map(_csv_text, row.values())),)).csv().rstrip("\r\n")
+    hot = "" if row["hottest_c"] is None else f"  joint {row['hottest_joint']} {row['hottest_c']:.1f} °C"
+    return f"{row['end_s']:.1f} s  d {row['d']:.2f}  load {row['load']:.2f}{hot}  {row['why']}"
+
+
+def _scores(twin: Twin, measures: Measures, **more: float | Array | int | None) -> ScoreRow:
     """The scores of one job or window, further figures, and their origin."""
     figures = {"d": measures.total, **{f"d_{j + 1}": d for j, d in enumerate(measures.difficulty)}}
     figures |= {"load": measures.total_load, "latent": measures.total_latent, **more}
-    plain: ScoreRow = {name: None if value is None else float(value) for name, value in figures.items()}
+    plain: ScoreRow = {name: v if v is None or isinstance(v, int) else float(v) for name, v in figures.items()}
     return plain | {"why": measures.why(), "twin": twin.version, "data": twin.data_hash}
 
 
@@ -130,11 +147,11 @@ SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c"
 """Short column heads of tables."""
 
 
-def _csv_text(value: str | float | None) -> str:
+def _csv_text(value: str | float | int | None) -> str:
     return f"{value:.6g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
-def _cell(value: str | float | None) -> str:
+def _cell(value: str | float | int | None) -> str:
     if value is None:
         return "–"
     return f"{value:.2f}" if isinstance(value, float) else str(value)

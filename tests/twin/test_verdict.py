@@ -14,6 +14,7 @@ from scipy.stats import beta, kstest
 from fleet.errors import CheckpointError, FleetError
 from fleet.motion import CHANNELS, Phase
 from twin.baselines import known_torque, torque_ratio, untrained_config
+from twin.log_windows import log_windows
 from twin.vae.config import TwinConfig
 from twin.vae.measures import (
     LEAST_VARIANCE,
@@ -30,7 +31,7 @@ from twin.vae.measures import (
 from twin.vae.train import train
 from twin.vae.twin import CARD, load, save
 from twin.vae.window import cut, cut_jobs, resample
-from twin.verdict import NoGuarantee, Rule, log_features, log_windows
+from twin.verdict import NoGuarantee, Rule, log_features
 
 
 @pytest.mark.parametrize(("count", "alpha"), [(64, 0.05), (100, 0.05), (39, 0.2)])

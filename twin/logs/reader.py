@@ -2,6 +2,7 @@
 
 import gzip
 import logging
+import os
 import zlib
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from math import isfinite
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -143,22 +144,32 @@ def read_csv(path: Path) -> LogTable:
         raise LogError(str(path), None, f"holds no text ({broken})." if broken else "is empty.")
     header, *lines = data.split(b"\n")
     names = _header(path, header)
+    rows, where, damage = _rows(lines[:-1], len(names), first=2)
+    if lines and lines[-1].strip():
+        # The last number may have lost digits even if all fields are present.
+        reason = f"the {'gzip data end' if broken else 'file ends'} in the middle of this line"
+        damage.append(Damage(len(lines) + 1, reason))
+    return LogTable(names, rows, where, tuple(damage), (broken,) if broken else ())
+
+
+def _rows(lines: Sequence[bytes], columns: int, *, first: int) -> tuple[Array, Array, list[Damage]]:
+    """Numbers of the good lines, [row, column], the line of each, [row], and the others; blank lines are ignored.
+
+    Args:
+        first: Number of the first line in the file.
+    """
     rows: list[list[float]] = []
     where: list[int] = []
     damage: list[Damage] = []
-    for line, raw in enumerate(lines, start=2):
+    for line, raw in enumerate(lines, start=first):
         if not raw.strip():
             continue
         try:
-            if line == len(lines) + 1:
-                # The last number may have lost digits even if all fields are present.
-                raise ValueError(f"the {'gzip data end' if broken else 'file ends'} in the middle of this line")
-            rows.append(_numbers(raw, len(names)))
+            rows.append(_numbers(raw, columns))
             where.append(line)
         except ValueError as error:
             damage.append(Damage(line, str(error)))
-    values = np.array(rows, dtype=float).reshape(-1, len(names))
-    return LogTable(names, values, np.array(where, dtype=int), tuple(damage), (broken,) if broken else ())
+    return np.array(rows, dtype=float).reshape(-1, columns), np.array(where, dtype=int), damage
 
 
 def _decompress(data: bytes) -> tuple[bytes, str | None]:
@@ -463,3 +474,111 @@ def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Reco
         raise LogError(str(path), None, f"holds no good line of numbers{': ' if dropped else '.'}{'; '.join(dropped)}")
     kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
     return Recording(name=name, time_s=time_s[keep], **kept, dropped=dropped)
+
+
+BLOCK_BYTES = 1 << 20
+"""Most bytes that are read at a time, and most of one line."""
+MAX_ROWS = 20_000
+"""Rows after which a growing log is checked even if its time does not advance."""
+
+
+class GrowingLog:
+    """Recordings of a CSV log while another process appends to it, in a `with` block; incomplete lines have to wait.
+
+    Args:
+        first_s: Length of the first recording.
+        damaged: As in `read`, for the lines of each recording.
+
+    Raises:
+        LogError: the file cannot be opened, or does not end in .csv.
+    """
+
+    def __init__(self, path: Path, *, first_s: float = 0.0, damaged: Damaged = "refuse") -> None:
+        if not path.name.lower().endswith(".csv"):
+            raise LogError(str(path), None, "cannot be followed: only a file that ends in .csv grows line by line.")
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
+        self._path, self._first_s, self._begun = path, first_s, b""
+        self._damaged: Damaged = damaged
+        self._lines = 0
+        """Complete lines so far."""
+        self._table: LogTable | None = None
+        """Rows since the last recording, after its last row."""
+        self._time, self._last_s = 0, -np.inf
+        """Column of the time, and the time of that row."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def read(self, until_s: float) -> Recording | None:
+        """The readings since the last call that returned some; None before the log has reached a time.
+
+        Raises:
+            LogError: as `read`; or the file was removed, replaced or truncated, or its time starts again.
+        """
+        while not self._is_due(until_s):
+            block = self._file.read(BLOCK_BYTES)
+            if not block:
+                self._check_unchanged()
+                return None
+            self._append(block)
+        assert self._table is not None
+        recording = _recording(self._path, _name(self._path), self._table, self._damaged)
+        begins = 0
+        if self._last_s > -np.inf:
+            if recording.time_s[0] != self._last_s:
+                reason = f"time starts again at {recording.time_s[0]:.10g} s; it was {self._last_s:.10g} s before"
+                raise LogError(str(self._path), None, f"{reason}. Follow a new file for each recording.")
+            begins = 1
+        self._last_s = float(recording.time_s[-1])
+        last = self._table.values[:, self._time] == self._last_s
+        self._table = LogTable(self._table.names, self._table.values[last][-1:], self._table.where[last][-1:], ())
+        return recording.part(slice(begins, None)) if len(recording.time_s) > begins else None
+
+    def _is_due(self, until_s: float) -> bool:
+        table = self._table
+        if table is None or len(table.values) + len(table.damage) >= MAX_ROWS:
+            return table is not None
+        time_s = table.values[:, self._time]
+        back = np.count_nonzero(time_s[1:] <= np.maximum.accumulate(time_s)[:-1])
+        if back > STRAY_ROWS or (self._damaged == "refuse" and (back or table.damage)):
+            return True
+        if self._last_s == -np.inf and len(time_s):
+            until_s = time_s[0] + self._first_s
+        return len(time_s) > (self._last_s > -np.inf) and bool(time_s[-1] >= until_s)
+
+    def _append(self, block: bytes) -> None:
+        *lines, self._begun = (self._begun + block).split(b"\n")
+        if len(self._begun) > BLOCK_BYTES:
+            raise LogError(str(self._path), self._lines + 1, f"has a line of more than {BLOCK_BYTES:,} bytes.")
+        if self._table is None and lines:
+            names = _header(self._path, lines.pop(0))
+            try:
+                self._time = names.index(format_of(names).time)
+            except ValueError as error:
+                raise LogError(str(self._path), 1, str(error)) from error
+            self._table, self._lines = LogTable(names, np.zeros((0, len(names))), np.zeros(0, int), ()), 1
+        if self._table is not None:
+            before = self._table
+            rows, where, damage = _rows(lines, len(before.names), first=self._lines + 1)
+            values, where = np.concatenate([before.values, rows]), np.concatenate([before.where, where])
+            self._table = LogTable(before.names, values, where, (*before.damage, *damage))
+            self._lines += len(lines)
+
+    def _check_unchanged(self) -> None:
+        """Raise a LogError if the file is another one now, or has lost bytes that were read."""
+        try:
+            now, ours = self._path.stat(), os.fstat(self._file.fileno())
+        except OSError:
+            raise LogError(str(self._path), None, "was removed while it was followed.") from None
+        replaced = (now.st_dev, now.st_ino) != (ours.st_dev, ours.st_ino)
+        if replaced or now.st_size < self._file.tell():
+            what = "replaced by another file" if replaced else "truncated"
+            raise LogError(
+                str(self._path), None, f"was {what} while it was followed. Start again to follow the new one."
+            )
