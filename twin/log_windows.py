@@ -72,7 +72,7 @@ class WindowFeed:
         self._pieces.append(piece)
         if piece.time_s[-1] < self.due_s:
             return []
-        config, joined = self._twin.config, _joined(self._pieces)
+        config, joined = self._twin.config, join(self._pieces)
         gaps = np.flatnonzero(np.diff(joined.time_s) > GAP_S)
         begin = int(gaps[-1]) + 1 if len(gaps) else 0
         parts = _windows(self._twin, joined.part(slice(None, begin)), self._hop) if begin else []
@@ -86,7 +86,7 @@ class WindowFeed:
         return parts
 
 
-def _joined(pieces: Sequence[Recording]) -> Recording:
+def join(pieces: Sequence[Recording]) -> Recording:
     """One recording of several with the same channels."""
     present = [channel for channel in READINGS if getattr(pieces[0], channel) is not None]
     joined = {name: np.concatenate([getattr(each, name) for each in pieces]) for name in ("time_s", *present)}
@@ -105,7 +105,7 @@ def _from(recording: Recording, time_s: float) -> Recording:
     ends = {channel: getattr(pair, channel) for channel in present}
     between = {channel: ((1 - share) * value[0] + share * value[1])[None] for channel, value in ends.items()}
     begin = replace(pair, time_s=np.array([time_s]), **between)
-    return _joined([begin, recording.part(slice(after, None))])
+    return join([begin, recording.part(slice(after, None))])
 
 
 def _check_joints(twin: Twin, recording: Recording) -> None:

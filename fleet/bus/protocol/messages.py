@@ -97,6 +97,10 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     """Predicted temperature of the hottest motor in the rest of the current job."""
     job_p_saturation: Share | None = None
     """Probability that a motor passes the warning limit in the rest of the current job."""
+    motion_difficulty: Number | None = None
+    """d of the last executed motion, of any job or of none, by the arm's twin."""
+    expected_c: tuple[Celsius, ...] = ()
+    """Motor temperatures that the arm's thermal network yields for the heat that it measures, [joint]."""
     q: tuple[Number, ...] = ()
     """rad, [joint]."""
     qd: tuple[Number, ...] = ()
@@ -110,7 +114,7 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("housing_c", "q", "qd", "tau", "current_a"):
+        for name in ("housing_c", "expected_c", "q", "qd", "tau", "current_a"):
             values = getattr(self, name)
             if values and len(values) != len(self.temp_c):
                 raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")
