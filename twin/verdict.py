@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.errors import FleetError, nearest
+from fleet.motion import CHANNELS
 from twin.log_windows import log_windows
 from twin.logs.recording import Recording
-from twin.vae.measures import READINGS, Calibration, Features, fewest
+from twin.vae.measures import PARTS, READINGS, Calibration, Features, fewest
 from twin.vae.twin import Twin
 
 Array = np.ndarray
@@ -50,7 +51,8 @@ class Rule:
         if count < wanted:
             raise NoGuarantee(
                 f"A false-alarm rate of {self.alpha:g} needs {wanted} held-out cool jobs of each kind or more (the "
-                f"twin of '{self.twin.arm}' has {count}). Choose alpha >= {1 / (count + 1):.3g}, or train on more."
+                f"twin of '{self.twin.arm}' has {count}). Choose --alpha >= {1 / (count + 1):.3g}, or train with more: "
+                "a larger --hold-out or more cool logs, or twin.exploration of a scenario."
             )
 
     @property
@@ -59,9 +61,9 @@ class Rule:
         assert self.twin.calibration is not None
         return self.twin.calibration
 
-    def p_value(self, features: Features) -> Array:
-        """p-values of features [..., joint], [...]."""
-        return self.calibration.p_value(features, self.twin.joint_weight, self.reading)
+    def p_value(self, features: Features, reading: str | None = None) -> Array:
+        """p-values of features [..., joint] by a reading, [...]; default: that of the rule."""
+        return self.calibration.p_value(features, self.twin.joint_weight, reading or self.reading)
 
     def anomalous(self, features: Features) -> Array:
         """Whether motion is anomalous, bool [...]."""
@@ -82,7 +84,53 @@ def word(anomalous: bool) -> str:
     return ANOMALOUS if anomalous else UNCRITICAL
 
 
+STRETCH_S = 120.0
+"""Length of the stretches of a log that are judged, to whole windows: shorter work hardly warms a motor."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogStretches:
+    """The windows of a recording, and all its stretches of `length` consecutive windows; gaps are left out.
+
+    A recording that is shorter than a stretch is one stretch.
+    """
+
+    windows: Features
+    """[window, joint]."""
+    stretches: Features
+    """Means of their windows, [stretch, joint]; one begins with each window."""
+    length: int
+
+    @classmethod
+    def of(cls, twin: Twin, recording: Recording) -> "LogStretches":
+        """Those of a recording; raises as `log_windows`."""
+        packed = np.concatenate([features.packed for *_, features in log_windows(twin, recording)])
+        config = twin.config
+        length = min(max(1, round(STRETCH_S * config.rate_hz / config.window)), len(packed))
+        means = np.lib.stride_tricks.sliding_window_view(packed, length, axis=0).mean(axis=-1)
+        return cls(Features(packed), Features(means), length)
+
+    def worst(self, weight: Array) -> Features:
+        """Errors of the stretch with the largest d, torque of that with the largest load, latents of all, [joint].
+
+        Args:
+            weight: w_k of the joints, [joint].
+        """
+        packed = self.windows.packed.mean(axis=0)
+        newest, heaviest = (
+            self.stretches.packed[np.argmax(score @ weight)]
+            for score in (self.stretches.difficulty, self.stretches.one_sided)
+        )
+        packed[:, : len(CHANNELS)] = newest[:, : len(CHANNELS)]
+        packed[:, len(CHANNELS) : PARTS] = heaviest[:, len(CHANNELS) : PARTS]
+        return Features(packed)
+
+    def share(self, anomalous: Array) -> float:
+        """Share of the windows that belong to stretches which are anomalous, bool [stretch]."""
+        inside = np.convolve(anomalous, np.ones(self.length))
+        return float(np.mean(inside > 0.5))
+
+
 def log_features(twin: Twin, recording: Recording) -> Features:
-    """Mean features of a recording over its windows, [joint]; raises as `log_windows`."""
-    parts = [features.packed for _, _, features in log_windows(twin, recording)]
-    return Features(np.concatenate(parts).mean(axis=0))
+    """Features by which a recording is judged, [joint]: those of its worst stretches; raises as `log_windows`."""
+    return LogStretches.of(twin, recording).worst(twin.joint_weight)

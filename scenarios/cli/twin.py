@@ -325,6 +325,10 @@ def train_command(
         return
     for twin in card["twins"]:
         out_console.print(quality_table(twin))
+    if log is not None:
+        count = card["twins"][0]["calibrated_on"]
+        alpha = f"verdicts with --alpha {1 / (count + 1):.2g} or more" if count else "no verdicts"
+        say(f"{count} cool recordings held out (--hold-out): {alpha}; --alpha 0.05 needs 19.", out_console)
     say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
 
 
@@ -341,7 +345,7 @@ def score_command(
         "Judge each job of a scenario, or each recording of a log: uncritical or anomalous.", False, panel=_VERDICT
     ),
     alpha: float | None = option(
-        "Largest share of cool jobs that may be called anomalous; default: 0.05.",
+        "Largest share of cool jobs that may be called anomalous; default: 0.05, which needs 19 held-out ones.",
         None,
         low=0,
         high=1,
@@ -349,7 +353,8 @@ def score_command(
         panel=_VERDICT,
     ),
     reading: Literal["load", "d", "latent"] | None = option(
-        "load (torque above the reconstruction), d, or latent (distance from cool motion); default: load.",
+        "Judge by load (torque above the reconstruction), d (novelty), or latent (distance from cool motion); default: "
+        "load.",
         None,
         panel=_VERDICT,
     ),
@@ -360,10 +365,10 @@ def score_command(
 ) -> None:
     """Score every job of a scenario, or a log window by window, with the version of the twin.
 
-    With --verdict a recording is one row, and a conformal p-value judges each row:
-    a new cool job is called anomalous with probability alpha at most, if it is like
-    the cool jobs that the twin held out of its training. Motion files of
-    `twin generate` are recordings, too.
+    With --verdict a recording is one row. Its worst stretch of two minutes is judged
+    by conformal p-values of load and novelty: a new cool recording is called anomalous
+    with probability alpha at most, if it is like the cool recordings that the twin
+    held out of its training. Motion files of `twin generate` are recordings, too.
     Takes seconds, and half a minute if the jobs must be planned first.
     """
     check_source(scenario, log)
@@ -377,32 +382,28 @@ def score_command(
         return
     if map_ is not None:
         check_file(map_, (".png",), overwrite, "--map")
-    import numpy as np
-
     from scenarios.motion.verdict_map import verdict_png
     from scenarios.prepare.twins import open_twin
     from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, render, window_rows, with_verdicts
     from scenarios.spec.load import load
-    from twin.vae.measures import Features
-    from twin.verdict import Rule, log_features
+    from twin.verdict import Rule
 
     chosen, twin = load(scenario) if scenario else None, open_twin(twins, arm)
     rule = Rule(twin=twin, **given) if verdict else None
-    jobs, recordings = [], []
+    features = None
     if chosen is not None:
         with progress_bar() as progress:
             jobs = jobs_of_arm(twin, chosen, progress)
             rows = job_rows(twin, jobs)
+        features = twin.features([plan for plan, _ in jobs], [times for _, times in jobs])
     else:
         recordings = options.recordings_of(Path(str(log)), skip_damaged)
-        windows = (row for recording in recordings for row in window_rows(twin, recording))
-        rows = log_rows(twin, recordings) if rule else list(windows)
-    caption = f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}"
-    if rule:
-        if chosen is not None:
-            features = twin.features([plan for plan, _ in jobs], [times for _, times in jobs])
+        if rule:
+            rows, features = log_rows(rule, recordings)
         else:
-            features = Features(np.stack([log_features(twin, recording).packed for recording in recordings]))
+            rows = [row for recording in recordings for row in window_rows(twin, recording)]
+    caption = f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}"
+    if rule and features is not None:
         rows = with_verdicts(rows, rule, features)
         caption = f"{rule.guarantee} Twin of {twin.arm}, version {twin.version}"
         if map_ is not None:

@@ -16,13 +16,15 @@ from twin.log_windows import LogWindows, log_windows
 from twin.logs.recording import Recording
 from twin.vae.measures import Features, Measures
 from twin.vae.twin import Twin
-from twin.verdict import Rule, log_features, word
+from twin.verdict import LogStretches, Rule, word
 
 Array = np.ndarray
 ScoreRow = dict[str, str | float | int | None]
 LOADED = 2
 """Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
 OMITTED = ("twin", "data", "log", "end_s", "hottest_joint", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+P_NAMES = {"d": "novelty"}
+"""Names of readings in columns of p-values, where they differ."""
 OMITTED_WITH_VERDICT = (f"d_{LOADED}", "latent", "d_cal")
 """Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
 
@@ -54,28 +56,34 @@ def job_rows(twin: Twin, jobs: Sequence[tuple[Plan, int]]) -> list[ScoreRow]:
     return rows
 
 
-def log_rows(twin: Twin, recordings: Sequence[Recording]) -> list[ScoreRow]:
-    """One row of mean scores per recording.
+def log_rows(rule: Rule, recordings: Sequence[Recording]) -> tuple[list[ScoreRow], Features]:
+    """One row of scores per recording, those of its worst stretches, and the features that are judged, [row, joint].
 
     Raises:
-        FleetError: as `twin.verdict.log_windows`.
+        FleetError: as `twin.log_windows.log_windows`.
     """
-    rows = list[ScoreRow]()
+    rows, judged, twin = list[ScoreRow](), list[Array](), rule.twin
     for recording in recordings:
-        measures = twin.measures_of(log_features(twin, recording))
+        log = LogStretches.of(twin, recording)
+        features = log.worst(twin.joint_weight)
+        judged.append(features.packed)
+        measures, share = twin.measures_of(features), log.share(rule.anomalous(log.stretches))
         hottest_c = None if recording.temp_c is None else recording.temp_c.max()
         begins: ScoreRow = {"recording": recording.name, "minutes": recording.duration_s / 60}
-        rows.append(begins | _scores(twin, measures, p_value=measures.p_value, hottest_c=hottest_c))
-    return rows
+        rows.append(begins | _scores(twin, measures, hottest_c=hottest_c, anomalous_share=share))
+    return rows, Features(np.stack(judged))
 
 
 def with_verdicts(rows: Sequence[ScoreRow], rule: Rule, features: Features) -> list[ScoreRow]:
-    """The rows with the p-value and the verdict of a rule on their features [row, joint] before the reasons."""
+    """The rows with p-values and the verdict of a rule on their features [row, joint] before the reasons."""
+    by = {name: f"p_{P_NAMES.get(name, name)}" for name in ("load", "d", rule.reading)}
+    p_values = {name: rule.p_value(features, name).tolist() for name in by}
     judged = list[ScoreRow]()
-    for row, p in zip(rows, rule.p_value(features).tolist(), strict=True):
+    for i, row in enumerate(rows):
         ends = {name: row[name] for name in ("why", "twin", "data")}
         begins = {name: value for name, value in row.items() if name not in (*ends, "p_value")}
-        judged.append({**begins, "p_value": p, "verdict": word(p <= rule.alpha), **ends})
+        each = {column: p_values[name][i] for name, column in by.items()}
+        judged.append({**begins, **each, "verdict": word(p_values[rule.reading][i] <= rule.alpha), **ends})
     return judged
 
 
@@ -143,7 +151,7 @@ def render(rows: Sequence[ScoreRow], how: str, *, caption: str) -> str | Table:
     )
 
 
-SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c": "°C"}
+SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c": "°C", "anomalous_share": "share"}
 """Short column heads of tables."""
 
 
