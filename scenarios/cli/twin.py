@@ -257,6 +257,7 @@ def export_command(
     twins: Path = options.TWINS,
     out: Path = option("A file that ends in .onnx.", Path("twin.onnx")),
     arm: str | None = options.TWIN_ARM,
+    precision: Literal["float32", "float64"] = option("Type of the input: float32 or float64.", "float32"),
     overwrite: bool = options.OVERWRITE,
 ) -> None:
     """Export a twin as ONNX, for scoring without Python; needs the extra `onnx`."""
@@ -267,7 +268,7 @@ def export_command(
     from twin.vae.onnx import export_onnx
 
     twin = open_twin(twins, arm)
-    say(f"Twin of {twin.arm}, version {twin.version}, written to {export_onnx(twin, out)}.", out_console)
+    say(f"Twin of {twin.arm}, version {twin.version}, written to {export_onnx(twin, out, precision)}.", out_console)
 
 
 def twin_of(folder: Path | None, arm: str) -> "Twin | None":
