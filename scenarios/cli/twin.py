@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING
+from dataclasses import MISSING, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -36,7 +36,7 @@ FOLLOW_S = 0.1
 def identify_command(
     log: Path = option("A log with motor temperatures, or a folder of logs of one arm.", MISSING),
     out: Path | None = option("Folder of the result, rc.json.", None),
-    arm: str = option("Name of the arm.", "arm", is_name=True),
+    arm: str | None = options.LOG_ARM,
     ambient: float | None = option("Ambient temperature, °C; default: 22 is assumed.", None, low=-40, high=60),
     skip_damaged: bool = options.SKIP_DAMAGED,
     overwrite: bool = options.OVERWRITE,
@@ -46,6 +46,7 @@ def identify_command(
 
     A day of logs takes half a minute to a minute.
     """
+    from scenarios.prepare.twins import arms_of
     from twin.thermal.checkpoint import CARD, save
     from twin.thermal.identify import AMBIENT_C, identify
 
@@ -54,7 +55,8 @@ def identify_command(
             raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
         check_overwrite(out / CARD, overwrite)
     ambient_c = AMBIENT_C if ambient is None else ambient
-    recordings = options.recordings_of(log, skip_damaged)
+    recordings = options.arm_recordings(log, arm, skip_damaged)
+    arm = arm or arms_of(recordings)[0]
     with progress_bar(kept="") as progress:
         progress("identifying", 0.0)
         network = identify(recordings, arm=arm, ambient_c=ambient_c)
@@ -124,10 +126,10 @@ def forecast_command(
     from twin.thermal.forecast import forecast
 
     identified = None if network is None else load(network)
-    so_far = one_of(options.recordings_of(log, skip_damaged), arm, log)
+    so_far = one_of(options.arm_recordings(log, arm, skip_damaged), log)
     path = Path(plan)
     if path.exists():
-        motion = one_of(options.recordings_of(path, skip_damaged), None, path)
+        motion = one_of(options.recordings_of(path, skip_damaged), path)
     else:
         with progress_bar() as progress:
             motion = motion_of(plan, arm, progress)
@@ -153,17 +155,12 @@ def forecast_command(
     say("No page was written; --out FILE.html writes one." if out is None else f"Open {out} in a browser.", out_console)
 
 
-def one_of(recordings: "list[Recording]", arm: str | None, path: Path) -> "Recording":
-    """The recording of an arm, or the only one.
-
-    Raises:
-        FleetError: there is none, or several and no arm is named.
-    """
-    chosen = [each for each in recordings if arm is None or len(recordings) == 1 or each.name.endswith(arm)]
-    if len(chosen) == 1:
-        return chosen[0]
-    names = ", ".join(each.name for each in recordings[:8])
-    raise FleetError(f"'{path}' has {len(recordings)} recordings ({names}): give one file, or name the arm with --arm.")
+def one_of(recordings: "list[Recording]", path: Path) -> "Recording":
+    """The only recording; raises a FleetError if there are several."""
+    if len(recordings) > 1:
+        names = ", ".join(each.name for each in recordings[:8])
+        raise FleetError(f"'{path}' has {len(recordings)} recordings ({names}): give one file of one arm.")
+    return recordings[0]
 
 
 def generate_command(
@@ -282,7 +279,12 @@ def train_command(
     scenario: str | None = options.SCENARIO_OR_LOG,
     log: Path | None = options.LOG,
     out: Path = option("Folder of the twins.", Path("runs/twins")),
-    arm: str | None = option("Train only this arm; default: every arm of the scenario.", None),
+    arm: str | None = option(
+        "Train only this arm; default: every arm of the scenario. --log: name of the arm; in a log of several arms, "
+        "the one to choose.",
+        None,
+        is_name=True,
+    ),
     *,
     given: Annotated[Given, From(TwinConfig)],
     size: Literal["quick", "full"] | None = option("quick or full. Default: as in the scenario; for logs quick.", None),
@@ -302,7 +304,7 @@ def train_command(
     The quick size takes up to a minute per arm and core, the full size four.
     Cached twins take seconds. A twin of logs is kept in --out only.
     """
-    check_source(scenario, log, arm)
+    check_source(scenario, log)
     from scenarios.prepare.twins import TWINS, save_twins, train_arms, train_log
     from scenarios.spec.load import load
 
@@ -311,8 +313,9 @@ def train_command(
     with explain_in_options(), bar as progress, new_folder(out, TWINS, overwrite=overwrite) as folder:
         if log is not None:
             config = config_of(size or "quick", given, of_log=True)
-            recordings = options.recordings_of(log, skip_damaged)
-            twins = [train_log(recordings, config, seed or 0, cool_c=cool, hold_out=hold_out, progress=progress)]
+            recordings = options.arm_recordings(log, arm, skip_damaged)
+            twin = train_log(recordings, config, seed or 0, cool_c=cool, hold_out=hold_out, progress=progress)
+            twins = [twin if arm is None else replace(twin, arm=arm)]
             source = f"log {log}"
         else:
             of_scenario = load(str(scenario))
@@ -447,13 +450,11 @@ def follow_log(twins: Path, arm: str | None, log: Path, how: str, skip_damaged: 
     stop.leave(f"Scored {count} windows of {first_s:g} s.")
 
 
-def check_source(scenario: str | None, log: Path | None, arm: str | None = None) -> None:
-    """Raise a FleetError unless either a scenario or a log is given, and --arm only with a scenario."""
+def check_source(scenario: str | None, log: Path | None) -> None:
+    """Raise a FleetError unless either a scenario or a log is given."""
     if (scenario is None) == (log is None):
         given = "neither" if scenario is None else "both"
         raise FleetError(f"Give either a scenario or --log FILE_OR_FOLDER (got {given}).")
-    if log is not None and arm is not None:
-        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
 
 
 @contextmanager
@@ -484,7 +485,7 @@ def report_command(
     scenario takes up to two minutes, a day of logs a minute for each seed. A failed
     section shows its reason; the exit code is then 1.
     """
-    check_source(scenario, log, arm)
+    check_source(scenario, log)
     from fleet.files import cache_folder
     from scenarios.show import twin_report
     from scenarios.spec.load import load
@@ -495,7 +496,7 @@ def report_command(
         how: Any = {"size": twin_report.SIZE, "folder": cache_folder(), "progress": progress}  # arguments
         if log is not None:
             title, source = f"The twin of the logs in {log.name}", f"--log {log.name}"
-            subjects = twin_report.log_subjects(options.recordings_of(log, skip_damaged), range(seeds), **how)
+            subjects = twin_report.log_subjects(options.arm_recordings(log, arm, skip_damaged), range(seeds), **how)
         else:
             chosen = load(str(scenario))
             index = 0 if arm is None else chosen.index_of(arm)

@@ -216,18 +216,12 @@ def replayed_arm(name: str, file: Path, twin: Path | None = None, network: Path 
     """Prepare an arm that replays a real arm's log and takes no jobs; see `monitor_of`.
 
     Raises:
-        LogError: the file cannot be read, or has no temperatures.
-        FleetError: the file holds several arms, and none of this name.
+        LogError: the file cannot be read, has no temperatures, or holds several arms and none of this name.
     """
-    from twin.logs.reader import read
+    from twin.logs.reader import of_arm, read
 
-    recordings = {each.name.rpartition("/")[2]: each for each in read(file, damaged="skip")}
-    if len(recordings) > 1 and name not in recordings:
-        raise FleetError(
-            f"'{file}' has the logs of several arms, and none of '{name}'. Give one of these names: "
-            f"{', '.join(recordings)}."
-        )
-    recording = recordings[name] if len(recordings) > 1 else next(iter(recordings.values()))
+    recordings = read(file, damaged="skip")
+    (recording,) = of_arm(recordings, name if len(recordings) > 1 else None, file)
     if recording.temp_c is None:
         raise LogError(str(file), None, "has no motor temperatures; a live arm needs them.")
     sensors = SensorLog(

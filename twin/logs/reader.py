@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet.errors import LogError
+from fleet.errors import LogError, nearest
 from fleet.robot import JOINTS
 from twin.logs.recording import CONTINUOUS, READINGS, Recording
 
@@ -435,6 +435,22 @@ def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Record
     if not recordings:
         raise LogError(str(path), None, f"none of its {len(files)} logs is usable; see the warnings.")
     return recordings
+
+
+def of_arm(recordings: Sequence[Recording], arm: str | None, path: Path) -> list[Recording]:
+    """The recordings of one arm: those of its name in files of several arms; all, if no file names an arm.
+
+    Raises:
+        LogError: there are several arms and none is named, or none of this name.
+    """
+    names = dict.fromkeys(each.name.rpartition("/")[2] for each in recordings if "/" in each.name)
+    if arm is None and len(names) > 1:
+        raise LogError(str(path), None, f"holds several arms: choose one with --arm ({', '.join(names)}).")
+    if arm is None or not names:
+        return list(recordings)
+    if arm not in names:
+        raise LogError(str(path), None, f"has no arm '{arm}'{nearest(arm, names)}")
+    return [each for each in recordings if each.name.rpartition("/")[2] == arm]
 
 
 def _name(path: Path) -> str:
