@@ -73,10 +73,9 @@ class WindowFeed:
         if piece.time_s[-1] < self.due_s:
             return []
         config, joined = self._twin.config, join(self._pieces)
-        gaps = np.flatnonzero(np.diff(joined.time_s) > GAP_S)
-        begin = int(gaps[-1]) + 1 if len(gaps) else 0
-        parts = _windows(self._twin, joined.part(slice(None, begin)), self._hop) if begin else []
-        last = joined.part(slice(begin, None))
+        rows = np.split(np.arange(len(joined.time_s)), np.flatnonzero(np.diff(joined.time_s) > GAP_S) + 1)
+        *before, last = (joined.part(each) for each in rows)
+        parts = [part for each in before for part in _windows(self._twin, each, self._hop)]
         samples = int(last.duration_s * config.rate_hz + 1e-6 * len(last.time_s))
         if samples >= config.window:
             count = (samples - config.window) // self._hop + 1

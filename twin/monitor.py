@@ -1,5 +1,7 @@
 """What a twin and a thermal network make of the motion of a live arm."""
 
+import math
+
 import numpy as np
 
 from fleet.errors import FleetError
@@ -17,11 +19,15 @@ SETTLED_S = 1e7
 """A step of this length leads to the steady state."""
 
 
+POSSIBLE_C = (-100.0, 500.0)
+"""Range of expected temperatures."""
+
+
 class Monitor:
     """Difficulty of the last window of motion, and expected temperatures; see `fleet.live.arm.body.MotionMonitor`.
 
-    The expected temperatures begin with the measured ones, and with housings that have been at these for long; after
-    an hour they hardly depend on this start. A gap of more than `HEAT_GAP_S` begins anew.
+    The expected temperatures begin with the measured ones, and with housings that have been at these for long. A gap of
+    more than `HEAT_GAP_S` begins anew, and so do readings that lead to no possible temperature.
 
     Args:
         every_s: Time from one window to the next.
@@ -52,11 +58,11 @@ class Monitor:
         difficulty, expected_c = self.scores
         if self._feed is not None and self._twin is not None and (parts := self._feed.add(piece)):
             *_, features = parts[-1]
-            difficulty = float(features.difficulty[-1] @ self._twin.joint_weight)
+            d = float(features.difficulty[-1] @ self._twin.joint_weight)
+            difficulty = d if math.isfinite(d) else None
         if self._network is not None:
             self._expect(piece, self._network)
-        if self._temp_c is not None:
-            expected_c = tuple(self._temp_c[WINDING].tolist())
+            expected_c = () if self._temp_c is None else tuple(self._temp_c[WINDING].tolist())
         self.scores = difficulty, expected_c
 
     def _expect(self, piece: Recording, network: Identified) -> None:
@@ -77,5 +83,7 @@ class Monitor:
                 warm = magnet_factor(temp_c[HOUSING], motors) ** 2 if log.source == "current" else 1.0
                 heat_w = drive_heat(temp_c, current_sq[i] * warm, friction_w[i], motors)
                 temp_c = thermal.step(temp_c, heat_w, network.ambient_c, dt_s)
+            if not (temp_c == np.clip(temp_c, *POSSIBLE_C)).all():
+                temp_c = None
             self._end_s = end_s = float(log.time_s[-1])
         self._temp_c, self._heat = temp_c, [joined.part(joined.time_s >= end_s)]

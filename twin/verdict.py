@@ -45,7 +45,7 @@ class Rule:
         if self.twin.calibration is None:
             raise NoGuarantee(
                 f"The twin of '{self.twin.arm}' has no held-out cool jobs, so a verdict has no guarantee. Train it "
-                "with exploration (twin.exploration of the scenario), or on more cool recordings."
+                "with exploration (twin.exploration of the scenario), or with a larger --hold-out or more cool logs."
             )
         count, wanted = self.twin.calibration.smallest_group, fewest(self.alpha)
         if count < wanted:

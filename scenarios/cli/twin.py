@@ -429,6 +429,7 @@ def follow_log(twins: Path, arm: str | None, log: Path, how: str, skip_damaged: 
     from scenarios.signals import until_stopped
     from twin.log_windows import WindowFeed
     from twin.logs.reader import GrowingLog
+    from twin.logs.recording import GAP_S
 
     twin, count = open_twin(twins, arm), 0
     feed, damaged = WindowFeed(twin), "skip" if skip_damaged else "refuse"
@@ -443,7 +444,12 @@ def follow_log(twins: Path, arm: str | None, log: Path, how: str, skip_damaged: 
             if recording is None:
                 stop.wait(FOLLOW_S)
                 continue
-            for row in score_windows(twin, feed.add(recording)):
+            parts = feed.add(recording)
+            if not parts and (step_s := recording.duration_s / max(len(recording.time_s) - 1, 1)) > GAP_S:
+                raise FleetError(
+                    f"'{log}' has a sample every {step_s:.3g} s; windows need one at least every {GAP_S:g} s."
+                )
+            for row in score_windows(twin, parts):
                 text = window_text(row, how)
                 echo(text if how != "csv" or count == 0 else text.splitlines()[1])
                 count += 1

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from fleet.bus.client import BusClient
 from fleet.errors import FleetError
-from fleet.robot import ThermalLimits
+from fleet.robot import JOINTS, ThermalLimits
 from scenarios.cli.options import split_names, the_fleet
 from scenarios.extras import require_extra
 from scenarios.live.arm import monitor_of
@@ -69,6 +69,8 @@ def run_listener(
         )
     names, where = names_of(joints), ros2_router(router, endpoint)
     monitor = monitor_of(twin, network, 1.0 / rate_hz)
+    if monitor is not None and len(names) != JOINTS:
+        raise FleetError(f"--twin and --network are for arms of {JOINTS} joints (got {len(names)} in --joints).")
     from fleet.live.clock import FleetClock
     from fleet.ros2.bridge import ArmReadings, Follower
 
@@ -136,7 +138,6 @@ def node_at(router: str, name: str, domain: int, stopped: Callable[[], bool]) ->
 
 def names_of(joints: str) -> tuple[str, ...]:
     """The given joint names, which must differ, or those of a Gen3."""
-    from fleet.robot import JOINTS
     from fleet.ros2.conversion import joint_names
 
     if not joints:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,15 @@ def test_a_growing_log_has_the_windows_of_the_finished_one(twin, motion, tmp_pat
         same = by_start[f"{row['start_s']:.6f}"]
         for name in ("d", "d_2", "load", "hottest_c", "end_s"):
             assert row[name] == pytest.approx(same[name], rel=1e-3, abs=1e-4), name
+
+
+def test_a_slow_log_has_no_windows_and_readings_after_gaps_begin_anew(twin, recording_of):
+    log = recording_of(4.0)
+    slow = replace(log, time_s=4.0 * np.arange(len(log.time_s)))
+    feed = WindowFeed(twin)
+    assert [part for i in range(len(slow.time_s)) for part in feed.add(slow.part(slice(i, i + 1)))] == []
+    parts = feed.add(replace(log, time_s=log.time_s + 5000.0))
+    assert [stretch.time_s[0] for stretch, _, _ in parts] == [pytest.approx(5000.0, abs=0.1)]
 
 
 def test_windows_may_overlap(twin, recording_of):

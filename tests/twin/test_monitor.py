@@ -58,6 +58,21 @@ def test_the_network_of_the_arm_yields_its_temperatures():
     assert warmed_k > 10.0
 
 
+def test_impossible_readings_give_no_scores_and_are_forgotten(twin):
+    log, _ = working(RcTwin.nominal(), 20.0, np.random.default_rng(1))
+    wrong = log.tau.copy()
+    wrong[40:60] = 1e200
+    monitor = Monitor(twin, identify([log], arm="own", ambient_c=AIR_C), every_s=0.96)
+    with np.errstate(all="ignore"):
+        scores = replayed(replace(log, tau=wrong, current_a=None), monitor, 10.0)
+    assert () in [expected_c for _, expected_c in scores[5:]]
+    np.testing.assert_allclose(scores[-1][1], scores[-1][1])
+    assert len(scores[-1][1]) == 7
+    for d, expected_c in scores:
+        assert all(-100 < each < 500 for each in expected_c)
+        assert d is None or 0 <= d <= 7
+
+
 def test_a_replayed_arm_publishes_d_and_expected_temperatures(twin, motion, tmp_path):
     save(twin, tmp_path / "twin")
     log, _ = working(RcTwin.nominal(), 20.0, np.random.default_rng(1))
