@@ -97,10 +97,6 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     """Predicted temperature of the hottest motor in the rest of the current job."""
     job_p_saturation: Share | None = None
     """Probability that a motor passes the warning limit in the rest of the current job."""
-    motion_difficulty: Number | None = None
-    """d of the last executed motion, of any job or of none, by the arm's twin."""
-    expected_c: tuple[Celsius, ...] = ()
-    """Motor temperatures that the arm's thermal network yields for the heat that it measures, [joint]."""
     q: tuple[Number, ...] = ()
     """rad, [joint]."""
     qd: tuple[Number, ...] = ()
@@ -111,6 +107,10 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     """[joint]."""
     epoch: str = ""
     """As in `Clock`, of its time; "" for unknown."""
+    motion_difficulty: Number | None = None
+    """d of the last executed motion, of any job or of none, by the arm's twin."""
+    expected_c: tuple[Celsius, ...] = ()
+    """Motor temperatures that the arm's thermal network yields for the heat that it measures, [joint]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
