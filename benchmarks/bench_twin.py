@@ -5,7 +5,7 @@
 CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
 layers, decoder, loss and backward pass, or the forward pass alone. A scored job lasts 16 s. --arms trains that many
 twins of the quick size in two processes and scores 1 000 jobs with each, beside an extrapolated training of `nn.LSTM`
-network after network.
+network after network. The last table scores a log of 10 Hz while it grows, line by line.
 """
 
 import os
@@ -25,7 +25,11 @@ from joblib import Parallel, delayed
 from torch import Tensor
 
 from benchmarks.harness import in_turns, options, seconds
-from fleet.motion import RATE_HZ
+from fleet.motion import CHANNELS, RATE_HZ
+from scenarios.prepare.twins import LOG_INPUT
+from scenarios.show.twin_scores import score_windows
+from twin.log_windows import WindowFeed
+from twin.logs.reader import GrowingLog
 from twin.vae.config import TwinConfig
 from twin.vae.model import LstmVae, build, weights_of
 from twin.vae.train import Run, train
@@ -133,6 +137,33 @@ def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
     print(f"{name:<34}{cells}{took['ours'] / took['plain']:>8.2f}")
 
 
+LOG_HZ, LOG_S = 10.0, 300.0
+"""Rate and length of the log that grows."""
+
+
+def following(config: TwinConfig, name: str, every_s: float | None) -> None:
+    """Scoring of a log that grows: CPU time of each window, and in all as a share of the log's duration."""
+    twin, profile = untrained(config), smooth(np.random.default_rng(0), LOG_S)[:: int(RATE_HZ / LOG_HZ)].astype(float)
+    profile[:, 0] = (profile[:, 0] + np.pi) % (2 * np.pi) - np.pi
+    head = ",".join(["time_s", *(f"{channel}_{j}" for channel in CHANNELS for j in range(1, JOINTS + 1))])
+    lines = [",".join(map(repr, [i / LOG_HZ, *row.ravel().tolist()])) for i, row in enumerate(profile)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "grows.csv"
+        path.write_text(head + "\n", encoding="utf-8")
+        feed, took, windows = WindowFeed(twin, every_s), list[float](), list[float]()
+        with path.open("a", encoding="utf-8") as out, GrowingLog(path) as growing:
+            for line in lines:
+                out.write(line + "\n")
+                out.flush()
+                start_s, scored = time.process_time(), 0
+                # A live arm is read at every sample.
+                while (recording := growing.read(feed.due_s if every_s is None else -np.inf)) is not None:
+                    scored += len(score_windows(twin, feed.add(recording)))
+                took.append(time.process_time() - start_s)
+                windows += [took[-1] / scored] if scored else []
+    print(f"{name:<46}{len(windows):>8}{1e3 * statistics.median(windows):>12.2f}{sum(took) / LOG_S:>12.2%}")
+
+
 def windows_in(length_s: float, config: TwinConfig) -> int:
     """Number of windows in which a twin scores motion of this length."""
     return len(starts(round(length_s * config.rate_hz), config.window, config.score_stride))
@@ -195,6 +226,11 @@ def main() -> None:
     print(f"\n{'scoring, 7 joints, ms':<34}" + "".join(f"{name:>11}" for name in columns) + f"{'ratio':>8}")
     scoring(default, "1 job of 16 s", windows_in(JOB_S, default), 200)
     scoring(default, "1 000 jobs of 16 s", JOBS * windows_in(JOB_S, default), 3)
+    print(f"\n{f'a log of {LOG_HZ:g} Hz as it grows':<46}{'windows':>8}{'ms, median':>12}{'of a core':>12}")
+    of_log = replace(TwinConfig.quick(), **LOG_INPUT)
+    following(of_log, "twin of a log, windows of 25 s", None)
+    following(of_log, "twin of a log, every 0.5 s", 0.5)
+    following(default, "twin of a scenario, every 0.1 s", 0.1)
 
 
 if __name__ == "__main__":

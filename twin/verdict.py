@@ -5,8 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.errors import FleetError, nearest
-from twin.logs.recording import Recording, Stretch, stretches
-from twin.vae.measures import READINGS, Calibration, Features, fewest
+from fleet.motion import CHANNELS
+from twin.log_windows import log_windows
+from twin.logs.recording import Recording
+from twin.vae.measures import PARTS, READINGS, Calibration, Features, fewest
 from twin.vae.twin import Twin
 
 Array = np.ndarray
@@ -43,13 +45,14 @@ class Rule:
         if self.twin.calibration is None:
             raise NoGuarantee(
                 f"The twin of '{self.twin.arm}' has no held-out cool jobs, so a verdict has no guarantee. Train it "
-                "with exploration (twin.exploration of the scenario), or on more cool recordings."
+                "with exploration (twin.exploration of the scenario), or with a larger --hold-out or more cool logs."
             )
         count, wanted = self.twin.calibration.smallest_group, fewest(self.alpha)
         if count < wanted:
             raise NoGuarantee(
                 f"A false-alarm rate of {self.alpha:g} needs {wanted} held-out cool jobs of each kind or more (the "
-                f"twin of '{self.twin.arm}' has {count}). Choose alpha >= {1 / (count + 1):.3g}, or train on more."
+                f"twin of '{self.twin.arm}' has {count}). Choose --alpha >= {1 / (count + 1):.3g}, or train with more: "
+                "a larger --hold-out or more cool logs, or twin.exploration of a scenario."
             )
 
     @property
@@ -58,9 +61,9 @@ class Rule:
         assert self.twin.calibration is not None
         return self.twin.calibration
 
-    def p_value(self, features: Features) -> Array:
-        """p-values of features [..., joint], [...]."""
-        return self.calibration.p_value(features, self.twin.joint_weight, self.reading)
+    def p_value(self, features: Features, reading: str | None = None) -> Array:
+        """p-values of features [..., joint] by a reading, [...]; default: that of the rule."""
+        return self.calibration.p_value(features, self.twin.joint_weight, reading or self.reading)
 
     def anomalous(self, features: Features) -> Array:
         """Whether motion is anomalous, bool [...]."""
@@ -81,30 +84,53 @@ def word(anomalous: bool) -> str:
     return ANOMALOUS if anomalous else UNCRITICAL
 
 
-def log_windows(twin: Twin, recording: Recording) -> list[tuple[Stretch, Array, Features]]:
-    """Each stretch without gaps with the first samples of its windows, which do not overlap, and their features.
+STRETCH_S = 120.0
+"""Length of the stretches of a log that are judged, to whole windows: shorter work hardly warms a motor."""
 
-    Raises:
-        FleetError: the recording has another number of joints than the twin, or no stretch of one window.
+
+@dataclass(frozen=True, eq=False)
+class LogStretches:
+    """The windows of a recording, and all its stretches of `length` consecutive windows; gaps are left out.
+
+    A recording that is shorter than a stretch is one stretch.
     """
-    if recording.joints != twin.joints:
-        raise FleetError(f"'{recording.name}' has {recording.joints} joints, the twin of '{twin.arm}' {twin.joints}.")
-    config, parts = twin.config, list[tuple[Stretch, Array, Features]]()
-    for stretch in stretches(recording, config.rate_hz):
-        first = np.arange(0, len(stretch.profile) - config.window + 1, config.window)
-        if len(first):
-            inside = first[:, None] + np.arange(config.window)
-            windows = stretch.profile[inside].transpose(0, 1, 3, 2)
-            parts.append((stretch, first, twin.window_features(windows)))
-    if not parts:
-        raise FleetError(
-            f"'{recording.name}' has no stretch of {config.window / config.rate_hz:g} s without a gap, which one "
-            "window needs."
+
+    windows: Features
+    """[window, joint]."""
+    stretches: Features
+    """Means of their windows, [stretch, joint]; one begins with each window."""
+    length: int
+
+    @classmethod
+    def of(cls, twin: Twin, recording: Recording) -> "LogStretches":
+        """Those of a recording; raises as `log_windows`."""
+        packed = np.concatenate([features.packed for *_, features in log_windows(twin, recording)])
+        config = twin.config
+        length = min(max(1, round(STRETCH_S * config.rate_hz / config.window)), len(packed))
+        means = np.lib.stride_tricks.sliding_window_view(packed, length, axis=0).mean(axis=-1)
+        return cls(Features(packed), Features(means), length)
+
+    def worst(self, weight: Array) -> Features:
+        """Errors of the stretch with the largest d, torque of that with the largest load, latents of all, [joint].
+
+        Args:
+            weight: w_k of the joints, [joint].
+        """
+        packed = self.windows.packed.mean(axis=0)
+        newest, heaviest = (
+            self.stretches.packed[np.argmax(score @ weight)]
+            for score in (self.stretches.difficulty, self.stretches.one_sided)
         )
-    return parts
+        packed[:, : len(CHANNELS)] = newest[:, : len(CHANNELS)]
+        packed[:, len(CHANNELS) : PARTS] = heaviest[:, len(CHANNELS) : PARTS]
+        return Features(packed)
+
+    def share(self, anomalous: Array) -> float:
+        """Share of the windows that belong to stretches which are anomalous, bool [stretch]."""
+        inside = np.convolve(anomalous, np.ones(self.length))
+        return float(np.mean(inside > 0.5))
 
 
 def log_features(twin: Twin, recording: Recording) -> Features:
-    """Mean features of a recording over its windows, [joint]; raises as `log_windows`."""
-    parts = [features.packed for _, _, features in log_windows(twin, recording)]
-    return Features(np.concatenate(parts).mean(axis=0))
+    """Features by which a recording is judged, [joint]: those of its worst stretches; raises as `log_windows`."""
+    return LogStretches.of(twin, recording).worst(twin.joint_weight)

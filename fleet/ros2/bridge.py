@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from fleet.bus.client import BusClient
@@ -19,6 +20,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, Quote, QuoteRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, MalformedMessage, State
 from fleet.errors import BusError, Refused
+from fleet.live.arm.body import MotionMonitor
 from fleet.live.arm.node import WARNING_S, ClockSync, RateLimitedWarnings
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import Recent
@@ -233,6 +235,7 @@ class Follower:
         arm: Its name in the fleet.
         topics: Topics of its joint states, and of the diagnostics with its motor temperatures.
         clock: Fleet time, at a speed of 1.
+        monitor: Gets the readings of every state with positions, velocities and torques.
     """
 
     def __init__(
@@ -246,13 +249,15 @@ class Follower:
         *,
         limits: ThermalLimits | None = None,
         rate_hz: float = 10.0,
+        monitor: MotionMonitor | None = None,
     ) -> None:
         self._link, self._arm, self._readings, self._clock = link, arm, readings, clock
         self._warning_c = (limits or ThermalLimits()).warning_c
         self._period_s, self._tick, self._due_s = 1.0 / rate_hz, 0, time.monotonic()
+        self._monitor = monitor
         self._warn, self._warn_from_s = RateLimitedWarnings(arm), time.monotonic() + WARNING_S
         self._sync = ClockSync(link, lambda: self._clock, self._set_clock, self._warn)
-        self._twin = f"ros2 {topics[0]}"
+        self._twin = f"ros2 {topics[0]}" if monitor is None else monitor.version
         self._refusal = f"this arm is a real one that publishes under {topics[0]}, and takes no work"
         self._publish_state = link.publisher(keys.of_arm(link.fleet, arm, "state"), State)
         self._publish_info = link.publisher(keys.of_arm(link.fleet, arm, "info"), Info)  # holds the last one
@@ -299,10 +304,19 @@ class Follower:
         if state is None and now_s >= self._warn_from_s:
             self._warn("state", f"publishes no state: there is {self._readings.missing(now_s)}.")
         if state is not None:
-            self._publish_state(state)
+            self._publish_state(self._with_scores(state, now_s))
 
     def _state(self, now_s: float) -> State | None:
         return self._readings.state(self._arm, self._tick, self._clock.now_s(now_s), now_s, self._warning_c)
+
+    def _with_scores(self, state: State, now_s: float) -> State:
+        """The state with what the monitor makes of the arm's motion, if the arm reports all that it needs."""
+        if self._monitor is None or not (state.q and state.qd and state.tau):
+            return state
+        time_s, temp_c, q, qd, tau = (np.array([v]) for v in (now_s, state.temp_c, state.q, state.qd, state.tau))
+        self._monitor.add(time_s, temp_c, q, qd, tau)
+        difficulty, expected_c = self._monitor.scores
+        return msgspec.structs.replace(state, motion_difficulty=difficulty, expected_c=expected_c)
 
     def _quote(self, request: QuoteRequest) -> Quote:
         now_s = time.monotonic()

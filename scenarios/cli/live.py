@@ -60,6 +60,12 @@ def arm_command(
     *,
     given: Annotated[Given, From(LiveSpec, "difficulty", "risk", "seed", "journal", "jobs", "fleet", "new_epoch")],
     source: Literal["sim", "log"] = option("sim (the scenario's arm), or log FILE.", "sim"),
+    twin: Path | None = option(
+        "--source log: folder of the arm's twin, which scores the motion; the scores are in its states.", None
+    ),
+    network: Path | None = option(
+        "--source log: folder of `thermofleet twin identify`; the temperatures that it yields are in the states.", None
+    ),
     policy: str = option(
         f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, a user-defined one as "
         f"FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}. Default: an auctioneer awards them.",
@@ -79,12 +85,15 @@ def arm_command(
     if (source == "log") != (file is not None):
         words = f"{source} {file or ''}".strip()
         raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {words}).")
+    if source == "sim" and (twin or network):
+        raise FleetError("--twin and --network are for --source log: a simulated arm has those of its scenario.")
     from scenarios.live.arm import run_arm
 
     spec = LiveSpec(**given)
     spec = replace(spec, policy=policy) if policy else spec
     alone = bool(policy)
-    run_arm(chosen, name, spec, endpoint, alone=alone, file=file, speed=speed, rate_hz=rate_hz, capacity=capacity)
+    own = {"file": file, "twin": twin, "network": network}
+    run_arm(chosen, name, spec, endpoint, alone=alone, **own, speed=speed, rate_hz=rate_hz, capacity=capacity)
 
 
 def auctioneer_command(
@@ -277,6 +286,10 @@ def ros2_command(
     ),
     joints: str = option("Names of its joints in ROS 2, from joint 1 on.", "", panel=_LISTEN),
     rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True, panel=_LISTEN),
+    twin: Path | None = option("Folder of the arm's twin, which scores the motion.", None, panel=_LISTEN),
+    network: Path | None = option(
+        "Folder of `thermofleet twin identify`; the temperatures that it yields are in the states.", None, panel=_LISTEN
+    ),
 ) -> None:
     """Connect a fleet to ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
     if (mode == "listen") != bool(topic):
@@ -300,4 +313,6 @@ def ros2_command(
             router=router,
             rate_hz=rate_hz,
             warning_c=warning_c,
+            twin=twin,
+            network=network,
         )

@@ -2,6 +2,8 @@
 
 import shlex
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,6 +74,9 @@ SKIP_DAMAGED = option("Skip damaged lines of a log.", False)
 TWINS = argument("A folder that `thermofleet twin train` wrote.")
 TWIN_ARM = option("Name of the arm, if the folder contains several twins.", None)
 SCENARIO_ARM = option("Arm of the scenario; default: the first.", None)
+LOG_ARM = option(
+    "Name of the arm; in a log of several arms (telemetry.parquet), the one to choose.", None, is_name=True
+)
 
 
 def channel_of(scenario: "Scenario", **fields: Any) -> Channel:
@@ -155,7 +160,21 @@ def recordings_of(log: Path, skip_damaged: bool) -> "list[Recording]":
     from twin.logs.reader import read, read_folder
 
     damaged = "skip" if skip_damaged else "refuse"
-    try:
+    with explain_damage():
         return read_folder(log, damaged=damaged) if log.is_dir() else read(log, damaged=damaged)
+
+
+def arm_recordings(log: Path, arm: str | None, skip_damaged: bool) -> "list[Recording]":
+    """The recordings of one arm; raises as `recordings_of` and `twin.logs.reader.of_arm`."""
+    from twin.logs.reader import of_arm
+
+    return of_arm(recordings_of(log, skip_damaged), arm, log)
+
+
+@contextmanager
+def explain_damage() -> Iterator[None]:
+    """Name the option of the command line in errors of damaged logs."""
+    try:
+        yield
     except LogError as error:
         raise FleetError(str(error).replace('damaged="skip"', "--skip-damaged")) from error

@@ -3,14 +3,14 @@
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING
+from dataclasses import MISSING, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fleet.errors import FleetError, nearest
+from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES
@@ -29,12 +29,14 @@ if TYPE_CHECKING:
 KNOWN_TWINS = option("A folder of twins. Default: those of the scenario, from the cache.", None, flag="--twins")
 SEED = option("Random seed.", 0, low=0, high=MAX_SEED)
 _VERDICT = "Verdicts"
+FOLLOW_S = 0.1
+"""Real seconds between two looks at a growing log."""
 
 
 def identify_command(
     log: Path = option("A log with motor temperatures, or a folder of logs of one arm.", MISSING),
     out: Path | None = option("Folder of the result, rc.json.", None),
-    arm: str = option("Name of the arm.", "arm", is_name=True),
+    arm: str | None = options.LOG_ARM,
     ambient: float | None = option("Ambient temperature, °C; default: 22 is assumed.", None, low=-40, high=60),
     skip_damaged: bool = options.SKIP_DAMAGED,
     overwrite: bool = options.OVERWRITE,
@@ -44,6 +46,7 @@ def identify_command(
 
     A day of logs takes half a minute to a minute.
     """
+    from scenarios.prepare.twins import arms_of
     from twin.thermal.checkpoint import CARD, save
     from twin.thermal.identify import AMBIENT_C, identify
 
@@ -52,7 +55,8 @@ def identify_command(
             raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
         check_overwrite(out / CARD, overwrite)
     ambient_c = AMBIENT_C if ambient is None else ambient
-    recordings = options.recordings_of(log, skip_damaged)
+    recordings = options.arm_recordings(log, arm, skip_damaged)
+    arm = arm or arms_of(recordings)[0]
     with progress_bar(kept="") as progress:
         progress("identifying", 0.0)
         network = identify(recordings, arm=arm, ambient_c=ambient_c)
@@ -124,10 +128,10 @@ def forecast_command(
     from twin.thermal.forecast import forecast
 
     identified = None if network is None else load(network.parent if network.name == CARD else network)
-    so_far = one_of(options.recordings_of(log, skip_damaged), arm, log)
+    so_far = one_of(options.arm_recordings(log, arm, skip_damaged), log)
     path = Path(plan)
     if path.exists():
-        motion = one_of(options.recordings_of(path, skip_damaged), arm, path)
+        motion = one_of(options.arm_recordings(path, arm, skip_damaged), path)
     else:
         with progress_bar() as progress:
             motion = motion_of(plan, arm, progress)
@@ -154,22 +158,11 @@ def forecast_command(
     say("No page was written; --out FILE.html writes one." if out is None else f"Open {out} in a browser.", out_console)
 
 
-def one_of(recordings: "list[Recording]", arm: str | None, path: Path) -> "Recording":
-    """The recording of an arm, or the only one.
-
-    Raises:
-        FleetError: there is none, or several and no arm is named.
-    """
-    arms = {each.name.rpartition("/")[2]: each for each in recordings}
-    if len(recordings) == 1:
-        return recordings[0]
-    if arm in arms:
-        return arms[arm]
-    if path.is_dir():
+def one_of(recordings: "list[Recording]", path: Path) -> "Recording":
+    """The only recording; raises a FleetError if there are several."""
+    if len(recordings) > 1:
         raise FleetError(f"'{path}' is a folder with {len(recordings)} logs: give one of its files.")
-    if arm is None:
-        raise FleetError(f"'{path}' has {len(recordings)} arms ({', '.join(arms)}): name one with --arm.")
-    raise FleetError(f"'{path}' has no arm '{arm}'{nearest(arm, arms)}")
+    return recordings[0]
 
 
 def generate_command(
@@ -263,6 +256,7 @@ def export_command(
     twins: Path = options.TWINS,
     out: Path = option("A file that ends in .onnx.", Path("twin.onnx")),
     arm: str | None = options.TWIN_ARM,
+    precision: Literal["float32", "float64"] = option("Type of the input: float32 or float64.", "float32"),
     overwrite: bool = options.OVERWRITE,
 ) -> None:
     """Export a twin as ONNX, for scoring without Python; needs the extra `onnx`."""
@@ -273,7 +267,7 @@ def export_command(
     from twin.vae.onnx import export_onnx
 
     twin = open_twin(twins, arm)
-    say(f"Twin of {twin.arm}, version {twin.version}, written to {export_onnx(twin, out)}.", out_console)
+    say(f"Twin of {twin.arm}, version {twin.version}, written to {export_onnx(twin, out, precision)}.", out_console)
 
 
 def twin_of(folder: Path | None, arm: str) -> "Twin | None":
@@ -287,7 +281,12 @@ def train_command(
     scenario: str | None = options.SCENARIO_OR_LOG,
     log: Path | None = options.LOG,
     out: Path = option("Folder of the twins.", Path("runs/twins")),
-    arm: str | None = option("Train only this arm; default: every arm of the scenario.", None),
+    arm: str | None = option(
+        "Train only this arm; default: every arm of the scenario. --log: name of the arm; in a log of several arms, "
+        "the one to choose.",
+        None,
+        is_name=True,
+    ),
     *,
     given: Annotated[Given, From(TwinConfig)],
     size: Literal["quick", "full"] | None = option("quick or full. Default: as in the scenario; for logs quick.", None),
@@ -307,7 +306,7 @@ def train_command(
     The quick size takes up to a minute per arm and core, the full size four.
     Cached twins take seconds. A twin of logs is kept in --out only.
     """
-    check_source(scenario, log, arm)
+    check_source(scenario, log)
     from scenarios.prepare.twins import TWINS, save_twins, train_arms, train_log
     from scenarios.spec.load import load
 
@@ -316,8 +315,9 @@ def train_command(
     with explain_in_options(), bar as progress, new_folder(out, TWINS, overwrite=overwrite) as folder:
         if log is not None:
             config = config_of(size or "quick", given, of_log=True)
-            recordings = options.recordings_of(log, skip_damaged)
-            twins = [train_log(recordings, config, seed or 0, cool_c=cool, hold_out=hold_out, progress=progress)]
+            recordings = options.arm_recordings(log, arm, skip_damaged)
+            twin = train_log(recordings, config, seed or 0, cool_c=cool, hold_out=hold_out, progress=progress)
+            twins = [twin if arm is None else replace(twin, arm=arm)]
             source = f"log {log}"
         else:
             of_scenario = load(str(scenario))
@@ -331,6 +331,10 @@ def train_command(
         return
     for twin in card["twins"]:
         out_console.print(quality_table(twin))
+    if log is not None:
+        count = card["twins"][0]["calibrated_on"]
+        alpha = f"verdicts with --alpha {1 / (count + 1):.2g} or more" if count else "no verdicts"
+        say(f"{count} cool recordings held out (--hold-out): {alpha}; --alpha 0.05 needs 19.", out_console)
     say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
 
 
@@ -340,13 +344,14 @@ def score_command(
     log: Path | None = options.LOG,
     arm: str | None = options.TWIN_ARM,
     format_: Literal["table", "csv"] = option("table or csv.", "table", flag="--format"),
+    follow: bool = option("--log: score a CSV file while it grows, a line per window, until Ctrl-C.", False),
     skip_damaged: bool = options.SKIP_DAMAGED,
     as_json: bool = options.JSON,
     verdict: bool = option(
         "Judge each job of a scenario, or each recording of a log: uncritical or anomalous.", False, panel=_VERDICT
     ),
     alpha: float | None = option(
-        "Largest share of cool jobs that may be called anomalous; default: 0.05.",
+        "Largest share of cool jobs that may be called anomalous; default: 0.05, which needs 19 held-out ones.",
         None,
         low=0,
         high=1,
@@ -354,7 +359,8 @@ def score_command(
         panel=_VERDICT,
     ),
     reading: Literal["load", "d", "latent"] | None = option(
-        "load (torque above the reconstruction), d, or latent (distance from cool motion); default: load.",
+        "Judge by load (torque above the reconstruction), d (novelty), or latent (distance from cool motion); default: "
+        "load.",
         None,
         panel=_VERDICT,
     ),
@@ -365,44 +371,45 @@ def score_command(
 ) -> None:
     """Score every job of a scenario, or a log window by window, with the version of the twin.
 
-    With --verdict a recording is one row, and a conformal p-value judges each row:
-    a new cool job is called anomalous with probability alpha at most, if it is like
-    the cool jobs that the twin held out of its training. Motion files of
-    `twin generate` are recordings, too.
+    With --verdict a recording is one row. Its worst stretch of two minutes is judged
+    by conformal p-values of load and novelty: a new cool recording is called anomalous
+    with probability alpha at most, if it is like the cool recordings that the twin
+    held out of its training. Motion files of `twin generate` are recordings, too.
     Takes seconds, and half a minute if the jobs must be planned first.
     """
     check_source(scenario, log)
     given: Given = {name: value for name, value in (("alpha", alpha), ("reading", reading)) if value is not None}
     if not verdict and (given or map_ is not None):
         raise FleetError("--alpha, --reading and --map are for --verdict: leave them out.")
+    if follow:
+        if log is None or verdict:
+            raise FleetError("--follow needs --log FILE.csv, and does not go with --verdict, which judges a whole log.")
+        follow_log(twins, arm, log, "json" if as_json else format_, skip_damaged)
+        return
     if map_ is not None:
         check_file(map_, (".png",), overwrite, "--map")
-    import numpy as np
-
     from scenarios.motion.verdict_map import verdict_png
     from scenarios.prepare.twins import open_twin
     from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, render, window_rows, with_verdicts
     from scenarios.spec.load import load
-    from twin.vae.measures import Features
-    from twin.verdict import Rule, log_features
+    from twin.verdict import Rule
 
     chosen, twin = load(scenario) if scenario else None, open_twin(twins, arm)
     rule = Rule(twin=twin, **given) if verdict else None
-    jobs, recordings = [], []
+    features = None
     if chosen is not None:
         with progress_bar() as progress:
             jobs = jobs_of_arm(twin, chosen, progress)
             rows = job_rows(twin, jobs)
+        features = twin.features([plan for plan, _ in jobs], [times for _, times in jobs])
     else:
         recordings = options.recordings_of(Path(str(log)), skip_damaged)
-        windows = (row for recording in recordings for row in window_rows(twin, recording))
-        rows = log_rows(twin, recordings) if rule else list(windows)
-    caption = f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}"
-    if rule:
-        if chosen is not None:
-            features = twin.features([plan for plan, _ in jobs], [times for _, times in jobs])
+        if rule:
+            rows, features = log_rows(rule, recordings)
         else:
-            features = Features(np.stack([log_features(twin, recording).packed for recording in recordings]))
+            rows = [row for recording in recordings for row in window_rows(twin, recording)]
+    caption = f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}"
+    if rule and features is not None:
         rows = with_verdicts(rows, rule, features)
         caption = f"{rule.guarantee} Twin of {twin.arm}, version {twin.version}"
         if map_ is not None:
@@ -417,13 +424,45 @@ def score_command(
         print_wide(shown)
 
 
-def check_source(scenario: str | None, log: Path | None, arm: str | None = None) -> None:
-    """Raise a FleetError unless either a scenario or a log is given, and --arm only with a scenario."""
+def follow_log(twins: Path, arm: str | None, log: Path, how: str, skip_damaged: bool) -> None:
+    """Print a line for each window of a growing log, until Ctrl-C or SIGTERM."""
+    from scenarios.prepare.twins import open_twin
+    from scenarios.show.twin_scores import score_windows, window_text
+    from scenarios.signals import until_stopped
+    from twin.log_windows import WindowFeed
+    from twin.logs.reader import GrowingLog
+    from twin.logs.recording import GAP_S
+
+    twin, count = open_twin(twins, arm), 0
+    feed, damaged = WindowFeed(twin), "skip" if skip_damaged else "refuse"
+    first_s = twin.config.window / twin.config.rate_hz
+    with (
+        until_stopped() as stop,
+        options.explain_damage(),
+        GrowingLog(log, first_s=first_s, damaged=damaged) as growing,
+    ):
+        while not stop.is_set():
+            recording = growing.read(feed.due_s)
+            if recording is None:
+                stop.wait(FOLLOW_S)
+                continue
+            parts = feed.add(recording)
+            if not parts and (step_s := recording.duration_s / max(len(recording.time_s) - 1, 1)) > GAP_S:
+                raise FleetError(
+                    f"'{log}' has a sample every {step_s:.3g} s; windows need one at least every {GAP_S:g} s."
+                )
+            for row in score_windows(twin, parts):
+                text = window_text(row, how)
+                echo(text if how != "csv" or count == 0 else text.splitlines()[1])
+                count += 1
+    stop.leave(f"Scored {count} windows of {first_s:g} s.")
+
+
+def check_source(scenario: str | None, log: Path | None) -> None:
+    """Raise a FleetError unless either a scenario or a log is given."""
     if (scenario is None) == (log is None):
         given = "neither" if scenario is None else "both"
         raise FleetError(f"Give either a scenario or --log FILE_OR_FOLDER (got {given}).")
-    if log is not None and arm is not None:
-        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
 
 
 @contextmanager
@@ -454,7 +493,7 @@ def report_command(
     scenario takes up to two minutes, a day of logs a minute for each seed. A failed
     section shows its reason; the exit code is then 1.
     """
-    check_source(scenario, log, arm)
+    check_source(scenario, log)
     from fleet.files import cache_folder
     from scenarios.show import twin_report
     from scenarios.spec.load import load
@@ -465,7 +504,7 @@ def report_command(
         how: Any = {"size": twin_report.SIZE, "folder": cache_folder(), "progress": progress}  # arguments
         if log is not None:
             title, source = f"The twin of the logs in {log.name}", f"--log {log.name}"
-            subjects = twin_report.log_subjects(options.recordings_of(log, skip_damaged), range(seeds), **how)
+            subjects = twin_report.log_subjects(options.arm_recordings(log, arm, skip_damaged), range(seeds), **how)
         else:
             chosen = load(str(scenario))
             index = 0 if arm is None else chosen.index_of(arm)

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -40,6 +41,9 @@ from scenarios.spec.options import LiveModel, LiveSpec, RiskName
 from scenarios.spec.schema import Scenario
 from scenarios.terminal import echo, progress_bar
 
+if TYPE_CHECKING:
+    from twin.monitor import Monitor
+
 log = logging.getLogger(__name__)
 
 TURN_S, CLOCK_S, RETIRE_S = 0.25, 2.0, 1.0
@@ -59,6 +63,8 @@ def run_arm(
     *,
     alone: bool = False,
     file: Path | None = None,
+    twin: Path | None = None,
+    network: Path | None = None,
     speed: float | None = None,
     rate_hz: float = STATE_HZ,
     capacity: int = 1,
@@ -68,6 +74,8 @@ def run_arm(
     Args:
         alone: Allocate jobs with the peers by the policy of `spec`, without an auctioneer.
         file: Log to replay instead of a simulated arm.
+        twin: Folder of the twin that scores the motion of a replayed arm.
+        network: Folder of the thermal network that yields its expected temperatures.
         speed: Fleet seconds per real second; None for that of the auctioneer.
 
     Raises:
@@ -86,7 +94,7 @@ def run_arm(
     refuse_other_way(folder, (name,), alone=alone, new_epoch=spec.new_epoch)
     with progress_bar() as progress:
         simulated = partial(simulated_arm, scenario, name, spec.difficulty, spec.seed, progress, risk=spec.risk)
-        arm = replayed_arm(name, file) if file else simulated()
+        arm = replayed_arm(name, file, twin, network) if file else simulated()
     # A quarantined award is not executed again: its lease expires at the auctioneer, which awards the job again or, if
     # it had permitted the last cycle, marks it unfinished.
     aside = quarantine(folder / f"{name}.aside", name)
@@ -185,22 +193,35 @@ def ambient_of(scenario: Scenario) -> Callable[[float], float]:
     return lambda at_s: float(scenario.ambient.at(np.array(at_s)))
 
 
-def replayed_arm(name: str, file: Path) -> PreparedArm:
-    """Prepare an arm that replays a real arm's log and takes no jobs.
+def monitor_of(twin: Path | None, network: Path | None, every_s: float) -> "Monitor | None":
+    """What compares motion with the twin and the thermal network of these folders; None without both.
+
+    Args:
+        every_s: Time between two scores.
 
     Raises:
-        LogError: the file cannot be read, or has no temperatures.
-        FleetError: the file holds several arms, and none of this name.
+        CheckpointError: a folder has none, or several twins.
     """
-    from twin.logs.reader import read
+    if twin is None and network is None:
+        return None
+    from scenarios.prepare.twins import open_twin
+    from twin.monitor import Monitor
+    from twin.thermal.checkpoint import load
 
-    recordings = {each.name.rpartition("/")[2]: each for each in read(file, damaged="skip")}
-    if len(recordings) > 1 and name not in recordings:
-        raise FleetError(
-            f"'{file}' has the logs of several arms, and none of '{name}'. Give one of these names: "
-            f"{', '.join(recordings)}."
-        )
-    recording = recordings[name] if len(recordings) > 1 else next(iter(recordings.values()))
+    models = None if twin is None else open_twin(twin), None if network is None else load(network)
+    return Monitor(*models, every_s=every_s)
+
+
+def replayed_arm(name: str, file: Path, twin: Path | None = None, network: Path | None = None) -> PreparedArm:
+    """Prepare an arm that replays a real arm's log and takes no jobs; see `monitor_of`.
+
+    Raises:
+        LogError: the file cannot be read, has no temperatures, or holds several arms and none of this name.
+    """
+    from twin.logs.reader import of_arm, read
+
+    recordings = read(file, damaged="skip")
+    (recording,) = of_arm(recordings, name if len(recordings) > 1 else None, file)
     if recording.temp_c is None:
         raise LogError(str(file), None, "has no motor temperatures; a live arm needs them.")
     sensors = SensorLog(
@@ -210,7 +231,11 @@ def replayed_arm(name: str, file: Path) -> PreparedArm:
     def refuse(work: Work) -> tuple[Plan, ...]:
         raise InfeasibleJob(name, work.places[0].name, f"this arm replays the log '{file.name}' and takes no jobs")
 
-    model, body = Blind(version=f"log {file.name}"), lambda time_s, dt_s: ReplayBody(sensors, time_s=time_s)
+    def body(time_s: float, dt_s: float) -> Body:
+        return ReplayBody(sensors, time_s=time_s, monitor=monitor_of(twin, network, dt_s))
+
+    monitor = monitor_of(twin, network, 1.0)  # errors before the arm joins the bus
+    model = Blind(version=f"log {file.name}" if monitor is None else monitor.version)
     return PreparedArm(name=name, model=model, plan=refuse, body=body, takes_jobs=False)
 
 

@@ -50,7 +50,7 @@ SOURCES: Mapping[Kind, Source] = {
 KINDS: tuple[Kind, ...] = (*SOURCES, "gaps")
 RECORDING_FORMAT = 7
 CARD = "recording.json"
-SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c")
+SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c", "expected_c")
 _COLUMNS = {
     inspect.IntType: pa.int64(),
     inspect.FloatType: pa.float64(),

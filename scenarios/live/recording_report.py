@@ -252,7 +252,7 @@ def telemetry_of(table: pa.Table, arms: Sequence[str]) -> Telemetry:
     readings = {
         name: np.stack([table[f"{name}_{j + 1}"].to_numpy(zero_copy_only=False) for j in range(JOINTS)], axis=-1)
         for name in SENSORS
-        if name != "housing_c"
+        if name not in ("housing_c", "expected_c")
     }
     shape = (len(time_s), len(arms), JOINTS)
     out = {name: np.full(shape, np.nan, np.float32) for name in readings}

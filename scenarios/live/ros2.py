@@ -3,13 +3,15 @@
 import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleet.bus.client import BusClient
 from fleet.errors import FleetError
-from fleet.robot import ThermalLimits
+from fleet.robot import JOINTS, ThermalLimits
 from scenarios.cli.options import split_names, the_fleet
 from scenarios.extras import require_extra
+from scenarios.live.arm import monitor_of
 from scenarios.signals import StopRequest, until_stopped
 from scenarios.terminal import echo
 
@@ -52,6 +54,8 @@ def run_listener(
     router: str,
     rate_hz: float,
     warning_c: float,
+    twin: Path | None,
+    network: Path | None,
 ) -> None:
     """Show a real arm with a ROS 2 driver as an arm of the fleet that takes no jobs, until Ctrl-C or SIGTERM.
 
@@ -64,6 +68,9 @@ def run_listener(
             "has them with --temperatures. docs/ros2.md describes its content."
         )
     names, where = names_of(joints), ros2_router(router, endpoint)
+    monitor = monitor_of(twin, network, 1.0 / rate_hz)
+    if monitor is not None and len(names) != JOINTS:
+        raise FleetError(f"--twin and --network are for arms of {JOINTS} joints (got {len(names)} in --joints).")
     from fleet.live.clock import FleetClock
     from fleet.ros2.bridge import ArmReadings, Follower
 
@@ -75,7 +82,8 @@ def run_listener(
         clock = FleetClock(1.0, time.monotonic())
         limits = limits_of(warning_c, max(warning_c + 1.0, DEFAULTS.error_c))
         readings, topics = ArmReadings(names, hardware), (topic, temperatures)
-        follower = Follower(link, node, arm, readings, topics, clock, limits=limits, rate_hz=rate_hz)
+        how = {"limits": limits, "rate_hz": rate_hz, "monitor": monitor}
+        follower = Follower(link, node, arm, readings, topics, clock, **how)
         echo(f"ready {arm} {topic} {os.getpid()}")
         _serve(follower.serve, stop, f"Stopped listening to {topic}.")
 
@@ -130,7 +138,6 @@ def node_at(router: str, name: str, domain: int, stopped: Callable[[], bool]) ->
 
 def names_of(joints: str) -> tuple[str, ...]:
     """The given joint names, which must differ, or those of a Gen3."""
-    from fleet.robot import JOINTS
     from fleet.ros2.conversion import joint_names
 
     if not joints:

@@ -40,13 +40,13 @@ from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario
 from scenarios.table import Table
 from twin.baselines import untrained_config
+from twin.log_windows import log_windows
 from twin.logs.recording import Recording, cool_stretches, stretches
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU, Calibration, Features
 from twin.vae.train import train
 from twin.vae.twin import Twin
 from twin.vae.window import cut, cut_jobs, draw_windows, resample, starts, windows_of
-from twin.verdict import log_windows
 
 Array = np.ndarray
 Cells = dict[tuple[int, int], list[dict[str, Any]]]

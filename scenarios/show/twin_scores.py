@@ -12,16 +12,19 @@ from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import all_works
 from scenarios.spec.schema import Scenario
 from scenarios.table import Column, Table
+from twin.log_windows import LogWindows, log_windows
 from twin.logs.recording import Recording
 from twin.vae.measures import Features, Measures
 from twin.vae.twin import Twin
-from twin.verdict import Rule, log_features, log_windows, word
+from twin.verdict import LogStretches, Rule, word
 
 Array = np.ndarray
-ScoreRow = dict[str, str | float | None]
+ScoreRow = dict[str, str | float | int | None]
 LOADED = 2
 """Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
-OMITTED = ("twin", "data", "log", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+OMITTED = ("twin", "data", "log", "end_s", "hottest_joint", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+P_NAMES = {"d": "novelty"}
+"""Names of readings in columns of p-values, where they differ."""
 OMITTED_WITH_VERDICT = (f"d_{LOADED}", "latent", "d_cal")
 """Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
 
@@ -53,28 +56,34 @@ def job_rows(twin: Twin, jobs: Sequence[tuple[Plan, int]]) -> list[ScoreRow]:
     return rows
 
 
-def log_rows(twin: Twin, recordings: Sequence[Recording]) -> list[ScoreRow]:
-    """One row of mean scores per recording.
+def log_rows(rule: Rule, recordings: Sequence[Recording]) -> tuple[list[ScoreRow], Features]:
+    """One row of scores per recording, those of its worst stretches, and the features that are judged, [row, joint].
 
     Raises:
-        FleetError: as `twin.verdict.log_windows`.
+        FleetError: as `twin.log_windows.log_windows`.
     """
-    rows = list[ScoreRow]()
+    rows, judged, twin = list[ScoreRow](), list[Array](), rule.twin
     for recording in recordings:
-        measures = twin.measures_of(log_features(twin, recording))
+        log = LogStretches.of(twin, recording)
+        features = log.worst(twin.joint_weight)
+        judged.append(features.packed)
+        measures, share = twin.measures_of(features), log.share(rule.anomalous(log.stretches))
         hottest_c = None if recording.temp_c is None else recording.temp_c.max()
         begins: ScoreRow = {"recording": recording.name, "minutes": recording.duration_s / 60}
-        rows.append(begins | _scores(twin, measures, p_value=measures.p_value, hottest_c=hottest_c))
-    return rows
+        rows.append(begins | _scores(twin, measures, hottest_c=hottest_c, anomalous_share=share))
+    return rows, Features(np.stack(judged))
 
 
 def with_verdicts(rows: Sequence[ScoreRow], rule: Rule, features: Features) -> list[ScoreRow]:
-    """The rows with the p-value and the verdict of a rule on their features [row, joint] before the reasons."""
+    """The rows with p-values and the verdict of a rule on their features [row, joint] before the reasons."""
+    by = {name: f"p_{P_NAMES.get(name, name)}" for name in ("load", "d", rule.reading)}
+    p_values = {name: rule.p_value(features, name).tolist() for name in by}
     judged = list[ScoreRow]()
-    for row, p in zip(rows, rule.p_value(features).tolist(), strict=True):
+    for i, row in enumerate(rows):
         ends = {name: row[name] for name in ("why", "twin", "data")}
         begins = {name: value for name, value in row.items() if name not in (*ends, "p_value")}
-        judged.append({**begins, "p_value": p, "verdict": word(p <= rule.alpha), **ends})
+        each = {column: p_values[name][i] for name, column in by.items()}
+        judged.append({**begins, **each, "verdict": word(p_values[rule.reading][i] <= rule.alpha), **ends})
     return judged
 
 
@@ -90,22 +99,38 @@ def window_rows(twin: Twin, recording: Recording) -> list[ScoreRow]:
     Raises:
         FleetError: the recording has another number of joints than the twin, or is shorter than one window.
     """
+    return score_windows(twin, log_windows(twin, recording))
+
+
+def score_windows(twin: Twin, parts: LogWindows) -> list[ScoreRow]:
+    """One row per window."""
     window, rows = twin.config.window, list[ScoreRow]()
-    for stretch, first, features in log_windows(twin, recording):
+    for stretch, first, features in parts:
         measures = twin.measures_of(features)
         for number, i in enumerate(first.tolist()):
             start_s, end_s = stretch.time_s[[i, i + window - 1]].tolist()
-            hottest_c = None if stretch.temp_c is None else stretch.temp_c[i : i + window].max()
             begins: ScoreRow = {"log": stretch.recording, "start_s": start_s, "end_s": end_s}
-            rows.append(begins | _scores(twin, measures.of_job(number), hottest_c=hottest_c))
+            each_c = None if stretch.temp_c is None else stretch.temp_c[i : i + window].max(axis=0)
+            hottest_c, joint = (None, None) if each_c is None else (each_c.max(), int(each_c.argmax()) + 1)
+            rows.append(begins | _scores(twin, measures.of_job(number), hottest_c=hottest_c, hottest_joint=joint))
     return rows
 
 
-def _scores(twin: Twin, measures: Measures, **more: float | Array | None) -> ScoreRow:
+def window_text(row: ScoreRow, how: str) -> str:
+    """One window as a line of text, of JSON, or of CSV under the names of its columns."""
+    if how == "json":
+        return json.dumps(row, allow_nan=False)
+    if how == "csv":
+        return Table(head=tuple(row), rows=(tuple(map(_csv_text, row.values())),)).csv().rstrip("\r\n")
+    hot = "" if row["hottest_c"] is None else f"  joint {row['hottest_joint']} {row['hottest_c']:.1f} °C"
+    return f"{row['end_s']:.1f} s  d {row['d']:.2f}  load {row['load']:.2f}{hot}  {row['why']}"
+
+
+def _scores(twin: Twin, measures: Measures, **more: float | Array | int | None) -> ScoreRow:
     """The scores of one job or window, further figures, and their origin."""
     figures = {"d": measures.total, **{f"d_{j + 1}": d for j, d in enumerate(measures.difficulty)}}
     figures |= {"load": measures.total_load, "latent": measures.total_latent, **more}
-    plain: ScoreRow = {name: None if value is None else float(value) for name, value in figures.items()}
+    plain: ScoreRow = {name: v if v is None or isinstance(v, int) else float(v) for name, v in figures.items()}
     return plain | {"why": measures.why(), "twin": twin.version, "data": twin.data_hash}
 
 
@@ -126,15 +151,15 @@ def render(rows: Sequence[ScoreRow], how: str, *, caption: str) -> str | Table:
     )
 
 
-SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c": "°C"}
+SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c": "°C", "anomalous_share": "share"}
 """Short column heads of tables."""
 
 
-def _csv_text(value: str | float | None) -> str:
+def _csv_text(value: str | float | int | None) -> str:
     return f"{value:.6g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
-def _cell(value: str | float | None) -> str:
+def _cell(value: str | float | int | None) -> str:
     if value is None:
         return "–"
     return f"{value:.2f}" if isinstance(value, float) else str(value)

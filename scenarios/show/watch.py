@@ -146,7 +146,7 @@ def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_D
             heat_bar(arm),
             "—" if arm.hottest_c is None else f"{arm.hottest_c:.1f} J{arm.joint}{'?' * bool(arm.bad_sensor)}",
             Text("—" if arm.headroom_k is None else f"{arm.headroom_k:.1f}", style=_headroom_style(arm.headroom_k)),
-            arm.job,
+            arm.job or format_motion(arm),
             f"{bar(done[arm.arm], JOB_CELLS)} {brief(arm.busy_s)}" if arm.arm in done else "",
         ]
         if wide:
@@ -233,6 +233,7 @@ def arm_line(arm: ArmSnapshot, *, joints: bool = False) -> str:
         "" if arm.headroom_k is None else f"headroom {arm.headroom_k:.1f} K",
         "joints " + " ".join(f"{temp_c:.1f}" for temp_c in arm.temp_c) if joints else "",
         f"job {arm.job}, {brief(arm.busy_s)} left" if arm.job and arm.busy_s else f"job {arm.job}" if arm.job else "",
+        format_motion(arm),
         f"open jobs: {scores}" if scores else "",
         f"state {format_age(arm.state_age_s)}",
         "" if arm.token else "no token",
@@ -257,6 +258,14 @@ def format_scores(arm: ArmSnapshot) -> str:
         p, d = figure(score.p_saturation, ".2f"), figure(score.difficulty, ".2f")
         parts.append(f"{job} {figure(score.peak_c, '.0f')} °C, P {p} (d {d})")
     return "; ".join(parts)
+
+
+def format_motion(arm: ArmSnapshot) -> str:
+    """Difficulty of the executed motion, and the temperature that the hottest motor should have."""
+    parts = [] if arm.motion_difficulty is None else [f"motion d {arm.motion_difficulty:.2f}"]
+    if arm.expected_c and arm.joint:
+        parts.append(f"joint {arm.joint} expected {arm.expected_c[arm.joint - 1]:.1f} °C")
+    return ", ".join(parts)
 
 
 def format_age(seconds: float | None) -> str:

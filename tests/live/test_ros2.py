@@ -274,7 +274,7 @@ def test_an_impossible_temperature_neither_heats_nor_cools_the_headroom(wrong_c)
 class Place:
     """A real arm in ROS 2, whoever follows it, and the rest of the fleet."""
 
-    def __init__(self, stack: ExitStack) -> None:
+    def __init__(self, stack: ExitStack, monitor=None) -> None:
         router = stack.enter_context(Router())
         self.ros = stack.enter_context(open_client(router.endpoint, timeout_s=PATIENCE_S))
         self.link, self.peer = (stack.enter_context(BusClient(router.endpoint, "shop")) for _ in range(2))
@@ -288,7 +288,7 @@ class Place:
         clock = FleetClock(1.0, time.monotonic())
         reality = ArmReadings(NAMES, "gen3")
         topics = ("/gen3/joint_states", "/diagnostics")
-        self.follower = Follower(self.link, node, "real", reality, topics, clock, rate_hz=50.0)
+        self.follower = Follower(self.link, node, "real", reality, topics, clock, rate_hz=50.0, monitor=monitor)
 
     def play(self, payload, type_hash=HASH):
         key = f"3/gen3/joint_states/sensor_msgs::msg::dds_::JointState_/{type_hash}"
@@ -335,6 +335,36 @@ def test_a_real_arm_is_an_arm_of_the_fleet(place, hashes):
     assert place.link.malformed == 0
     ticks = [state.tick for state in place.states]
     assert ticks == sorted(set(ticks))
+
+
+class Seen:
+    """A monitor that keeps its readings."""
+
+    version, scores = "d:1", (1.5, (41.0,) * 7)
+
+    def __init__(self):
+        self.readings = []
+
+    def add(self, *readings):
+        self.readings.append(readings)
+
+
+def test_the_states_of_a_real_arm_have_the_scores_of_its_monitor():
+    with ExitStack() as stack:
+        seen = Seen()
+        place = Place(stack, seen)
+
+        def live(**more):
+            place.play(joint_state(NAMES, Q, **more))
+            place.warm(diagnostics())
+
+        zeros = (0.0,) * 7
+        place.until(lambda: place.states and place.infos, lambda: live(qd=zeros, tau=zeros))
+    assert (place.states[-1].motion_difficulty, place.states[-1].expected_c) == Seen.scores
+    assert place.infos == [Info("real", 7, "d:1")]
+    time_s, temp_c, q, *_ = (np.concatenate(each) for each in zip(*seen.readings, strict=True))
+    assert (np.diff(time_s) > 0).all()
+    assert (tuple(q[0]), tuple(temp_c[0])) == (Q, TEMP_C)
 
 
 @pytest.mark.parametrize(

@@ -106,6 +106,7 @@ ARM = {
     "ghost": "No arm 'ghost'",
     "left --source log": "log with a FILE",
     "left some.csv": "log with a FILE",
+    "left --twin some": "--twin and --network are for --source log",
     "left --source video": "No source 'video'. Allowed: log, sim.",
     "left --difficulty oracle": "No difficulty 'oracle'. Allowed: blind, twin.",
     "left --speed 0": "--speed must be 0.001 to 10000",

@@ -51,7 +51,8 @@ def test_logs_get_a_verdict_and_a_map(thermofleet, folder, tmp_path, monkeypatch
     asked = ("twin", "score", twins, "--verdict", "--log")
     said = thermofleet(*asked, folder / "heavy.csv", "--alpha", 0.125, "--json", "--map", drawn)
     (row,) = json.loads(said.out)["rows"]
-    assert (row["verdict"], row["p_value"], row["recording"]) == ("anomalous", 0.125, "heavy")
+    assert (row["verdict"], row["p_load"], row["recording"]) == ("anomalous", 0.125, "heavy")
+    assert (row["anomalous_share"], row["p_novelty"] <= 1.0) == (1.0, True)
     assert row["latent"] > 0
     assert drawn.read_bytes().startswith(b"\x89PNG")
     said = thermofleet(*asked, folder / "logs", "--alpha", 0.125, "--json", "--reading", "d")

@@ -7,6 +7,9 @@ import re
 import shutil
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 
 from scenarios.cli.main import main
@@ -274,3 +277,37 @@ def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_p
         assert (refused.code, sentence in refused.err) == (2, True), refused.err
     refused = thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--out", page)
     assert "--overwrite" in refused.err
+
+
+def test_one_arm_of_a_log_of_several_is_chosen_by_its_name(thermofleet, tmp_path):
+    """The twin and the network of an arm are those of a log of this arm alone."""
+    logs = {name: logged(name, seed=seed, seconds=400.0) for name, seed in (("left", 1), ("right", 2))}
+    names = [f"{channel}_{j}" for channel in ("q", "qd", "tau", "temp_c") for j in range(1, 8)]
+    columns = {
+        name: np.hstack([log.time_s[:, None], log.q, log.qd, log.tau, log.temp_c + 0.01 * log.time_s[:, None]])
+        for name, log in logs.items()
+    }
+    both = {"arm": np.repeat(list(logs), len(logs["left"].time_s)).tolist()}
+    both |= {each: np.concatenate([c[:, i] for c in columns.values()]) for i, each in enumerate(["time_s", *names])}
+    path, alone = tmp_path / "telemetry.parquet", tmp_path / "alone" / "telemetry.parquet"
+    alone.parent.mkdir()
+    pq.write_table(pa.table(both), path)
+    pq.write_table(pa.table(both).filter(pc.field("arm") == "right"), alone)
+    cards = {}
+    for log, arm in ((path, ("--arm", "right")), (alone, ())):
+        said = thermofleet("twin", "train", "--log", log, *arm, *TINY, "--out", log.parent / "twins", "--json")
+        assert said.code == 0, said.err
+        (twin,) = json.loads(said.out)["twins"]
+        identified = thermofleet("twin", "identify", "--log", log, *arm, "--json")
+        assert identified.code == 0, identified.err
+        network = json.loads(identified.out)
+        cards[log] = twin["arm"], twin["data_hash"], network["arm"], network["data_hash"]
+    assert cards[path] == cards[alone]
+    assert cards[path][::2] == ("right", "right")
+    for words in (("train", "--out", tmp_path / "x"), ("identify",), ("forecast", "--plan", alone)):
+        for arm, sentence in (
+            ((), "holds several arms: choose one with --arm (left, right)."),
+            (("--arm", "rigth"), "has no arm 'rigth'; did you mean 'right'? Allowed: left, right."),
+        ):
+            said = thermofleet("twin", *words, "--log", path, *arm)
+            assert (said.code, sentence in said.err) == (2, True), said.err

@@ -1,5 +1,7 @@
+import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,9 +24,12 @@ def session(path):
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
-def assert_parity(twin, path, x):
+def assert_parity(twin, path, x, precision="float32"):
+    x = x.astype(precision)
     reconstruction, errors, mu = session(path).run(None, {"windows": x})
-    np.testing.assert_allclose((reconstruction - twin.reconstruct(x)) / twin.scaler.std, 0, atol=1e-5)
+    assert reconstruction.dtype == x.dtype
+    tolerance = 1e-5 if precision == "float64" else 2e-4  # float32 has 1e-6 rad at two turns, over 0.02 rad
+    np.testing.assert_allclose((reconstruction - twin.reconstruct(x)) / twin.scaler.std, 0, atol=tolerance)
     np.testing.assert_allclose(errors, twin.window_features(x).errors, atol=1e-5)
     np.testing.assert_allclose(mu, twin.posterior(x)[0], atol=1e-5)
 
@@ -35,8 +40,15 @@ def exported(twin, tmp_path_factory):
 
 
 @pytest.mark.parametrize("count", [1, 2, 9])
-def test_onnxruntime_says_what_the_twin_says(twin, exported, rng, motion, count):
-    assert_parity(twin, exported, windows(rng, motion, count))
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_onnxruntime_says_what_the_twin_says(twin, exported, rng, motion, count, precision, tmp_path):
+    path = exported if precision == "float32" else export_onnx(twin, tmp_path / "double.onnx", precision)
+    assert_parity(twin, path, windows(rng, motion, count), precision)
+
+
+def test_no_windows_have_no_scores(exported):
+    results = session(exported).run(None, {"windows": np.zeros((0, 12, 7, 3), np.float32)})
+    assert [each.shape for each in results] == [(0, 12, 7, 3), (0, 7, 3), (0, 7, 2)]
 
 
 def test_the_file_says_whose_it_is(twin, exported):
@@ -45,7 +57,19 @@ def test_the_file_says_whose_it_is(twin, exported):
     assert said["arm"] == "arm_0"
     assert said["data_hash"] == twin.data_hash
     assert (said["channels"], said["rate_hz"], said["window"]) == ("q,qd,tau", "12.5", "12")
+    assert (said["layout"], said["units"], said["joints"]) == ("batch,time,joint,channel", "rad,rad/s,N·m", "7")
     assert [path.name for path in exported.parent.iterdir()] == [MODEL]
+
+
+def test_the_example_needs_nothing_but_the_file(twin, exported, rng, motion, tmp_path):
+    x, example = windows(rng, motion, 5), Path(__file__).parents[2] / "examples" / "onnx_score.py"
+    np.save(tmp_path / "windows.npy", x)
+    assert len([line for line in example.read_text().splitlines() if line]) <= 20
+    words = [sys.executable, "-P", example, exported, tmp_path / "windows.npy"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, check=True)
+    head, *d = done.stdout.splitlines()
+    assert twin.version in head
+    np.testing.assert_allclose([float(each) for each in d], twin.measures_of(twin.window_features(x)).total, rtol=1e-4)
 
 
 @pytest.mark.parametrize("change", [{"scope": "arm", "latent": 3}, {"kind": "ae"}, {"layers": 2}])

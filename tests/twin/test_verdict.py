@@ -9,11 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.distance import mahalanobis
-from scipy.stats import beta, kstest
+from scipy.stats import beta, binom, kstest
 
 from fleet.errors import CheckpointError, FleetError
 from fleet.motion import CHANNELS, Phase
 from twin.baselines import known_torque, torque_ratio, untrained_config
+from twin.log_windows import log_windows
+from twin.logs.recording import Recording
 from twin.vae.config import TwinConfig
 from twin.vae.measures import (
     LEAST_VARIANCE,
@@ -30,7 +32,7 @@ from twin.vae.measures import (
 from twin.vae.train import train
 from twin.vae.twin import CARD, load, save
 from twin.vae.window import cut, cut_jobs, resample
-from twin.verdict import NoGuarantee, Rule, log_features, log_windows
+from twin.verdict import LogStretches, NoGuarantee, Rule, log_features
 
 
 @pytest.mark.parametrize(("count", "alpha"), [(64, 0.05), (100, 0.05), (39, 0.2)])
@@ -59,7 +61,9 @@ def test_no_verdict_without_a_guarantee(twin, make_plan, motion):
     with pytest.raises(NoGuarantee, match="has no held-out cool jobs"):
         Rule(twin=twin)
     known = twin.with_calibration(jobs, jobs[:3])
-    with pytest.raises(NoGuarantee, match=r"needs 19 held-out cool jobs of each kind .* has 3\). Choose alpha >= 0.25"):
+    with pytest.raises(
+        NoGuarantee, match=r"needs 19 held-out cool jobs of each kind .* has 3\). Choose --alpha >= 0.25"
+    ):
         Rule(twin=known)
     with pytest.raises(FleetError, match="alpha must be between 0 and 1"):
         Rule(twin=known, alpha=1.0)
@@ -74,13 +78,63 @@ def test_no_verdict_without_a_guarantee(twin, make_plan, motion):
     assert "7 jobs of 2 kinds" in rule.guarantee
 
 
-def test_a_recording_has_the_mean_of_its_windows(twin, recording_of):
-    recording = recording_of(60.0)
-    parts = log_windows(twin, recording)
-    packed = np.concatenate([features.packed for _, _, features in parts])
-    np.testing.assert_allclose(log_features(twin, recording).packed, packed.mean(axis=0))
+def test_a_recording_is_judged_by_its_worst_stretches(twin, recording_of, monkeypatch):
+    """Second method: every stretch in a loop."""
+    monkeypatch.setattr("twin.verdict.STRETCH_S", 10 * 0.96)
+    recording, w = recording_of(60.0), twin.joint_weight
+    ((_, _, features),) = log_windows(twin, recording)
+    stretches = [features.packed[i : i + 10].mean(axis=0) for i in range(len(features.packed) - 9)]
+    judged = log_features(twin, recording)
+    assert judged.one_sided @ w == pytest.approx(max(Features(each).one_sided @ w for each in stretches))
+    assert judged.difficulty @ w == pytest.approx(max(Features(each).difficulty @ w for each in stretches))
+    np.testing.assert_allclose(judged.packed[:, PARTS:], features.packed[..., PARTS:].mean(axis=0))
+    short = recording.part(slice(0, 300))  # shorter than a stretch: one stretch
+    (window,) = (each.packed.mean(axis=0) for _, _, each in log_windows(twin, short))
+    np.testing.assert_allclose(log_features(twin, short).packed, window)
     with pytest.raises(FleetError, match=r"no stretch of 0\.96 s without a gap"):
         log_features(twin, recording_of(0.5))
+
+
+def swinging(motion, seed, seconds, load=1.0):
+    """A log of smooth motion at 12.5 Hz; load [time] scales the torque."""
+    q, qd, tau = motion(np.random.default_rng(seed), seconds).astype(float)[::4].swapaxes(0, 1)
+    return Recording(name=f"log_{seed}", time_s=np.arange(len(q)) / 12.5, q=q, qd=qd, tau=tau * load)
+
+
+@pytest.fixture(scope="module")
+def cool_logs(twin, motion):
+    """Judged features of cool recordings, 20 to 60 s long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin.verdict.STRETCH_S", 10.0)
+        lengths = np.random.default_rng(8).uniform(20.0, 60.0, 240)
+        return np.stack([log_features(twin, swinging(motion, i, s)).packed for i, s in enumerate(lengths)])
+
+
+@pytest.mark.parametrize("reading", ["load", "d"])
+def test_few_cool_recordings_are_called_anomalous(twin, cool_logs, reading):
+    """Each recording against 19 others: the rate is 1 in 20, within the 99.9 % bound of a binomial variable."""
+    rng, alarms = np.random.default_rng(3), 0
+    for i in range(len(cool_logs)):
+        others = rng.permutation(np.delete(np.arange(len(cool_logs)), i))[:19]
+        known = twin.calibrated_on(Features(cool_logs[others]), np.zeros(19, int))
+        alarms += int(Rule(twin=known, reading=reading).anomalous(Features(cool_logs[i])))
+    assert 0 < alarms <= binom.ppf(0.999, len(cool_logs), 0.05)
+
+
+def test_a_load_is_found_in_a_long_rest(twin, motion, cool_logs, monkeypatch):
+    """150 s of load before 20 min of rest; the mean over the whole recording is that of a cool one."""
+    monkeypatch.setattr("twin.verdict.STRETCH_S", 10.0)
+    rule = Rule(twin=twin.calibrated_on(Features(cool_logs), np.zeros(len(cool_logs), int)))
+    log = swinging(motion, 999, 1350.0)
+    load = np.where(log.time_s < 150.0, 3.0, 0.1)[:, None]
+    stretches = LogStretches.of(twin, replace(log, tau=log.tau * load))
+    worst, mean = stretches.worst(twin.joint_weight), Features(stretches.windows.packed.mean(axis=0))
+    assert rule.anomalous(worst)
+    assert not rule.anomalous(mean)
+    assert stretches.share(rule.anomalous(stretches.stretches)) == pytest.approx(150 / 1350, abs=0.02)
+    assert stretches.share(np.array([True] + [False] * (len(stretches.stretches.packed) - 1))) == pytest.approx(
+        stretches.length / len(stretches.windows.packed)
+    )
 
 
 errors = st.floats(0.0, 20.0)

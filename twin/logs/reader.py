@@ -3,6 +3,7 @@
 import codecs
 import gzip
 import logging
+import os
 import re
 import zlib
 from bisect import bisect_left
@@ -13,13 +14,13 @@ from datetime import UTC, datetime
 from itertools import groupby
 from math import isfinite
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, Self, get_args
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet.errors import LogError
+from fleet.errors import LogError, nearest
 from fleet.readings import judge, repeats
 from fleet.robot import JOINTS
 from twin.logs.recording import GAP_S, READINGS, Recording
@@ -155,30 +156,17 @@ def read_csv(path: Path) -> LogTable:
         raise LogError(str(path), None, f"holds no text ({broken})." if broken else "is empty.")
     lines = _as_utf8(data).split(b"\n")
     first = next((i for i, raw in enumerate(lines) if not _IGNORED.fullmatch(raw)), 0)
-    names, separator = _header(path, first + 1, lines[first])
-    rows: list[list[float]] = []
-    where: list[int] = []
-    damage: list[Damage] = []
-    for line, raw in enumerate(lines[first + 1 :], start=first + 2):
-        if _IGNORED.fullmatch(raw):
-            continue
-        try:
-            if b"\0" in raw:
-                raise ValueError("holds NUL bytes, as after a power failure")
-            if line == len(lines):
-                # The last number may have lost digits even if all fields are present.
-                raise ValueError(f"the {'gzip data end' if broken else 'file ends'} in the middle of this line")
-            rows.append(_numbers(raw, names, separator))
-            where.append(line)
-        except ValueError as error:
-            damage.append(Damage(line, str(error)))
-    values = np.array(rows, dtype=float).reshape(-1, len(names))
-    # An index column has no name, or the one that pandas gives it.
-    named = [i for i, name in enumerate(names) if name and not name.startswith("Unnamed: ")]
-    kept = tuple(names[i] for i in named)
-    return LogTable(kept, values[:, named], np.array(where, dtype=int), tuple(damage), (broken,) if broken else ())
+    columns = _header(path, first + 1, lines[first])
+    values, where, damage = _rows(lines[first + 1 : -1], columns, first=first + 2)
+    if len(lines) > first + 1 and not _IGNORED.fullmatch(lines[-1]):
+        # The last number may have lost digits even if all fields are present.
+        reason = f"the {'gzip data end' if broken else 'file ends'} in the middle of this line"
+        reason = _NUL_BYTES if b"\0" in lines[-1] else reason
+        damage.append(Damage(len(lines), reason))
+    return LogTable(columns.named, values, where, tuple(damage), (broken,) if broken else ())
 
 
+_NUL_BYTES = "holds NUL bytes, as after a power failure"
 _IGNORED = re.compile(rb"\s*(#[^\0]*|sep=.\s*)?")
 """Blank lines, comments, and the line with the separator for Excel; also before the header."""
 
@@ -188,6 +176,43 @@ def _as_utf8(data: bytes) -> bytes:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace").encode()
     return data.removeprefix(codecs.BOM_UTF8)
+
+
+class _Columns(NamedTuple):
+    """The header of a CSV file."""
+
+    names: tuple[str, ...]
+    """Of all columns; "" for one without a name."""
+    separator: str
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Names of columns that have one: not of an index column, also with the name that pandas gives it."""
+        return tuple(name for name in self.names if name and not name.startswith("Unnamed: "))
+
+
+def _rows(lines: Sequence[bytes], columns: _Columns, *, first: int) -> tuple[Array, Array, list[Damage]]:
+    """Numbers of the good lines, [row, named column], the line of each, [row], and the others.
+
+    Args:
+        first: Number of the first line in the file.
+    """
+    rows: list[list[float]] = []
+    where: list[int] = []
+    damage: list[Damage] = []
+    for line, raw in enumerate(lines, start=first):
+        if _IGNORED.fullmatch(raw):
+            continue
+        try:
+            if b"\0" in raw:
+                raise ValueError(_NUL_BYTES)
+            rows.append(_numbers(raw, columns.names, columns.separator))
+            where.append(line)
+        except ValueError as error:
+            damage.append(Damage(line, str(error)))
+    values = np.array(rows, dtype=float).reshape(-1, len(columns.names))
+    kept = [i for i, name in enumerate(columns.names) if name in columns.named]
+    return values[:, kept], np.array(where, dtype=int), damage
 
 
 def _decompress(data: bytes) -> tuple[bytes, str | None]:
@@ -204,8 +229,7 @@ def _decompress(data: bytes) -> tuple[bytes, str | None]:
     return b"".join(parts), f"the gzip data are {reason}"
 
 
-def _header(path: Path, line: int, raw: bytes) -> tuple[tuple[str, ...], str]:
-    """The column names, "" for one without a name, and the separator."""
+def _header(path: Path, line: int, raw: bytes) -> _Columns:
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -217,7 +241,7 @@ def _header(path: Path, line: int, raw: bytes) -> tuple[tuple[str, ...], str]:
     names = tuple(name.strip().strip('"') for name in text.split(separator))
     if double := sorted({name for name in names if name and names.count(name) > 1}):
         raise LogError(str(path), line, f"names the column '{double[0]}' twice.")
-    return names, separator
+    return _Columns(names, separator)
 
 
 def _numbers(raw: bytes, names: Sequence[str], separator: str) -> list[float]:
@@ -493,6 +517,22 @@ def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Record
     return recordings
 
 
+def of_arm(recordings: Sequence[Recording], arm: str | None, path: Path) -> list[Recording]:
+    """The recordings of one arm: those of its name in files of several arms; all, if no file names an arm.
+
+    Raises:
+        LogError: there are several arms and none is named, or none of this name.
+    """
+    names = dict.fromkeys(each.name.rpartition("/")[2] for each in recordings if "/" in each.name)
+    if arm is None and len(names) > 1:
+        raise LogError(str(path), None, f"holds several arms: choose one with --arm ({', '.join(names)}).")
+    if arm is None or not names:
+        return list(recordings)
+    if arm not in names:
+        raise LogError(str(path), None, f"has no arm '{arm}'{nearest(arm, names)}")
+    return [each for each in recordings if each.name.rpartition("/")[2] == arm]
+
+
 def _name(path: Path) -> str:
     return next((path.name[: -len(s)] for s in SUFFIXES if path.name.lower().endswith(s)), path.name)
 
@@ -549,3 +589,121 @@ def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Reco
     if len(time_s) and time_s[0] >= EPOCH_S:
         time_s = time_s - time_s[0]
     return Recording(name=name, time_s=time_s, **kept, dropped=dropped)
+
+
+BLOCK_BYTES = 1 << 20
+"""Most bytes that are read at a time, and most of one line."""
+MAX_ROWS = 20_000
+"""Rows after which a growing log is checked even if its time does not advance."""
+
+
+class GrowingLog:
+    """Recordings of a CSV log while another process appends to it, in a `with` block; incomplete lines have to wait.
+
+    Args:
+        first_s: Length of the first recording.
+        damaged: As in `read`, for the lines of each recording.
+
+    Raises:
+        LogError: the file cannot be opened, or does not end in .csv.
+    """
+
+    def __init__(self, path: Path, *, first_s: float = 0.0, damaged: Damaged = "refuse") -> None:
+        if not path.name.lower().endswith(".csv"):
+            raise LogError(str(path), None, "cannot be followed: only a file that ends in .csv grows line by line.")
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
+        self._path, self._first_s, self._begun = path, first_s, b""
+        self._damaged: Damaged = damaged
+        self._lines = 0
+        """Complete lines so far."""
+        self._columns: _Columns | None = None
+        self._origin_s = 0.0
+        """First time of a log whose times are seconds since 1970, which are given from 0."""
+        self._table: LogTable | None = None
+        """Rows since the last recording, after its last row."""
+        self._time, self._last_s = 0, -np.inf
+        """Column of the time, and the time of that row."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def read(self, until_s: float) -> Recording | None:
+        """The readings since the last call that returned some; None before the log has reached a time.
+
+        Raises:
+            LogError: as `read`; or the file was removed, replaced or truncated, or its time starts again.
+        """
+        while not self._is_due(until_s):
+            block = self._file.read(BLOCK_BYTES)
+            if not block:
+                self._check_unchanged()
+                return None
+            self._append(block)
+        assert self._table is not None
+        recording = _recording(self._path, _name(self._path), self._table, self._damaged)
+        begins = 0
+        if self._last_s > -np.inf:
+            if recording.time_s[0] != self._last_s:
+                reason = f"time starts again at {recording.time_s[0]:.10g} s; it was {self._last_s:.10g} s before"
+                raise LogError(str(self._path), None, f"{reason}. Follow a new file for each recording.")
+            begins = 1
+        self._last_s = float(recording.time_s[-1])
+        last = self._table.values[:, self._time] == self._last_s
+        self._table = LogTable(self._table.names, self._table.values[last][-1:], self._table.where[last][-1:], ())
+        return recording.part(slice(begins, None)) if len(recording.time_s) > begins else None
+
+    def _is_due(self, until_s: float) -> bool:
+        table = self._table
+        if table is None or len(table.values) + len(table.damage) >= MAX_ROWS:
+            return table is not None
+        time_s = table.values[:, self._time]
+        back = np.count_nonzero(time_s[1:] <= np.maximum.accumulate(time_s)[:-1])
+        if back > STRAY_ROWS or (self._damaged == "refuse" and (back or table.damage)):
+            return True
+        if self._last_s == -np.inf and len(time_s):
+            until_s = time_s[0] + self._first_s
+        return len(time_s) > (self._last_s > -np.inf) and bool(time_s[-1] >= until_s)
+
+    def _append(self, block: bytes) -> None:
+        *lines, self._begun = (self._begun + block).split(b"\n")
+        if len(self._begun) > BLOCK_BYTES:
+            raise LogError(str(self._path), self._lines + 1, f"has a line of more than {BLOCK_BYTES:,} bytes.")
+        while self._columns is None and lines:
+            self._lines += 1
+            raw = lines.pop(0).removeprefix(codecs.BOM_UTF8)
+            if not _IGNORED.fullmatch(raw):
+                self._columns = _header(self._path, self._lines, raw)
+                names = self._columns.named
+                try:
+                    self._time = names.index(format_of(names).time)
+                except ValueError as error:
+                    raise LogError(str(self._path), self._lines, str(error)) from error
+                self._table = LogTable(names, np.zeros((0, len(names))), np.zeros(0, int), ())
+        if self._columns is not None and self._table is not None:
+            before = self._table
+            rows, where, damage = _rows(lines, self._columns, first=self._lines + 1)
+            if not self._origin_s and len(rows) and rows[0, self._time] >= EPOCH_S:
+                self._origin_s = float(rows[0, self._time])
+            rows[:, self._time] -= self._origin_s
+            values, where = np.concatenate([before.values, rows]), np.concatenate([before.where, where])
+            self._table = LogTable(before.names, values, where, (*before.damage, *damage))
+            self._lines += len(lines)
+
+    def _check_unchanged(self) -> None:
+        """Raise a LogError if the file is another one now, or has lost bytes that were read."""
+        try:
+            now, ours = self._path.stat(), os.fstat(self._file.fileno())
+        except OSError:
+            raise LogError(str(self._path), None, "was removed while it was followed.") from None
+        replaced = (now.st_dev, now.st_ino) != (ours.st_dev, ours.st_ino)
+        if replaced or now.st_size < self._file.tell():
+            what = "replaced by another file" if replaced else "truncated"
+            raise LogError(
+                str(self._path), None, f"was {what} while it was followed. Start again to follow the new one."
+            )

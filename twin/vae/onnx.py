@@ -1,12 +1,14 @@
 """A twin as one ONNX file, which scores motion without Python or torch.
 
-Input `windows` in SI units, double [batch, time, joint, channel]: an angle of several turns over a small standard
-deviation needs more digits than a float has. Outputs `reconstruction` (SI, double, angles near the training data),
-`errors` (time mean of |x − x̂| in z-scores, [batch, joint, channel]) and `mu` ([batch, net, latent]).
+Input `windows` in SI units, [batch, time, joint, channel], float32 or float64: after hundreds of turns an angle over a
+small standard deviation needs more digits than float32 has. Outputs `reconstruction` (SI, of the same type, angles near
+the training data), `errors` (time mean of |x − x̂| in z-scores, float32 [batch, joint, channel]) and `mu` (float32
+[batch, net, latent]). The metadata say how d follows from `errors`: `examples/onnx_score.py`.
 """
 
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -24,16 +26,20 @@ from twin.vae.window import Q
 MODEL = "twin.onnx"
 OPSET = 17
 OUTPUTS = ["reconstruction", "errors", "mu"]
+UNITS = ("rad", "rad/s", "N·m")
+"""Of the channels."""
+Precision = Literal["float32", "float64"]
 
 
 class ExportError(FleetError):
     """A twin could not be exported; the message names what is missing."""
 
 
-def export_onnx(twin: Twin, path: Path) -> Path:
-    """Write the twin as ONNX; its metadata names arm, version, training data, channels and rate.
+def export_onnx(twin: Twin, path: Path, precision: Precision = "float32") -> Path:
+    """Write the twin as ONNX; its metadata have all that a program needs to score motion.
 
     Args:
+        precision: Type of the input.
         path: A file that ends in `.onnx`, or a folder, made if need be, for `twin.onnx`.
 
     Returns:
@@ -48,7 +54,8 @@ def export_onnx(twin: Twin, path: Path) -> Path:
         raise ExportError(f"Export to ONNX needs the extra 'onnx': {install('onnx')}.") from None
     file = path if path.suffix == ".onnx" else path / MODEL
     file.parent.mkdir(parents=True, exist_ok=True)
-    example = torch.zeros(2, twin.config.window, twin.joints, len(CHANNELS), dtype=torch.float64)
+    kind = torch.float32 if precision == "float32" else torch.float64
+    example = torch.zeros(2, twin.config.window, twin.joints, len(CHANNELS), dtype=kind)
     with atomic_path(file) as draft:
         with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
             # The dynamo exporter needs onnxscript. The warning about LSTMs with a varying batch does not apply: ours
@@ -69,9 +76,15 @@ def export_onnx(twin: Twin, path: Path) -> Path:
             "twin_version": twin.version,
             "arm": twin.arm,
             "data_hash": twin.data_hash,
+            "layout": "batch,time,joint,channel",
             "channels": ",".join(CHANNELS),
+            "units": ",".join(UNITS),
+            "joints": str(twin.joints),
             "rate_hz": repr(twin.config.rate_hz),
             "window": str(twin.config.window),
+            "joint_weight": ",".join(map(repr, twin.joint_weight.tolist())),
+            "difficulty": "d = sum over joints k of joint_weight[k] * (1 - exp(-sum over channels c of errors[k, c]))",
+            "resampling": "a sample at rate_hz is the mean of the readings over its time; angles do not jump by a turn",
         }
         onnx.helper.set_model_props(model, metadata)
         onnx.save(model, str(draft))
@@ -100,6 +113,8 @@ class _OnnxTwin(nn.Module):
             self.register_buffer(name, torch.from_numpy(np.array(value, dtype=float)))
 
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        # One window more: onnxruntime has no LSTM of an empty batch.
+        kind, windows = windows.dtype, torch.cat([windows.double(), windows.new_zeros(1, *windows.shape[1:]).double()])
         turn, home, mean, std = (self.get_buffer(name) for name in ("turn", "home", "mean", "std"))
         away = (windows.mean(dim=1, keepdim=True) - home) / (2 * torch.pi)
         z = ((windows - turn * torch.round(away) - mean) / std).float()
@@ -109,4 +124,5 @@ class _OnnxTwin(nn.Module):
             means.append(mu)
             parts.append(net.decode(mu, self.steps))
         z_hat, mu = torch.cat(parts, dim=2).unflatten(2, (-1, len(CHANNELS))), torch.stack(means, dim=1)
-        return z_hat.double() * std + mean, (z - z_hat).abs().mean(dim=1), mu
+        results = (z_hat.double() * std + mean).to(kind), (z - z_hat).abs().mean(dim=1), mu
+        return results[0][:-1], results[1][:-1], results[2][:-1]

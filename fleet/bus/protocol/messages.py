@@ -107,10 +107,14 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     """[joint]."""
     epoch: str = ""
     """As in `Clock`, of its time; "" for unknown."""
+    motion_difficulty: Number | None = None
+    """d of the last executed motion, of any job or of none, by the arm's twin."""
+    expected_c: tuple[Celsius, ...] = ()
+    """Motor temperatures that the arm's thermal network yields for the heat that it measures, [joint]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("housing_c", "q", "qd", "tau", "current_a"):
+        for name in ("housing_c", "expected_c", "q", "qd", "tau", "current_a"):
             values = getattr(self, name)
             if values and len(values) != len(self.temp_c):
                 raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")

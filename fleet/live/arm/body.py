@@ -55,6 +55,9 @@ class SensorReading:
     """N·m, [joint]."""
     current_a: tuple[float, ...] = ()
     """[joint]."""
+    motion_difficulty: float | None = field(default=None, kw_only=True)
+    """As in `fleet.bus.protocol.messages.State`, like the next one."""
+    expected_c: tuple[float, ...] = field(default=(), kw_only=True)
 
 
 class Body(Protocol):
@@ -160,18 +163,45 @@ class SensorLog:
     tau: Array
     current_a: Array | None = None
 
+    def part(self, rows: slice) -> "SensorLog":
+        """Some of the samples."""
+        current_a = None if self.current_a is None else self.current_a[rows]
+        time_s, temp_c, q, qd, tau = (each[rows] for each in (self.time_s, self.temp_c, self.q, self.qd, self.tau))
+        return SensorLog(time_s, temp_c, q, qd, tau, current_a)
+
+
+class MotionMonitor(Protocol):
+    """Compares what an arm does with what its twin and its thermal network expect."""
+
+    def add(
+        self, time_s: Array, temp_c: Array, q: Array, qd: Array, tau: Array, current_a: Array | None = None
+    ) -> None:
+        """Take readings that are later than those before, as in `SensorLog`."""
+        ...
+
+    @property
+    def version(self) -> str:
+        """Versions of twin and network."""
+        ...
+
+    @property
+    def scores(self) -> tuple[float | None, tuple[float, ...]]:
+        """`motion_difficulty` and `expected_c`, as in `fleet.bus.protocol.messages.State`."""
+        ...
+
 
 class ReplayBody:
     """Body that replays a log once, in fleet time; then it keeps the last sample. See `fleet.live.arm.body.Body`.
 
     Args:
         time_s: Fleet time of the first sample.
+        monitor: Gets every sample when it has passed.
     """
 
-    def __init__(self, log: SensorLog, *, time_s: float = 0.0) -> None:
+    def __init__(self, log: SensorLog, *, time_s: float = 0.0, monitor: MotionMonitor | None = None) -> None:
         if not len(log.time_s):
             raise ValueError("A log needs at least one sample.")
-        self._log = log
+        self._log, self._monitor, self._monitored = log, monitor, 0
         self._start_s = self._now_s = time_s
 
     @property
@@ -232,7 +262,14 @@ class ReplayBody:
         current_a = () if log.current_a is None else tuple(log.current_a[row].tolist())
         mode = "working" if np.abs(qd).max() > MOVING_RAD_S else "idle"
         temp_c, q, tau = (tuple(values[row].tolist()) for values in (log.temp_c, log.q, log.tau))
-        return SensorReading(mode, temp_c, q, tuple(qd.tolist()), tau, current_a)
+        reading = SensorReading(mode, temp_c, q, tuple(qd.tolist()), tau, current_a)
+        if self._monitor is None:
+            return reading
+        if row >= self._monitored:
+            self._monitor.add(**vars(log.part(slice(self._monitored, row + 1))))
+            self._monitored = row + 1
+        difficulty, expected_c = self._monitor.scores
+        return replace(reading, motion_difficulty=difficulty, expected_c=expected_c)
 
     @property
     def _row(self) -> int:

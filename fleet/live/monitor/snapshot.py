@@ -98,6 +98,10 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """Last possible temperature, [joint]."""
     bad_sensor: str = ""
     """Sentence on motors whose last temperatures are impossible."""
+    motion_difficulty: float | None = None
+    """d of the last executed motion."""
+    expected_c: tuple[float, ...] = ()
+    """Motor temperatures that its thermal network yields for the measured heat, [joint]."""
     job: str = ""
     busy_s: float = 0.0
     """Fleet seconds until it is home with its current job done."""
@@ -387,6 +391,8 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         headroom_k=state.headroom_k if state else None,
         temp_c=temps_c,
         bad_sensor=arm.sensors.fault,
+        motion_difficulty=state.motion_difficulty if state else None,
+        expected_c=state.expected_c if state else (),
         job=state.job if state else "",
         busy_s=state.busy_s if state else 0.0,
         away=bool(state and state.space),

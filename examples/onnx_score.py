@@ -1,0 +1,18 @@
+"""Difficulty of motion by an exported twin: python examples/onnx_score.py twin.onnx windows.npy
+
+windows.npy: [batch, time, joint, channel], as the metadata of the file describe it. Needs numpy and onnxruntime only.
+"""
+
+import sys
+
+import numpy as np
+import onnxruntime
+
+session = onnxruntime.InferenceSession(sys.argv[1])
+about, given = session.get_modelmeta().custom_metadata_map, session.get_inputs()[0]
+windows = np.load(sys.argv[2]).astype(np.float32 if "float" in given.type else np.float64)
+errors = np.asarray(session.run(["errors"], {given.name: windows})[0])
+weight = np.array(about["joint_weight"].split(","), dtype=float)
+d = (1.0 - np.exp(-errors.sum(axis=-1))) @ weight
+print(f"twin of {about['arm']}, version {about['twin_version']}: {about['difficulty']}")
+print(*(f"{each:.6f}" for each in d), sep="\n")
