@@ -156,7 +156,8 @@ def _draw_matrix(axes: Axes, tasks: Sequence[tuple[str, str]], report: LayoutRep
             if len(tasks) <= MOST_NUMBERS:
                 text = "place" if each.same_place else f"{100 * each.share:.0f}"
                 ink = "white" if each.share > 0.6 else INK
-                axes.text(b, a, text, ha="center", va="center", fontsize=7, color=ink)
+                size = 7.0 if len(tasks) <= MOST_NUMBERS / 2 else 5.0
+                axes.text(b, a, text, ha="center", va="center", fontsize=size, color=ink)
     axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0)
     names = [f"{arm}: {job}" for arm, job in tasks]
     axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
