@@ -144,7 +144,8 @@ LOG_HZ, LOG_S = 10.0, 300.0
 def following(config: TwinConfig, name: str, every_s: float | None) -> None:
     """Scoring of a log that grows: CPU time of each window, and in all as a share of the log's duration."""
     twin, profile = untrained(config), smooth(np.random.default_rng(0), LOG_S)[:: int(RATE_HZ / LOG_HZ)].astype(float)
-    profile[:, 0] = (profile[:, 0] + np.pi) % (2 * np.pi) - np.pi
+    profile[:, 0] /= np.abs(profile[:, 0]).max()  # rad, inside the stops
+    profile[:, 1] = np.gradient(profile[:, 0], 1.0 / LOG_HZ, axis=0)
     head = ",".join(["time_s", *(f"{channel}_{j}" for channel in CHANNELS for j in range(1, JOINTS + 1))])
     lines = [",".join(map(repr, [i / LOG_HZ, *row.ravel().tolist()])) for i, row in enumerate(profile)]
     with tempfile.TemporaryDirectory() as folder:
