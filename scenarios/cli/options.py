@@ -41,12 +41,14 @@ def check_table_file(out: Path, others: tuple[str, ...] = ()) -> None:
     """Check the value of --out for a table, .csv or .xlsx, or a file with one of the other endings, before any work.
 
     Raises:
-        FleetError: it has another ending, is a folder, or needs an extra that is not installed.
+        FleetError: it has another ending, is a folder or a table that exists, or needs an extra that is not installed.
     """
     from scenarios.extras import require_extra
     from scenarios.result_folder import check_file
 
     check_file(out, (*others, *TABLE_FILES), overwrite=True)
+    if out.suffix.lower() in TABLE_FILES and out.exists():
+        raise FleetError(f"'{out}' exists; give another --out, or delete it.")
     if out.suffix.lower() == ".xlsx":
         require_extra("xlsx")
 
@@ -151,8 +153,11 @@ def the_fleet(name: str, endpoint: str) -> str:
     raise FleetError(f"There is no fleet at {endpoint} yet. Name the one to wait for with --fleet.")
 
 
-def recordings_of(log: Path, skip_damaged: bool) -> "list[Recording]":
+def recordings_of(log: Path, skip_damaged: bool, *, measured: bool = True) -> "list[Recording]":
     """The recordings of a log file, or of all logs in a folder.
+
+    Args:
+        measured: As in `twin.logs.reader.read`, of a file.
 
     Raises:
         FleetError: names file and line, and how to go on without them.
@@ -161,14 +166,14 @@ def recordings_of(log: Path, skip_damaged: bool) -> "list[Recording]":
 
     damaged = "skip" if skip_damaged else "refuse"
     with explain_damage():
-        return read_folder(log, damaged=damaged) if log.is_dir() else read(log, damaged=damaged)
+        return read_folder(log, damaged=damaged) if log.is_dir() else read(log, damaged=damaged, measured=measured)
 
 
-def arm_recordings(log: Path, arm: str | None, skip_damaged: bool) -> "list[Recording]":
+def arm_recordings(log: Path, arm: str | None, skip_damaged: bool, *, measured: bool = True) -> "list[Recording]":
     """The recordings of one arm; raises as `recordings_of` and `twin.logs.reader.of_arm`."""
     from twin.logs.reader import of_arm
 
-    return of_arm(recordings_of(log, skip_damaged), arm, log)
+    return of_arm(recordings_of(log, skip_damaged, measured=measured), arm, log)
 
 
 @contextmanager

@@ -131,7 +131,7 @@ def forecast_command(
     so_far = one_of(options.arm_recordings(log, arm, skip_damaged), log)
     path = Path(plan)
     if path.exists():
-        motion = one_of(options.arm_recordings(path, arm, skip_damaged), path)
+        motion = one_of(options.arm_recordings(path, arm, skip_damaged, measured=False), path)
     else:
         with progress_bar() as progress:
             motion = motion_of(plan, arm, progress)

@@ -15,6 +15,7 @@ from difflib import get_close_matches
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
+from itertools import islice
 from math import inf, isfinite, nextafter
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,8 +29,10 @@ from scenarios.spec.units import question
 SUFFIXES = (".csv", ".tsv", ".parquet", ".xlsx")
 """Of job tables; other files of jobs are JSON."""
 MOST_ROWS, MOST_BYTES = 10_000, 20_000_000
-MOST_NUMBERS = 5
-"""Row numbers in one sentence."""
+MOST_NUMBERS, MOST_FAULTS = 5, 100
+"""Row numbers in one sentence, and sentences on one table."""
+MOST_COLUMNS = 100
+"""Of a sheet."""
 DAY_S = 86_400.0
 DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
 _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
@@ -122,7 +125,7 @@ def _names(cell: Cell, _: object) -> tuple[str, ...]:
 
 def _kind(cell: Cell, _: object) -> str:
     if (text := _text(cell)) not in KINDS:
-        raise ValueError(f"'{printable(text)}' is no kind of job{nearest(text, KINDS)}")
+        raise ValueError(f"'{printable(text, 60)}' is no kind of job{nearest(text[:60], KINDS)}")
     return text
 
 
@@ -189,10 +192,12 @@ class _Faults(dict[tuple[str, str], list[int]]):
         if not self:
             return
         total, lines = sum(map(len, self.values())), list[str]()
-        for (column, sentence), rows in self.items():
+        for (column, sentence), rows in islice(self.items(), MOST_FAULTS):
             more = f" and {len(rows) - MOST_NUMBERS} more" if len(rows) > MOST_NUMBERS else ""
             numbers = f"row{'s' * (len(rows) > 1)} {', '.join(map(str, rows[:MOST_NUMBERS]))}{more}"
             lines.append(f"  {numbers}{f', column {column}' if column else ''}: {sentence}.")
+        if len(self) > MOST_FAULTS:
+            lines.append(f"  … and {len(self) - MOST_FAULTS} more kinds of faults.")
         raise ScenarioError("\n".join([f"{where} has {total} fault{'s' * (total > 1)}:", *lines]))
 
 
@@ -374,11 +379,16 @@ def _csv_rows(content: bytes, where: str) -> tuple[Rows, bool]:
     delimiter = delimiter or max(",;\t|", key=head.count)
 
     def rows() -> Rows:
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+        number = skipped
         try:
-            yield from enumerate(reader, start=1 + skipped)
+            for number, cells in enumerate(reader, start=1 + skipped):
+                yield number, cells
         except csv.Error as error:
-            raise ScenarioError(f"{where}, line {reader.line_num}: not a line of CSV ({error}).") from error
+            raise ScenarioError(
+                f"{where}, after row {number}: not CSV ({error}). A quoted cell must end with a quote before the "
+                "separator; a quote inside it is written twice."
+            ) from error
 
     return rows(), delimiter != ","
 
@@ -401,8 +411,12 @@ def _parquet_rows(path: Path, where: str) -> Rows:
     import pyarrow.parquet as pq
 
     try:
+        if (count := pq.ParquetFile(path).metadata.num_rows) > MOST_ROWS:
+            raise ScenarioError(f"{where} has {count} rows; a job table has at most {MOST_ROWS}.")
         table = pq.read_table(path)
-    except pa.ArrowInvalid as error:
+    except FileNotFoundError:
+        raise
+    except (pa.ArrowException, OSError) as error:
         raise ScenarioError(f"{where} is not a Parquet file ({str(error).splitlines()[0]}).") from error
     yield 0, table.column_names
     yield from enumerate(zip(*(column.to_pylist() for column in table.columns), strict=True), start=1)
@@ -414,10 +428,27 @@ def _xlsx_rows(path: Path, where: str) -> Rows:
     require_extra("xlsx")
     openpyxl = import_module("openpyxl")
     try:
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        values, written = (openpyxl.load_workbook(path, data_only=data_only) for data_only in (True, False))
     except Exception as error:  # also those of zipfile and of an XML parser
         raise ScenarioError(f"{where} is not an XLSX file ({error}).") from error
-    yield from enumerate(book.active.iter_rows(values_only=True), start=1)
+    if not values.worksheets:
+        raise ScenarioError(f"{where} has no sheet with cells.")
+    sheet, formulas = values.worksheets[0], written.worksheets[0]
+    if sheet.max_row > MOST_ROWS + 1 or sheet.max_column > MOST_COLUMNS:
+        raise ScenarioError(
+            f"{where} has {sheet.max_row} rows and {sheet.max_column} columns; a job table has at most {MOST_ROWS} and "
+            f"{MOST_COLUMNS}. Delete cells beside or below the table."
+        )
+    if sheet.merged_cells.ranges:
+        raise ScenarioError(f"{where} has merged cells ({min(map(str, sheet.merged_cells.ranges))}): unmerge them.")
+    for row in formulas.iter_rows():
+        for cell in row:
+            if cell.data_type == "f" and sheet[cell.coordinate].value is None:
+                raise ScenarioError(
+                    f"{where}, cell {cell.coordinate}: a formula without a stored value. Open and save the file in a "
+                    "spreadsheet, or give the value."
+                )
+    yield from enumerate(sheet.iter_rows(values_only=True), start=1)
 
 
 def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:

@@ -266,6 +266,28 @@ def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
         assert sentence in faults_of(tmp_path, f"{SHORT.replace(',', ';')}\n{row}\n", begin)
 
 
+def test_a_quote_that_is_never_closed_is_told_and_no_row_is_lost(tmp_path):
+    text = 'name,kind,places,#note\na,hold,bench,"5 inch\nb,hold,bench,x\n'
+    with pytest.raises(ScenarioError, match=r"'jobs.csv', after row 1: not CSV .*A quoted cell must end with a quote"):
+        small_table(tmp_path, text)
+
+
+def test_what_a_workbook_hides_is_told(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    for change, sentence in (
+        (lambda sheet: sheet.__setitem__("D2", "=1+1"), "cell D2: a formula without a stored value"),
+        (lambda sheet: sheet.merge_cells("D2:D3"), r"has merged cells \(D2:D3\): unmerge them"),
+        (lambda sheet: sheet.__setitem__("XFD1048576", 1), "has 1048576 rows and 16384 columns; a job table has at"),
+    ):
+        book = openpyxl.Workbook()
+        for row in csv.reader([SHORT, *ROWS]):
+            book.active.append(row)
+        change(book.active)
+        book.save(tmp_path / "jobs.xlsx")
+        with pytest.raises(ScenarioError, match=sentence):
+            read_job_table(tmp_path / "jobs.xlsx")
+
+
 HEADS = {
     "name,kind,places,paylod": "column paylod: unknown; did you mean 'payload'? Allowed: name, kind, places",
     "name,kind": "row 1: no column places; every job needs name, kind, places.",

@@ -372,3 +372,32 @@ def test_no_reading_is_possible_where_none_is_in_range():
     hot = np.full((3, 7), 300.0)
     assert not possible_temperatures(np.arange(3.0), hot).any()
     assert BadReading("all", "").whole
+
+
+@pytest.mark.parametrize(("channel", "digits"), [("tau", 1), ("current_a", 1), ("temp_c", 0)])
+def test_coarse_recorders_and_slow_ones_are_not_refused(channel: str, digits: int) -> None:
+    """Most readings of such a channel repeat: no sensor is dead for that."""
+    time_s = np.arange(0.0, 900.0, 0.5)
+    q = 0.4 * np.sin(np.outer(time_s, 0.1 * np.arange(1, 8)) + np.arange(7))
+    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": 2.0 * np.cos(q), "temp_c": 31.0 + 0.2 * np.sin(q)}
+    readings["current_a"] = 0.1 * readings["tau"]
+    readings[channel] = readings[channel].round(digits)
+    assert judge(time_s, readings, degrees=False) == []
+    slow = {name: values[::4] for name, values in readings.items()}
+    assert judge(time_s[::4], slow, degrees=False) == []
+
+
+def test_a_planned_motion_has_no_sensors(tmp_path: Path) -> None:
+    """The torque of a vertical axis is 0 all the time."""
+    time_s = np.arange(0.0, 60.0, 0.1)
+    q = np.zeros((len(time_s), 7))
+    q[:, 0] = 0.01 * time_s
+    head = ",".join(["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau") for j in range(1, 8))])
+    qd = np.zeros_like(q)
+    qd[:, 0] = 0.01
+    tau = np.zeros_like(q)
+    tau[:, 1] = 20.0 + 0.1 * np.sin(time_s)
+    path = tmp_path / "plan.csv"
+    rows = np.column_stack([time_s, q, qd, tau])
+    path.write_text("\n".join([head, *(",".join(map(repr, row.tolist())) for row in rows)]) + "\n", encoding="utf-8")
+    assert len(read(path, measured=False)[0].time_s) == len(time_s)

@@ -111,6 +111,19 @@ def test_no_start_is_safe_if_a_cold_arm_gets_there_too(hour) -> None:
     assert endless.safe_start_k(60.0) == -np.inf
 
 
+def test_a_longer_run_is_never_safer_and_keeps_the_peaks_of_short_bursts(hour) -> None:
+    """A quarter of an hour with a burst of 20 s: P(limit) of 200 repetitions is not below that of 16."""
+    _, log, _, _ = hour
+    plan = held(np.zeros(JOINTS), 900.0)
+    plan.tau[:40] = 1.6 * FULL_REACH_NM
+    few, many = (forecast(log, plan, n, ambient_c=AIR_C) for n in (16, 200))
+    limit_c = float(np.median(few.interval()[1].max()))
+    assert many.probability(limit_c) >= few.probability(limit_c) > 0.0
+    for found in (few, many):
+        longest_s = found.longest_s(limit_c)
+        assert (found.sampled_c[:, found.time_s <= longest_s].max(axis=(1, 2)) >= limit_c).mean() <= RISK
+
+
 def test_the_same_seed_gives_the_same_forecast_and_short_cycles_that_of_long_ones(hour) -> None:
     _, log, _, found = hour
     again = forecast(log, held(FULL_REACH_NM), 30, ambient_c=AIR_C)

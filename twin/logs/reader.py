@@ -9,7 +9,7 @@ import zlib
 from bisect import bisect_left
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import groupby
 from math import isfinite
@@ -464,12 +464,13 @@ NOT_LOGS = ("events.parquet",)
 log = logging.getLogger(__name__)
 
 
-def read(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
+def read(path: str | Path, *, damaged: Damaged = "refuse", measured: bool = True) -> list[Recording]:
     """The recordings of one file: one, or in a telemetry.parquet one per arm.
 
     Args:
         damaged: "refuse" raises on any unusable line; "skip" drops such lines, logs a warning, and lists them in
             `Recording.dropped`.
+        measured: Whether sensors made a CSV log; of a planned motion only ranges are judged.
 
     Raises:
         LogError: file, line and reason.
@@ -483,7 +484,7 @@ def read(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
         raise LogError(str(path), None, "is a folder; a log is a file.")
     if path.suffix == ".parquet":
         return [_recording(path, f"{name}/{arm}", table, damaged) for arm, table in read_arms(path).items()]
-    return [_recording(path, name, read_csv(path), damaged)]
+    return [_recording(path, name, read_csv(path), damaged, measured=measured)]
 
 
 def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
@@ -537,8 +538,15 @@ def _name(path: Path) -> str:
     return next((path.name[: -len(s)] for s in SUFFIXES if path.name.lower().endswith(s)), path.name)
 
 
-def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Recording:
-    """A recording from the good rows of a table."""
+def _recording(
+    path: Path, name: str, table: LogTable, damaged: Damaged, *, measured: bool = True, part: bool = False
+) -> Recording:
+    """A recording from the good rows of a table.
+
+    Args:
+        measured: As in `read`.
+        part: Of a growing log: with damaged="skip", most of its rows may be wrong.
+    """
     is_csv = path.suffix != ".parquet"
     try:
         layout = format_of(table.names) if is_csv else PLAIN
@@ -554,7 +562,9 @@ def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Reco
     rows = np.flatnonzero(~np.isin(table.where, [d.line for d in damage]))
     good = {channel: values[rows] for channel, values in readings.items()}
     dropped_lines = {d.line for d in damage}
-    bad = judge(time_s[rows], good, degrees=layout.turns, measured=is_csv)
+    bad = judge(time_s[rows], good, degrees=layout.turns, measured=is_csv and measured)
+    if part and damaged == "skip":
+        bad = [replace(found, most=False) for found in bad]
     for found in sorted(bad, key=lambda found: not found.whole):
         lines = table.where[rows[found.rows]].tolist()
         if found.whole:
@@ -566,7 +576,7 @@ def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Reco
         broken = (*broken, f"its columns {', '.join(unknown)} are unknown to a {layout.name}")
     keep = ~np.isin(table.where, [d.line for d in damage])
     dropped = (*broken, *damage_summary(damage))
-    if not keep.any():
+    if not keep.any() and not (part and damaged == "skip"):
         raise LogError(str(path), None, f"holds no good line of numbers{': ' if dropped else '.'}{'; '.join(dropped)}")
     if damaged == "refuse" and dropped:
         others = len(broken) + len(damage) - 1
@@ -579,7 +589,7 @@ def _recording(path: Path, name: str, table: LogTable, damaged: Damaged) -> Reco
         log.warning("%s: dropped: %s", path, sentence)
     kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
     time_s = time_s[keep]
-    if is_csv and (held := repeats(time_s, kept, GAP_S)):
+    if is_csv and measured and not part and (held := repeats(time_s, kept, GAP_S)):
         share = sum(end - start for start, end in held) / len(time_s)
         log.warning(
             "%s: %.0f %% of its lines repeat the one before, for more than %g s, as those of a slow logger. They are "
@@ -646,13 +656,17 @@ class GrowingLog:
                 return None
             self._append(block)
         assert self._table is not None
-        recording = _recording(self._path, _name(self._path), self._table, self._damaged)
+        recording = _recording(self._path, _name(self._path), self._table, self._damaged, part=True)
+        if not len(recording.time_s):
+            empty = np.zeros(0, int)
+            self._table = LogTable(self._table.names, self._table.values[empty], empty, ())
+            return None
         begins = 0
         if self._last_s > -np.inf:
-            if recording.time_s[0] != self._last_s:
+            if recording.time_s[0] < self._last_s:
                 reason = f"time starts again at {recording.time_s[0]:.10g} s; it was {self._last_s:.10g} s before"
                 raise LogError(str(self._path), None, f"{reason}. Follow a new file for each recording.")
-            begins = 1
+            begins = int(recording.time_s[0] == self._last_s)
         self._last_s = float(recording.time_s[-1])
         last = self._table.values[:, self._time] == self._last_s
         self._table = LogTable(self._table.names, self._table.values[last][-1:], self._table.where[last][-1:], ())

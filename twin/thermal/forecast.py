@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import cycle, islice
+from itertools import cycle, islice, pairwise
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -50,7 +50,7 @@ MOST_S = 7 * 86400.0
 MOST_STEPS = 180
 """Steps of the log."""
 MOST_POINTS = 3000
-"""Steps of a long run."""
+"""Points of a long run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class ThermalForecast:
         Earliest and latest are the ends of the 95 % interval.
         """
         first_s = self._first_s(limit_c)
-        first_s = np.sort(np.where(first_s <= self.run_s, first_s, np.inf))
+        first_s = np.sort(np.where(first_s <= self.run_s + 1e-6, first_s, np.inf))
         early, middle, late = first_s[[round(q * (len(first_s) - 1)) for q in (RISK, 0.5, 1.0 - RISK)]]
         return float(early), float(middle), float(late)
 
@@ -105,7 +105,9 @@ class ThermalForecast:
         Returns:
             inf if it is longer than the simulated time.
         """
-        return float(np.sort(self._first_s(limit_c))[int(RISK * len(self.sampled_c))])
+        first_s = float(np.sort(self._first_s(limit_c))[int(RISK * len(self.sampled_c))])
+        before = int(np.searchsorted(self.time_s, first_s)) - 1  # at that time it is already there
+        return np.inf if math.isinf(first_s) else float(self.time_s[max(before, 0)])
 
     def safe_start_k(self, limit_c: float) -> float:
         """By how much all motors may be warmer at the start, K; negative: they must be cooler. To first order.
@@ -171,9 +173,8 @@ def forecast(
     start_c = np.concatenate([start_c, likely_c[None], likely_c[None]])
     start_c[:, WINDING] = last_c
     start_c[-1] += 1.0
-    step_s = max(STEP_S, run_s / MOST_POINTS)
-    steps = max(round(cycle_s / step_s), 1)
-    dt_s = cycle_s / steps if steps > 1 else run_s / max(round(run_s / step_s), 1)
+    steps = max(round(cycle_s / STEP_S), 1)
+    dt_s = cycle_s / steps if steps > 1 else run_s / max(round(run_s / STEP_S), 1)
     values = vector.values(x)
     loads = _loads(cycle_log, motors, steps, values, start_c)
     count = math.ceil(max(run_s, LONGEST_S) / dt_s - 1e-9)
@@ -185,9 +186,14 @@ def forecast(
         start_c=start_c,
         ambient_c=np.full(len(x), ambient_c),
     )
-    temp_c = np.stack([each[:, WINDING] for each in course], axis=1)
+    # Of a long run the highest temperature in several steps is kept, so that no peak is lost.
+    edges = sorted({*range(0, count, math.ceil(count / MOST_POINTS)), round(run_s / dt_s), count})
+    kept = [next(course)[:, WINDING]]
+    for first, last in pairwise(edges):
+        kept.append(np.max([each[:, WINDING] for each in islice(course, last - first)], axis=0))
+    temp_c = np.stack(kept, axis=1)
     return ThermalForecast(
-        time_s=dt_s * np.arange(count + 1),
+        time_s=dt_s * np.array(edges),
         sampled_c=temp_c[:SAMPLES].astype(np.float32),
         slope=temp_c[-1] - temp_c[-2],
         run_s=run_s,
