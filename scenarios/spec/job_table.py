@@ -414,8 +414,6 @@ def _parquet_rows(path: Path, where: str) -> Rows:
         if (count := pq.ParquetFile(path).metadata.num_rows) > MOST_ROWS:
             raise ScenarioError(f"{where} has {count} rows; a job table has at most {MOST_ROWS}.")
         table = pq.read_table(path)
-    except FileNotFoundError:
-        raise
     except (pa.ArrowException, OSError) as error:
         raise ScenarioError(f"{where} is not a Parquet file ({str(error).splitlines()[0]}).") from error
     yield 0, table.column_names
@@ -454,7 +452,7 @@ def _xlsx_rows(path: Path, where: str) -> Rows:
 def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:
     """The job as fields of a `JobStream` with one arrival; without a due date it is due at the end of the shift."""
     gap_s = max(0.0, (horizon_s if job.due_s is None else job.due_s) - job.release_s)
-    close = (gap_s, nextafter(gap_s, inf), nextafter(gap_s, 0.0))  # of which one gives exactly the due date
+    close = (gap_s, nextafter(gap_s, inf), nextafter(gap_s, 0.0))  # release + one of these is exactly the due date
     return {
         **{name: getattr(job, name) for name in ("name", "kind", "dwell_s", "force_n", "value", "after")},
         "places": job.every_places,

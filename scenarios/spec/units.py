@@ -104,7 +104,7 @@ def check_times(times_s: Sequence[float], horizon_s: float, where: str) -> None:
     inside, count = sum(time < horizon_s for time in times_s), len(times_s)
     if not times_s:
         raise ScenarioError(f"{where} gives no job: there are no times. Give seconds from the begin of the shift.")
-    if not horizon_s > 0:  # which is told elsewhere
+    if not horizon_s > 0:  # reported when the scenario is made
         return
     question, last = _unit_of_times(times_s, horizon_s), max(times_s)
     if not inside:

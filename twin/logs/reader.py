@@ -160,9 +160,8 @@ def read_csv(path: Path) -> LogTable:
     values, where, damage = _rows(lines[first + 1 : -1], columns, first=first + 2)
     if len(lines) > first + 1 and not _IGNORED.fullmatch(lines[-1]):
         # The last number may have lost digits even if all fields are present.
-        reason = f"the {'gzip data end' if broken else 'file ends'} in the middle of this line"
-        reason = _NUL_BYTES if b"\0" in lines[-1] else reason
-        damage.append(Damage(len(lines), reason))
+        cut = f"the {'gzip data end' if broken else 'file ends'} in the middle of this line"
+        damage.append(Damage(len(lines), _NUL_BYTES if b"\0" in lines[-1] else cut))
     return LogTable(columns.named, values, where, tuple(damage), (broken,) if broken else ())
 
 
@@ -211,7 +210,8 @@ def _rows(lines: Sequence[bytes], columns: _Columns, *, first: int) -> tuple[Arr
         except ValueError as error:
             damage.append(Damage(line, str(error)))
     values = np.array(rows, dtype=float).reshape(-1, len(columns.names))
-    kept = [i for i, name in enumerate(columns.names) if name in columns.named]
+    named = columns.named
+    kept = [i for i, name in enumerate(columns.names) if name in named]
     return values[:, kept], np.array(where, dtype=int), damage
 
 

@@ -60,7 +60,7 @@ class ThermalForecast:
     time_s: Array
     """Since the end of the log, [time]."""
     sampled_c: Array
-    """Motor temperatures, float32 [sample, time, joint]."""
+    """Motor temperatures, float32 [sample, time, joint]; of a run of many steps the highest since the time before."""
     slope: Array
     """Change by a start that is 1 K warmer everywhere, [time, joint]."""
     run_s: float
