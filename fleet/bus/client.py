@@ -8,6 +8,7 @@ malformed message is counted and logged, and never raises; a malformed request i
 
 import logging
 import math
+import threading
 import time
 import weakref
 from collections import deque
@@ -299,6 +300,21 @@ class BusClient:
             if replies.messages or replies.refusals:
                 break
         return replies.first(key)
+
+    def wait_for_queryable(self, key: str, timeout_s: float) -> bool:
+        """Wait until a participant replies under a concrete key; whether one does.
+
+        A new session learns a moment after it opens who does, and a query before that moment gets no reply.
+        """
+        matching = threading.Event()
+        querier = self._open().declare_querier(key, target=zenoh.QueryTarget.ALL)
+        listener = querier.declare_matching_listener(
+            _direct(lambda status: matching.set() if status.matching else matching.clear())
+        )
+        found = querier.matching_status.matching or matching.wait(timeout_s)
+        listener.undeclare()
+        querier.undeclare()
+        return found
 
     # Replying and subscribing
 

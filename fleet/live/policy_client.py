@@ -18,6 +18,8 @@ from fleet.observation import Observation
 
 CONNECT_S = 1.0
 """Most real seconds until a router accepts the connection."""
+FOUND_S = 0.3
+"""Most real seconds until a new connection knows that a process serves the policy."""
 _FIELDS = ArmObservation.__struct_fields__[1:]
 
 
@@ -41,6 +43,7 @@ class PolicyClient:
         self._key = keys.of_policy(fleet, policy)
         self._limit_s = limit_s
         self._client = BusClient(endpoint, fleet, timeout_s=min(CONNECT_S, limit_s))
+        self._found = False  # since it connected
         self._whose = f"policy '{policy}' at {endpoint}"
         self.reset(np.random.default_rng(0))
 
@@ -60,6 +63,7 @@ class PolicyClient:
             actions = self._query(ActRequest(self._shift, self._seed, self._decision, seen), observations)
         except BaseException:  # also of a time limit
             # Not when it is deleted: a traceback may keep it until any thread collects garbage, one of Zenoh's, too.
+            self._found = False
             with suppress(BusError):
                 self._client.close()
             raise
@@ -74,6 +78,8 @@ class PolicyClient:
                 f"{error} The {self._whose} is reached there: start a router with thermofleet bus router, then its "
                 "process."
             ) from error
+        if not self._found:
+            self._found = client.wait_for_queryable(self._key, min(FOUND_S, self._limit_s))
         replies = client.query_and_wait(self._key, request, ActReply, timeout_s=self._limit_s, most=2)
         actions = dict(self._reply_in(replies, request).actions)
         for arm, action in actions.items():

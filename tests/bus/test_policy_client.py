@@ -24,6 +24,7 @@ from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
+from fleet.live import policy_client
 from fleet.live.policy_client import PolicyClient
 from fleet.observation import FIELDS, Layout, Observation
 from tests.waiting import PATIENCE_S
@@ -193,6 +194,14 @@ def test_nobody_two_and_no_router_are_told_apart_at_once(router, served):
     nowhere = PolicyClient("mine", fleet="f", endpoint="tcp/127.0.0.1:1", limit_s=PATIENCE_S)
     with refused("No router answered at tcp/127.0.0.1:1 .* start a router with thermofleet bus router"):
         nowhere.act(seen())
+
+
+def test_a_process_that_starts_with_the_first_decision_is_found(router, served, monkeypatch):
+    monkeypatch.setattr(policy_client, "FOUND_S", PATIENCE_S)
+    starting = threading.Timer(0.05, served, ['{"actions": {}}'])
+    starting.start()
+    assert client(router).act(seen()) == {}
+    starting.join(PATIENCE_S)
 
 
 def test_a_router_that_ends_in_a_shift_is_an_error_within_the_limit():
