@@ -20,6 +20,7 @@ class Arrivals:
     """When jobs of a stream arrive: independently with exponential gaps, in batches, or at given times."""
 
     kind: Literal["poisson", "batch", "trace"]
+    """In a scenario file also weekly, with times of day `at` and, if not every day, `weekdays`: it becomes a trace."""
     every_s: float | None = None
     """poisson: mean gap. batch: gap between batches; None for a single batch."""
     count: int | None = None

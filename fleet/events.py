@@ -20,6 +20,9 @@ EventKind = Literal[
     "recover",
     "moved",
     "contact",
+    "failure",
+    "break",
+    "break_end",
 ]
 EVENT_KINDS: tuple[str, ...] = get_args(EventKind)
 
@@ -53,6 +56,9 @@ MEANINGS: dict[EventKind, Meaning] = {
     "contact": Meaning(
         "A link or payload of the arm is inside another arm, the floor or a fixture (plant `mujoco`).", "depth, mm"
     ),
+    "failure": Meaning("The arm failed, not by heat: it stopped.", "time until it is repaired, s"),
+    "break": Meaning("A break of the arm began.", "its length, s", live=True),
+    "break_end": Meaning("A break of the arm ended.", live=True),
 }
 
 EVENTS_PER_BOOT = 1_000_000_000

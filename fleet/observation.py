@@ -90,7 +90,9 @@ class Observation:
         Array, Field("fleet", _MEMBER, "s", 0, LONG_S, 64, "age of the member's last message; 100000 without any")
     ]
     fleet_working: Annotated[Array, Field("fleet", _MEMBER, "1", 0, 1, 1, "1 when the member was working then")]
-    fleet_faulted: Annotated[Array, Field("fleet", _MEMBER, "1", 0, 1, 1, "1 when the member was faulted then")]
+    fleet_faulted: Annotated[
+        Array, Field("fleet", _MEMBER, "1", 0, 1, 1, "1 when the member was faulted or had a break then")
+    ]
     fleet_busy_s: Annotated[
         Array, Field("fleet", _MEMBER, "s", 0, LONG_S, 1024, "time until the member is home, as it shared; 0 if free")
     ]
@@ -113,6 +115,9 @@ class Observation:
     faulted: Annotated[Array, Field("own", (), "1", 0, 1, 1, "1 from a fault until it recovers")]
     busy_s: Annotated[Array, Field("own", (), "s", 0, LONG_S, 1024, "time until it is home, with the current job done")]
     last_award: Annotated[Array, Field("own", (), "1", -1, 1, 1, "last claim: 1 won, -1 lost, 0 none made")]
+    break_in_s: Annotated[
+        Array, Field("own", (), "s", 0, LONG_S, 16384, "time until its next break, 0 during one; 100000 without any")
+    ]
     temp_c: Annotated[Array, Field("own", _JOINT, "°C", -60, 200, 64, "own motor temperatures as measured")]
     housing_c: Annotated[Array, Field("own", _JOINT, "°C", -60, 200, 64, "own estimate of the housing temperatures")]
     ambient_c: Annotated[Array, Field("own", (), "°C", -60, 200, 64, "ambient temperature at this arm")]
@@ -185,7 +190,7 @@ class Observation:
 
     @property
     def peer_faulted(self) -> Array:
-        """1 when the peer was faulted then, [..., peer]."""
+        """1 when the peer was faulted or had a break then, [..., peer]."""
         return self._of_peers(self.fleet_faulted)
 
     @property

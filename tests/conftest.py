@@ -17,7 +17,7 @@ import pytest
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.engine.batch import RewardWeights, Shift
 from fleet.engine.profile_plant import ProfilePlant
-from fleet.engine.state import World
+from fleet.engine.state import ABSENCE, World
 from fleet.engine.tables import tables_of
 from fleet.engine.world import Arm, Space, build_world
 from fleet.env.allocation_v2 import Episode
@@ -162,6 +162,7 @@ def shop(
     start_warm: bool = False,
     space: Space | None = None,
     plans_per_job: int = 1,
+    absences: Sequence[tuple[int, int, int, int]] = (),
 ) -> tuple[World, ProfilePlant]:
     """A world in which every arm can do every job (unless arms are given), and the plant that moves it."""
     if isinstance(arms, int):
@@ -178,6 +179,7 @@ def shop(
         start_warm=start_warm,
         space=space,
         plans_per_job=plans_per_job,
+        absences=np.array(list(absences), ABSENCE),
     )
     rest_q = np.stack([a.robot.home_q() for a in arms])
     return world, ProfilePlant(plans, rest_q, np.stack([a.rest_tau for a in arms]))
@@ -201,11 +203,13 @@ class Shifts:
     hard_due: float = 0.2
     """Share of the jobs that expire."""
     plans_per_job: int = 1
+    absences: int = 0
+    """Breaks and failures in a shift."""
 
     def __call__(self, seed: np.random.SeedSequence) -> Episode:
         """The episode of a seed."""
         jobs, sensors = self.drawn(seed)
-        world, plant = self.shop(jobs)
+        world, plant = self.shop(jobs, self.absent(seed))
         return Episode(world=world, plant=plant, twins=("by payload",) * self.arms, sensors=sensors)
 
     def drawn(self, seed: np.random.SeedSequence) -> tuple[list[Job], np.random.SeedSequence]:
@@ -230,12 +234,24 @@ class Shifts:
             )
         return jobs, sensors
 
-    def shop(self, jobs: Sequence[Job]) -> tuple[World, ProfilePlant]:
+    def absent(self, seed: np.random.SeedSequence) -> list[tuple[int, int, int, int]]:
+        """Absences of a seed, which may overlap: arm, first tick, tick after the last, kind."""
+        draw = np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 2)))
+        begins = draw.integers(0, self.ticks, self.absences).tolist()
+        return [
+            (int(draw.integers(self.arms)), begin, begin + int(draw.integers(1, 9)), int(draw.integers(1, 4)))
+            for begin in begins
+        ]
+
+    def shop(
+        self, jobs: Sequence[Job], absences: Sequence[tuple[int, int, int, int]] = ()
+    ) -> tuple[World, ProfilePlant]:
         """A world with these jobs."""
         arms = [arm(i, WORKS, times=Times(cycle=10.0 + 2.0 * i)) for i in range(self.arms)]
         return shop(
             [jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c,
             space=crowded(self.crowding) if self.crowding else None, plans_per_job=self.plans_per_job,
+            absences=absences,
         )  # fmt: skip
 
     def library(self) -> Library:
@@ -267,6 +283,7 @@ class AsArrays:
             after=np.array([[index[name] for name in each.after] or [-1] for each in jobs], dtype=int).reshape(-1, 1),
             expires=np.array([each.expires for each in jobs]),
             noise_key=key_of(sensors),
+            absences=np.array(self.shifts.absent(seed), ABSENCE),
         )
 
 

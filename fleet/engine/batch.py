@@ -5,7 +5,7 @@ Rows are reset here, and reward terms, named and weighted in the scenario, are s
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from fleet.engine.claims import set_phase
 from fleet.engine.corrections import line_of
 from fleet.engine.crossings import hottest
 from fleet.engine.observe import average_excess, excess_of
-from fleet.engine.state import DONE, RUNNING, WAITING, State
+from fleet.engine.state import ABSENCE, DONE, RUNNING, WAITING, State, no_absences
 from fleet.engine.step import (
     BLOCK,
     CLAIM,
@@ -68,6 +68,7 @@ def reset_rows(
     repetitions: Array,
     expires: Array,
     after: Array,
+    absences: Array,
 ) -> None:
     """Put new shifts into some envs.
 
@@ -83,6 +84,7 @@ def reset_rows(
         repetitions: int [job].
         expires: bool [job].
         after: int [job, n], −1 for none.
+        absences: `ABSENCE` [row, absence].
     """
     t, s = sim.tables, sim.state
     for n in range(len(rows)):
@@ -90,7 +92,7 @@ def reset_rows(
         env, jobs, queue = s.env[e], s.jobs[e], s.queue[e]
         env["fleet"], env["ambient_offset_k"], env["noise_key"] = fleet[n], ambient_offset_k[n], noise_key[n]
         env["number"] = env["unfinished"] = count
-        env["tick"] = env["given_up"] = env["head"] = 0
+        env["tick"] = env["given_up"] = env["head"] = env["turn"] = 0
         env["alarm"], env["changed"] = False, True
         for j in range(len(jobs)):
             job, exists = jobs[j], j < count
@@ -111,6 +113,10 @@ def reset_rows(
                     place -= 1
                 queue[place] = j
             job["queued_s"] = job["release_s"]
+        for i in range(s.absences.shape[1]):
+            s.absences[e, i]["kind"] = 0
+            if i < absences.shape[1]:
+                s.absences[e, i] = absences[n, i]
         for a in range(s.arms.shape[1]):
             s.arms[e, a] = t.start[fleet[n], a]
             arm, net = s.arms[e, a], t.modal[fleet[n], a]
@@ -192,6 +198,8 @@ class Shift:
     """int [job, n], −1 for none."""
     noise_key: int
     """Of the sensor noise, 64 bits; see `fleet.seeding`."""
+    absences: Array = field(default_factory=no_absences)
+    """Breaks and failures of the arms, `ABSENCE` [absence]."""
 
 
 Parts = tuple[Array, Array]
@@ -352,8 +360,12 @@ class Engine:
         waits = int((after >= 0).sum(axis=1).max(initial=0))
         after = -np.sort(-after, axis=1)[:, :waits]
         jobs = int(np.diff(first).max())
-        if jobs > room or waits > self.state.after.shape[2]:
-            self._make_room(jobs, waits)
+        longest = max(len(shift.absences) for shift in shifts)
+        absences = np.zeros((len(shifts), longest), ABSENCE)
+        for row, shift in zip(absences, shifts, strict=True):
+            row[: len(shift.absences)] = shift.absences
+        if jobs > room or waits > self.state.after.shape[2] or longest > self.state.absences.shape[1]:
+            self._make_room(jobs, waits, longest)
 
         def of_all(name: str) -> Array:
             return np.concatenate([getattr(shift, name) for shift in shifts])
@@ -363,6 +375,7 @@ class Engine:
             np.array([shift.fleet for shift in shifts]), np.array([shift.ambient_offset_k for shift in shifts]),
             np.array([shift.noise_key for shift in shifts], np.uint64), first,
             of_all("kind"), of_all("release_s"), of_all("due_s"), of_all("repetitions"), of_all("expires"), after,
+            absences,
         )  # fmt: skip
 
     def observe(self, envs: Array, out: Parts) -> None:
@@ -460,6 +473,8 @@ class Engine:
         jobs = state.jobs.shape[1]
         self.state.env[:], self.state.arms[:] = state.env, state.arms
         self.state.jobs[:, :jobs], self.state.failed_arm[:, :jobs] = state.jobs, state.failed_arm
+        self.state.absences["kind"] = 0
+        self.state.absences[:, : state.absences.shape[1]] = state.absences
         self.refresh()
 
     def refresh(self) -> None:
@@ -476,7 +491,7 @@ class Engine:
             state.env["head"][e] = count - n
         state.env["unfinished"] = (exists & (state.status < DONE)).sum(axis=1)
         state.env["given_up"] = (exists & (state.status > DONE)).sum(axis=1)
-        state.env["changed"] = True
+        state.env["changed"], state.env["turn"] = True, 0
         working = (state.mode == WORKING) & (state.job >= 0)
         state.arms["kind"] = np.where(working, state.kind[env, state.job], self.tables.work.shape[1])
         times_s = self.tables.plans["times_s"][state.plan]
@@ -492,13 +507,14 @@ class Engine:
         for e, a in np.argwhere(state.mode == WORKING).tolist():
             set_phase(self.tables.plans, state.arms[e, a])
 
-    def _make_room(self, jobs: int, waits: int) -> None:
-        """For more jobs a shift, a tenth more than asked for, keeping what is there."""
+    def _make_room(self, jobs: int, waits: int, absences: int = 0) -> None:
+        """For more jobs a shift, a tenth more than asked for, or absences, keeping what is there."""
         before = self._simulation
         room = before.state.jobs.shape[1]
         jobs = jobs + jobs // 10 if jobs > room else room
         envs, arms = before.state.arms.shape
-        state = empty_state(envs, arms, jobs, max(before.state.after.shape[2], waits))
+        absences = max(before.state.absences.shape[1], absences)
+        state = empty_state(envs, arms, jobs, max(before.state.after.shape[2], waits), absences)
         events = event_buffer(envs * (arms * PER_ARM + jobs) if len(before.events.what) else 0)
         for new, old in zip((*state, *events), (*before.state, *before.events), strict=True):
             new[tuple(slice(0, n) for n in old.shape)] = old
@@ -538,6 +554,7 @@ def shifts_of(state: State, noise_keys: Sequence[int]) -> list[Shift]:
             expires=state.expires[e, :count],
             after=state.after[e, :count],
             noise_key=key,
+            absences=state.absences[e],
         )
         for e, (count, key) in enumerate(zip(state.number.tolist(), noise_keys, strict=True))
     ]

@@ -125,7 +125,7 @@ def fill_masks(sim: Simulation, e: int, filled: int, slot_kind: Array, busy: Arr
         mask = o.mask[e, a]
         for action in range(1, len(mask) - 1):
             mask[action] = 0
-        if s.arms[e, a]["mode"] != IDLE:
+        if s.arms[e, a]["mode"] != IDLE or s.arms[e, a]["absent"]:
             continue
         action = 1
         for k in range(filled):

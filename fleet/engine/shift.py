@@ -52,7 +52,7 @@ def broadcast(engine: Engine, parts: Parts, names: Sequence[str], twins: tuple[s
     has_plan = filled[..., None] & (duration_s > 0)
     return Broadcast(
         time_s=float(engine.state.tick[env] * tables.dt_s),
-        mode=engine.state.mode[env].astype(int),
+        mode=np.where(engine.state.absent[env] > 0, FAULTED, engine.state.mode[env]).astype(int),
         busy_s=known.busy_s.astype(float),
         temp_c=known.temp_c.astype(float),
         headroom_k=known.headroom_k.astype(float),
@@ -307,7 +307,7 @@ def _stepped(engine: Engine, world: World, plant: Plant, actions: Array | None, 
 def _without_room(state: State, world: World) -> State:
     """Views of the state with as many jobs as the world has; an engine may have room for more."""
     jobs = world.jobs.exists.shape[1]
-    return State(state.env, state.arms, *(values[:, :jobs] for values in state[2:]))
+    return state.of_jobs(slice(0, jobs))
 
 
 def record_of(engine: Engine, env: int = 0) -> StepRecord:

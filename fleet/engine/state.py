@@ -18,6 +18,16 @@ Array = np.ndarray
 
 WAITING, RUNNING, DONE, GIVEN_UP, EXPIRED = range(5)
 """Status of a job."""
+FINISH_JOB, FINISH_CYCLE, BROKEN = 1, 2, 3
+"""Kinds of absence: an arm takes no more jobs; it gives its job back after the present cycle, too; or it stops at once
+with a failure."""
+ABSENCE = np.dtype([("arm", "i4"), ("begin", "i4"), ("end", "i4"), ("kind", "i4")], align=True)
+"""Ticks from `begin` to `end` in which an arm takes no jobs; of kind 0 there is none."""
+
+
+def no_absences() -> Array:
+    """Absences of a shift without any, `ABSENCE` [0]."""
+    return np.zeros(0, ABSENCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +142,8 @@ class World:
     """Drift of the readings of motor temperatures from the start of the shift, [arm]."""
     believed: Law | None
     """What the arms believe of their heat, if they learn: see `fleet.engine.world.Arm.learns`."""
+    absences: Array
+    """Breaks and failures of the arms in every env, `ABSENCE` [absence]."""
 
     @property
     def horizon_s(self) -> float:
@@ -176,14 +188,15 @@ ARM = np.dtype(
         ("mode", "i1"),
         ("last_award", "i1"),
         ("pending", "?"),
-        ("unused", "i1", 9),
+        ("absent", "i1"),
+        ("unused", "i1", 8),
     ],
     align=True,
 )
 """All that changes of an arm, four cache lines, the last of which is all that claims need; see the properties of
 `State`. `current_sq` and `friction_w` are the heat drive of the present phase of its plan, which ends when `progress_s`
 is `phase_end_s`; `kind` is that of its job, and `pending` whether the job is still to be finished (False on the way
-home)."""
+home). `absent` is the kind of the present absence, 0 for none."""
 
 JOB = np.dtype(
     [
@@ -214,15 +227,17 @@ ENV = np.dtype(
         ("unfinished", "i4"),
         ("given_up", "i4"),
         ("head", "i4"),
+        ("turn", "i4"),
         ("alarm", "?"),
         ("changed", "?"),
-        ("unused", "i1", 14),
+        ("unused", "i1", 10),
     ],
     align=True,
 )
 """A shift. `number` counts its jobs, `unfinished` those neither done nor given up; `head` is where its queue begins.
-What is on offer stays as it is until `next_s`, the next release or due date, unless something has `changed`. `alarm`:
-an arm at work has passed the warning limit in the last step."""
+What is on offer stays as it is until `next_s`, the next release or due date, unless something has `changed`. `turn`
+is the tick at which the next absence begins or ends. `alarm`: an arm at work has passed the warning limit in the last
+step."""
 
 
 class State(NamedTuple):
@@ -240,11 +255,17 @@ class State(NamedTuple):
     """Jobs that must be done first, int [env, job, n], −1 for none."""
     queue: Array
     """Waiting jobs, released or not, by queueing time, int [env, job], from `head` to the number of jobs."""
+    absences: Array
+    """`ABSENCE` [env, absence]."""
+
+    def of_jobs(self, jobs: slice) -> Self:
+        """Views of the state with some of the jobs."""
+        names = ("jobs", "failed_arm", "after", "queue")
+        return self._replace(**{name: getattr(self, name)[:, jobs] for name in names})
 
     def copy(self, envs: slice = slice(None), jobs: slice = slice(None)) -> Self:
         """The state of some envs and of their first jobs in arrays of its own."""
-        per_job = (values[envs, jobs].copy() for values in (self.jobs, self.failed_arm, self.after, self.queue))
-        return type(self)(self.env[envs].copy(), self.arms[envs].copy(), *per_job)
+        return type(self)(*(values[envs].copy() for values in self.of_jobs(jobs)))
 
     def changed(self, **fields: Array | float) -> Self:
         """A copy in which some of the properties have other values."""
@@ -331,6 +352,11 @@ class State(NamedTuple):
     def last_award(self) -> Array:
         """1 the last claim was won, −1 lost, 0 none was made, int [env, arm]."""
         return self.arms["last_award"]
+
+    @property
+    def absent(self) -> Array:
+        """FINISH_JOB, FINISH_CYCLE or BROKEN in an absence, else 0, int [env, arm]."""
+        return self.arms["absent"]
 
     @property
     def faults(self) -> Array:

@@ -11,12 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.engine.claims import give_up, resolve_claims, return_to_queue, set_phase, update_offers
+from fleet.engine.claims import cycles_begun, give_up, resolve_claims, return_to_queue, set_phase, update_offers
 from fleet.engine.corrections import compare, line_of
 from fleet.engine.crossings import Crossed, hottest, step_with_crossing
 from fleet.engine.observe import observe
-from fleet.engine.state import DONE, GIVEN_UP, LANES, WAITING, State
+from fleet.engine.state import BROKEN, DONE, FINISH_CYCLE, GIVEN_UP, LANES, WAITING, State
 from fleet.engine.tables import (
+    BREAK,
+    BREAK_END,
+    FAILURE,
     FAULT,
     FINISH,
     GIVE_BACK,
@@ -45,6 +48,7 @@ TOTAL, FINISHED, JOBS_DONE, TICK, OUTCOME = range(5, 10)
 intervals that are over; and the number of all columns."""
 ROUNDING_S = 1e-9
 """Sums of phases may be off by this much; a whole step must not be lost to it."""
+NEVER = np.iinfo(np.int32).max
 _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 
 
@@ -374,10 +378,24 @@ def stop(sim: Simulation, e: int, a: int, cut_s: float, joint: int) -> None:
         cut_s: When, seconds into the step.
         joint: The motor.
     """
+    arm = sim.state.arms[e, a]
+    if len(sim.events.what) > 0:
+        record_event(sim.events, FAULT, e, a, arm["job"], joint, cut_s, sim.tables.error_c)
+    halt(sim, e, a, cut_s, cut_s, True)
+    arm["faults"] += 1
+    arm["lost_s"] += sim.tables.dt_s - cut_s
+
+
+@jit
+def halt(sim: Simulation, e: int, a: int, cut_s: float, at_s: float, by_heat: bool) -> None:
+    """Make an arm faulted where it is; its job returns to the queue, or is given up after too many faults by heat.
+
+    Args:
+        cut_s: When, seconds after the present tick.
+        at_s: The same as seconds into the step, which may have ended at this tick.
+    """
     t, s, events, recording = sim.tables, sim.state, sim.events, len(sim.events.what) > 0
     env, arm, now_s = s.env[e], s.arms[e, a], s.env[e]["tick"] * t.dt_s
-    if recording:
-        record_event(events, FAULT, e, a, arm["job"], joint, cut_s, t.error_c)
     if arm["mode"] == WORKING and arm["pending"]:
         j = nonnegative(arm["job"])
         job, times_s = s.jobs[e, j], t.plans[nonnegative(arm["plan"])]["times_s"]
@@ -387,21 +405,21 @@ def stop(sim: Simulation, e: int, a: int, cut_s: float, joint: int) -> None:
         # Once it may move again the arm ends the cycle in which it stopped, which does not count.
         arm["todo"] = min(kept + 1, arm["todo"]) if arm["progress_s"] > times_s[0] else 0
         before, again = nonnegative(job["returns"]), False
-        for n in range(before):
-            again = again or s.failed_arm[e, j, n] == a
-        job["returns"] += 1
-        again = again or before + 1 == MOST_FAULTS
+        if by_heat:
+            for n in range(before):
+                again = again or s.failed_arm[e, j, n] == a
+            job["returns"] += 1
+            again = again or before + 1 == MOST_FAULTS
         if again:
             give_up(s, e, j, GIVEN_UP)
         else:
-            s.failed_arm[e, j, before] = a
+            if by_heat:
+                s.failed_arm[e, j, before] = a
             job["status"], job["queued_s"] = WAITING, now_s + cut_s
             return_to_queue(s, e, j, now_s + t.dt_s)
         arm["pending"] = False
         if recording:
-            record_event(events, GIVE_UP if again else RETURN, e, a, j, -1, cut_s, float(kept))
-    arm["faults"] += 1
-    arm["lost_s"] += t.dt_s - cut_s
+            record_event(events, GIVE_UP if again else RETURN, e, a, j, -1, at_s, float(kept))
     arm["mode"], arm["job"], arm["kind"], arm["phase_end_s"] = FAULTED, -1, t.start[env["fleet"], a]["kind"], np.inf
     for k in range(LANES):
         arm["current_sq"][k] = arm["friction_w"][k] = 0.0
@@ -422,8 +440,8 @@ def recover(sim: Simulation, e: int, a: int, cool_s: float) -> None:
     now_s, end_s = env["tick"] * t.dt_s, (env["tick"] + 1) * t.dt_s
     if arm["clear_at_s"] == np.inf and cool_s < np.inf:
         arm["clear_at_s"] = now_s + cool_s + t.clear_s
-    if arm["clear_at_s"] <= end_s:
-        recovered_s = arm["clear_at_s"] - now_s
+    if arm["clear_at_s"] <= end_s and arm["absent"] != BROKEN:
+        recovered_s = max(arm["clear_at_s"] - now_s, 0.0)  # the repair of a failure may take longer
         arm["lost_s"] -= t.dt_s - recovered_s
         arm["clear_at_s"] = np.inf
         if arm["plan"] < 0:
@@ -439,6 +457,49 @@ def recover(sim: Simulation, e: int, a: int, cool_s: float) -> None:
             record_event(events, MOVED, e, a, -1, -1, arm["moved_at_s"] - now_s, 0.0)
         arm["moved_at_s"] = np.inf
         stand_at_home(s, arm, home, e, IDLE if arm["mode"] == WORKING else FAULTED)
+
+
+@jit_inline
+def update_absences(sim: Simulation, rows: Array) -> None:
+    """Begin and end the absences of some envs that do so now."""
+    for row in rows:
+        e = nonnegative(row)
+        if sim.state.env[e]["turn"] <= sim.state.env[e]["tick"]:
+            turn_absences(sim, e)
+
+
+@jit
+def turn_absences(sim: Simulation, e: int) -> None:
+    """Find out which arms of an env are absent now, and when that changes next."""
+    t, s, events, recording = sim.tables, sim.state, sim.events, len(sim.events.what) > 0
+    env = s.env[e]
+    env["turn"], env["changed"] = NEVER, True
+    for n in range(s.absences.shape[1]):
+        each = s.absences[e, n]
+        if each["kind"] > 0 and each["begin"] > env["tick"]:
+            env["turn"] = min(env["turn"], each["begin"])
+        elif each["kind"] > 0 and each["end"] > env["tick"]:
+            env["turn"] = min(env["turn"], each["end"])
+    for a in range(nonnegative(s.arms.shape[1])):
+        arm, kind, end = s.arms[e, a], 0, 0
+        for n in range(s.absences.shape[1]):
+            each = s.absences[e, n]
+            if each["arm"] == a and each["begin"] <= env["tick"] < each["end"] and each["kind"] > kind:
+                kind, end = each["kind"], each["end"]
+        before, left_s = arm["absent"], (end - env["tick"]) * t.dt_s
+        arm["absent"] = kind
+        if kind == before:
+            continue
+        if recording and kind != BROKEN and (kind > 0) != (0 < before < BROKEN):
+            record_event(events, BREAK if kind else BREAK_END, e, a, -1, -1, t.dt_s, left_s)
+        if kind == BROKEN:
+            if recording:
+                record_event(events, FAILURE, e, a, arm["job"], -1, t.dt_s, left_s)
+            if arm["mode"] != FAULTED:
+                halt(sim, e, a, 0.0, t.dt_s, False)
+        elif kind == FINISH_CYCLE and arm["mode"] == WORKING and arm["pending"]:
+            arm["todo"] = cycles_begun(t.plans, arm)
+            set_phase(t.plans, arm)
 
 
 BLOCK = 128
@@ -480,6 +541,7 @@ def take_steps(
                 if len(sim.path_c) > 0:
                     keep_path(sim, going)
             if now & OFFER:
+                update_absences(sim, going)
                 update_offers(sim, going)
             if now & PLAY:
                 collect_rewards(sim, going, terms)

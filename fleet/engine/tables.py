@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.difficulty import KNOWN, extend_curve, forecast_arrays
-from fleet.engine.state import ARM, ENV, JOB, LANES, State, World
+from fleet.engine.state import ABSENCE, ARM, ENV, JOB, LANES, State, World
 from fleet.events import Event, EventKind
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import NODES
@@ -26,6 +26,7 @@ from fleet.telemetry import IDLE
 Array = np.ndarray
 
 AWARD, LOST, ILLEGAL, WARNING, FINISH, HOME, FAULT, RETURN, GIVE_UP, RECOVER, MOVED, GIVE_BACK, EXPIRE = range(13)
+FAILURE, BREAK, BREAK_END = range(13, 16)
 """Kinds of recorded events, in the order in which those of one step are reported."""
 PER_ARM = 10
 """Most events of one arm in one step; besides, every job may expire."""
@@ -69,7 +70,7 @@ def events_of(world: World, state: State, buffer: EventBuffer) -> Iterator[Event
     what, numbers = buffer.what[:count], buffer.numbers[:count]
     began_s = (state.tick - 1) * world.dt_s
     # What becomes of the job follows the fault of its arm.
-    phase = np.where((what[:, 0] == RETURN) | (what[:, 0] == GIVE_UP), FAULT, what[:, 0])
+    phase = np.where(np.isin(what[:, 0], (FAILURE, RETURN, GIVE_UP)), FAULT, what[:, 0])
     for row in np.lexsort((what[:, 2], what[:, 1], phase)).tolist():
         kind, e, a, j, joint = what[row].tolist()
         offset_s, value = numbers[row].tolist()
@@ -119,6 +120,12 @@ def _described(
             return "give_back", value, f"{state.cycles[e, j]} of {world.jobs.repetitions[e, j]} cycles kept"
         case 12:
             return "expire", math.nan, "its due date passed before an arm began it"
+        case 13:
+            return "failure", value, f"not by heat; repaired after {value:.0f} s"
+        case 14:
+            return "break", value, f"for {value:.0f} s"
+        case 15:
+            return "break_end", math.nan, ""
         case _:
             return "recover", math.nan, f"every motor below {limits.restart_c:g} °C and the fault cleared"
 
@@ -538,7 +545,8 @@ def tables_of(world: World) -> tuple[Tables, State]:
         value=jobs.value,
         alike=jobs.alike,
     )
-    state = empty_state(envs, arms, jobs.exists.shape[1], jobs.after.shape[2])
+    state = empty_state(envs, arms, jobs.exists.shape[1], jobs.after.shape[2], len(world.absences))
+    state.absences[:] = world.absences
     state.env["fleet"], state.env["number"] = np.arange(envs), count
     state.jobs["kind"] = np.arange(jobs.exists.shape[1])
     for name in ("release_s", "due_s", "repetitions", "expires"):
@@ -547,8 +555,8 @@ def tables_of(world: World) -> tuple[Tables, State]:
     return owned(tables), state
 
 
-def empty_state(envs: int, arms: int, jobs: int, waits: int) -> State:
-    """Room for a number of jobs, each of which waits for up to `waits` others; there are none yet."""
+def empty_state(envs: int, arms: int, jobs: int, waits: int, absences: int = 0) -> State:
+    """Room for a number of jobs, each of which waits for up to `waits` others, and of absences; there are none yet."""
     state = State(
         env=_aligned((envs,), ENV),
         arms=_aligned((envs, arms), ARM),
@@ -556,6 +564,7 @@ def empty_state(envs: int, arms: int, jobs: int, waits: int) -> State:
         failed_arm=np.full((envs, jobs, MOST_FAULTS - 1), -1, np.int32),
         after=np.full((envs, jobs, waits), -1, np.int32),
         queue=np.zeros((envs, jobs), np.int32),
+        absences=np.zeros((envs, absences), ABSENCE),
     )
     state.jobs["release_s"] = state.jobs["due_s"] = np.inf
     state.jobs["repetitions"] = 1

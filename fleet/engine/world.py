@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from fleet.difficulty import Difficulty, DifficultyModel, Forecast, stack_forecasts
-from fleet.engine.state import JobTable, Law, Offers, PlanTable, World
+from fleet.engine.state import JobTable, Law, Offers, PlanTable, World, no_absences
 from fleet.heat.motor import Motors, gen3_motors, stack_motors
 from fleet.heat.thermal import (
     HOUSING,
@@ -174,6 +174,7 @@ def build_world(
     start_warm: bool,
     space: Space | None = None,
     plans_per_job: int = PLANS,
+    absences: Array | None = None,
 ) -> tuple[World, tuple[Plan, ...]]:
     """The world of one or more parallel shifts, and the plans behind the rows of its plan table.
 
@@ -183,6 +184,7 @@ def build_world(
         start_warm: Arms begin at their idle equilibrium rather than at ambient.
         space: Which plans of two arms would touch; none if not given.
         plans_per_job: Most plans that an arm offers for a job.
+        absences: Breaks and failures, `ABSENCE` [absence]; none if not given.
     """
     motors, thermal, rest, phi, gamma, observer, believed = _laws(tuple(arms), dt_s)
     plans, offers = _offers(arms, shifts, plans_per_job)
@@ -218,6 +220,7 @@ def build_world(
         gamma=gamma,
         drift_k_per_s=np.array([arm.drift_k_per_s for arm in arms]),
         believed=believed,
+        absences=no_absences() if absences is None else absences,
     )
     return world, plans
 

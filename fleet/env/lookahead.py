@@ -2,8 +2,9 @@
 
 It has the plans and space of all arms, their current jobs, the jobs in the slots, and of each arm the measured motor
 temperatures, the estimated housings and the identified thermal network. If the arms learn (source `twin`), the heat of
-the plans and the temperatures are corrected as in their predictions. The simulator has no jobs without a slot, no
-future jobs, no future ambient temperature, no sensor errors and no true temperatures.
+the plans and the temperatures are corrected as in their predictions. It knows breaks, and when a present failure will
+be repaired. The simulator has no jobs without a slot, no future jobs, no future failures, no future ambient
+temperature, no sensor errors and no true temperatures.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.engine.batch import Engine, RewardWeights, shifts_of
-from fleet.engine.state import DONE, GIVEN_UP, RUNNING, State
+from fleet.engine.state import BROKEN, DONE, GIVEN_UP, RUNNING, State
 from fleet.engine.tables import Plans, Script, Tables
 from fleet.heat.thermal import HOUSING, WINDING
 from fleet.observation import Layout, Observation
@@ -90,6 +91,7 @@ class CellSimulator:
         hidden = (known.status[0] != DONE) & (known.status[0] != RUNNING)
         hidden[open_] = False
         known.status[0, hidden] = GIVEN_UP
+        known.absences["kind"][(known.absences["kind"] == BROKEN) & (known.absences["begin"] > known.tick)] = 0
         known.temp_c[0, :, WINDING] = [each.temp_c for each in seen.values()]
         known.temp_c[0, :, HOUSING] = [each.housing_c for each in seen.values()]
         mine, tick = self._engine, int(state.tick[env])

@@ -17,6 +17,7 @@ from scenarios.cell_layout import near_of
 from scenarios.prepare.fleet import Fleet, prepare, world_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, check_progress, quiet
+from scenarios.spec.calendar import absences_of
 from scenarios.spec.jobs import JobSampler, alternatives_of, weights_of
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, DifficultyName, RiskName
@@ -120,4 +121,5 @@ class _ShiftSampler:
             expires=self._expires[stream],
             after=jobs.after,
             noise_key=key_of(sensor_seed),
+            absences=absences_of(self._fleet.all[conditions.fleet].scenario, seed),
         )

@@ -34,6 +34,7 @@ from scenarios.prepare.randomisation import Randomisation, ShiftConditions, rand
 from scenarios.prepare.shipped import is_shipped
 from scenarios.prepare.surprise import arms_with_surprises
 from scenarios.progress import Count, Progress, check_progress, quiet
+from scenarios.spec.calendar import absences_of
 from scenarios.spec.jobs import JobSampler, all_works, rehearsal_works, weights_of
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, BusName, DifficultyName, PlantName, RiskName
@@ -268,11 +269,14 @@ def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
     return replace(arm, model=model, known=(arm.thermal, arm.motors), drift_k_per_s=0.0)
 
 
-def world_of(fleet: Fleet, jobs: Sequence[Job], warmer_k: float = 0.0) -> tuple[World, tuple[Plan, ...]]:
+def world_of(
+    fleet: Fleet, jobs: Sequence[Job], warmer_k: float = 0.0, absences: np.ndarray | None = None
+) -> tuple[World, tuple[Plan, ...]]:
     """The world of a shift with these jobs, and the plan of each row of its plan table.
 
     Args:
         warmer_k: Added to every temperature of the cell, at the start and ambient.
+        absences: As in `build_world`.
     """
     scenario = fleet.scenario
     times = (np.arange(scenario.ticks) + 0.5) * scenario.decision_interval_s
@@ -286,6 +290,7 @@ def world_of(fleet: Fleet, jobs: Sequence[Job], warmer_k: float = 0.0) -> tuple[
         ambient_c=scenario.ambient.at(times)[:, None] + air_offsets(scenario),
         start_warm=scenario.start == "idle_warm",
         space=fleet.space.rows,
+        absences=absences,
     )
     if warmer_k:
         warmed = ("ambient_c", "start_c", "start_housing_c")
@@ -312,7 +317,8 @@ class ShiftFactory:
         fleet = self.fleet.all[chosen]
         scenario, arms = fleet.scenario, fleet.arms
         jobs_seed, sensor_seed = shift_seeds(seed)
-        world, plans = world_of(fleet, self._samplers[chosen].jobs(jobs_seed, rate), warmer_k)
+        jobs, absences = self._samplers[chosen].jobs(jobs_seed, rate), absences_of(scenario, seed)
+        world, plans = world_of(fleet, jobs, warmer_k, absences)
         robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
         others = {plan: other for arm in arms for plan, other in arm.executed.items()}
         executed = tuple(others.get(plan, plan) for plan in plans)

@@ -10,7 +10,7 @@ import io
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from datetime import datetime, time, timedelta
+from datetime import UTC, datetime, time, timedelta, tzinfo
 from difflib import get_close_matches
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -111,7 +111,21 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
         raise ValueError(f"expected seconds, h:mm, h:mm:ss, or {DATE} (got {_shown(cell)})") from None
     if begin is None:
         raise ValueError(f"a date needs shift_begin, the begin of the shift (got {_shown(cell)})")
-    return ((date if date.tzinfo else date.replace(tzinfo=begin.tzinfo)) - begin).total_seconds()
+    date = date if date.tzinfo else date.replace(tzinfo=begin.tzinfo)
+    return (date.astimezone(UTC) - begin.astimezone(UTC)).total_seconds()  # within one zone, dates ignore summer time
+
+
+def seconds_of(given: object, begin: datetime | None, horizon_s: float) -> float:
+    """Time from the begin of the shift, s, as a cell of a table may give it.
+
+    Args:
+        begin: Of the shift; None for unknown.
+        horizon_s: Length of the shift.
+
+    Raises:
+        ValueError: it is no time.
+    """
+    return _seconds(given, _Dialect(begin, False, horizon_s))
 
 
 def _name(cell: Cell, _: object = None) -> str:
@@ -465,8 +479,11 @@ def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:
     }
 
 
-def shift_begin(given: object, where: str) -> datetime | None:
+def shift_begin(given: object, where: str, zone: tzinfo | None = None) -> datetime | None:
     """The begin of a shift from an ISO date with a zone; None without one.
+
+    Args:
+        zone: Of its times of day; by default that of the date.
 
     Raises:
         ScenarioError: it is no such date.
@@ -475,6 +492,8 @@ def shift_begin(given: object, where: str) -> datetime | None:
     if isinstance(given, str) and given:
         with suppress(ValueError):
             begin = datetime.fromisoformat(given)
-    if begin in (None, "") or (isinstance(begin, datetime) and begin.tzinfo):
-        return begin or None
+    if begin in (None, ""):
+        return None
+    if isinstance(begin, datetime) and (begin.tzinfo or zone):
+        return begin.replace(tzinfo=begin.tzinfo or zone).astimezone(zone or begin.tzinfo)
     raise ScenarioError(f"{where} must be {DATE} (got {given}).")

@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 
 from fleet.errors import ScenarioError, nearest, printable
+from scenarios.spec.calendar import check_breaks, with_calendar, zone_of
 from scenarios.spec.job_table import cycle_of, decode_text, read_job_table, shift_begin, stream_fields
 from scenarios.spec.schema import JobStream, Scenario
 from scenarios.spec.units import check_times, check_units
@@ -208,16 +209,18 @@ def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
 
 
 def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
-    """The parsed file with a stream for each row of its job tables, and with the begin of the shift as a text."""
-    begin = shift_begin(raw.get("shift_begin"), f"{path.name}: shift_begin")
-    raw = {**raw, "shift_begin": begin and begin.isoformat()}
-    jobs, places, horizon_s = raw.get("jobs"), raw.get("places"), raw.get("horizon_s")
+    """The parsed file with times in seconds, a stream for each row of its job tables, and the begin as a text."""
+    zone = zone_of(raw.get("time_zone"), f"{path.name}: time_zone")
+    begin = shift_begin(raw.get("shift_begin"), f"{path.name}: shift_begin", zone)
+    places, horizon_s = raw.get("places"), raw.get("horizon_s")
+    # Their own faults are reported when the scenario is made.
+    horizon_s = float(horizon_s) if isinstance(horizon_s, int | float) and 0 < horizon_s < MOST_S else 0.0
+    raw = with_calendar(raw, begin, horizon_s, path.name) | {"shift_begin": begin and begin.isoformat()}
+    jobs = raw.get("jobs")
     if not isinstance(jobs, list) or not any(isinstance(each, Mapping) and "table" in each for each in jobs):
         return raw
     tables = [place for place in places if isinstance(place, Mapping)] if isinstance(places, list) else []
     names = [place["name"] for place in tables if isinstance(place.get("name"), str)]
-    # Their own faults are reported when the scenario is made.
-    horizon_s = float(horizon_s) if isinstance(horizon_s, int | float) and 0 < horizon_s < MOST_S else 0.0
     streams: list[object] = []
     for i, each in enumerate(jobs):
         if not isinstance(each, Mapping) or "table" not in each:
@@ -327,6 +330,7 @@ def _check(scenario: Scenario, path: Path) -> None:
         stream, _, number = name.rpartition("-")
         if name not in numbered and stream in numbered and len(number) >= 3 and number.isdecimal():
             raise ScenarioError(f"{file}: jobs: '{name}' is also a job of the stream '{stream}'; rename one of them.")
+    check_breaks(scenario, file)
     try:
         scenario.bus.channel().check([arm.name for arm in scenario.arms])
     except ValueError as error:

@@ -36,9 +36,24 @@ MOST_EXPLORATION = 10_000
 MOST_SPREAD = 10.0
 MOST_WEIGHT = 1e9
 MOST_NOISE_K = 50.0
-_NOT_OF_ROBOT = ("position_m", "tilt_deg", "sensor_noise_k")
+MOST_BREAKS = 1000
+_NOT_OF_ROBOT = ("position_m", "tilt_deg", "sensor_noise_k", "fails")
 _NUMBER = 8
 """Characters that the name of a job may have after that of its stream."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failures:
+    """Failures of an arm that have nothing to do with heat, at random: each stops it at once, until it is repaired."""
+
+    every_s: float
+    """Mean time from a repair to the next failure."""
+    repair_s: float
+    """Mean time to repair."""
+
+    def __post_init__(self) -> None:
+        check_between(self, 60.0, BOUNDS["due_s"].high, "every_s")
+        check_between(self, 1.0, BOUNDS["due_s"].high, "repair_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +72,8 @@ class ArmSpec:
     wear: float = Robot.wear
     sensor_noise_k: float | None = None
     """Standard deviation of a reading of a motor temperature; None: that of the Gen3, at most 0.014 K."""
+    fails: Failures | None = None
+    """Failures other than by heat; None: it has none."""
 
     def __post_init__(self) -> None:
         self.robot()
@@ -137,6 +154,31 @@ class Ambient:
         """Ambient temperatures at the times, °C, of the same shape."""
         times, temps = zip(*self.points, strict=True)
         return np.interp(time_s, times, temps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Break:
+    """A time in which arms take no jobs, such as a break of their operators or maintenance.
+
+    In a file, `begin` and `end` may take the place of the times in seconds: as in a job table, `h:mm` from the begin of
+    the shift, with `shift_begin` a time of day; then the break recurs on the `weekdays`, if given.
+    """
+
+    name: str
+    begin_s: float
+    """Seconds from the begin of the shift; an arm takes no jobs from the next decision on."""
+    end_s: float
+    arms: tuple[str, ...] = ()
+    """Their names; (): all arms."""
+    finish: Literal["cycle", "job"] = "cycle"
+    """What an arm at work still finishes: the present cycle, and gives the job back, or the job."""
+
+    def __post_init__(self) -> None:
+        most_s = BOUNDS["due_s"].high
+        check_between(self, -most_s, most_s, "begin_s", "end_s")
+        if self.begin_s >= self.end_s:
+            raise ValueError(f"Break.end_s must be after begin_s (got {self.begin_s:g}, {self.end_s:g})")
+        check_names(self, "name", "arms")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,8 +357,12 @@ class Scenario:
     spread: Spread = field(default_factory=Spread)
     bus: BusSpec = field(default_factory=BusSpec)
     surprises: tuple[Surprise, ...] = ()
+    breaks: tuple[Break, ...] = ()
     shift_begin: str | None = None
-    """Date, time and zone of the begin of the shift, to which the times of a job table refer."""
+    """Date, time and zone of the begin of the shift, to which times of day refer."""
+    time_zone: str | None = None
+    """IANA name of the zone of times of day, such as Europe/Berlin, with its summer time; None: that of `shift_begin`,
+    which then has one."""
 
     def __post_init__(self) -> None:
         check_positive(self, "horizon_s", "decision_interval_s", "telemetry_interval_s")

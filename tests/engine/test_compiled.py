@@ -52,7 +52,7 @@ def check_equal(episode: Episode, seed: int, **options) -> ShiftRunner:
 
 
 def test_compiled_and_uncompiled_agree_with_faults_and_returned_jobs(small) -> None:
-    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=LIMITS)
+    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=LIMITS, absences=5)
     runs = [check_equal(make(np.random.SeedSequence(seed)), seed) for seed in range(3)]
     kinds = {event.kind for run in runs for event in run.events}
     assert {"award", "lost", "illegal", "warning", "fault", "return", "recover", "finish", "home"} <= kinds

@@ -227,7 +227,7 @@ def test_a_step_ends_as_soon_as_an_arm_may_claim_a_job(small) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_batch_steps_as_the_single_environment(small, threads) -> None:
-    shifts, envs = small.Shifts(ticks=60), 5
+    shifts, envs = small.Shifts(ticks=60, absences=5), 5
     batch = BatchEnv(shifts.library(), envs, seed=SEED, autoreset=False, decisions="events", threads=threads)
     obs, _ = batch.reset()
     rewards, seconds = np.zeros(envs), np.zeros(envs)

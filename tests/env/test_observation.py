@@ -193,6 +193,21 @@ def least_difficulty(world: World, a: int, j: int) -> float:
     return 0.0 if j < 0 else min(known, default=-1.0)
 
 
+def is_absent(world: World, arm: int, now_s: float) -> bool:
+    """Whether an arm has a break or is under repair now."""
+    return any(a == arm and first * world.dt_s <= now_s < end * world.dt_s for a, first, end, _ in absences(world))
+
+
+def break_in_s(world: World, arm: int, now_s: float) -> float:
+    """Return the time until the next break of an arm, which does not foresee failures."""
+    begins = [first for a, first, end, kind in absences(world) if a == arm and kind < 3 and end * world.dt_s > now_s]
+    return min((max(0.0, first * world.dt_s - now_s) for first in begins), default=LONG_S)
+
+
+def absences(world: World) -> list[tuple[int, int, int, int]]:
+    return world.absences.tolist()
+
+
 def reference(world: World, state: State, slots: list[int], key: int, layout: Layout) -> dict[str, np.ndarray]:
     """Compute the fields of all arms of env 0, [arm, ...], one by one; members as of this moment.
 
@@ -217,7 +232,7 @@ def reference(world: World, state: State, slots: list[int], key: int, layout: La
         known_c = np.concatenate([measured_c[a], state.housing_c[0, a], ambient_c[a : a + 1]])
         busy_s = float(times_s[away[a]] @ [1, todo, 1] - state.progress_s[0, a]) if mode == WORKING else 0.0
         mine: dict[str, object] = {
-            "working": mode == WORKING, "faulted": mode == FAULTED,
+            "working": mode == WORKING, "faulted": mode == FAULTED, "break_in_s": break_in_s(world, a, now_s),
             "last_award": state.last_award[0, a], "temp_c": measured_c[a],
             "busy_s": busy_s, "headroom_k": world.limits.warning_c - measured_c[a].max(),
             "error_headroom_k": world.limits.error_c - measured_c[a].max(),
@@ -259,6 +274,9 @@ def reference(world: World, state: State, slots: list[int], key: int, layout: La
         members = list(range(arms)) if layout.near is None else list(layout.near[a])
         for name in ("working", "faulted", "busy_s", "headroom_k"):
             mine[f"fleet_{name}"] = [own[b][name] for b in members]
+        for name, shown in (("working", 0), ("faulted", 1)):
+            here = mine[f"fleet_{name}"]
+            mine[f"fleet_{name}"] = [shown if is_absent(world, b, now_s) else here[m] for m, b in enumerate(members)]
         mine["fleet_age_s"] = [0.0] * len(members)
         mine["fleet_difficulty"] = least[members]
         for name in ("duration_s", "peak_c", "p_saturation"):
@@ -268,7 +286,8 @@ def reference(world: World, state: State, slots: list[int], key: int, layout: La
 
 def reference_mask(world: World, state: State, slots: list[int], expected: dict[str, np.ndarray]) -> np.ndarray:
     """Legal actions: wait, every plan of an idle arm with free stations and space, and give back."""
-    idle = state.mode[0] == IDLE
+    now_s = state.tick[0] * world.dt_s
+    idle = (state.mode[0] == IDLE) & ~np.array([is_absent(world, a, now_s) for a in range(len(world.arms))])
     legal = idle[:, None] * (expected["duration_s"] > 0) * expected["free"]
     legal *= np.repeat(expected["station_free"], world.plans_per_job, axis=1)
     return np.concatenate([np.ones((len(legal), 1)), legal, expected["give_back"][:, None]], axis=1)
@@ -336,7 +355,7 @@ def test_vectors_equal_the_reference(small, play, draft, two_plans, data) -> Non
 
 def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(small, play) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
-    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, crowding=0.3)
+    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, crowding=0.3, absences=7)
     played = [compare_with_reference(play, make(np.random.SeedSequence(seed)), seed) for seed in range(4)]
     last = [state for state, _ in played]
     assert sum(closed for _, closed in played) > 0

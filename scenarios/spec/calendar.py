@@ -1,0 +1,204 @@
+"""The calendar of a shift: breaks and recurring jobs at times of day, and the absences of arms in ticks.
+
+A scenario file gives `begin` and `end` of a break as a job table does: in seconds or `h:mm` from the begin of the
+shift, or as dates; with `shift_begin`, `h:mm` is a time of day. With `weekdays` a break recurs on these days, and so do
+arrivals of kind `weekly`. They become plain times here, so the rest of the product knows no calendar.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime, time, timedelta, tzinfo
+from math import ceil
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from fleet.engine.state import ABSENCE, BROKEN, FINISH_CYCLE, FINISH_JOB, no_absences
+from fleet.errors import ScenarioError, nearest, printable
+from fleet.seeding import child
+from scenarios.spec.job_table import DAY_S, seconds_of
+from scenarios.spec.schema import MOST_BREAKS, Scenario
+
+WEEKDAYS = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
+FAILURES = 3
+"""Child of the seed of a shift that samples the failures of its arms."""
+_ROUNDING = 1e-9
+"""Ticks by which a break may begin or end late."""
+
+
+def zone_of(name: object, where: str) -> tzinfo | None:
+    """The time zone of an IANA name; None without one.
+
+    Raises:
+        ScenarioError: there is no such zone on this machine.
+    """
+    if name is None:
+        return None
+    try:
+        return ZoneInfo(str(name))
+    except (ValueError, OSError) as error:  # a ZoneInfoNotFoundError is a KeyError
+        raise ScenarioError(f"{where}: '{printable(str(name))}' is no name of a time zone ({error}).") from error
+    except KeyError as error:
+        raise ScenarioError(
+            f"{where}: there is no time zone '{printable(str(name))}'; give a name as Europe/Berlin or UTC."
+        ) from error
+
+
+def with_calendar(raw: Mapping[str, Any], begin: datetime | None, horizon_s: float, file: str) -> dict[str, Any]:
+    """The parsed file with the times of its breaks and recurring jobs in seconds; Any: values of TOML.
+
+    Args:
+        begin: Of the shift; None for unknown.
+        horizon_s: Length of the shift; 0 if it is not valid, which is reported later.
+
+    Raises:
+        ScenarioError: a time, a weekday, or the begin of the shift is missing or wrong.
+    """
+    made = dict(raw)
+    if not horizon_s:
+        return made
+    if isinstance(breaks := raw.get("breaks"), list):
+        made["breaks"] = [
+            entry
+            for i, each in enumerate(breaks)
+            for entry in (
+                _break_times(each, begin, horizon_s, f"{file}: breaks[{i}]") if isinstance(each, Mapping) else [each]
+            )
+        ]
+    if isinstance(jobs := raw.get("jobs"), list):
+        made["jobs"] = [_recurring(each, begin, horizon_s, f"{file}: jobs[{i}]") for i, each in enumerate(jobs)]
+    return made
+
+
+def _break_times(
+    given: Mapping[str, Any], begin: datetime | None, horizon_s: float, where: str
+) -> Iterator[dict[str, Any]]:
+    """The breaks of one entry, with `begin_s` and `end_s`."""
+    entry = {name: value for name, value in given.items() if name not in ("begin", "end", "weekdays")}
+    if "begin" not in given and "end" not in given and "weekdays" not in given:
+        yield entry  # whose own times are checked with its fields
+        return
+    if missing := [name for name in ("begin", "end") if name not in given]:
+        raise ScenarioError(f"{where}: '{missing[0]}' is missing; a break has begin and end.")
+    if "weekdays" in given:
+        first, last = (_clock(given[name], f"{where}.{name}") for name in ("begin", "end"))
+        for day_s, date in _days(given["weekdays"], begin, horizon_s, f"{where}.weekdays"):
+            begin_s, end_s = day_s(date, first), day_s(date + timedelta(days=last <= first), last)
+            if end_s > 0 and begin_s < horizon_s:
+                yield entry | {"begin_s": begin_s, "end_s": end_s}
+        return
+    try:
+        first_s, last_s = (seconds_of(given[name], begin, horizon_s) for name in ("begin", "end"))
+    except ValueError as error:
+        raise ScenarioError(f"{where}: {error}.") from error
+    if last_s < first_s and begin is not None and isinstance(given["end"], str | time):
+        last_s += DAY_S
+    yield entry | {"begin_s": first_s, "end_s": last_s}
+
+
+def _recurring(stream: Any, begin: datetime | None, horizon_s: float, where: str) -> Any:
+    """A stream whose weekly arrivals are a trace; any other value as it is (Any: values of TOML)."""
+    arrivals = stream.get("arrivals") if isinstance(stream, Mapping) else None
+    if not isinstance(arrivals, Mapping) or arrivals.get("kind") != "weekly":
+        return stream
+    where = f"{where}.arrivals"
+    if unknown := sorted(arrivals.keys() - {"kind", "at", "weekdays"}):
+        raise ScenarioError(f"{where}: arrivals of kind 'weekly' take no '{unknown[0]}'; they take at, weekdays.")
+    if not isinstance(times := arrivals.get("at"), list) or not times:
+        raise ScenarioError(f'{where}.at must be a list of times of day, as ["6:00", "14:30"] (got {times!r}).')
+    clocks = [_clock(each, f"{where}.at") for each in times]
+    days = _days(arrivals.get("weekdays", list(WEEKDAYS)), begin, horizon_s, f"{where}.weekdays")
+    found = sorted({day_s(date, each) for day_s, date in days for each in clocks})
+    inside = [time_s for time_s in found if 0 <= time_s < horizon_s]
+    if not inside:
+        raise ScenarioError(f"{where}: none of these times lies within the shift of {horizon_s:g} s from {begin}.")
+    return {**stream, "arrivals": {"kind": "trace", "times_s": inside}}
+
+
+def _days(given: object, begin: datetime | None, horizon_s: float, where: str) -> Iterator[tuple[Any, datetime]]:
+    """Midnight of each of the weekdays that may touch the shift, and a function of it and a time of day.
+
+    The function gives seconds since the begin of the shift; a clock that is set in between counts.
+    """
+    if begin is None:
+        raise ScenarioError(f"{where}: weekdays need shift_begin, the begin of the shift.")
+    if not isinstance(given, list) or not given:
+        raise ScenarioError(f"{where} must be a list of days, as {list(WEEKDAYS[:2])} (got {given!r}).")
+    for name in given:
+        if name not in WEEKDAYS:
+            raise ScenarioError(f"{where}: there is no day '{printable(str(name))}'{nearest(str(name), WEEKDAYS)}")
+
+    def since_begin(date: datetime, clock: time) -> float:
+        local = datetime.combine(date, clock, begin.tzinfo)
+        return (local.astimezone(UTC) - begin.astimezone(UTC)).total_seconds()
+
+    for day in range(-1, ceil(horizon_s / DAY_S) + 1):
+        date = datetime.combine(begin.date() + timedelta(days=day), time())
+        if WEEKDAYS[date.weekday()] in given:
+            yield since_begin, date
+
+
+def _clock(given: object, where: str) -> time:
+    """A time of day."""
+    if isinstance(given, time):
+        return given
+    try:
+        hours, _, rest = str(given).partition(":")
+        return time.fromisoformat(f"{hours:0>2}:{rest}")
+    except ValueError as error:
+        raise ScenarioError(f"{where}: expected a time of day, as '6:00' (got {given!r}).") from error
+
+
+def check_breaks(scenario: Scenario, file: str) -> None:
+    """Check the arms and times of the breaks.
+
+    Raises:
+        ScenarioError: names the break.
+    """
+    if len(scenario.breaks) > MOST_BREAKS:
+        raise ScenarioError(f"{file}: breaks: at most {MOST_BREAKS} in a shift (got {len(scenario.breaks)}).")
+    arms = [arm.name for arm in scenario.arms]
+    for i, each in enumerate(scenario.breaks):
+        for name in each.arms:
+            if name not in arms:
+                raise ScenarioError(f"{file}: breaks[{i}].arms: there is no arm '{name}'{nearest(name, arms)}")
+    outside = [each for each in scenario.breaks if each.end_s <= 0 or each.begin_s >= scenario.horizon_s]
+    if len(outside) == len(scenario.breaks) > 0:
+        first = outside[0]
+        raise ScenarioError(
+            f"{file}: breaks: '{first.name}', {first.begin_s:g} to {first.end_s:g} s, and all others lie outside the "
+            f"shift of {scenario.horizon_s:g} s; is shift_begin right?"
+        )
+
+
+def absences_of(scenario: Scenario, seed: np.random.SeedSequence) -> np.ndarray:
+    """Breaks of the arms, and failures sampled for the shift of a seed, `ABSENCE` [absence].
+
+    A break begins with the first decision at or after its begin. Failures are a Poisson process of the time in which an
+    arm is in order, with exponential times to repair: the usual model of availability (IEC 61703).
+    """
+    names, dt_s, rows = [arm.name for arm in scenario.arms], scenario.decision_interval_s, list[tuple[int, ...]]()
+
+    def add(arm: int, begin_s: float, end_s: float, kind: int) -> None:
+        begin, end = (ceil(each / dt_s - _ROUNDING) for each in (max(begin_s, 0.0), end_s))
+        if end > 0 and begin < scenario.ticks:
+            rows.append((arm, begin, min(max(end, begin + 1), scenario.ticks), kind))
+
+    for each in scenario.breaks:
+        for name in each.arms or names:
+            kind = FINISH_CYCLE if each.finish == "cycle" else FINISH_JOB
+            add(names.index(name), each.begin_s, each.end_s, kind)
+    for index, arm in enumerate(scenario.arms):
+        if arm.fails is None:
+            continue
+        rng, now_s = np.random.default_rng(child(seed, FAILURES, index)), 0.0
+        while (now_s := now_s + rng.exponential(arm.fails.every_s)) < scenario.horizon_s:
+            begin_s, now_s = now_s, now_s + rng.exponential(arm.fails.repair_s)
+            add(index, begin_s, now_s, BROKEN)
+    return np.array(rows, ABSENCE) if rows else no_absences()
+
+
+def break_at(breaks: Sequence[Any], arm: str, time_s: float) -> Any:
+    """The break of an arm at a time, one that ends after the cycle before one that ends after the job; None without."""
+    now = [each for each in breaks if each.begin_s <= time_s < each.end_s and (not each.arms or arm in each.arms)]
+    return min(now, key=lambda each: (each.finish != "cycle", -each.end_s), default=None)

@@ -1,0 +1,188 @@
+"""Breaks, recurring jobs and failures: times of day and summer time by hand, availability in closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.engine.state import BROKEN, FINISH_CYCLE, FINISH_JOB
+from fleet.errors import ScenarioError
+from scenarios.prepare.batch import make_batch
+from scenarios.prepare.fleet import make_env, prepare
+from scenarios.run.shift import run
+from scenarios.spec.calendar import absences_of, break_at
+from scenarios.spec.options import RunSpec
+from scenarios.spec.parse import parse_scenario
+from scenarios.spec.schema import Failures, Scenario
+from tests.scenarios.test_load import FILE, small
+
+HOUR_S = 3600.0
+SEED = np.random.SeedSequence(1)
+
+
+def with_breaks(*breaks: dict, **fields: object) -> Scenario:
+    return parse_scenario({**small(), "horizon_s": 48 * HOUR_S, **fields, "breaks": list(breaks)}, FILE)
+
+
+def hours(scenario: Scenario) -> list[tuple[float, float]]:
+    return [(each.begin_s / HOUR_S, each.end_s / HOUR_S) for each in scenario.breaks]
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "fields", "expected"),
+    [
+        (1800, "0:45", {}, (0.5, 0.75)),
+        ("12:00", "12:30", {}, (12.0, 12.5)),
+        ("12:00", "12:30", {"shift_begin": "2026-11-23T06:00+01:00"}, (6.0, 6.5)),
+        ("22:00", "5:00", {"shift_begin": "2026-11-23T06:00+01:00"}, (16.0, 23.0)),
+        ("2026-11-24T06:00", "2026-11-24T07:00", {"shift_begin": "2026-11-23T06:00+01:00"}, (24.0, 25.0)),
+        ("2026-11-24T06:00Z", "2026-11-24T07:00Z", {"shift_begin": "2026-11-23T06:00+01:00"}, (25.0, 26.0)),
+        # The clocks are put forward at 2:00 of 29 March.
+        (
+            "2026-03-29T06:00", "2026-03-29T07:00",
+            {"shift_begin": "2026-03-28T20:00", "time_zone": "Europe/Berlin"}, (9.0, 10.0),
+        ),
+    ],
+)  # fmt: skip
+def test_a_break_has_the_times_that_are_meant(begin, end, fields, expected) -> None:
+    assert hours(with_breaks({"name": "lunch", "begin": begin, "end": end}, **fields)) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("shift_begin", "expected"),
+    [
+        ("2026-03-27T20:00", [(33.0, 34.0)]),  # Friday evening before summer time begins: 34 h by the clock
+        ("2026-10-23T20:00", [(35.0, 36.0)]),  # before it ends
+        ("2026-11-27T20:00", [(34.0, 35.0)]),
+    ],
+)
+def test_a_weekly_break_knows_summer_time(shift_begin, expected) -> None:
+    entry = {"name": "service", "begin": "6:00", "end": "7:00", "weekdays": ["sunday"]}
+    assert hours(with_breaks(entry, shift_begin=shift_begin, time_zone="Europe/Berlin")) == expected
+
+
+def test_a_daily_night_break_covers_the_begin_of_the_shift() -> None:
+    days = ["monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday"]
+    entry = {"name": "night", "begin": "22:00", "end": "6:00", "weekdays": days}
+    found = hours(with_breaks(entry, shift_begin="2026-11-23T05:00Z", horizon_s=30 * HOUR_S))
+    assert found == [(-7.0, 1.0), (17.0, 25.0)]
+
+
+def test_recurring_jobs_arrive_at_their_times_of_day() -> None:
+    raw = small() | {"horizon_s": 48 * HOUR_S, "shift_begin": "2026-03-27T20:00", "time_zone": "Europe/Berlin"}
+    stream = raw["jobs"][0] | {"arrivals": {"kind": "weekly", "at": ["14:30", "6:00"], "weekdays": ["sunday"]}}
+    arrivals = parse_scenario(raw | {"jobs": [stream]}, FILE).jobs[0].arrivals
+    assert arrivals.times_s == (33.0 * HOUR_S, 41.5 * HOUR_S)
+    every_day = raw["jobs"][0] | {"arrivals": {"kind": "weekly", "at": ["6:00"]}}
+    assert len(parse_scenario(raw | {"jobs": [every_day]}, FILE).jobs[0].arrivals.times_s or ()) == 2
+
+
+BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"breaks": [BREAK | {"end": "3:00"}]}, r"breaks\[0\].end_s must be after begin_s \(got 14400, 10800\)"),
+        ({"breaks": [{"name": "lunch", "begin": "4:00"}]}, r"breaks\[0\]: 'end' is missing; a break has begin and end"),
+        ({"breaks": [BREAK | {"begin": "noon"}]}, r"breaks\[0\]: expected seconds, h:mm, h:mm:ss, or a date"),
+        ({"breaks": [BREAK | {"arms": ["lefty"]}]}, r"breaks\[0\].arms: there is no arm 'lefty'; did you mean 'left'"),
+        ({"breaks": [BREAK | {"finish": "now"}]}, r"breaks\[0\].finish: 'now' is not allowed"),
+        ({"breaks": [BREAK | {"begn": 3}]}, r"breaks\[0\]: unknown key 'begn'; did you mean 'begin_s'"),
+        ({"breaks": [BREAK | {"weekdays": ["sunday"]}]}, r"weekdays need shift_begin, the begin of the shift"),
+        ({"breaks": [BREAK | {"begin": "90:00", "end": "91:00"}]}, "all others lie outside the shift of 172800 s"),
+        ({"time_zone": "Europe/Berln"}, "there is no time zone 'Europe/Berln'; give a name as Europe/Berlin"),
+        ({"shift_begin": "2026-11-23T06:00"}, "shift_begin must be a date with time and zone"),
+        (
+            {"breaks": [BREAK | {"weekdays": ["sun"]}], "shift_begin": "2026-11-23T06:00Z"},
+            r"breaks\[0\].weekdays: there is no day 'sun'",
+        ),
+        (
+            {"breaks": [BREAK | {"begin": "4:75", "weekdays": ["sunday"]}], "shift_begin": "2026-11-23T06:00Z"},
+            r"breaks\[0\].begin: expected a time of day, as '6:00' \(got '4:75'\)",
+        ),
+        (
+            {"arms": [{"name": "a", "fails": {"every_s": 10, "repair_s": 60}}]},
+            r"arms\[0\].fails.every_s must be between 60",
+        ),
+    ],
+)  # fmt: skip
+def test_mistakes_are_named(changes, expected) -> None:
+    with pytest.raises(ScenarioError, match=expected):
+        parse_scenario({**small(), "horizon_s": 48 * HOUR_S} | changes, FILE)
+
+
+def test_weekly_arrivals_that_cannot_be_are_named() -> None:
+    raw = small() | {"shift_begin": "2026-11-23T06:00Z"}
+    for arrivals, expected in (
+        ({"at": ["6:00"], "every_s": 5}, "arrivals of kind 'weekly' take no 'every_s'; they take at, weekdays"),
+        ({}, r"jobs\[0\].arrivals.at must be a list of times of day"),
+        ({"at": ["5:59"], "weekdays": ["monday"]}, "none of these times lies within the shift"),
+    ):
+        stream = raw["jobs"][0] | {"arrivals": {"kind": "weekly", **arrivals}}
+        with pytest.raises(ScenarioError, match=expected):
+            parse_scenario(raw | {"jobs": [stream]}, FILE)
+
+
+def test_breaks_begin_and_end_with_decisions() -> None:
+    scenario = with_breaks(
+        {"name": "one", "begin_s": 95, "end_s": 130},
+        {"name": "two", "begin_s": 200.0, "end_s": 201.0, "arms": [small()["arms"][1]["name"]], "finish": "job"},
+        {"name": "three", "begin_s": -50, "end_s": 20, "arms": [small()["arms"][0]["name"]]},
+    )
+    assert scenario.decision_interval_s == 10.0
+    assert absences_of(scenario, SEED).tolist() == [
+        *((a, 10, 13, FINISH_CYCLE) for a in range(len(scenario.arms))),
+        (1, 20, 21, FINISH_JOB),
+        (0, 0, 2, FINISH_CYCLE),
+    ]
+    assert break_at(scenario.breaks, scenario.arms[1].name, 200.5).name == "two"
+    assert break_at(scenario.breaks, scenario.arms[0].name, 200.5) is None
+
+
+def test_availability_is_mean_time_between_failures_over_that_with_the_repair() -> None:
+    """MTBF / (MTBF + MTTR) = 0.8, in 200 shifts within four standard errors; arms are independent."""
+    base = with_breaks(horizon_s=200 * HOUR_S, telemetry_interval_s=10.0)
+    fails = Failures(every_s=4 * HOUR_S, repair_s=HOUR_S)
+    scenario = replace(base, arms=tuple(replace(arm, fails=fails) for arm in base.arms))
+    down = np.zeros((200, len(scenario.arms)))
+    for seed in range(len(down)):
+        found = absences_of(scenario, np.random.SeedSequence(seed))
+        assert set(found["kind"].tolist()) == {BROKEN}
+        np.add.at(down[seed], found["arm"], (found["end"] - found["begin"]) / scenario.ticks)
+    for arm in range(len(scenario.arms)):
+        error = down[:, arm].std() / np.sqrt(len(down))
+        assert abs(down[:, arm].mean() - 0.2) < 4 * error
+    covariance = np.cov(down.T)
+    assert abs(covariance[0, 1]) < 0.25 * np.sqrt(covariance[0, 0] * covariance[1, 1])
+    one = replace(scenario, arms=(scenario.arms[0], base.arms[1], *scenario.arms[2:]))
+    both, own = (absences_of(each, SEED) for each in (scenario, one))
+    np.testing.assert_array_equal(own[own["arm"] == 0], both[both["arm"] == 0])
+
+
+def test_a_shift_with_breaks_and_failures_is_the_same_in_every_environment(small_toml, plans) -> None:
+    from scenarios.spec.load import load
+
+    base = load(small_toml)
+    arms = tuple(replace(arm, fails=Failures(every_s=600.0, repair_s=120.0)) for arm in base.arms)
+    scenario = replace(with_breaks(BREAK | {"begin": "0:05", "end": "0:10"}), arms=arms, horizon_s=1800.0)
+    scenario = replace(scenario, jobs=base.jobs, places=base.places, fixtures=base.fixtures, name=base.name)
+    fleet = prepare(scenario, difficulty="blind", cache=plans)
+    done = run(fleet, RunSpec(policy="wspt", seed=3, bus="memory", difficulty="blind"))
+    kinds = {event.kind for event in done.events}
+    assert {"break", "break_end", "failure", "recover"} <= kinds
+    assert not any(300.0 <= event.time_s < 600.0 for event in done.events if event.kind == "award")
+    env = make_env(scenario, difficulty="blind", cache=plans)
+    batch = make_batch(scenario, 1, seed=3, difficulty="blind", cache=plans, autoreset=False)
+    single, _ = env.reset(seed=3)
+    many, _ = batch.reset()
+    for _ in range(90):
+        masks = np.stack([single[arm]["action_mask"] for arm in env.agents])
+        np.testing.assert_array_equal(many["action_mask"][0], masks)
+        shared = np.broadcast_to(many["shared"][0], (len(masks), many["shared"].shape[1]))
+        vectors = np.concatenate([shared, many["own"][0]], axis=1)
+        np.testing.assert_array_equal(vectors, np.stack([single[arm]["observation"] for arm in env.agents]))
+        first = masks[:, 1:-1].argmax(axis=1) + 1
+        actions = np.where(masks[:, 1:-1].any(axis=1), first, 0)
+        single, *_ = env.step(dict(zip(env.agents, actions.tolist(), strict=True)))
+        many, *_ = batch.step(actions[None])
