@@ -13,7 +13,7 @@ from scenarios.run.schedule import schedule
 
 ARMS = ("arm_0", "arm_1")
 HORIZON_S = 1000.0
-ENDINGS = ("home", "fault", "late fault", "idle fault", "give back", "back fault")
+ENDINGS = ("home", "fault", "late fault", "idle fault", "give back", "back fault", "failure")
 gaps = st.integers(min_value=1, max_value=40).map(lambda n: n * 0.5)
 
 
@@ -43,8 +43,9 @@ def logs(draw: st.DrawFn) -> tuple[list[Event], dict[str, int]]:
                 events.append(Event(time_s=now, kind="home", arm=arm, job=name))
                 continue
             held = "" if ending == "idle fault" else name
-            events.append(Event(time_s=now, kind="fault", arm=arm, job=held, joint=2))
-            if ending == "fault":
+            kind = "failure" if ending == "failure" else "fault"
+            events.append(Event(time_s=now, kind=kind, arm=arm, job=held, joint=0 if ending == "failure" else 2))
+            if ending in ("fault", "failure"):
                 events.append(Event(time_s=now, kind="return", arm=arm, job=name, value=3.0))
                 told["returned"] += 1
             now += draw(gaps)
@@ -66,7 +67,8 @@ def test_every_award_is_one_assignment_and_every_fault_one_outage(log: tuple[lis
     result = schedule(events, ARMS, HORIZON_S)
     awards = sorted((e.time_s, e.arm, e.job) for e in events if e.kind == "award")
     assert sorted((a.start_s, a.arm, a.job) for a in result.assignments) == awards
-    faults = sorted((e.time_s, e.arm, e.joint) for e in events if e.kind == "fault")
+    faults = sorted((e.time_s, e.arm, e.joint) for e in events if e.kind in ("fault", "failure"))
+    assert all((o.joint > 0) == (o.kind == "fault") for o in result.outages)
     assert sorted((o.start_s, o.arm, o.joint) for o in result.outages) == faults
     for outcome in ("finished", "returned", "running"):
         assert sum(a.outcome == outcome for a in result.assignments) == told[outcome]

@@ -311,7 +311,8 @@ class BusClient:
         listener = querier.declare_matching_listener(
             _direct(lambda status: matching.set() if status.matching else matching.clear())
         )
-        found = querier.matching_status.matching or matching.wait(timeout_s)
+        now: Any = querier.matching_status  # not a bool, as Zenoh's stubs state
+        found = now.matching or matching.wait(timeout_s)
         listener.undeclare()
         querier.undeclare()
         return found

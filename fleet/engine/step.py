@@ -493,9 +493,9 @@ def turn_absences(sim: Simulation, e: int) -> None:
         if recording and kind != BROKEN and (kind > 0) != (0 < before < BROKEN):
             record_event(events, BREAK if kind else BREAK_END, e, a, -1, -1, t.dt_s, left_s)
         if kind == BROKEN:
-            if recording:
-                record_event(events, FAILURE, e, a, arm["job"], -1, t.dt_s, left_s)
             if arm["mode"] != FAULTED:
+                if recording:
+                    record_event(events, FAILURE, e, a, arm["job"], -1, t.dt_s, left_s)
                 halt(sim, e, a, 0.0, t.dt_s, False)
         elif kind == FINISH_CYCLE and arm["mode"] == WORKING and arm["pending"]:
             arm["todo"] = cycles_begun(t.plans, arm)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fleet.breaks import breaks_of
 from fleet.bus.client import BusClient, NoReply
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
@@ -285,6 +286,7 @@ def make_node(
         boot=history.boot,
         ambient_c=arm.ambient_c or ambient_of(scenario),
         takes_jobs=arm.takes_jobs,
+        breaks=breaks_of(scenario.breaks, arm.name),
     )
     body = arm.body(clock.now_s(time.monotonic()), clock.speed / rate_hz)
     auctioneers = partial(AuctioneerClient, history=kept)

@@ -16,7 +16,9 @@ Array = np.ndarray
 
 Outcome = Literal["finished", "returned", "given_up", "running"]
 
-_ORDER = ("recover", "finish", "give_back", "home", "award", "fault", "return", "give_up")
+_ORDER = (
+    "recover", "break_end", "finish", "give_back", "home", "break", "award", "fault", "failure", "return", "give_up",
+)  # fmt: skip
 """The event kinds that determine a schedule, in the order in which they can occur at the same time."""
 
 SAME_MOMENT_DIGITS = 6
@@ -52,25 +54,28 @@ class JobSpan:
 
 @dataclass(frozen=True, kw_only=True)
 class Outage:
-    """Time of one arm lost to a fault."""
+    """Time of one arm lost to a fault or another failure, or in a break."""
 
     arm: str
     start_s: float
     end_s: float
     """Time of recovery, or the horizon."""
-    joint: int
-    """Motor that caused it, 1..7."""
+    kind: Literal["fault", "failure", "break"] = "fault"
+    joint: int = 0
+    """Motor that caused a fault, 1..7."""
     recovered: bool
     reason: str = ""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Assignments and outages up to a horizon, in order of the arms, then of time."""
+    """Assignments, outages and breaks up to a horizon, in order of the arms, then of time."""
 
     assignments: tuple[JobSpan, ...]
     outages: tuple[Outage, ...]
     horizon_s: float
+    breaks: tuple[Outage, ...] = ()
+    """An arm may still finish a cycle or a job in them."""
 
 
 def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float) -> Schedule:
@@ -92,11 +97,13 @@ def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float) -> 
         own[event.arm].append(event)
     assignments: list[JobSpan] = []
     outages: list[Outage] = []
+    breaks: list[Outage] = []
     for arm, log in own.items():
         log.sort(key=lambda e: (round(e.time_s, SAME_MOMENT_DIGITS), _ORDER.index(e.kind)))
         assignments += _assignments(arm, log, horizon_s)
         outages += _outages(arm, log, horizon_s)
-    return Schedule(tuple(assignments), tuple(outages), horizon_s)
+        breaks += _breaks(arm, log, horizon_s)
+    return Schedule(tuple(assignments), tuple(outages), horizon_s, tuple(breaks))
 
 
 def payloads(telemetry: Telemetry, plan: Schedule, arms: Sequence[str], payload_of: Mapping[str, float]) -> Array:
@@ -139,11 +146,12 @@ def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[JobSp
                 raise ValueError(f"{_at(event)}: '{arm}' is home from '{event.job}', which it did not finish.")
             out.append(_assignment(award, finish, event.time_s, "finished"))
             award = None
-        elif event.kind == "fault" and award is not None:
+        elif event.kind in ("fault", "failure") and award is not None:
             ends = (e for e in log[i + 1 :] if e.kind in ("return", "give_up") and e.job == award.job)
             after = given_back or next(ends, None)
             outcome = "given_up" if after and after.kind == "give_up" else "returned"
-            out.append(_assignment(award, finish, event.time_s, outcome, after))
+            stretch = _assignment(award, finish, event.time_s, outcome, after)
+            out.append(replace(stretch, faulted=event.kind == "fault"))
             award, stopped = None, True
         elif (
             event.kind == "return" and award is not None and award.job == event.job
@@ -174,9 +182,9 @@ def _assignment(
 
 def _outages(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
     """Outages of one arm, from its events in order."""
-    changes = [event for event in log if event.kind in ("fault", "recover")]
+    changes = [event for event in log if event.kind in ("fault", "failure", "recover")]
     for i, event in enumerate(changes):
-        if event.kind == "fault" and i % 2:
+        if event.kind != "recover" and i % 2:
             raise ValueError(f"{_at(event)}: '{arm}' faults while it is faulted.")
         if event.kind == "recover" and not i % 2:
             raise ValueError(f"{_at(event)}: '{arm}' recovers without a fault.")
@@ -185,12 +193,28 @@ def _outages(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
             arm=arm,
             start_s=fault.time_s,
             end_s=recovery.time_s if recovery else max(horizon_s, fault.time_s),
+            kind="fault" if fault.kind == "fault" else "failure",
             joint=fault.joint,
             recovered=recovery is not None,
             reason=fault.reason,
         )
         for fault, recovery in zip_longest(changes[::2], changes[1::2])
     ]
+
+
+def _breaks(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
+    """Breaks of one arm, from its events in order; the log of one that began before may lack its begin."""
+    out: list[Outage] = []
+    begin_s: float | None = 0.0
+    for event in log:
+        if event.kind == "break":
+            begin_s = event.time_s
+        elif event.kind == "break_end" and begin_s is not None:
+            out.append(Outage(arm=arm, start_s=begin_s, end_s=event.time_s, kind="break", recovered=True))
+            begin_s = None
+    if begin_s:
+        out.append(Outage(arm=arm, start_s=begin_s, end_s=max(horizon_s, begin_s), kind="break", recovered=False))
+    return out
 
 
 def _at(event: Event) -> str:

@@ -91,13 +91,15 @@ def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) 
     """Time of the arms that can do a job between its release and its award, s, by what they did; "": later jobs."""
     were = "were" if len(able) > 1 else "was"
     earlier, out = f"{were} at work since before its release", f"{were} out after a fault"
+    failed, paused = f"{were} out after a failure", "had a break"
     hot, idle = f"{were} idle above the warning limit", f"{were} idle: its place was taken, or the policy let it wait"
-    time_s: dict[str, float] = dict.fromkeys(("", earlier, out, hot, idle), 0.0)
+    time_s: dict[str, float] = dict.fromkeys(("", earlier, out, failed, paused, hot, idle), 0.0)
     at_s = log.readings.time_s
     step_s = float(np.median(np.diff(at_s))) if len(at_s) > 1 else 0.0
     for arm in able:
         spans = [(s, earlier if s.start_s < begin_s else "") for s in log.plan.assignments if s.arm == arm]
-        spans += [(outage, out) for outage in log.plan.outages if outage.arm == arm]
+        spans += [(each, out if each.kind == "fault" else failed) for each in log.plan.outages if each.arm == arm]
+        spans += [(each, paused) for each in log.plan.breaks if each.arm == arm]
         free = (at_s >= begin_s) & (at_s < end_s)
         for span, why in spans:
             time_s[why] += max(0.0, min(span.end_s, end_s) - max(span.start_s, begin_s))

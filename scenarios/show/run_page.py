@@ -57,6 +57,10 @@ def verdict(log: ShiftLog) -> Verdict:
         sentences.append(f"{len(faults)} faults in all, of {names_text(arms)}: see the events below.")
     elif not faults:
         sentences.append(_hottest(metrics))
+    if failures := [outage for outage in plan.outages if outage.kind == "failure"]:
+        arms, out_s = sorted({each.arm for each in failures}), sum(each.end_s - each.start_s for each in failures)
+        count = f"{len(failures)} failure{'s' * (len(failures) > 1)} not by heat"
+        sentences.append(f"{count}: {names_text(arms)} out for {duration(out_s)} in all.")
     if log.policy != WEIGHS_PEAK:
         sentences += _foreseen(faults, plan, offers)
     if contacts:
@@ -204,7 +208,18 @@ ROWS = 300
 """Most rows of the event table, and of the table of requests."""
 BEFORE_S = 5.0
 """A click on an event goes to this time before it."""
-NOTABLE = ("fault", "contact", "recover", "return", "warning", "torque_warning", "lost")
+NOTABLE = (
+    "fault",
+    "failure",
+    "contact",
+    "recover",
+    "return",
+    "break",
+    "break_end",
+    "warning",
+    "torque_warning",
+    "lost",
+)
 """Event kinds of the event table, most important first; the least important are dropped first."""
 MOST_AWARDS = 300
 MOST_ARMS = 8

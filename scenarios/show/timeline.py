@@ -25,10 +25,10 @@ Trace = dict[str, Any]
 Span = TypeVar("Span", JobSpan, Outage)
 
 STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
-FAULT, WARNING = "#cc2222", "#e08a00"
+FAULT, WARNING, FAILURE, BREAK = "#cc2222", "#e08a00", "#444444", "#8a8a8a"
 BAR = {"type": "bar", "orientation": "h", "legend": "legend"}
-BAR_HEIGHT = 0.62
-"""In rows."""
+BAR_HEIGHT, BREAK_HEIGHT = 0.62, 0.24
+"""In rows; an arm may work in a break."""
 LATE = {"color": INK, "width": 1.6}
 HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7, "solidity": 0.35}
 ARM_NAME, STREAM_NAME = 16, 30
@@ -194,9 +194,15 @@ def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
     """Work, outages and marks; the row of an arm is its index, times are in units of `unit_s`."""
     outages, arms = log.plan.outages, log.arms
     traces = _work_bars(log, unit_s)
-    if outages:
-        look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": "x"}}
-        traces.append(_bars("out after a fault", outages, _outage_text, arms, unit_s, look))
+    for name, spans, colour, shape in (
+        ("out after a fault", [each for each in outages if each.kind == "fault"], FAULT, "x"),
+        ("failed, not by heat", [each for each in outages if each.kind == "failure"], FAILURE, "x"),
+        ("break", log.plan.breaks, BREAK, "\\"),
+    ):
+        if spans:
+            look = {"color": colour, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": shape}}
+            bars = _bars(name, spans, _outage_text, arms, unit_s, look)
+            traces.append(bars | ({"width": BREAK_HEIGHT} if name == "break" else {}))
     if not traces:  # without a trace Plotly draws no rows
         traces.append(_legend_entry("no job was begun", {}) | {"showlegend": True})
     for kind, symbol, colour in MARKS:  # above the bars of their arm
@@ -296,7 +302,9 @@ def _assignment_text(a: JobSpan) -> str:
 
 
 def _outage_text(o: Outage) -> str:
-    """Hover text of one outage."""
+    """Hover text of one outage or break."""
+    if o.kind == "break":
+        return f"<b>{plain(o.arm)} has a break</b><br>{clock(o.start_s)} – {clock(o.end_s)}"
     end = "recovered" if o.recovered else "not recovered"
     return f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s)} – {clock(o.end_s)}, {end}<br>{plain(o.reason)}"
 

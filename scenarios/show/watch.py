@@ -39,6 +39,9 @@ PLAIN = {
     "give_back": "gives {job} back after a cycle",
     "give_up": "gives {job} up",
     "contact": "has touched something",
+    "failure": "has failed, not by heat",
+    "break": "has a break",
+    "break_end": "is back from a break",
 }
 """Events in words; others are shown by their kind."""
 

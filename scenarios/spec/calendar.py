@@ -5,7 +5,7 @@ shift, or as dates; with `shift_begin`, `h:mm` is a time of day. With `weekdays`
 arrivals of kind `weekly`. They become plain times here, so the rest of the product knows no calendar.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, time, timedelta, tzinfo
 from math import ceil
 from typing import Any
@@ -196,9 +196,3 @@ def absences_of(scenario: Scenario, seed: np.random.SeedSequence) -> np.ndarray:
             begin_s, now_s = now_s, now_s + rng.exponential(arm.fails.repair_s)
             add(index, begin_s, now_s, BROKEN)
     return np.array(rows, ABSENCE) if rows else no_absences()
-
-
-def break_at(breaks: Sequence[Any], arm: str, time_s: float) -> Any:
-    """The break of an arm at a time, one that ends after the cycle before one that ends after the job; None without."""
-    now = [each for each in breaks if each.begin_s <= time_s < each.end_s and (not each.arms or arm in each.arms)]
-    return min(now, key=lambda each: (each.finish != "cycle", -each.end_s), default=None)

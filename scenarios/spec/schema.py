@@ -6,6 +6,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from fleet.arrivals import Arrivals
+from fleet.breaks import Break
 from fleet.bus.exchange.channel import Channel, Partition, TopologyName
 from fleet.engine.batch import RewardWeights
 from fleet.env.validation import Decisions
@@ -154,31 +155,6 @@ class Ambient:
         """Ambient temperatures at the times, °C, of the same shape."""
         times, temps = zip(*self.points, strict=True)
         return np.interp(time_s, times, temps)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Break:
-    """A time in which arms take no jobs, such as a break of their operators or maintenance.
-
-    In a file, `begin` and `end` may take the place of the times in seconds: as in a job table, `h:mm` from the begin of
-    the shift, with `shift_begin` a time of day; then the break recurs on the `weekdays`, if given.
-    """
-
-    name: str
-    begin_s: float
-    """Seconds from the begin of the shift; an arm takes no jobs from the next decision on."""
-    end_s: float
-    arms: tuple[str, ...] = ()
-    """Their names; (): all arms."""
-    finish: Literal["cycle", "job"] = "cycle"
-    """What an arm at work still finishes: the present cycle, and gives the job back, or the job."""
-
-    def __post_init__(self) -> None:
-        most_s = BOUNDS["due_s"].high
-        check_between(self, -most_s, most_s, "begin_s", "end_s")
-        if self.begin_s >= self.end_s:
-            raise ValueError(f"Break.end_s must be after begin_s (got {self.begin_s:g}, {self.end_s:g})")
-        check_names(self, "name", "arms")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -564,7 +564,7 @@ def test_stale_documents_are_named_and_made_anew(tmp_path, capsys):
 def test_every_kind_of_event_has_a_meaning_and_live_ones_are_those_that_arms_report():
     live = {kind for kind, meaning in MEANINGS.items() if meaning.live}
     assert tuple(MEANINGS) == EVENT_KINDS
-    assert live == {*_REPORTED, "award", "finish", "return"}
+    assert live == {*_REPORTED, "award", "finish", "return", "break", "break_end"}
     page = Path("docs/bus/messages.md").read_text(encoding="utf-8")
     assert all(f"| `{kind}` | {meaning.text} | {meaning.value} |" in page for kind, meaning in MEANINGS.items())
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from fleet.breaks import Break
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -222,6 +223,35 @@ def test_the_cycle_in_progress_counts_when_the_award_is_revoked_and_the_arm_is_a
     assert arm.body.away is None
     assert arm.node.unfit() == ""
     assert [r.cycles for _, r in ArmHistory().replay(arm.book.records()).reports.values()] in ([1], [])
+
+
+@pytest.mark.parametrize(("finish", "repetitions"), [("cycle", 40), ("job", 8)])
+def test_an_arm_takes_no_jobs_in_a_break_and_returns_or_finishes_its_own_first(bus, finish, repetitions):
+    auctioneer, events, states, line = Auctioneer(bus.link()), [], [], bus.link()
+    line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
+    line.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: states.append(state))
+    arm = bus.arm(breaks=(Break(name="lunch", begin_s=160.0, end_s=300.0, finish=finish),))
+    assign(bus, line, replace(JOB, repetitions=repetitions))
+    bus.serve(lambda: any(e.kind == "break" for e in events))
+    bus.serve(lambda: auctioneer.reports)
+    (report,) = auctioneer.reports
+    if finish == "job":
+        assert (report.outcome, report.cycles) == ("finished", 8)
+    else:
+        begun_s = next(e.time_s for e in events if e.kind == "award") + 3.0
+        assert report.outcome == "returned"
+        assert report.reason == "a break, 'lunch'"
+        assert report.cycles == int((report.time_s - 2.0 - begun_s) / 10.0 + 1e-6)
+        assert 1 <= report.cycles < 20
+    quote = bus.ask(line, "quote", request(), Quote)
+    assert (quote.capacity, states[-1].break_in_s) == (0, 0.0)
+    refused = bus.ask(line, "award", award(quote.quote, name="w2"), Ack)
+    assert (refused.accepted, "I have a break, 'lunch'" in refused.reason) == (False, True)
+    bus.serve(lambda: events[-1].kind == "break_end")
+    assert [(e.reason, e.time_s >= 300.0) for e in events if e.kind == "break_end"] == [("lunch", True)]
+    bus.serve(lambda: states[-1].break_in_s is None)
+    assert bus.ask(line, "quote", request(), Quote).capacity == 1
+    assert arm.node.unfit() == ""
 
 
 def test_a_stopped_arm_returns_its_job_as_sure(bus):

@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet.breaks import break_at, break_in_s, breaks_of
 from fleet.engine.state import BROKEN, FINISH_CYCLE, FINISH_JOB
 from fleet.errors import ScenarioError
 from scenarios.prepare.batch import make_batch
 from scenarios.prepare.fleet import make_env, prepare
 from scenarios.run.shift import run
-from scenarios.spec.calendar import absences_of, break_at
+from scenarios.show.run_page import report_html
+from scenarios.spec.calendar import absences_of
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import parse_scenario
 from scenarios.spec.schema import Failures, Scenario
@@ -136,8 +138,12 @@ def test_breaks_begin_and_end_with_decisions() -> None:
         (1, 20, 21, FINISH_JOB),
         (0, 0, 2, FINISH_CYCLE),
     ]
-    assert break_at(scenario.breaks, scenario.arms[1].name, 200.5).name == "two"
-    assert break_at(scenario.breaks, scenario.arms[0].name, 200.5) is None
+    first, second = (breaks_of(scenario.breaks, arm.name) for arm in scenario.arms[:2])
+    now = break_at(second, 200.5)
+    assert now is not None
+    assert now.name == "two"
+    assert break_at(first, 200.5) is None
+    assert [break_in_s(second, time_s) for time_s in (0.0, 100.0, 130.0, 201.0)] == [95.0, 0.0, 70.0, None]
 
 
 def test_availability_is_mean_time_between_failures_over_that_with_the_repair() -> None:
@@ -172,6 +178,9 @@ def test_a_shift_with_breaks_and_failures_is_the_same_in_every_environment(small
     kinds = {event.kind for event in done.events}
     assert {"break", "break_end", "failure", "recover"} <= kinds
     assert not any(300.0 <= event.time_s < 600.0 for event in done.events if event.kind == "award")
+    page = report_html(done)
+    assert "failed, not by heat" in page
+    assert "has a break" in page
     env = make_env(scenario, difficulty="blind", cache=plans)
     batch = make_batch(scenario, 1, seed=3, difficulty="blind", cache=plans, autoreset=False)
     single, _ = env.reset(seed=3)

@@ -109,6 +109,8 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     """As in `Clock`, of its time; "" for unknown."""
     motion_difficulty: Number | None = None
     """d of the last executed motion, of any job or of none, by the arm's twin."""
+    break_in_s: Duration | None = None
+    """Time until the arm's next break begins, 0 during one; left out without any. In a break it takes no jobs."""
     expected_c: tuple[Celsius, ...] = ()
     """Motor temperatures that the arm's thermal network yields for the heat that it measures, [joint]."""
 

@@ -109,6 +109,8 @@ class ActiveAward:
     """Whether the last cycle may begin, under a lease."""
     revoked: bool = False
     """No cycle may begin any more."""
+    why: str = "the award was revoked"
+    """Why, if it is."""
     cycles_on_disk: int = 0
     lease_s: float = 0.0
     """Length of its leases, real seconds."""
@@ -474,13 +476,19 @@ class AwardExecutor:
         for number, active in enumerate(self.active):
             self._close(active, "returned", time_s, now_s, reason, faulted=faulted and number == 0)
 
+    def revoke(self, reason: str) -> None:
+        """Begin no more cycles of the awards without permission to commit, and return them: the arm has a break."""
+        for active in self.active:
+            if not (active.may_commit or active.revoked):
+                active.revoked, active.why = True, reason
+
     def return_ended(self, time_s: float, now_s: float, *, at_home: bool) -> None:
         """Return awards that are revoked, or without a lease for `return_after_s`; the current one from home only."""
         for active in self.active:
             unleased_s = now_s - active.lease_end_s
             expired = not active.may_commit and unleased_s > self.config.return_after_s
             if (active.revoked or expired) and (at_home or active is not self._current):
-                reason = "the award was revoked" if active.revoked else f"no lease for {unleased_s:.0f} s"
+                reason = active.why if active.revoked else f"no lease for {unleased_s:.0f} s"
                 self._close(active, "returned", time_s, now_s, reason)
 
     def _close(
@@ -530,7 +538,7 @@ class AwardExecutor:
             name = active.award.award
             if active.award.auctioneer != lease.auctioneer:
                 continue
-            if name in lease.may_commit and not active.may_commit:
+            if name in lease.may_commit and not (active.may_commit or active.revoked):
                 active.may_commit = self._try_to_keep(CommitPermitted(name))
             if name in lease.revoked:
                 active.revoked = True

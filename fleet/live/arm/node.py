@@ -28,6 +28,7 @@ import msgspec
 import numpy as np
 
 from fleet.arm.space import plan_key, space_name
+from fleet.breaks import Break, break_at, break_in_s
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -74,6 +75,8 @@ class ArmConfig:
     ambient_c: Callable[[float], float] = lambda time_s: 25.0
     """Measured ambient temperature of the cell by fleet time."""
     takes_jobs: bool = True
+    breaks: tuple[Break, ...] = ()
+    """Its breaks, in fleet time."""
 
     def __post_init__(self) -> None:
         if not 0 < self.rate_hz <= 1000:
@@ -424,6 +427,7 @@ class ArmNode:
         self._plans: dict[str, ScoredPlan] = {}
         """Plan of each active award: it stays even if the estimator drops it."""
         self._reading = body.read_sensors()
+        self._break: Break | None = None
         self._state_due_s = self._retry_s = -math.inf
         """Real seconds at which the next state message and the next attempt to write are due."""
         self._warn = RateLimitedWarnings(self._name)
@@ -564,6 +568,8 @@ class ArmNode:
             return "I am faulted"
         if self._headroom_k <= 0:
             return f"I am too hot: a motor is {-self._headroom_k:.1f} K above the warning limit"
+        if self._break is not None:
+            return f"I have a break, '{self._break.name}', for {self._break.end_s - self._body.time_s:.0f} s"
         if self._body.away is not None and not self.executor.active:
             return "I am on my way home"
         return ""
@@ -576,6 +582,7 @@ class ArmNode:
             self._retry_s = real_s + WRITE_RETRY_S
             self.executor.retry_writes()
         self._advance_body(real_s)
+        self._keep_breaks()
         self.executor.return_ended(self._body.time_s, real_s, at_home=self._body.away is None)
         for auctioneer, request in self.executor.lease_requests(real_s):
             self.work_source.request_leases(auctioneer, request, real_s)
@@ -585,6 +592,18 @@ class ArmNode:
         if real_s >= self._state_due_s:
             self._state_due_s = next_due_s(self._state_due_s, real_s, 1.0 / self._config.rate_hz)
             self._send_state()
+
+    def _keep_breaks(self) -> None:
+        """Begin and end breaks; in some the arm ends the cycle and returns its jobs."""
+        before, time_s = self._break, self._body.time_s
+        self._break = now = break_at(self._config.breaks, time_s)
+        if now is not None and now.finish == "cycle":
+            self.executor.revoke(f"a break, '{now.name}'")
+        if now is not None and before is None:
+            event = Event(time_s=time_s, kind="break", value=now.end_s - time_s, reason=now.name)
+            self._publish.event(event, self.clock.epoch)
+        elif now is None and before is not None:
+            self._publish.event(Event(time_s=time_s, kind="break_end", reason=before.name), self.clock.epoch)
 
     @property
     def _current(self) -> ActiveAward | None:
@@ -697,6 +716,7 @@ class ArmNode:
                 busy_s=busy_s if math.isfinite(busy_s := self._busy_s()) else 0.0,
                 housing_c=tuple(self._body.housing_c.tolist()),
                 ambient_c=self._ambient_c,
+                break_in_s=break_in_s(self._config.breaks, self._body.time_s),
                 **self._describe_job(),
                 **vars(self._reading),
             )

@@ -81,6 +81,8 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     headroom_k = np.array([each.headroom_k if each else 0.0 for each in heard])
     room = np.array([quote is not None and quote.capacity > 0 for quote in quotes]) & (modes != "faulted")
     working = np.isin(modes, ["idle", "working"]) & ~room
+    breaks_s = [None if state is None else state.break_in_s for state in states]
+    paused = np.array([break_s == 0.0 for break_s in breaks_s])
     feasible = table(lambda offer: 1.0) > 0
     free = np.array([[not in_way for in_way in row] for row in in_the_way]).reshape(feasible.shape)
     stations = [bidding.has_free_stations(job) for job in bidding.jobs]
@@ -104,6 +106,9 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         working=working | (modes == ""),
         faulted=modes == "faulted",
         busy_s=busy_s,
+        break_in_s=np.array(
+            [LONG_S if each is None or each.break_in_s is None else each.break_in_s for each in states]
+        ),
         last_award=np.array([last.get(arm, 0) for arm in arms]),
         temp_c=temp_c,
         housing_c=_per_joint(states, "housing_c", temp_c),
@@ -128,8 +133,8 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         returns=per_job([bidding.returned.get(job.name, (0, 0.0))[0] for job in bidding.jobs]),
         expires=per_job([float(job.expires) for job in bidding.jobs]),
         fleet_age_s=of_all([_age_s(arm, bidding) for arm in arms]),
-        fleet_working=of_all(working),
-        fleet_faulted=of_all(modes == "faulted"),
+        fleet_working=of_all(working & ~paused),
+        fleet_faulted=of_all((modes == "faulted") | paused),
         fleet_busy_s=of_all(busy_s),
         fleet_headroom_k=of_all(headroom_k),
         fleet_difficulty=of_all(least),
