@@ -5,7 +5,7 @@ warning limit that the hottest motor uses, times t_aj, is the thermal arm time h
 over the shift of length T; 1 is the capacity of the fleet:
 
 - time: the least λ for which all jobs can be shared out (in parts) with no arm busy for longer than λ·T,
-  min λ, Σ_a x_aj = 1, Σ_j t_aj x_aj ≤ λ·T, x ≥ 0, a linear program;
+  min λ, Σ_a x_aj = 1, Σ_j t_aj x_aj ≤ λ·T, x ≥ 0, a linear program; T without the breaks and failures of the arm;
 - thermal, the thermal load factor: the same with h_aj, among the assignments that the arms have time for
   (Σ_j t_aj x_aj ≤ T, or the time load's λ·T if larger): the load of the best assignment;
 - blind: the load of the hottest arm when every job is split equally among the arms that can do it.
@@ -60,12 +60,21 @@ def load_factor(world: World) -> LoadFactor:
         return LoadFactor(0.0, 0.0, 0.0, 0.0)
     times = world.plans.times_s[plan]
     length_s = times[..., 0] + world.jobs.repetitions[0, jobs] * times[..., 1] + times[..., 2]
-    busy = np.where(possible, length_s, 0.0) / world.horizon_s
-    heat = _heat_share(world, plan) * busy
+    length_s = np.where(possible, length_s, 0.0)
+    heat = _heat_share(world, plan) * length_s / world.horizon_s
+    busy = length_s / np.maximum(_present_s(world), world.dt_s)[:, None]
     time = _least(busy, possible)
     blind = (heat * possible / possible.sum(axis=0)).sum(axis=1).max()
     thermal, able = _least(heat, possible, busy, max(1.0, time)), float(possible.mean())
     return LoadFactor(thermal=thermal, blind=float(blind), time=time, able=able)
+
+
+def _present_s(world: World) -> Array:
+    """Length of the shift without breaks and failures, s, [arm]."""
+    present = np.ones((len(world.arms), world.ticks), bool)
+    for each in world.absences:
+        present[each["arm"], each["begin"] : each["end"]] = False
+    return present.sum(axis=1) * world.dt_s
 
 
 def _heat_share(world: World, plan: Array) -> Array:

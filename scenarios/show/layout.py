@@ -17,6 +17,7 @@ from scenarios.prepare.arms import PlannedArm, plan_arms
 from scenarios.prepare.fleet import ShiftFactory, cell_problems, prepare, space_of
 from scenarios.prepare.load_factor import LoadFactor, load_factor
 from scenarios.progress import Progress, quiet
+from scenarios.show.words import clock, duration
 from scenarios.spec.jobs import all_works, alternatives_of, fault_price, works_of
 from scenarios.spec.schema import ArmSpec, JobStream, Scenario
 from scenarios.table import Table
@@ -264,6 +265,7 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
         f"{load.able:.0%} of the arms can do a job (mean over the jobs)\n"
         f"{_fault_cost(scenario)}\n"
         f"people touch an arm for up to {people.contact_s:g} s: a surface of {people.burn_c:g} °C or more burns"
+        f"{_absences(scenario)}"
     )
     refused = list(dict.fromkeys(map(str, fleet.infeasible)))
     more = [f"… and {len(refused) - MOST_REASONS} more."] if len(refused) > MOST_REASONS else []
@@ -339,6 +341,24 @@ def _work(stream: JobStream) -> str:
             return f"press {where} with {stream.force_n:g} N{held}, {times} × {stream.dwell_s:g} s"
         case "pick_place" | "sort":
             return f"{stream.kind} {where}, {loads} kg, {times} times"
+
+
+def _absences(scenario: Scenario) -> str:
+    """Breaks and failures, a line each."""
+    lines = [
+        f"\nbreak '{each.name}' of {', '.join(each.arms) or 'all arms'}: {clock(max(each.begin_s, 0.0))} to "
+        f"{clock(each.end_s)}, after the present {each.finish}"
+        for each in scenario.breaks[:MOST_REASONS]
+    ]
+    if len(scenario.breaks) > MOST_REASONS:
+        lines.append(f"\n… and {len(scenario.breaks) - MOST_REASONS} more breaks")
+    lines += [
+        f"\n{arm.name} fails every {duration(arm.fails.every_s)} of work and is repaired in "
+        f"{duration(arm.fails.repair_s)}, both at random"
+        for arm in scenario.arms
+        if arm.fails is not None
+    ]
+    return "".join(lines)
 
 
 def _arrivals(stream: JobStream) -> str:

@@ -14,8 +14,8 @@ ONE_JOB_S = 3.0 + 3 * 10.0 + 2.0
 """Approach, three cycles, retreat of a job of `small.job`."""
 
 
-def load_of(small, jobs, arms) -> LoadFactor:
-    world, _ = small.shop([jobs], arms=arms, ticks=TICKS)
+def load_of(small, jobs, arms, **more) -> LoadFactor:
+    world, _ = small.shop([jobs], arms=arms, ticks=TICKS, **more)
     return load_factor(world)
 
 
@@ -47,6 +47,16 @@ def test_the_thermal_load_is_the_share_of_time_at_which_the_cycle_settles_at_the
     settled = world.thermal.steady(mixed, world.ambient_c.mean(axis=0))[..., WINDING]
     assert settled.max() == pytest.approx(60.0, abs=1e-6)
     assert share > 1.0  # it cannot go on for ever, as its name says
+
+
+def test_breaks_leave_less_time_and_the_same_heat(small):
+    """Two that overlap take 200 of 600 s of one of two arms, so both have 1,000 s together."""
+    content = small.work(payload_kg=small.WARM)
+    jobs, arms = [small.job(f"j{i}", content) for i in range(8)], equal_arms(small, 2, content)
+    whole, less = load_of(small, jobs, arms), load_of(small, jobs, arms, absences=[(0, 10, 20, 1), (0, 15, 30, 2)])
+    assert whole.time == pytest.approx(8 * ONE_JOB_S / (2 * HORIZON_S))
+    assert less.time == pytest.approx(8 * ONE_JOB_S / 1000.0)
+    assert (less.thermal, less.blind) == pytest.approx((whole.thermal, whole.blind))
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
