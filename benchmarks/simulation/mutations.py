@@ -19,7 +19,7 @@ from fleet.live.auction import rounds as round_module
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.ledger import Ledger, LedgerView
 from fleet.live.auction.records import Awarded, Checked, Operated, PastJobs, content_hash
-from fleet.live.auction.rounds import LedgerWriter, Timing
+from fleet.live.auction.rounds import LedgerWriter, Rounds, Timing
 from fleet.live.consensus.grants import Claimant, Granter
 from fleet.live.consensus.jobs import JobGranted
 from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, Journal
@@ -262,6 +262,12 @@ add_mutation(
     "space-freed-early",
     "closed awards keep their space until the arm is at home",
     (Ledger, "_end", _ends_free),
+    alone=False,
+)
+add_mutation(
+    "space-not-asked",
+    "the space of an idle arm is freed without another job",
+    (Rounds, "_ask_for_space", lambda _: lambda self, real_s: None),
     alone=False,
 )
 add_mutation(

@@ -1,8 +1,8 @@
 """One simulated life of a fleet: jobs and faults by one seed, rules after every event, and all settled at the end.
 
 Rules besides those of `simulated_fleet`: after the faults every job is finished, given up for the reasons that the
-product names, or unfinished because an arm stopped in its last cycle; every wait ends; requests of people have their
-effect (`steering`); the recording has every result once (`recording`).
+product names, or unfinished because an arm stopped in its last cycle; every wait ends; arms that are idle at home take
+no space; requests of people have their effect (`steering`); the recording has every result once (`recording`).
 """
 
 from collections.abc import Mapping
@@ -41,6 +41,8 @@ CHECK_S = 2.0
 """True seconds between two checks whether all is settled."""
 RECORD_S = 120.0
 """True seconds after the last result in which the recorder has it."""
+FREE_S = 60.0
+"""True seconds after the last job in which the space of all arms must be free."""
 SETTLE_S = 240.0
 """True seconds after the faults in which all jobs must be settled, besides the time that they take."""
 
@@ -93,6 +95,7 @@ class Shift(Fleet):
             world.run(self.faulty_s)
             heal(self)
             self._settle()
+            self._check_space()
             self._end_recording()
 
     def _submit(self) -> None:
@@ -198,6 +201,28 @@ class Shift(Fleet):
 
         if not self.alone:
             check_steering(self.sent, states, self.node(AUCTIONEER).auctioneer.ledger.jobs)
+
+    def _check_space(self) -> None:
+        """Check that arms that are idle at home take no space: it would stay closed if they left now.
+
+        Raises:
+            Violation: one does.
+        """
+        deadline_s = self.world.now_s + FREE_S
+        while taken := self._taken():
+            if self.world.now_s > deadline_s:
+                raise Violation(f"'{taken[0]}' is idle at home, and its space is closed.")
+            self.world.run(self.world.now_s + CHECK_S)
+
+    def _taken(self) -> list[str]:
+        """Arms whose space is closed, as the participants know it; the fleet may be about to start one again."""
+        if any(self.node(name) is None for name in self.names):
+            return ["a process"]
+        if not self.alone:
+            space = self.node(AUCTIONEER).auctioneer.ledger.taken_space()
+            return [arm for arm in self.arms if space.get(arm)] if self.submitter.accepted else []
+        registers = [self.node(name).work_source.participant.granter.register for name in self.arms]
+        return [arm for arm in self.arms if any(register.space[arm] for register in registers)]
 
     def _end_recording(self) -> None:
         process, deadline_s = self.world.processes[RECORDER], self.world.now_s + RECORD_S

@@ -428,6 +428,7 @@ class ArmNode:
         """Plan of each active award: it stays even if the estimator drops it."""
         self._reading = body.read_sensors()
         self._break: Break | None = None
+        self._quoted_s = -math.inf
         self._state_due_s = self._retry_s = -math.inf
         """Real seconds at which the next state message and the next attempt to write are due."""
         self._warn = RateLimitedWarnings(self._name)
@@ -440,11 +441,19 @@ class ArmNode:
         self._step()
 
     def retire(self, until_s: float) -> None:
-        """Return all awards, and report them until they are acknowledged or `time.monotonic()` is `until_s`."""
+        """Return all awards, report them until they are acknowledged, and quote the space of an arm at home.
+
+        At the latest it ends when `time.monotonic()` is `until_s`.
+        """
         self._config = replace(self._config, takes_jobs=False)
         self.executor.return_all(self._body.time_s, time.monotonic(), "the arm was stopped")
-        while self.executor.has_pending_reports and time.monotonic() < until_s:
-            self.serve(until_s)
+        reported_s = time.monotonic() if self.executor.has_pending_reports else -math.inf
+        while time.monotonic() < until_s:
+            if self.executor.has_pending_reports:
+                reported_s = time.monotonic()
+            elif self._body.away is not None or self._quoted_s >= reported_s:
+                break
+            self.serve(min(until_s, time.monotonic() + POLL_S))
 
     # Requests
 
@@ -463,7 +472,7 @@ class ArmNode:
         if len(jobs) != len(request.jobs):
             raise Refused("The request names a job twice.")
         estimates, name = self.estimate(request.jobs, request.cycles, dry_run=request.dry_run), ""
-        real_s = time.monotonic()
+        real_s = self._quoted_s = time.monotonic()
         if not request.dry_run:
             offers = {estimate.job: (jobs[estimate.job], len(estimate.plans)) for estimate in estimates}
             name = self.executor.add_quote(offers, real_s)

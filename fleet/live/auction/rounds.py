@@ -541,8 +541,9 @@ class Rounds:
         """Why no arm can do a job."""
         self._planned: set[str] = set()
         """Waiting jobs for which arms have plans, or have said that there is none."""
-        self._scan_s = -math.inf
-        self._pause_s = timing.pause_s[0]
+        self._scan_s = self._space_s = -math.inf
+        """Real seconds from which jobs are offered, and arms are asked for their space alone."""
+        self._pause_s = self._space_pause_s = timing.pause_s[0]
 
     def step(self, real_s: float, time_s: float) -> None:
         """Open or close a round if that is due."""
@@ -570,8 +571,8 @@ class Rounds:
     def retry_now(self) -> None:
         """Offer delayed jobs again at once: something has changed."""
         self._later_s.clear()
-        self._scan_s = -math.inf
-        self._pause_s = self._timing.pause_s[0]
+        self._scan_s = self._space_s = -math.inf
+        self._pause_s = self._space_pause_s = self._timing.pause_s[0]
 
     def delay(self, real_s: float, jobs: Iterable[str]) -> None:
         """Offer these jobs again after a pause, which is longer each time in a row."""
@@ -585,26 +586,53 @@ class Rounds:
         ledger = self._writer.ledger
         able = {arm for arm in self.present if not ledger.is_paused(arm)}
         bidders = frozenset(able - {message.arm for _, message in waiting})
-        if not bidders or any(real_s < lease.sent_s + self._timing.window_s for lease, _ in waiting):
+        if any(real_s < lease.sent_s + self._timing.window_s for lease, _ in waiting):
             return
         self._later_s = {job: at_s for job, at_s in self._later_s.items() if at_s > real_s}
         self._notes = {job: note for job, note in self._notes.items() if job in ledger.waiting}
         self._planned &= ledger.waiting.keys()
         jobs = tuple(ledger.ready(time_s, self._timing.max_jobs, excluded=self._later_s))
         busy = ledger.busy_stations()
-        if not any(busy.isdisjoint(job.stations) for job in jobs):
+        if not (bidders and any(busy.isdisjoint(job.stations) for job in jobs)):
+            self._ask_for_space(real_s)
             return
-        self._count += 1
-        auction = f"{self._name}-{self._boot}-{self._count}"
-        self.open = Round(auction, jobs, bidders, real_s + self._timing.window_s, self._writer.ledger.closed_space())
+        auction = self._open(jobs, bidders, real_s)
         self._writer.out.append(Announcement(self._name, auction, time_s, tuple(job.name for job in jobs)))
         cycles = {job.name: done for job in jobs if (done := self._writer.ledger.jobs[job.name].cycles)}
         self._writer.out.append(QuoteRequest(auction, jobs, cycles=cycles))
 
+    def _open(self, jobs: tuple[JobSpec, ...], asked: frozenset[str], real_s: float) -> str:
+        """Open a round; return its name."""
+        self._count += 1
+        auction = f"{self._name}-{self._boot}-{self._count}"
+        self.open = Round(auction, jobs, asked, real_s + self._timing.window_s, self._writer.ledger.closed_space())
+        return auction
+
+    def _ask_for_space(self, real_s: float) -> None:
+        """Open a round without jobs for present arms that may still take space for closed awards.
+
+        Otherwise the space of an arm without a next job would stay closed, also when the arm has left. Only a quote
+        frees it: a state may have been sent before the award. The quote is a dry run of the last job that was changed.
+        """
+        ledger = self._writer.ledger
+        takes_space = frozenset(arm for arm, names in ledger.closed_space().items() if names) & self.present
+        last = ledger.recent[-1].status.job if ledger.recent else ""
+        if not takes_space or real_s < self._space_s or last not in ledger.jobs:
+            return
+        self._space_s = real_s + self._space_pause_s
+        self._space_pause_s = min(2 * self._space_pause_s, self._timing.pause_s[1])
+        auction = self._open((), takes_space, real_s)
+        self._writer.out.append(QuoteRequest(auction, (ledger.jobs[last].spec,), dry_run=True))
+
     def _close(self, closing: Round, real_s: float, time_s: float) -> None:
         self.open = None
-        if not self._writer.try_to_record("Nothing is awarded", *stated_spaces(self._writer.ledger, closing, time_s)):
+        spaces = stated_spaces(self._writer.ledger, closing, time_s)
+        if not self._writer.try_to_record("Nothing is awarded", *spaces):
             self.delay(real_s, (job.name for job in closing.jobs))
+            return
+        if not closing.jobs:
+            if spaces:
+                self.retry_now()
             return
         entries = [self._writer.ledger.jobs[job.name] for job in closing.jobs]
         entries = [e for e, job in zip(entries, closing.jobs, strict=True) if e.state == "waiting" and e.spec == job]
