@@ -19,13 +19,13 @@ from fleet.errors import FleetError
 from fleet.heat.motor import Motors, magnet_factor
 from fleet.heat.thermal import HOUSING, WINDING, temperature_steps
 from fleet.motion import Drive
-from fleet.robot import JOINTS
 from twin.logs.recording import HEAT_GAP_S, STEP_S, HeatLog, Recording, check_recordings, heat_logs, source_of
 from twin.thermal.identify import (
     AMBIENT_C,
     Identified,
     ParameterVector,
     Problem,
+    check_seven_joints,
     nominal_heat_model,
     solve,
     usual_noise,
@@ -231,12 +231,6 @@ def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLo
             f"{ambient_c:g} °C, which no powered motor can be. State the ambient temperature of the log (--ambient)."
         )
     return logs[-1], so_far.temp_c[-1]
-
-
-def check_seven_joints(recording: Recording) -> None:
-    """Raise a FleetError unless a recording has the joints of the thermal network."""
-    if recording.joints != JOINTS:
-        raise FleetError(f"'{recording.name}' has {recording.joints} joints, the thermal network {JOINTS}.")
 
 
 def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:
