@@ -1,5 +1,6 @@
 """Cache folders, and files that are written atomically."""
 
+import codecs
 import os
 import threading
 from collections.abc import Iterator
@@ -7,6 +8,24 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fleet.errors import FleetError
+
+
+def _of_windows(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeDecodeError)
+    return error.object[error.start : error.end].decode("cp1252", errors="replace"), error.end
+
+
+codecs.register_error("cp1252", _of_windows)
+
+
+def decode_text(content: bytes) -> str:
+    """The text of a table that people exchange: UTF-8 or, with a byte order mark, UTF-16.
+
+    Bytes that are no UTF-8 are taken for Windows-1252, which old spreadsheets write, also among UTF-8.
+    """
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", errors="replace")
+    return content.decode("utf-8-sig", errors="cp1252")
 
 
 def cache_folder() -> Path:

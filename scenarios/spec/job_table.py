@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 from fleet.bus.protocol.auction import JobSpec
 from fleet.errors import ScenarioError, check_names, nearest, printable
+from fleet.files import decode_text
 from fleet.job import BOUNDS, DWELL_S, KINDS, check_alternatives, check_bounds, check_duration, check_dwell
 from scenarios.spec.units import question
 
@@ -371,7 +372,7 @@ def _rows(path: Path, where: str) -> tuple[Rows, bool]:
 
 
 def _csv_rows(content: bytes, where: str) -> tuple[Rows, bool]:
-    text, skipped, delimiter = decode_text(content, where), 0, ""
+    text, skipped, delimiter = text_of(content, where), 0, ""
     first, _, rest = text.partition("\n")
     if declared := re.fullmatch(r"sep=(.)", first.strip('"\r')):  # written by Excel
         text, skipped, delimiter = rest, 1, declared[1]
@@ -393,17 +394,11 @@ def _csv_rows(content: bytes, where: str) -> tuple[Rows, bool]:
     return rows(), delimiter != ","
 
 
-def decode_text(content: bytes, where: str) -> str:
-    """The text of a file: UTF-16 with a byte order mark, UTF-8, or else Windows-1252, which old spreadsheets write.
-
-    Raises:
-        ScenarioError: it has another encoding.
-    """
-    is_utf16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-    for encoding in ("utf-16",) if is_utf16 else () if b"\x00" in content else ("utf-8-sig", "cp1252"):
-        with suppress(UnicodeDecodeError):
-            return content.decode(encoding)
-    raise ScenarioError(f"{where} is not a UTF-8 text file. Save it as UTF-8.")
+def text_of(content: bytes, where: str) -> str:
+    """The text of a file, as `decode_text` reads it; raises a ScenarioError for other data."""
+    if "\0" in (text := decode_text(content)):
+        raise ScenarioError(f"{where} is not a text file in UTF-8: it has NUL bytes. Save it as UTF-8.")
+    return text
 
 
 def _parquet_rows(path: Path, where: str) -> Rows:

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from fleet.errors import ScenarioError, nearest, printable
-from scenarios.spec.job_table import cycle_of, decode_text, read_job_table, shift_begin, stream_fields
+from scenarios.spec.job_table import cycle_of, read_job_table, shift_begin, stream_fields, text_of
 from scenarios.spec.schema import JobStream, Scenario
 from scenarios.spec.units import check_times, check_units
 
@@ -363,7 +363,7 @@ def _with_traces(scenario: Scenario, path: Path) -> Scenario:
 
 def _trace(where: Path, place: str) -> tuple[float, ...]:
     try:
-        lines = decode_text(where.read_bytes(), f"{place}: '{where.name}'").splitlines()
+        lines = text_of(where.read_bytes(), f"{place}: '{where.name}'").splitlines()
     except FileNotFoundError as error:
         raise ScenarioError(f"{place}: there is no file '{where}'.") from error
     except OSError as error:

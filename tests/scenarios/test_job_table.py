@@ -305,7 +305,7 @@ def test_a_wrong_head_is_told(tmp_path, head, sentence):
 def test_a_file_that_is_no_table_is_told(tmp_path):
     for name, content, sentence in (
         ("jobs.parquet", b"PAR1", "'jobs.parquet' is not a Parquet file ("),
-        ("jobs.csv", b"\x00\x01", "'jobs.csv' is not a UTF-8 text file. Save it as UTF-8."),
+        ("jobs.csv", b"\x00\x01", "'jobs.csv' is not a text file in UTF-8: it has NUL bytes. Save it as UTF-8."),
         ("none.csv", None, "'none.csv': there is no file '"),
     ):
         if content:
@@ -322,6 +322,12 @@ def test_excel_may_name_its_separator_in_the_first_row(tmp_path):
     (tmp_path / "jobs.csv").write_bytes(text.encode("cp1252"))
     (job,) = read_job_table(tmp_path / "jobs.csv")
     assert (job.name, job.payload_kg, job.release_s) == ("ä", 1.5, 30.0)
+
+
+def test_rows_of_several_programs_may_have_several_encodings(tmp_path):
+    rows = [f"{name},hold,bench".encode(code) for name, code in (("Öl", "utf-8"), ("Maß", "cp1252"), ("€", "cp1252"))]
+    (tmp_path / "jobs.csv").write_bytes(b"\n".join([b"name,kind,places", *rows, b"\x81,hold,bench"]))
+    assert [job.name for job in read_job_table(tmp_path / "jobs.csv")] == ["Öl", "Maß", "€", "\ufffd"]
 
 
 def test_a_thousand_rows_are_read_and_all_their_faults_told_within_a_second(tmp_path):

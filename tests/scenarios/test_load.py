@@ -322,7 +322,7 @@ TRACES = [
     (b"-1\n", "must be >= 0 and in order (-1.0 s is not)."),
     (b"0\nnan\n5\n", "must be >= 0 and in order (nan s is not)."),
     (b"0\ninf\n", "must be >= 0 and in order (inf s is not)."),
-    (b"\xff\xfe\x00", "'times.txt' is not a UTF-8 text file."),
+    (b"\xff\xfe\x00", "line 1 of 'times.txt' is not a number of seconds"),
 ]
 
 
