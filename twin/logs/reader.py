@@ -524,14 +524,16 @@ def _name(path: Path) -> str:
 
 
 def _recording(
-    path: Path, name: str, table: LogTable, damaged: Damaged, *, measured: bool = True, part: bool = False
+    path: Path, name: str, table: LogTable, damaged: Damaged, *, measured: bool = True, warned: set[str] | None = None
 ) -> Recording:
     """A recording from the good rows of a table.
 
     Args:
         measured: As in `read`.
-        part: Of a growing log: with damaged="skip", most of its rows may be wrong.
+        warned: Of a part of a growing log: what was dropped from earlier parts, which is not said again. With
+            damaged="skip", most rows of a part may be wrong.
     """
+    part = warned is not None
     is_csv = path.suffix != ".parquet"
     try:
         layout = format_of(table.names) if is_csv else PLAIN
@@ -571,7 +573,11 @@ def _recording(
         remedy = "" if broken or not first.remedy else f"{first.remedy} "
         raise LogError(str(path), line, f'{reason}{more}. {remedy}Use damaged="skip" to read the undamaged lines.')
     for sentence in dropped:
-        log.warning("%s: dropped: %s", path, sentence)
+        what = _kind(re.sub(r"^lines? [\d to]+: ", "", sentence))
+        if warned is None or what not in warned:
+            log.warning("%s: dropped: %s%s", path, sentence, " (said once)" if part else "")
+        if warned is not None:
+            warned.add(what)
     kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
     time_s = time_s[keep]
     if is_csv and measured and not part and (held := repeats(time_s, kept, GAP_S)):
@@ -612,6 +618,7 @@ class GrowingLog:
             raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
         self._path, self._first_s, self._begun = path, first_s, b""
         self._damaged: Damaged = damaged
+        self._warned = set[str]()
         self._lines = 0
         """Complete lines so far."""
         self._columns: _Columns | None = None
@@ -641,7 +648,7 @@ class GrowingLog:
                 return None
             self._append(block)
         assert self._table is not None
-        recording = _recording(self._path, _name(self._path), self._table, self._damaged, part=True)
+        recording = _recording(self._path, _name(self._path), self._table, self._damaged, warned=self._warned)
         if not len(recording.time_s):
             empty = np.zeros(0, int)
             self._table = LogTable(self._table.names, self._table.values[empty], empty, ())
