@@ -38,11 +38,13 @@ class Count(float):
 
     done: float
     total: int
+    at_once: int
+    """Number that is worked on at the same time."""
 
-    def __new__(cls, done: float, total: int) -> "Count":
+    def __new__(cls, done: float, total: int, at_once: int = 1) -> "Count":
         """The fraction."""
         count = super().__new__(cls, done / total)
-        count.done, count.total = done, total
+        count.done, count.total, count.at_once = done, total, at_once
         return count
 
 
@@ -69,9 +71,15 @@ class StageClock:
         return now_s - self._began_s
 
     def left_s(self, now_s: float) -> float | None:
-        """Time until the stage ends at its mean pace so far, s; None while there is nothing to judge by."""
-        done, spent_s = self.fraction - self._first, self.elapsed_s(now_s)
-        return spent_s / done * (1.0 - self.fraction) if spent_s >= LEAST_S and done > 0 else None
+        """Time until the stage ends at its mean pace so far, s; None while there is nothing to judge by.
+
+        What others work on when one is done is taken for half done.
+        """
+        done, left, spent_s = self.fraction - self._first, 1.0 - self.fraction, self.elapsed_s(now_s)
+        if spent_s < LEAST_S or done <= 0:
+            return None
+        begun = min((self.fraction.at_once - 1) / self.fraction.total, left) if isinstance(self.fraction, Count) else 0
+        return spent_s / (done + begun / 2) * (left - begun / 2)
 
     @property
     def label(self) -> str:
@@ -87,7 +95,9 @@ class StageClock:
     def line(self, now_s: float) -> str:
         """The stage, its count, the part done and the time left, as one line."""
         left_s = self.left_s(now_s)
-        left = f"about {brief(left_s)} left" if left_s is not None else f"for {brief(self.elapsed_s(now_s))}"
+        left = (
+            f"about {brief(left_s)} left of this stage" if left_s is not None else f"for {brief(self.elapsed_s(now_s))}"
+        )
         return f"{self.label}: {self.fraction:.0%}, {left}."
 
 

@@ -104,8 +104,8 @@ def load_or_make(models: Sequence[CachedModel[Model]], stage: str, progress: Pro
     loaded = [_load_intact(model) for model in models]
     missing = [model for model, ready in zip(models, loaded, strict=True) if ready is None]
 
-    def report(made: float) -> None:
-        progress(stage, Count(len(models) - len(missing) + made, len(models)))
+    def report(made: float, at_once: int = 1) -> None:
+        progress(stage, Count(len(models) - len(missing) + made, len(models), at_once))
 
     report(0)
     if missing:
@@ -119,10 +119,11 @@ def load_or_make(models: Sequence[CachedModel[Model]], stage: str, progress: Pro
 
         from scenarios.processes import worker_processes
 
-        with worker_processes(min(len(missing), cpu_count())) as pool:
+        workers = min(len(missing), cpu_count())
+        with worker_processes(workers) as pool:
             for reason in pool(delayed(model.make)(model.folder, _ignore) for model in missing):
                 reasons.append(reason)
-                report(len(reasons))
+                report(len(reasons), workers)
     for reason in filter(None, reasons):
         log.warning("%s", reason)
     return [model.load(model.folder) if ready is None else ready for model, ready in zip(models, loaded, strict=True)]

@@ -117,7 +117,9 @@ def test_what_is_dropped_from_a_growing_log_is_said_once(motion, tmp_path, caplo
     path = tmp_path / "grows.csv"
     path.write_text(f"note,{head}")
     with GrowingLog(path, damaged="skip") as growing:
-        for damage, line in zip(("", "1,2,oops\n", "3,4\n", "5,0,x,0\n" + "5,0,x" + ",0" * 27 + "\n"), lines, strict=False):
+        for damage, line in zip(
+            ("", "1,2,oops\n", "3,4\n", "5,0,x,0\n" + "5,0,x" + ",0" * 27 + "\n"), lines, strict=False
+        ):
             with path.open("a") as out:
                 out.write(f"7,{line}{damage}")
             growing.read(-np.inf)

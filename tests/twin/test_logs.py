@@ -257,6 +257,7 @@ def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
     good = {"arm": ["a"] * 3, **columns}
     for table, words, line in (
         (columns, "lacks the column arm", None),
+        (good | {"tick": [1, 2, 3]}, "is part of the recording of a fleet.*`thermofleet bus replay`", None),
         (good | {"q_3": ["x"] * 3}, "column q_3 holds string, not numbers", None),
         ({name: values for name, values in good.items() if name != "q_3"}, "lacks the column q_3", None),
         ({name: values for name, values in good.items() if name != "time_s"}, "lacks the column time_s", None),

@@ -414,6 +414,9 @@ def read_arms(path: Path) -> dict[str, LogTable]:
         table = pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
         raise LogError(str(path), None, f"is not a complete parquet file ({str(error).splitlines()[0]}).") from error
+    if "tick" in table.column_names:
+        reason = "is part of the recording of a fleet. A recording is a folder: publish it again with"
+        raise LogError(str(path), None, f"{reason} `thermofleet bus replay`, or look at it with `thermofleet report`.")
     if ARM not in table.column_names or len(table.column_names) == 1:
         missing = "time_s" if ARM in table.column_names else ARM
         raise LogError(str(path), None, f"lacks the column {missing} of a telemetry.parquet.")

@@ -14,7 +14,7 @@ Card = TypeVar("Card")
 class _Head(msgspec.Struct):
     """The part that is read first."""
 
-    format: int
+    format: object
 
 
 def write_card(card: msgspec.Struct, path: Path) -> None:
@@ -34,7 +34,7 @@ def read_card(path: Path, kind: type[Card], *, format_: int, what: str) -> Card:
         text = path.read_bytes()
         head = msgspec.json.decode(text, type=_Head)
         if head.format != format_:
-            raise CheckpointError(f"{path}: format {head.format} is not supported, only {format_}.")
+            raise CheckpointError(f"{path}: format {head.format!r} is not supported, only {format_}.")
         return msgspec.json.decode(text, type=kind)
     except FileNotFoundError:
         raise CheckpointError(f"No {what} in {path.parent}: {path.name} is missing.") from None
