@@ -14,7 +14,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import numpy as np
 
@@ -430,12 +430,12 @@ def open_twin(folder: Path, arm: str | None = None) -> Twin:
         raise CheckpointError(f"There is no folder '{folder}'; make one with: thermofleet twin train … --out {folder}.")
     if (folder / TWIN_CARD).exists():
         return load(folder)
-    homes = {home.name.removesuffix(".twin"): home for home in sorted(folder.glob("*.twin"))}
+    homes = {unquote(home.name.removesuffix(".twin")): home for home in sorted(folder.glob("*.twin"))}
     if not homes:
         raise CheckpointError(f"'{folder}' holds no twin ({TWIN_CARD}, or folders ARM.twin).")
     if arm is None and len(homes) > 1:
         raise CheckpointError(f"'{folder}' holds {len(homes)} twins; choose one with --arm: {', '.join(homes)}.")
-    name = next(iter(homes)) if arm is None else quote(arm, safe="")
+    name = next(iter(homes)) if arm is None else arm
     if name not in homes:
-        raise CheckpointError(f"No twin of arm '{arm}' in '{folder}'{nearest(name, homes)}")
+        raise CheckpointError(f"No twin of arm '{name}' in '{folder}'{nearest(name, homes)}")
     return load(homes[name])

@@ -37,8 +37,6 @@ MOST_COLUMNS = 100
 DAY_S = 86_400.0
 DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
 _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
-_NOT_IN_NAMES = re.compile(r"[/\\\[\]]")
-"""Percent-encoded, as in keys of the bus."""
 _ARROW, _OR = re.compile(r"\s*(?:->|→|>|,|;)\s*"), re.compile(r"\s*[|;,]\s*")
 _THOUSANDS = re.compile(r"[1-9]\d{0,2}(\.\d{3})+")
 _GERMAN_DATE = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}) +(\d{1,2}:\d{2}.*)")
@@ -115,13 +113,9 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     return ((date if date.tzinfo else date.replace(tzinfo=begin.tzinfo)) - begin).total_seconds()
 
 
-def _name(cell: Cell, _: object = None) -> str:
-    return _NOT_IN_NAMES.sub(lambda found: f"%{ord(found[0]):02X}", _text(cell))
-
-
 def _names(cell: Cell, _: object) -> tuple[str, ...]:
     parts = cell if isinstance(cell, list) else _OR.split(_text(cell))
-    return tuple(_name(part) for part in parts if _text(part))
+    return tuple(_text(part) for part in parts if _text(part))
 
 
 def _kind(cell: Cell, _: object) -> str:
@@ -157,7 +151,7 @@ def _is_empty(cell: Cell) -> bool:
 
 
 _COLUMNS: Mapping[str, tuple[str, Callable[[Cell, _Dialect], object], object]] = {
-    "name": ("name", _name, ""),
+    "name": ("name", lambda cell, _: _text(cell), ""),
     "kind": ("kind", _kind, ""),
     "places": ("every_places", _places, ()),
     "payload": ("payload_kg", _number, 0.0),
@@ -303,7 +297,7 @@ def _problems(row: Row, wrong: Collection[str]) -> Iterator[tuple[str, str]]:
     """Field and sentence of each fault in the values of a row, at most one a field."""
     checks: list[tuple[str, Callable[[], None]]] = [
         *((field, lambda field=field: check_bounds(row, field)) for field in BOUNDS if hasattr(row, field)),
-        *((field, lambda field=field: check_names(row, field)) for field in ("name", "after")),
+        *((field, lambda field=field: check_names(row, field, of_jobs=True)) for field in ("name", "after")),
         ("every_places", lambda: check_names(row, "places")),
         ("every_places", lambda: check_alternatives(row, row.kind, row.every_places) if row.kind else None),
         ("dwell_s", lambda: check_dwell(row, row.kind, row.dwell_s)),

@@ -347,9 +347,10 @@ class Scenario:
                 f"(got {latest_s:.15g})"
             )
         check_names(self, "name")
-        for each in (*self.arms, *self.places, *self.fixtures, *self.jobs):
+        for each in (*self.arms, *self.places, *self.fixtures):
             check_names(each, "name")
         for stream in self.jobs:
+            check_names(stream, "name", of_jobs=True)
             if stream.numbered and len(stream.name) > MAX_NAME - _NUMBER:
                 raise ValueError(
                     f"JobStream.name must have at most {MAX_NAME - _NUMBER} characters, as its jobs have a number "

@@ -139,9 +139,9 @@ def test_a_row_without_due_date_is_due_at_the_end_of_the_shift_and_defaults_are_
     assert (job.due_s, job.value, job.repetitions, job.release_s, job.expires) == (180.0, 1.0, 1, 0.0, False)
 
 
-def test_names_keep_spaces_and_have_slashes_percent_encoded_as_on_keys(tmp_path):
-    first, second = drawn(small_table(tmp_path, f"{SHORT}\nA 1/2,hold,bench,,,,,,,\nb,hold,shelf,,,,,,,A 1/2\n"), 0)
-    assert (first.name, second.after) == ("A 1%2F2", ("A 1%2F2",))
+def test_names_are_those_of_the_table(tmp_path):
+    first, second = drawn(small_table(tmp_path, f"{SHORT}\n[A] 1/2,hold,bench,,,,,,,\nb,hold,shelf,,,,,,,[A] 1/2\n"), 0)
+    assert (first.name, second.after) == ("[A] 1/2", ("[A] 1/2",))
 
 
 def test_names_may_continue_those_of_other_rows(tmp_path):
