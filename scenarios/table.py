@@ -183,9 +183,13 @@ class Table:
         return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
     def csv(self) -> str:
-        """As comma-separated values, with the group of a row, if any, as its first column."""
+        """As comma-separated values, with the group of a row, if any, as its first column.
+
+        A text that a spreadsheet would take for a formula has an apostrophe before it.
+        """
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(self._lines())
+        lines = (["'" * _is_formula(cell) + cell for cell in cells] for cells in self._lines())
+        csv.writer(text, lineterminator="\n").writerows(lines)
         return text.getvalue()
 
     def xlsx(self) -> bytes:
@@ -202,7 +206,7 @@ class Table:
             for column, text in enumerate(cells, start=1):
                 is_number = NUMBER.fullmatch(text) and row > 1
                 cell = book.active.cell(row, column, float(text) if is_number else visible(text, "\n"))
-                cell.data_type = "n" if is_number else "s"
+                cell.data_type, cell.quotePrefix = "n" if is_number else "s", _is_formula(text)
         file = io.BytesIO()
         book.save(file)
         return file.getvalue()
@@ -218,6 +222,12 @@ class Table:
         for index, row in enumerate(self.rows):
             group = [self.groups[index]] if index in self.groups else group
             yield (*group, *row)
+
+
+def _is_formula(text: str) -> bool:
+    """Whether a spreadsheet would compute this cell of a CSV file, as =1+1; numbers and percentages are none."""
+    is_number = NUMBER.fullmatch(text.rstrip(" %").replace(",", ""))
+    return text.lstrip()[:1] in ("=", "+", "-", "@") and not is_number
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
