@@ -15,7 +15,7 @@ from difflib import get_close_matches
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
-from itertools import islice
+from itertools import chain, islice
 from math import inf, isfinite, nextafter
 from pathlib import Path
 from types import SimpleNamespace
@@ -203,8 +203,8 @@ def read_job_table(
     begin: datetime | None = None,
     horizon_s: float = inf,
     places: Collection[str] | None = None,
-) -> list[JobSpec]:
-    """The jobs of a table in the order of its rows; times count from the begin of the shift.
+) -> dict[int, JobSpec]:
+    """The jobs of a table by the numbers of their rows, in order; times count from the begin of the shift.
 
     Args:
         where: Name of the table in errors; by default the path.
@@ -216,12 +216,11 @@ def read_job_table(
         ScenarioError: the file cannot be read, or rows are wrong: all faults, each with its row and column.
         MissingExtra: the library for an XLSX file is not installed.
     """
-    where, faults, jobs = where or str(path), _Faults(), list[JobSpec]()
+    where, faults, jobs = where or str(path), _Faults(), dict[int, JobSpec]()
     lines, decimal_comma = _rows(path, where)
     number, head = next(lines, (1, ()))
     columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma, horizon_s)
     faults.raise_any(where)
-    no_place = cache(lambda name: f"no place '{printable(name)}'{nearest(name, places or ())}")
     rows: dict[str, tuple[int, Row]] = {}
     for count, (number, cells) in enumerate(lines):
         if count == MOST_ROWS:
@@ -233,17 +232,15 @@ def read_job_table(
         for field, sentence in _problems(row, wrong):
             faults.add(number, _COLUMN_OF[field], sentence)
             wrong.add(field)
-        for name in dict.fromkeys(row.places) if places is not None and "every_places" not in wrong else ():
-            if name not in places:
-                faults.add(number, "places", no_place(name))
+        if places is not None and "every_places" not in wrong:
+            _check_places(number, row.places, places, faults)
         if row.name and row.name in rows:
             faults.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
         elif not wrong:
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
-            jobs.append(JobSpec(**{name: value for name, value in fields.items() if name != "every_places"}))
+            jobs[number] = JobSpec(**{name: value for name, value in fields.items() if name != "every_places"})
         rows.setdefault(row.name, (number, row))
-    if places is not None:
-        _check_after(rows, faults)
+    _check_after(rows, faults, only_rows=places is not None)
     faults.raise_any(where)
     if not jobs:
         raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
@@ -328,8 +325,38 @@ def _check_force(row: Row) -> None:
         raise ValueError(f"only a press has a contact force (got {row.force_n:g} N for a {row.kind})")
 
 
-def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults) -> None:
-    for number, row in rows.values():
+def check_cell(jobs: Mapping[int, JobSpec], places: Collection[str], where: str) -> None:
+    """Check that a cell has the places of the jobs, which are given by row.
+
+    Raises:
+        ScenarioError: all that it lacks, each with its row and column.
+    """
+    faults = _Faults()
+    for number, job in jobs.items():
+        _check_places(number, tuple(chain.from_iterable(job.every_places)), places, faults)
+    faults.raise_any(where)
+
+
+def _check_places(number: int, names: Sequence[str], places: Collection[str], faults: _Faults) -> None:
+    for name in dict.fromkeys(names):
+        if name not in places:
+            faults.add(number, "places", _no_place(name, tuple(places)))
+
+
+@cache
+def _no_place(name: str, places: Sequence[str]) -> str:
+    return f"no place '{printable(name)}'{nearest(name, places)}"
+
+
+def cell_of(number: int, job: JobSpec, reason: str) -> str:
+    """Row and, if the reason of a refusal quotes one of its cells, column of a job in a table."""
+    columns = {"places": chain.from_iterable(job.every_places), "after": job.after, "name": (job.name,)}
+    quoted = (column for column, names in columns.items() if any(f"'{name}'" in reason for name in names))
+    return f"row {number}{''.join(f', column {column}' for column in islice(quoted, 1))}"
+
+
+def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults, *, only_rows: bool) -> None:
+    for number, row in rows.values() if only_rows else ():
         for name in row.after:
             if name not in rows:
                 faults.add(number, "after", f"there is no job '{printable(name)}' in this table")
@@ -438,8 +465,12 @@ def _xlsx_rows(path: Path, where: str) -> Rows:
     yield from enumerate(sheet.iter_rows(values_only=True), start=1)
 
 
-def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:
-    """The job as fields of a `JobStream` with one arrival; without a due date it is due at the end of the shift."""
+def stream_fields(job: JobSpec, horizon_s: float, row: str) -> dict[str, object]:
+    """The job as fields of a `JobStream` with one arrival; without a due date it is due at the end of the shift.
+
+    Args:
+        row: File and row of the job, for errors.
+    """
     gap_s = max(0.0, (horizon_s if job.due_s is None else job.due_s) - job.release_s)
     close = (gap_s, nextafter(gap_s, inf), nextafter(gap_s, 0.0))  # release + one of these is exactly the due date
     return {
@@ -451,6 +482,7 @@ def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:
         "due_s": next((each for each in close if job.release_s + each == job.due_s), gap_s),
         "due": "hard" if job.expires else "soft",
         "numbered": False,
+        "row": row,
     }
 
 
