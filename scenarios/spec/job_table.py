@@ -197,7 +197,7 @@ class _Faults(dict[tuple[str, str], list[int]]):
 
 
 def read_job_table(
-    path: Path,
+    file: Path | bytes,
     where: str = "",
     *,
     begin: datetime | None = None,
@@ -207,6 +207,7 @@ def read_job_table(
     """The jobs of a table by the numbers of their rows, in order; times count from the begin of the shift.
 
     Args:
+        file: Its path, or the content of a CSV file.
         where: Name of the table in errors; by default the path.
         begin: Of the shift, with its zone; needed for dates.
         horizon_s: Length of the shift; a time of day before its begin must be within it on the next day.
@@ -216,9 +217,11 @@ def read_job_table(
         ScenarioError: the file cannot be read, or rows are wrong: all faults, each with its row and column.
         MissingExtra: the library for an XLSX file is not installed.
     """
-    where, faults, jobs = where or str(path), _Faults(), dict[int, JobSpec]()
-    lines, decimal_comma = _rows(path, where)
+    where, faults, jobs = where or str(file), _Faults(), dict[int, JobSpec]()
+    lines, decimal_comma = _rows(file, where)
     number, head = next(lines, (1, ()))
+    if len(head) > MOST_COLUMNS:
+        raise ScenarioError(f"{where} has {len(head)} columns; a job table has at most {MOST_COLUMNS}.")
     columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma, horizon_s)
     faults.raise_any(where)
     rows: dict[str, tuple[int, Row]] = {}
@@ -373,22 +376,25 @@ def cycle_of(after: Mapping[str, Sequence[str]]) -> list[str]:
     return []
 
 
-def _rows(path: Path, where: str) -> tuple[Rows, bool]:
+def _rows(file: Path | bytes, where: str) -> tuple[Rows, bool]:
     """Rows of a file that are not empty, and whether a comma in them may be a decimal point."""
     try:
-        if (size := path.stat().st_size) > MOST_BYTES:
+        size = len(file) if isinstance(file, bytes) else file.stat().st_size
+        if size > MOST_BYTES:
             raise ScenarioError(f"{where} has {size} bytes; a job table has at most {MOST_BYTES}.")
-        match path.suffix.lower():
-            case ".parquet":
-                rows, decimal_comma = _parquet_rows(path, where), False
-            case ".xlsx":
-                rows, decimal_comma = _xlsx_rows(path, where), False
+        match file:
+            case bytes():
+                rows, decimal_comma = _csv_rows(file, where)
+            case Path() if file.suffix.lower() == ".parquet":
+                rows, decimal_comma = _parquet_rows(file, where), False
+            case Path() if file.suffix.lower() == ".xlsx":
+                rows, decimal_comma = _xlsx_rows(file, where), False
             case _:
-                rows, decimal_comma = _csv_rows(path.read_bytes(), where)
+                rows, decimal_comma = _csv_rows(file.read_bytes(), where)
     except FileNotFoundError as error:
-        raise ScenarioError(f"{where}: there is no file '{path}'.") from error
+        raise ScenarioError(f"{where}: there is no file '{file}'.") from error
     except OSError as error:
-        raise ScenarioError(f"{where}: cannot read '{path}': {error.strerror}.") from error
+        raise ScenarioError(f"{where}: cannot read '{file}': {error.strerror}.") from error
     return ((number, cells) for number, cells in rows if not all(map(_is_empty, cells))), decimal_comma
 
 
