@@ -343,9 +343,11 @@ def test_a_thousand_rows_are_read_and_all_their_faults_told_within_a_second(tmp_
     assert time.perf_counter() - begin_s < 1.0
 
 
-def test_rows_outside_the_shift_are_counted_and_a_name_of_a_streams_job_is_refused(tmp_path, caplog):
+def test_rows_outside_the_shift_are_counted_and_a_name_of_a_streams_job_is_refused(tmp_path, caplog, plans):
     rows = [f"j{i},hold,bench,,,{i * 60},,,," for i in range(5)]
-    small_table(tmp_path, "\n".join([SHORT, *rows]))
+    scenario = small_table(tmp_path, "\n".join([SHORT, *rows]))
+    log = run(prepare(scenario, difficulty="blind", cache=plans), policy="edd", difficulty="blind")
+    assert "2 of 5 jobs of tables and traces never arrived: their times are outside the shift." in log.page()
     assert "'jobs.csv': 2 of 5 times are outside the shift, which ends at horizon_s = 180" in caplog.text
     assert "gives no job: its only time is outside" in faults_of(tmp_path, f"{SHORT}\na,hold,bench,,,180,,,,\n")
     (tmp_path / "jobs.csv").write_text(f"{SHORT}\nsort-001,hold,bench,,,,,,,\n", encoding="utf-8")
