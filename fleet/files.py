@@ -2,6 +2,7 @@
 
 import codecs
 import os
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,13 +10,8 @@ from pathlib import Path
 
 from fleet.errors import FleetError
 
-
-def _of_windows(error: UnicodeError) -> tuple[str, int]:
-    assert isinstance(error, UnicodeDecodeError)
-    return error.object[error.start : error.end].decode("cp1252", errors="replace"), error.end
-
-
-codecs.register_error("cp1252", _of_windows)
+_NO_UTF8 = re.compile("[\udc80-\udcff]+")
+"""How Python keeps such bytes."""
 
 
 def decode_text(content: bytes) -> str:
@@ -25,7 +21,8 @@ def decode_text(content: bytes) -> str:
     """
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16", errors="replace")
-    return content.decode("utf-8-sig", errors="cp1252")
+    text = content.decode("utf-8-sig", errors="surrogateescape")
+    return _NO_UTF8.sub(lambda found: found[0].encode("utf-8", "surrogateescape").decode("cp1252", "replace"), text)
 
 
 def cache_folder() -> Path:

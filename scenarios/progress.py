@@ -39,10 +39,9 @@ class Count(float):
     done: float
     total: int
     at_once: int
-    """Number that is worked on at the same time."""
 
     def __new__(cls, done: float, total: int, at_once: int = 1) -> "Count":
-        """The fraction."""
+        """The fraction; `at_once` are worked on at the same time."""
         count = super().__new__(cls, done / total)
         count.done, count.total, count.at_once = done, total, at_once
         return count
@@ -71,15 +70,14 @@ class StageClock:
         return now_s - self._began_s
 
     def left_s(self, now_s: float) -> float | None:
-        """Time until the stage ends at its mean pace so far, s; None while there is nothing to judge by.
-
-        What others work on when one is done is taken for half done.
-        """
+        """Time until the stage ends at its mean pace so far, s; None while there is nothing to judge by."""
         done, left, spent_s = self.fraction - self._first, 1.0 - self.fraction, self.elapsed_s(now_s)
         if spent_s < LEAST_S or done <= 0:
             return None
-        begun = min((self.fraction.at_once - 1) / self.fraction.total, left) if isinstance(self.fraction, Count) else 0
-        return spent_s / (done + begun / 2) * (left - begun / 2)
+        if isinstance(self.fraction, Count):  # what others work on when one is done is half done, on average
+            half = min((self.fraction.at_once - 1) / self.fraction.total, left) / 2
+            done, left = done + half, left - half
+        return spent_s / done * left
 
     @property
     def label(self) -> str:

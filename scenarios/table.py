@@ -30,6 +30,8 @@ another column, up to which it is not broken."""
 TABLE_FILES = (".csv", ".xlsx")
 """Endings of files of tables for spreadsheets."""
 NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")
+FORMULA = re.compile(r"\s*[=+@-](?![\d.,]+(e[+-]?\d+)? ?%?$)")
+"""Begin of a text that a spreadsheet would compute; numbers and percentages are none."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,7 @@ class Table:
         A text that a spreadsheet would take for a formula has an apostrophe before it.
         """
         text = io.StringIO()
-        lines = (["'" * _is_formula(cell) + cell for cell in cells] for cells in self._lines())
+        lines = (["'" * bool(FORMULA.match(cell)) + cell for cell in cells] for cells in self._lines())
         csv.writer(text, lineterminator="\n").writerows(lines)
         return text.getvalue()
 
@@ -206,7 +208,7 @@ class Table:
             for column, text in enumerate(cells, start=1):
                 is_number = NUMBER.fullmatch(text) and row > 1
                 cell = book.active.cell(row, column, float(text) if is_number else visible(text, "\n"))
-                cell.data_type, cell.quotePrefix = "n" if is_number else "s", _is_formula(text)
+                cell.data_type, cell.quotePrefix = "n" if is_number else "s", bool(FORMULA.match(text))
         file = io.BytesIO()
         book.save(file)
         return file.getvalue()
@@ -222,12 +224,6 @@ class Table:
         for index, row in enumerate(self.rows):
             group = [self.groups[index]] if index in self.groups else group
             yield (*group, *row)
-
-
-def _is_formula(text: str) -> bool:
-    """Whether a spreadsheet would compute this cell of a CSV file, as =1+1; numbers and percentages are none."""
-    is_number = NUMBER.fullmatch(text.rstrip(" %").replace(",", ""))
-    return text.lstrip()[:1] in ("=", "+", "-", "@") and not is_number
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

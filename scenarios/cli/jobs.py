@@ -75,7 +75,7 @@ def submit_command(
         done = quote_jobs(tuple(jobs.values()), endpoint, fleet, timeout_s=timeout, as_json=as_json)
     else:
         table = file if file.lower().endswith(SUFFIXES) else ""
-        done = submit_jobs(jobs, endpoint, fleet, by=by, wait=wait, table=table)
+        done = submit_jobs(jobs, endpoint, fleet, by=by, wait=wait, table=table, begin=shift_begin)
     if not done:
         raise typer.Exit(1)
 

@@ -61,7 +61,7 @@ from fleet.live.monitor.async_bridge import AsyncBridge, EventFeed, FeedEntry
 from fleet.live.monitor.snapshot import MAX_JOBS
 from scenarios.cli.options import the_fleet
 from scenarios.signals import until_stopped
-from scenarios.spec.job_table import cell_of, check_cell, read_job_table, shift_begin
+from scenarios.spec.job_table import read_job_table, shift_begin, with_cell
 from scenarios.spec.schema import Scenario
 from scenarios.terminal import Interrupted, echo
 
@@ -357,28 +357,21 @@ def application(
 
     async def submit_table(request: Request) -> Response:
         content = await read_bytes(request, MAX_TABLE_BYTES, body_s)
-        name, replies = "The table", list[SubmissionReply]()
         begin, by = (request.query_params.get(key, "") for key in ("shift_begin", "by"))
+        places, reply = None, SubmissionReply("", ())
+        with suppress(Refused, BusError):  # no participant knows the cell
+            places = [place.name for place in (await ask_cell()).places]
+        read = partial(read_job_table, begin=shift_begin(begin, "shift_begin"), places=places)
+        table = await limited(lambda: asyncio.to_thread(read, content, "The table"))
+        rows = {job.name: (f"row {number}", job) for number, job in table.items()}
         try:
-            read = partial(read_job_table, content, name, begin=shift_begin(begin, "shift_begin"))
-            rows = await limited(lambda: asyncio.to_thread(read))
-            with suppress(Refused):  # no participant knows the cell
-                check_cell(rows, [place.name for place in (await ask_cell()).places], name)
-        except ScenarioError as error:
-            raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
-        numbers = {job.name: (number, job) for number, job in rows.items()}
-        try:
-            for jobs in batches(tuple(rows.values())):
-                replies.append(await ask(keys.of_jobs(bridge.fleet, "submit"), Submission(jobs, by), SubmissionReply))
+            for jobs in batches(tuple(table.values())):
+                new = await ask(keys.of_jobs(bridge.fleet, "submit"), Submission(jobs, by), SubmissionReply)
+                reply = replace(new, jobs=(*reply.jobs, *(with_cell(each, rows) for each in new.jobs)))
         except (BusError, Refused) as error:
-            accepted = [f"row {numbers[each.job][0]}" for reply in replies for each in reply.jobs if each.accepted]
-            raise BusError(f"{error} Accepted before: {', '.join(accepted) or 'no job'}.") from error
-        admissions = [
-            replace(each, reason=f"{cell_of(*numbers[each.job], each.reason)}: {each.reason}") if each.reason else each
-            for reply in replies
-            for each in reply.jobs
-        ]
-        return json_response(replace(replies[-1], jobs=tuple(admissions)))
+            accepted = ", ".join(rows[each.job][0] for each in reply.jobs if each.accepted)
+            raise BusError(f"{error} Accepted before: {accepted or 'no job'}.") from error
+        return json_response(reply)
 
     control = of_jobs("control", ControlRequest, Controlled)
     clear = of_jobs("clear", ClearRequest, Cleared)
@@ -405,10 +398,7 @@ def application(
 
     async def post_ask(request: Request) -> Response:
         body = await read_body(request, AskBody, body_s)
-        try:
-            quote_request = decode(QuoteRequest, encode(QuoteRequest("http", body.jobs, dry_run=True)))
-        except MalformedMessage as error:
-            raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+        quote_request = decode(QuoteRequest, encode(QuoteRequest("http", body.jobs, dry_run=True)))
         return json_response(await limited(lambda: bridge.quotes(quote_request)))
 
     async def events(request: Request) -> Response:
@@ -440,7 +430,7 @@ def application(
     routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
     if page is not None:
         routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
-    handlers = dict.fromkeys((HttpProblem, BusError, Refused, HTTPException, Exception), error_response)
+    handlers = dict.fromkeys((HttpProblem, BusError, Refused, ScenarioError, HTTPException, Exception), error_response)
     access = Middleware(AccessCheck, tokens=tokens, **({"public": is_public} if page is not None else {}))
     return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
 
@@ -512,15 +502,13 @@ async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
     """Read the message that is the body of a request.
 
     Raises:
-        HttpProblem: too large, too slow, not JSON, or not a message of this kind.
+        HttpProblem: not JSON, too large or too slow.
+        MalformedMessage: not a message of this kind.
     """
     if (given := content_type(request)) != "application/json":
         detail = f"The body must be application/json, or for /v4/jobs also {TABLE} (got '{given}')."
         raise HttpProblem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
-    try:
-        return decode(kind, await read_bytes(request, MAX_BYTES, body_s))
-    except MalformedMessage as error:
-        raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+    return decode(kind, await read_bytes(request, MAX_BYTES, body_s))
 
 
 def content_type(request: Request) -> str:
@@ -555,6 +543,8 @@ def error_response(_: Request, error: Exception) -> Response:
     match error:
         case HttpProblem():
             return problem_response(error.status, error.detail)
+        case ScenarioError() | MalformedMessage():
+            return problem_response(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
         case BusError() | Refused():
             return problem_response(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
         case HTTPException():

@@ -43,7 +43,7 @@ from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import the_fleet
 from scenarios.signals import until_stopped
-from scenarios.spec.job_table import SUFFIXES, cell_of, check_cell, read_job_table, shift_begin
+from scenarios.spec.job_table import SUFFIXES, read_job_table, shift_begin, with_cell
 from scenarios.table import Column, Table
 from scenarios.terminal import echo, out_console, print_json, say
 
@@ -62,37 +62,45 @@ Decoded = TypeVar("Decoded")
 
 
 def submit_jobs(
-    jobs: Mapping[int, JobSpec], endpoint: str, fleet: str, *, by: str = "", wait: bool = False, table: str = ""
+    jobs: Mapping[int, JobSpec],
+    endpoint: str,
+    fleet: str,
+    *,
+    by: str = "",
+    wait: bool = False,
+    table: str = "",
+    begin: str = "",
 ) -> bool:
     """Submit jobs and print the decision on each; return whether all are accepted and, after a wait, finished.
 
     Args:
         jobs: By number, as from `read_jobs`.
         wait: Follow the accepted jobs to their end.
-        table: The job table with these rows, to name them. If the cell lacks one of its places, nothing is submitted.
+        table: The job table that has them, to name its rows. If the cell lacks one of its places, nothing is submitted.
+        begin: As for `read_jobs`.
 
     Raises:
         FleetError: the submission is refused, there is no auctioneer, it disappears while jobs are followed, or the
             cell lacks places of a job table.
     """
-    states, rows = dict[str, str](), {job.name: (number, job) for number, job in jobs.items()}
-
-    def show(line: str, job: str, reason: str) -> None:
-        echo(f"{line} ({table}, {cell_of(*rows[job], reason)})" if table and reason and job in rows else line)
+    states = dict[str, str]()
+    rows = {job.name: (f"{table}, row {number}", job) for number, job in jobs.items() if table}
 
     def show_change(status: JobStatus) -> None:
         if states.get(status.job) != status.state:
             states[status.job] = status.state
-            show(describe_status(status), status.job, status.reason)
+            echo(describe_status(with_cell(status, rows)))
 
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         client = JobClient(link, by, show_change)
         try:
             if table:
-                with suppress(Refused):  # no participant knows the cell
+                with suppress(Refused, NoReply):  # no participant knows the cell
                     cell = link.ask(keys.of_jobs(link.fleet, "cell"), CellRequest(), Cell, timeout_s=REPLY_S)
-                    check_cell(jobs, [place.name for place in cell.places], table)
-            admissions = client.submit_and_wait(tuple(jobs.values()))
+                    read_job_table(
+                        Path(table), begin=shift_begin(begin, ""), places=[each.name for each in cell.places]
+                    )
+            admissions = [with_cell(each, rows) for each in client.submit_and_wait(tuple(jobs.values()))]
         except Refused as error:
             raise FleetError(f"The auctioneer refused the submission: {error}") from error
         except NoReply as error:
@@ -102,8 +110,7 @@ def submit_jobs(
             ) from error
         for admission in admissions:
             decision = "accepted" if admission.accepted else "refused"
-            line = f"{admission.job}: {decision}{f': {admission.reason}' if admission.reason else ''}"
-            show(line, admission.job, admission.reason)
+            echo(f"{admission.job}: {decision}{f': {admission.reason}' if admission.reason else ''}")
         while wait and client.open and not stop.is_set():
             client.step()
             link.serve(time.monotonic() + TURN_S)

@@ -19,9 +19,11 @@ from itertools import chain, islice
 from math import inf, isfinite, nextafter
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from fleet.bus.protocol.auction import JobSpec
+from msgspec.structs import replace
+
+from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus
 from fleet.errors import ScenarioError, check_names, nearest, printable
 from fleet.files import decode_text
 from fleet.job import BOUNDS, DWELL_S, KINDS, check_alternatives, check_bounds, check_duration, check_dwell
@@ -44,6 +46,7 @@ _FLAGS = {
     **dict.fromkeys(("yes", "true", "1", "hard", "ja", "wahr"), True),
     **dict.fromkeys(("no", "false", "0", "soft", "nein", "falsch"), False),
 }
+Told = TypeVar("Told", Admission, JobStatus)
 Cell = Any
 """A text, number, date, list or None, according to the file."""
 Rows = Iterator[tuple[int, Sequence[Cell]]]
@@ -203,6 +206,7 @@ def read_job_table(
     begin: datetime | None = None,
     horizon_s: float = inf,
     places: Collection[str] | None = None,
+    closed: bool = False,
 ) -> dict[int, JobSpec]:
     """The jobs of a table by the numbers of their rows, in order; times count from the begin of the shift.
 
@@ -211,7 +215,8 @@ def read_job_table(
         where: Name of the table in errors; by default the path.
         begin: Of the shift, with its zone; needed for dates.
         horizon_s: Length of the shift; a time of day before its begin must be within it on the next day.
-        places: Places of the cell; `places` must name some of them, and `after` rows of the table. None: not checked.
+        places: Of the cell; None: not checked.
+        closed: Whether `after` must name rows of the table.
 
     Raises:
         ScenarioError: the file cannot be read, or rows are wrong: all faults, each with its row and column.
@@ -224,6 +229,7 @@ def read_job_table(
         raise ScenarioError(f"{where} has {len(head)} columns; a job table has at most {MOST_COLUMNS}.")
     columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma, horizon_s)
     faults.raise_any(where)
+    no_place = cache(lambda name: f"no place '{printable(name)}'{nearest(name, places or ())}")
     rows: dict[str, tuple[int, Row]] = {}
     for count, (number, cells) in enumerate(lines):
         if count == MOST_ROWS:
@@ -235,15 +241,16 @@ def read_job_table(
         for field, sentence in _problems(row, wrong):
             faults.add(number, _COLUMN_OF[field], sentence)
             wrong.add(field)
-        if places is not None and "every_places" not in wrong:
-            _check_places(number, row.places, places, faults)
+        for name in dict.fromkeys(row.places) if places is not None and "every_places" not in wrong else ():
+            if name not in places:
+                faults.add(number, "places", no_place(name))
         if row.name and row.name in rows:
             faults.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
         elif not wrong:
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
             jobs[number] = JobSpec(**{name: value for name, value in fields.items() if name != "every_places"})
         rows.setdefault(row.name, (number, row))
-    _check_after(rows, faults, only_rows=places is not None)
+    _check_after(rows, faults, closed=closed)
     faults.raise_any(where)
     if not jobs:
         raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
@@ -328,38 +335,23 @@ def _check_force(row: Row) -> None:
         raise ValueError(f"only a press has a contact force (got {row.force_n:g} N for a {row.kind})")
 
 
-def check_cell(jobs: Mapping[int, JobSpec], places: Collection[str], where: str) -> None:
-    """Check that a cell has the places of the jobs, which are given by row.
+def with_cell(told: Told, jobs: Mapping[str, tuple[str, JobSpec]]) -> Told:
+    """A decision or status whose reason, if any, begins with the row of the job and the column that it quotes.
 
-    Raises:
-        ScenarioError: all that it lacks, each with its row and column.
+    Args:
+        jobs: The jobs of a table by name, each after its row.
     """
-    faults = _Faults()
-    for number, job in jobs.items():
-        _check_places(number, tuple(chain.from_iterable(job.every_places)), places, faults)
-    faults.raise_any(where)
-
-
-def _check_places(number: int, names: Sequence[str], places: Collection[str], faults: _Faults) -> None:
-    for name in dict.fromkeys(names):
-        if name not in places:
-            faults.add(number, "places", _no_place(name, tuple(places)))
-
-
-@cache
-def _no_place(name: str, places: Sequence[str]) -> str:
-    return f"no place '{printable(name)}'{nearest(name, places)}"
-
-
-def cell_of(number: int, job: JobSpec, reason: str) -> str:
-    """Row and, if the reason of a refusal quotes one of its cells, column of a job in a table."""
+    if not told.reason or told.job not in jobs:
+        return told
+    row, job = jobs[told.job]
     columns = {"places": chain.from_iterable(job.every_places), "after": job.after, "name": (job.name,)}
-    quoted = (column for column, names in columns.items() if any(f"'{name}'" in reason for name in names))
-    return f"row {number}{''.join(f', column {column}' for column in islice(quoted, 1))}"
+    quoted = (column for column, names in columns.items() if any(f"'{name}'" in told.reason for name in names))
+    place = ", column ".join([row, *islice(quoted, 1)])
+    return replace(told, reason=f"{place}: {told.reason}")
 
 
-def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults, *, only_rows: bool) -> None:
-    for number, row in rows.values() if only_rows else ():
+def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults, *, closed: bool) -> None:
+    for number, row in rows.values() if closed else ():
         for name in row.after:
             if name not in rows:
                 faults.add(number, "after", f"there is no job '{printable(name)}' in this table")
@@ -378,23 +370,14 @@ def cycle_of(after: Mapping[str, Sequence[str]]) -> list[str]:
 
 def _rows(file: Path | bytes, where: str) -> tuple[Rows, bool]:
     """Rows of a file that are not empty, and whether a comma in them may be a decimal point."""
-    try:
-        size = len(file) if isinstance(file, bytes) else file.stat().st_size
-        if size > MOST_BYTES:
-            raise ScenarioError(f"{where} has {size} bytes; a job table has at most {MOST_BYTES}.")
-        match file:
-            case bytes():
-                rows, decimal_comma = _csv_rows(file, where)
-            case Path() if file.suffix.lower() == ".parquet":
-                rows, decimal_comma = _parquet_rows(file, where), False
-            case Path() if file.suffix.lower() == ".xlsx":
-                rows, decimal_comma = _xlsx_rows(file, where), False
-            case _:
-                rows, decimal_comma = _csv_rows(file.read_bytes(), where)
-    except FileNotFoundError as error:
-        raise ScenarioError(f"{where}: there is no file '{file}'.") from error
-    except OSError as error:
-        raise ScenarioError(f"{where}: cannot read '{file}': {error.strerror}.") from error
+    content = file if isinstance(file, bytes) else read_bytes(file, where)
+    match "" if isinstance(file, bytes) else file.suffix.lower():
+        case ".parquet":
+            rows, decimal_comma = _parquet_rows(content, where), False
+        case ".xlsx":
+            rows, decimal_comma = _xlsx_rows(content, where), False
+        case _:
+            rows, decimal_comma = _csv_rows(content, where)
     return ((number, cells) for number, cells in rows if not all(map(_is_empty, cells))), decimal_comma
 
 
@@ -421,6 +404,20 @@ def _csv_rows(content: bytes, where: str) -> tuple[Rows, bool]:
     return rows(), delimiter != ","
 
 
+def read_bytes(path: Path, where: str) -> bytes:
+    """The content of a file; raises a ScenarioError if it cannot be read or is too large."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except FileNotFoundError as error:
+        raise ScenarioError(f"{where}: there is no file '{path}'.") from error
+    except OSError as error:
+        raise ScenarioError(f"{where}: cannot read '{path}': {error.strerror}.") from error
+    if len(content) > MOST_BYTES:
+        raise ScenarioError(f"{where} has more than {MOST_BYTES} bytes.")
+    return content
+
+
 def text_of(content: bytes, where: str) -> str:
     """The text of a file, as `decode_text` reads it; raises a ScenarioError for other data."""
     if "\0" in (text := decode_text(content)):
@@ -428,27 +425,30 @@ def text_of(content: bytes, where: str) -> str:
     return text
 
 
-def _parquet_rows(path: Path, where: str) -> Rows:
+def _parquet_rows(content: bytes, where: str) -> Rows:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        if (count := pq.ParquetFile(path).metadata.num_rows) > MOST_ROWS:
+        file = pq.ParquetFile(pa.BufferReader(content))
+        if (count := file.metadata.num_rows) > MOST_ROWS:
             raise ScenarioError(f"{where} has {count} rows; a job table has at most {MOST_ROWS}.")
-        table = pq.read_table(path)
+        table = file.read()
     except (pa.ArrowException, OSError) as error:
         raise ScenarioError(f"{where} is not a Parquet file ({str(error).splitlines()[0]}).") from error
     yield 0, table.column_names
     yield from enumerate(zip(*(column.to_pylist() for column in table.columns), strict=True), start=1)
 
 
-def _xlsx_rows(path: Path, where: str) -> Rows:
+def _xlsx_rows(content: bytes, where: str) -> Rows:
     from scenarios.extras import require_extra
 
     require_extra("xlsx")
     openpyxl = import_module("openpyxl")
     try:
-        values, written = (openpyxl.load_workbook(path, data_only=data_only) for data_only in (True, False))
+        values, written = (
+            openpyxl.load_workbook(io.BytesIO(content), data_only=data_only) for data_only in (True, False)
+        )
     except Exception as error:  # also those of zipfile and of an XML parser
         raise ScenarioError(f"{where} is not an XLSX file ({error}).") from error
     if not values.worksheets:

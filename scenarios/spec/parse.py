@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from fleet.errors import ScenarioError, nearest, printable
-from scenarios.spec.job_table import cycle_of, read_job_table, shift_begin, stream_fields, text_of
+from scenarios.spec.job_table import cycle_of, read_bytes, read_job_table, shift_begin, stream_fields, text_of
 from scenarios.spec.schema import JobStream, Scenario
 from scenarios.spec.units import check_times, check_units
 
@@ -228,7 +228,7 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
         file = path.parent / each["table"]
         where = f"{where}.table: '{file.name}'"
         try:
-            rows = read_job_table(file, where, begin=begin, horizon_s=horizon_s or inf, places=names)
+            rows = read_job_table(file, where, begin=begin, horizon_s=horizon_s or inf, places=names, closed=True)
             check_times([row.release_s for row in rows.values()], horizon_s, where)
         except ScenarioError as error:
             faults.append(str(error))
@@ -375,12 +375,7 @@ def _with_traces(scenario: Scenario, path: Path) -> Scenario:
 
 
 def _trace(where: Path, place: str) -> tuple[float, ...]:
-    try:
-        lines = text_of(where.read_bytes(), f"{place}: '{where.name}'").splitlines()
-    except FileNotFoundError as error:
-        raise ScenarioError(f"{place}: there is no file '{where}'.") from error
-    except OSError as error:
-        raise ScenarioError(f"{place}: cannot read '{where}': {error.strerror}.") from error
+    lines = text_of(read_bytes(where, place), f"{place}: '{where.name}'").splitlines()
     times: list[float] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):

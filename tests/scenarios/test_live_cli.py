@@ -434,9 +434,9 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         table.write_text("name,kind,places,after\na,hold,belt,\nd,hold,belt,\ne,hold,belt,no/one\n")
         code, out, _ = thermofleet("job", "submit", table, *at)
         assert (code, out.splitlines()) == (1, [
-            f"a: refused: Another job has the name 'a'; names must be unique. ({table}, row 2, column name)",
+            f"a: refused: {table}, row 2, column name: Another job has the name 'a'; names must be unique.",
             "d: accepted",
-            f"e: refused: It waits for 'no/one', which is unknown or was not accepted. ({table}, row 4, column after)",
+            f"e: refused: {table}, row 4, column after: It waits for 'no/one', which is unknown or was not accepted.",
         ])  # fmt: skip
         thermofleet("job", "cancel", "d", *at)
         code, _, err = thermofleet(
