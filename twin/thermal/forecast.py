@@ -25,7 +25,6 @@ from twin.thermal.identify import (
     Identified,
     ParameterVector,
     Problem,
-    check_seven_joints,
     nominal_heat_model,
     solve,
     usual_noise,
@@ -214,7 +213,6 @@ def _parameters(network: Identified | None) -> ParameterVector:
 
 def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLog, Array]:
     """The last stretch of a log without a gap, in at most `MOST_STEPS` steps, and its last motor temperatures."""
-    check_seven_joints(so_far)
     if so_far.temp_c is None:
         raise FleetError(f"The log '{so_far.name}' has no motor temperatures, from which a forecast starts.")
     late = so_far.part(so_far.time_s >= so_far.time_s[-1] - MEMORY_S)
@@ -235,7 +233,6 @@ def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLo
 
 def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:
     """The heat of a repetition, in every interval between samples."""
-    check_seven_joints(plan)
     silent = replace(plan, temp_c=np.zeros_like(plan.q))  # of no use here
     logs = heat_logs(silent, motors, source_of([plan]), step_s=0.0)
     if len(plan.time_s) < LEAST_SAMPLES:

@@ -567,21 +567,12 @@ def _hash(recordings: Sequence[Recording]) -> str:
     return digest.hexdigest()[:16]
 
 
-def check_seven_joints(recording: Recording) -> None:
-    """Raise an IdentificationError unless a recording has the joints of the thermal network."""
-    if recording.joints != JOINTS:
-        raise IdentificationError(
-            f"Recording '{recording.name}' has {recording.joints} joints, the thermal network {JOINTS}."
-        )
-
-
 def _check_recordings(recordings: Sequence[Recording]) -> None:
     if not recordings:
         raise IdentificationError("Identification needs at least one recording (got none).")
     if twice := sorted(name for name, count in Counter(r.name for r in recordings).items() if count > 1):
         raise IdentificationError(f"Names of recordings must differ; given more than once: {', '.join(twice)}.")
     for recording in recordings:
-        check_seven_joints(recording)
         if recording.temp_c is None:
             raise IdentificationError(
                 f"Recording '{recording.name}' has no motor temperatures. Record temperature_motor of every joint "
