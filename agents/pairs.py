@@ -7,7 +7,6 @@ Numbers of one option come from one arm's observation; numbers of the set (alter
 arm, peers) come from the observations of all arms. They do not depend on the order or number of arms and slots.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ from agents.policy import per_option, plans_of
 from agents.prices import BidPrice, Bids, Weights
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
+from fleet.json_file import read_card, write_card
 from fleet.observation import Observation
 
 Array = np.ndarray
@@ -192,9 +192,7 @@ def save_pairs(parameters: Array, folder: Path, **details: object) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder / PAIRS) as draft, draft.open("wb") as file:
         np.save(file, parameters.astype(np.float32))
-    with atomic_path(folder / PAIRS_CARD) as draft:
-        card = {"format": PAIRS_FORMAT, **details}
-        draft.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    write_card({"format": PAIRS_FORMAT, **details}, folder / PAIRS_CARD)
 
 
 def load_pairs(folder: Path) -> LearnedPrices:
@@ -203,15 +201,13 @@ def load_pairs(folder: Path) -> LearnedPrices:
     Raises:
         CheckpointError: a file is missing, damaged or of another format.
     """
+    read_card(folder / PAIRS_CARD, dict, format_=PAIRS_FORMAT, what="policy over pairs")
     try:
-        found = json.loads((folder / PAIRS_CARD).read_text(encoding="utf-8"))["format"]
         with (folder / PAIRS).open("rb") as opened:
             parameters = np.load(opened, allow_pickle=False)
     except Exception as error:  # whatever it is, the files are missing or damaged
         reason = f"{type(error).__name__}: {error}"
         raise CheckpointError(f"There is no policy over pairs in '{folder}' ({reason}).") from error
-    if found != PAIRS_FORMAT:
-        raise CheckpointError(f"{folder / PAIRS_CARD}: format {found} is not {PAIRS_FORMAT}. Train the policy again.")
     shape, kind = np.shape(parameters), getattr(parameters, "dtype", None)
     if shape != (PARAMETERS,) or kind != np.float32 or not (np.abs(parameters) <= MOST_PARAMETER).all():
         raise CheckpointError(

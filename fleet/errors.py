@@ -127,17 +127,21 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
 
 MAX_NAME = 128
 """Characters; a file name with it and an ending has at most 255 bytes."""
-NAME_RULE = f"1 to {MAX_NAME} printable characters without / \\ [ ], and no dot or space at the start"
+_JOB_RULE, NAME_RULE = (
+    f"1 to {MAX_NAME} printable characters{without}, and no dot or space at the start"
+    for without in ("", " without / \\ [ ]")
+)
+"""Rules for names of jobs, and of fleets, arms, auctioneers and places."""
 _FORBIDDEN = frozenset("/\\[]")
-"""Rule for names of fleets, arms, auctioneers, jobs and places."""
 
 
-def is_name(text: str) -> bool:
+def is_name(text: str, *, of_job: bool = False) -> bool:
     """Whether a text follows the rule for names, `NAME_RULE`: it is one file name, and is shown as it is written."""
-    return 0 < len(text) <= MAX_NAME and text[0] not in ". " and text.isprintable() and _FORBIDDEN.isdisjoint(text)
+    is_shown = 0 < len(text) <= MAX_NAME and text[0] not in ". " and text.isprintable()
+    return is_shown and (of_job or _FORBIDDEN.isdisjoint(text))
 
 
-def check_names(owner: object, *fields: str) -> None:
+def check_names(owner: object, *fields: str, of_jobs: bool = False) -> None:
     """Check that these fields, or all elements of a tuple of names or of such tuples, are names.
 
     Raises:
@@ -147,8 +151,9 @@ def check_names(owner: object, *fields: str) -> None:
         given = getattr(owner, field)
         several = given if isinstance(given, tuple) else (given,)
         for name in chain.from_iterable((each,) if isinstance(each, str) else each for each in several):
-            if not is_name(name):
-                raise ValueError(f"{type(owner).__name__}.{field} must have {NAME_RULE} (got '{printable(name)}').")
+            if not is_name(name, of_job=of_jobs):
+                rule = _JOB_RULE if of_jobs else NAME_RULE
+                raise ValueError(f"{type(owner).__name__}.{field} must have {rule} (got '{printable(name)}').")
 
 
 def printable(text: str, longest: int = 4 * MAX_NAME) -> str:

@@ -1,12 +1,28 @@
 """Cache folders, and files that are written atomically."""
 
+import codecs
 import os
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from fleet.errors import FleetError
+
+_NO_UTF8 = re.compile("[\udc80-\udcff]+")
+"""How Python keeps such bytes."""
+
+
+def decode_text(content: bytes) -> str:
+    """The text of a table that people exchange: UTF-8 or, with a byte order mark, UTF-16.
+
+    Bytes that are no UTF-8 are taken for Windows-1252, which old spreadsheets write, also among UTF-8.
+    """
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", errors="replace")
+    text = content.decode("utf-8-sig", errors="surrogateescape")
+    return _NO_UTF8.sub(lambda found: found[0].encode("utf-8", "surrogateescape").decode("cp1252", "replace"), text)
 
 
 def cache_folder() -> Path:

@@ -38,11 +38,12 @@ class Count(float):
 
     done: float
     total: int
+    at_once: int
 
-    def __new__(cls, done: float, total: int) -> "Count":
-        """The fraction."""
+    def __new__(cls, done: float, total: int, at_once: int = 1) -> "Count":
+        """The fraction; `at_once` are worked on at the same time."""
         count = super().__new__(cls, done / total)
-        count.done, count.total = done, total
+        count.done, count.total, count.at_once = done, total, at_once
         return count
 
 
@@ -70,8 +71,13 @@ class StageClock:
 
     def left_s(self, now_s: float) -> float | None:
         """Time until the stage ends at its mean pace so far, s; None while there is nothing to judge by."""
-        done, spent_s = self.fraction - self._first, self.elapsed_s(now_s)
-        return spent_s / done * (1.0 - self.fraction) if spent_s >= LEAST_S and done > 0 else None
+        done, left, spent_s = self.fraction - self._first, 1.0 - self.fraction, self.elapsed_s(now_s)
+        if spent_s < LEAST_S or done <= 0:
+            return None
+        if isinstance(self.fraction, Count):  # what others work on when one is done is half done, on average
+            half = min((self.fraction.at_once - 1) / self.fraction.total, left) / 2
+            done, left = done + half, left - half
+        return spent_s / done * left
 
     @property
     def label(self) -> str:
@@ -87,7 +93,9 @@ class StageClock:
     def line(self, now_s: float) -> str:
         """The stage, its count, the part done and the time left, as one line."""
         left_s = self.left_s(now_s)
-        left = f"about {brief(left_s)} left" if left_s is not None else f"for {brief(self.elapsed_s(now_s))}"
+        left = (
+            f"about {brief(left_s)} left of this stage" if left_s is not None else f"for {brief(self.elapsed_s(now_s))}"
+        )
         return f"{self.label}: {self.fraction:.0%}, {left}."
 
 

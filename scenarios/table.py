@@ -30,6 +30,8 @@ another column, up to which it is not broken."""
 TABLE_FILES = (".csv", ".xlsx")
 """Endings of files of tables for spreadsheets."""
 NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")
+FORMULA = re.compile(r"\s*[=+@-](?![\d.,]+(e[+-]?\d+)? ?%?$)")
+"""Begin of a text that a spreadsheet would compute; numbers and percentages are none."""
 
 
 @dataclass(frozen=True)
@@ -183,9 +185,13 @@ class Table:
         return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
     def csv(self) -> str:
-        """As comma-separated values, with the group of a row, if any, as its first column."""
+        """As comma-separated values, with the group of a row, if any, as its first column.
+
+        A text that a spreadsheet would take for a formula has an apostrophe before it.
+        """
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(self._lines())
+        lines = (["'" * bool(FORMULA.match(cell)) + cell for cell in cells] for cells in self._lines())
+        csv.writer(text, lineterminator="\n").writerows(lines)
         return text.getvalue()
 
     def xlsx(self) -> bytes:
@@ -202,7 +208,7 @@ class Table:
             for column, text in enumerate(cells, start=1):
                 is_number = NUMBER.fullmatch(text) and row > 1
                 cell = book.active.cell(row, column, float(text) if is_number else visible(text, "\n"))
-                cell.data_type = "n" if is_number else "s"
+                cell.data_type, cell.quotePrefix = "n" if is_number else "s", bool(FORMULA.match(text))
         file = io.BytesIO()
         book.save(file)
         return file.getvalue()

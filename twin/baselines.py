@@ -15,10 +15,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fleet.difficulty import KNOWN, Forecast
+from fleet.json_file import check_version, read_card, write_card
 from fleet.motion import Plan
 from twin.thermal.thermal_twin import LEAST_JOBS, NotEnoughExperience
 from twin.vae.config import TwinConfig
-from twin.vae.json_file import check_version, read_card, write_card
 from twin.vae.measures import TAU, Features
 from twin.vae.window import STD_FLOOR, check_jobs
 

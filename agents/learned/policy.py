@@ -4,13 +4,12 @@ Deep sets (Zaheer et al., NeurIPS 2017): small shared networks encode options an
 So the logits are equivariant in the options, and invariant to the order and number of peers.
 """
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 from safetensors import SafetensorError
@@ -21,7 +20,8 @@ from agents.learned.config import NetworkSize
 from agents.policy import WAIT, plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
-from fleet.observation import VERSION, Layout, Observation
+from fleet.json_file import read_card, write_card
+from fleet.observation import Layout, Observation
 
 OWN, OPTION, PEER, PAIR = 27, 15, 5, 3
 """Number of features of the arm itself, of an option, of an arm of the fleet, and of its score of an option."""
@@ -246,6 +246,13 @@ def draw(logits: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (logits + rng.gumbel(size=logits.shape)).argmax(axis=-1)
 
 
+class PolicyCard(msgspec.Struct):
+    """What `load_policy` reads of the card."""
+
+    format: int
+    size: NetworkSize
+
+
 def save_policy(actor: Actor, size: NetworkSize, folder: Path, **details: object) -> None:
     """Write an actor into a folder, made if need be; each file is written atomically.
 
@@ -256,9 +263,7 @@ def save_policy(actor: Actor, size: NetworkSize, folder: Path, **details: object
     with atomic_path(folder / WEIGHTS) as draft:
         # save_file would make the file unreadable for group and others.
         draft.write_bytes(save({name: value.contiguous() for name, value in actor.state_dict().items()}))
-    card = {"format": FORMAT, "size": asdict(size), **details}
-    with atomic_path(folder / CARD) as draft:
-        draft.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    write_card({"format": FORMAT, "size": size, **details}, folder / CARD)
 
 
 def load_policy(folder: Path) -> LearnedPolicy:
@@ -267,19 +272,7 @@ def load_policy(folder: Path) -> LearnedPolicy:
     Raises:
         CheckpointError: a file is missing, damaged or of another format.
     """
-    try:
-        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
-        if card["format"] != FORMAT:
-            raise CheckpointError(
-                f"{folder / CARD}: format {card['format']} is not {FORMAT}: its network takes no observations of "
-                f"version {VERSION}. Train the policy again."
-            )
-        size = NetworkSize(**card["size"])
-    except FileNotFoundError as error:
-        raise CheckpointError(f"There is no trained policy in '{folder}': no {CARD}.") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{folder / CARD}: not the card of a policy ({error}).") from error
-    actor = Actor(size)
+    actor = Actor(read_card(folder / CARD, PolicyCard, format_=FORMAT, what="trained policy").size)
     try:
         actor.load_state_dict(load_file(folder / WEIGHTS))
     except (OSError, SafetensorError, RuntimeError) as error:

@@ -64,16 +64,18 @@ def submit_command(
     if as_json and not quote:
         raise FleetError("--json is for --quote: leave it out.")
     from scenarios.live.requests import job_of, quote_jobs, read_jobs, submit_jobs
+    from scenarios.spec.job_table import SUFFIXES
 
     if file:
         jobs = read_jobs(file, shift_begin)
     else:
         fields = {"name": name or kind, "kind": kind, "places": place or [], "repetitions": repetitions}
-        jobs = [job_of({**fields, "payload_kg": payload, "dwell_s": dwell, "force_n": force})]
+        jobs = {1: job_of({**fields, "payload_kg": payload, "dwell_s": dwell, "force_n": force})}
     if quote:
-        done = quote_jobs(jobs, endpoint, fleet, timeout_s=timeout, as_json=as_json)
+        done = quote_jobs(tuple(jobs.values()), endpoint, fleet, timeout_s=timeout, as_json=as_json)
     else:
-        done = submit_jobs(jobs, endpoint, fleet, by=by, wait=wait)
+        table = file if file.lower().endswith(SUFFIXES) else ""
+        done = submit_jobs(jobs, endpoint, fleet, by=by, wait=wait, table=table, begin=shift_begin)
     if not done:
         raise typer.Exit(1)
 

@@ -56,7 +56,7 @@ def up_command(
 def arm_command(
     scenario: str = options.SCENARIO,
     name: str = argument("Arm of the scenario; with --source log any name.", is_name=True),
-    file: Path | None = argument("--source log: a Gen3 log, a plain log, or a recording.", None),
+    file: Path | None = argument("--source log: a Gen3 log, a plain log, or the telemetry.parquet of a run.", None),
     *,
     given: Annotated[Given, From(LiveSpec, "difficulty", "risk", "seed", "journal", "jobs", "fleet", "new_epoch")],
     source: Literal["sim", "log"] = option("sim (the scenario's arm), or log FILE.", "sim"),

@@ -374,9 +374,9 @@ def report_command(
     scenario: str | None = option("Of a recording: scenario of the fleet, if no auctioneer described its cell.", None),
     meshes: bool = option("Of a run: Kinova's shells; needs the extra `meshes`.", False),
     trace: str | None = option(
-        "Write no page, but print what led to this event: job, award, plan, offers, twin, training data, configuration "
-        "and code. EVENT is a row of the event log from 0; a kind such as fault, also with an arm or a job as "
-        "fault@arm_1; or a job, for its award. Of several events, the first one.",
+        "Print the causes of an event instead of writing the page: its job, award, plan, offers, twin, training data, "
+        "configuration and code. EVENT: a kind, as fault; a kind of one arm or job, as fault@arm_1; a job, for its "
+        "award; or a row of the event log, from 0. If several events fit, the first one.",
         None,
         metavar="EVENT",
     ),

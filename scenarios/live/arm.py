@@ -194,11 +194,10 @@ def ambient_of(scenario: Scenario) -> Callable[[float], float]:
     return lambda at_s: float(scenario.ambient.at(np.array(at_s)))
 
 
-def monitor_of(twin: Path | None, network: Path | None, every_s: float) -> "Monitor | None":
-    """What compares motion with the twin and the thermal network of these folders; None without both.
+def monitor_of(twin: Path | None, network: Path | None) -> "Callable[[float], Monitor] | None":
+    """Makes what compares motion with the twin and the thermal network of these folders; None without both.
 
-    Args:
-        every_s: Time between two scores.
+    Its argument is the time between two scores, s.
 
     Raises:
         CheckpointError: a folder has none, or several twins.
@@ -210,7 +209,7 @@ def monitor_of(twin: Path | None, network: Path | None, every_s: float) -> "Moni
     from twin.thermal.checkpoint import load
 
     models = None if twin is None else open_twin(twin), None if network is None else load(network)
-    return Monitor(*models, every_s=every_s)
+    return lambda every_s: Monitor(*models, every_s=every_s)
 
 
 def replayed_arm(name: str, file: Path, twin: Path | None = None, network: Path | None = None) -> PreparedArm:
@@ -232,11 +231,12 @@ def replayed_arm(name: str, file: Path, twin: Path | None = None, network: Path 
     def refuse(work: Work) -> tuple[Plan, ...]:
         raise InfeasibleJob(name, work.places[0].name, f"this arm replays the log '{file.name}' and takes no jobs")
 
-    def body(time_s: float, dt_s: float) -> Body:
-        return ReplayBody(sensors, time_s=time_s, monitor=monitor_of(twin, network, dt_s))
+    monitor = monitor_of(twin, network)  # errors before the arm joins the bus
 
-    monitor = monitor_of(twin, network, 1.0)  # errors before the arm joins the bus
-    model = Blind(version=f"log {file.name}" if monitor is None else monitor.version)
+    def body(time_s: float, dt_s: float) -> Body:
+        return ReplayBody(sensors, time_s=time_s, monitor=monitor and monitor(dt_s))
+
+    model = Blind(version=monitor(1.0).version if monitor else f"log {file.name}")
     return PreparedArm(name=name, model=model, plan=refuse, body=body, takes_jobs=False)
 
 

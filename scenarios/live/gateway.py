@@ -16,9 +16,9 @@ import secrets
 import signal
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import (
@@ -30,6 +30,7 @@ from typing import (
 
 import msgspec
 import uvicorn
+from msgspec.structs import replace
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -54,11 +55,13 @@ from fleet.bus.protocol.operator import (
     ResetRequest,
 )
 from fleet.env.render.heat import heat_scale
-from fleet.errors import NAME_RULE, BusError, FleetError, Refused, is_name, nearest
+from fleet.errors import NAME_RULE, BusError, FleetError, Refused, ScenarioError, is_name, nearest
+from fleet.live.job_client import batches
 from fleet.live.monitor.async_bridge import AsyncBridge, EventFeed, FeedEntry
 from fleet.live.monitor.snapshot import MAX_JOBS
 from scenarios.cli.options import the_fleet
 from scenarios.signals import until_stopped
+from scenarios.spec.job_table import read_job_table, shift_begin, with_cell
 from scenarios.spec.schema import Scenario
 from scenarios.terminal import Interrupted, echo
 
@@ -77,6 +80,8 @@ MAX_SENDERS = 4096
 """Maximum number of tokens and addresses whose rate is kept."""
 MAX_BYTES = 60_000
 """Size of a body: the limit of the router, less the overhead of a message."""
+MAX_TABLE_BYTES = 1_000_000
+"""Size of a job table."""
 MAX_READERS, MAX_REQUESTS = 64, 16
 BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
 """Real seconds for a body to arrive, for a reader to receive, and between two heartbeats."""
@@ -85,6 +90,8 @@ MAX_WAITING = 128
 """Connections without a complete request; the next one closes the oldest."""
 HEADER_S = 5.0
 """Real seconds until a connection without a complete request is closed."""
+TABLE = "text/csv"
+"""Content type of a job table."""
 PAGE = "dashboard.html"
 FILES = ("page.css", "dashboard.css", "cell.js", "stream.js", "tables.js", "actions.js", "dashboard.js")
 TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
@@ -343,7 +350,29 @@ def application(
 
         return post
 
-    submit = of_jobs("submit", Submission, SubmissionReply)
+    submit_json = of_jobs("submit", Submission, SubmissionReply)
+
+    async def submit(request: Request) -> Response:
+        return await (submit_table if content_type(request) == TABLE else submit_json)(request)
+
+    async def submit_table(request: Request) -> Response:
+        content = await read_bytes(request, MAX_TABLE_BYTES, body_s)
+        begin, by = (request.query_params.get(key, "") for key in ("shift_begin", "by"))
+        places, reply = None, SubmissionReply("", ())
+        with suppress(Refused, BusError):  # no participant knows the cell
+            places = [place.name for place in (await ask_cell()).places]
+        read = partial(read_job_table, begin=shift_begin(begin, "shift_begin"), places=places)
+        table = await limited(lambda: asyncio.to_thread(read, content, "The table"))
+        rows = {job.name: (f"row {number}", job) for number, job in table.items()}
+        try:
+            for jobs in batches(tuple(table.values())):
+                new = await ask(keys.of_jobs(bridge.fleet, "submit"), Submission(jobs, by), SubmissionReply)
+                reply = replace(new, jobs=(*reply.jobs, *(with_cell(each, rows) for each in new.jobs)))
+        except (BusError, Refused) as error:
+            accepted = ", ".join(rows[each.job][0] for each in reply.jobs if each.accepted)
+            raise BusError(f"{error} Accepted before: {accepted or 'no job'}.") from error
+        return json_response(reply)
+
     control = of_jobs("control", ControlRequest, Controlled)
     clear = of_jobs("clear", ClearRequest, Cleared)
 
@@ -369,10 +398,7 @@ def application(
 
     async def post_ask(request: Request) -> Response:
         body = await read_body(request, AskBody, body_s)
-        try:
-            quote_request = decode(QuoteRequest, encode(QuoteRequest("http", body.jobs, dry_run=True)))
-        except MalformedMessage as error:
-            raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+        quote_request = decode(QuoteRequest, encode(QuoteRequest("http", body.jobs, dry_run=True)))
         return json_response(await limited(lambda: bridge.quotes(quote_request)))
 
     async def events(request: Request) -> Response:
@@ -393,7 +419,7 @@ def application(
         ("GET", "/v4/fleet", "monitor", fleet, "Arms, jobs and messages, as `thermofleet bus watch --json`."),
         ("GET", "/v4/events", "monitor", events, "Every message as server-sent events."),
         ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
-        ("POST", "/v4/jobs", "submitter", submit, "Submit jobs: a Submission."),
+        ("POST", "/v4/jobs", "submitter", submit, "Submit jobs: a Submission, or a table as text/csv."),
         ("GET", "/v4/cell", "monitor", get_cell, "Places, arms, kinds of jobs and limits."),
         ("GET", "/v4/scene", "monitor", get_scene, "Arms, places and colours in three dimensions."),
         ("POST", "/v4/control", "operator", control, "Cancel, settle, change, pause, resume: a ControlRequest."),
@@ -404,7 +430,7 @@ def application(
     routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
     if page is not None:
         routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
-    handlers = dict.fromkeys((HttpProblem, BusError, Refused, HTTPException, Exception), error_response)
+    handlers = dict.fromkeys((HttpProblem, BusError, Refused, ScenarioError, HTTPException, Exception), error_response)
     access = Middleware(AccessCheck, tokens=tokens, **({"public": is_public} if page is not None else {}))
     return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
 
@@ -476,27 +502,35 @@ async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
     """Read the message that is the body of a request.
 
     Raises:
-        HttpProblem: too large, too slow, not JSON, or not a message of this kind.
+        HttpProblem: not JSON, too large or too slow.
+        MalformedMessage: not a message of this kind.
     """
-    content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if content_type != "application/json":
-        detail = f"The body must be application/json (got '{content_type}')."
+    if (given := content_type(request)) != "application/json":
+        detail = f"The body must be application/json, or for /v4/jobs also {TABLE} (got '{given}')."
         raise HttpProblem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
-    parts: list[bytes] = []
+    return decode(kind, await read_bytes(request, MAX_BYTES, body_s))
+
+
+def content_type(request: Request) -> str:
+    """Kind of the body of a request, without parameters."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+async def read_bytes(request: Request, most: int, body_s: float) -> bytes:
+    """Read a body of at most so many bytes; raises an HttpProblem if it is too large or too slow."""
+    content = bytearray()
     try:
         async with asyncio.timeout(body_s):
             async for part in request.stream():
-                parts.append(part)
-                if sum(map(len, parts)) > MAX_BYTES:
-                    detail = f"A body has at most {MAX_BYTES} bytes; send several requests."
+                content += part
+                if len(content) > most:
+                    detail = f"A body has at most {most} bytes; send several requests."
                     raise HttpProblem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
-        return decode(kind, b"".join(parts))
     except TimeoutError as error:
         raise HttpProblem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {body_s:g} s.") from error
     except ClientDisconnect as error:
         raise HttpProblem(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
-    except MalformedMessage as error:
-        raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+    return bytes(content)
 
 
 def json_response(value: object) -> Response:
@@ -509,6 +543,8 @@ def error_response(_: Request, error: Exception) -> Response:
     match error:
         case HttpProblem():
             return problem_response(error.status, error.detail)
+        case ScenarioError() | MalformedMessage():
+            return problem_response(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
         case BusError() | Refused():
             return problem_response(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
         case HTTPException():

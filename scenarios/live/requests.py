@@ -6,6 +6,7 @@ import secrets
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,6 +24,7 @@ from fleet.bus.protocol.auction import (
     Quote,
     QuoteRequest,
 )
+from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Action,
@@ -41,7 +43,7 @@ from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import the_fleet
 from scenarios.signals import until_stopped
-from scenarios.spec.job_table import SUFFIXES, read_job_table, shift_begin
+from scenarios.spec.job_table import SUFFIXES, read_job_table, shift_begin, with_cell
 from scenarios.table import Column, Table
 from scenarios.terminal import echo, out_console, print_json, say
 
@@ -59,26 +61,46 @@ _UNKNOWN_KIND = re.compile(r"Invalid enum value '(.*)'", re.DOTALL)
 Decoded = TypeVar("Decoded")
 
 
-def submit_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, by: str = "", wait: bool = False) -> bool:
+def submit_jobs(
+    jobs: Mapping[int, JobSpec],
+    endpoint: str,
+    fleet: str,
+    *,
+    by: str = "",
+    wait: bool = False,
+    table: str = "",
+    begin: str = "",
+) -> bool:
     """Submit jobs and print the decision on each; return whether all are accepted and, after a wait, finished.
 
     Args:
+        jobs: By number, as from `read_jobs`.
         wait: Follow the accepted jobs to their end.
+        table: The job table that has them, to name its rows. If the cell lacks one of its places, nothing is submitted.
+        begin: As for `read_jobs`.
 
     Raises:
-        FleetError: the submission is refused, there is no auctioneer, or it disappears while jobs are followed.
+        FleetError: the submission is refused, there is no auctioneer, it disappears while jobs are followed, or the
+            cell lacks places of a job table.
     """
-    states: dict[str, str] = {}
+    states = dict[str, str]()
+    rows = {job.name: (f"{table}, row {number}", job) for number, job in jobs.items() if table}
 
     def show_change(status: JobStatus) -> None:
         if states.get(status.job) != status.state:
             states[status.job] = status.state
-            echo(describe_status(status))
+            echo(describe_status(with_cell(status, rows)))
 
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         client = JobClient(link, by, show_change)
         try:
-            admissions = client.submit_and_wait(jobs)
+            if table:
+                with suppress(Refused, NoReply):  # no participant knows the cell
+                    cell = link.ask(keys.of_jobs(link.fleet, "cell"), CellRequest(), Cell, timeout_s=REPLY_S)
+                    read_job_table(
+                        Path(table), begin=shift_begin(begin, ""), places=[each.name for each in cell.places]
+                    )
+            admissions = [with_cell(each, rows) for each in client.submit_and_wait(tuple(jobs.values()))]
         except Refused as error:
             raise FleetError(f"The auctioneer refused the submission: {error}") from error
         except NoReply as error:
@@ -140,8 +162,10 @@ def _is_unplanned(answers: Replies[Quote]) -> bool:
     return any(estimate.reason == NOT_PLANNED for estimate in estimates)
 
 
-def read_jobs(file: str, begin: str = "") -> list[JobSpec]:
+def read_jobs(file: str, begin: str = "") -> dict[int, JobSpec]:
     """Read the jobs of a file of JSON, or of standard input for `-`, or of a job table by its suffix.
+
+    They are numbered by the lines or rows of the file, or by their places in a list.
 
     Args:
         begin: Date, time and zone of fleet time 0, for the dates in a job table.
@@ -160,10 +184,10 @@ def read_jobs(file: str, begin: str = "") -> list[JobSpec]:
     except OSError as error:
         raise FleetError(f"Cannot read '{file}': {error.strerror}.") from error
     if raw.lstrip().startswith(b"["):
-        jobs = _decode(raw, list[JobSpec], name)
+        jobs = dict(enumerate(_decode(raw, list[JobSpec], name)))
     else:
         lines = enumerate(raw.splitlines(), start=1)
-        jobs = [_decode(line, JobSpec, f"{name}, line {number}") for number, line in lines if line.strip()]
+        jobs = {number: _decode(line, JobSpec, f"{name}, line {number}") for number, line in lines if line.strip()}
     if not jobs:
         raise FleetError(f"{name} contains no jobs.")
     return jobs

@@ -68,8 +68,9 @@ def run_listener(
             "has them with --temperatures. docs/ros2.md describes its content."
         )
     names, where = names_of(joints), ros2_router(router, endpoint)
-    monitor = monitor_of(twin, network, 1.0 / rate_hz)
-    if monitor is not None and len(names) != JOINTS:
+    monitors = monitor_of(twin, network)
+    monitor = monitors and monitors(1.0 / rate_hz)
+    if monitor and len(names) != JOINTS:
         raise FleetError(f"--twin and --network are for arms of {JOINTS} joints (got {len(names)} in --joints).")
     from fleet.live.clock import FleetClock
     from fleet.ros2.bridge import ArmReadings, Follower

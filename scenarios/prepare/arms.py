@@ -192,8 +192,9 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
         if near and any(reason.endswith("at home") for reason in reasons):
             continue  # it may be possible once the homes are apart
         more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
+        column = "payload" if stream.row and here and all(error.too_heavy for error in here) else "places"
         problems.append(
-            f"{file}: jobs[{i}].places: no arm can do '{stream.name}' with {' or '.join(loads)} kg "
+            f"{file}: {stream.place_of(i, column)}: no arm can do '{stream.name}' with {' or '.join(loads)} kg "
             f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
         )
     return problems

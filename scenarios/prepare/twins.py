@@ -14,7 +14,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import numpy as np
 
@@ -104,8 +104,8 @@ def load_or_make(models: Sequence[CachedModel[Model]], stage: str, progress: Pro
     loaded = [_load_intact(model) for model in models]
     missing = [model for model, ready in zip(models, loaded, strict=True) if ready is None]
 
-    def report(made: float) -> None:
-        progress(stage, Count(len(models) - len(missing) + made, len(models)))
+    def report(made: float, at_once: int = 1) -> None:
+        progress(stage, Count(len(models) - len(missing) + made, len(models), at_once))
 
     report(0)
     if missing:
@@ -119,10 +119,11 @@ def load_or_make(models: Sequence[CachedModel[Model]], stage: str, progress: Pro
 
         from scenarios.processes import worker_processes
 
-        with worker_processes(min(len(missing), cpu_count())) as pool:
+        workers = min(len(missing), cpu_count())
+        with worker_processes(workers) as pool:
             for reason in pool(delayed(model.make)(model.folder, _ignore) for model in missing):
                 reasons.append(reason)
-                report(len(reasons))
+                report(len(reasons), workers)
     for reason in filter(None, reasons):
         log.warning("%s", reason)
     return [model.load(model.folder) if ready is None else ready for model, ready in zip(models, loaded, strict=True)]
@@ -429,12 +430,12 @@ def open_twin(folder: Path, arm: str | None = None) -> Twin:
         raise CheckpointError(f"There is no folder '{folder}'; make one with: thermofleet twin train … --out {folder}.")
     if (folder / TWIN_CARD).exists():
         return load(folder)
-    homes = {home.name.removesuffix(".twin"): home for home in sorted(folder.glob("*.twin"))}
+    homes = {unquote(home.name.removesuffix(".twin")): home for home in sorted(folder.glob("*.twin"))}
     if not homes:
         raise CheckpointError(f"'{folder}' holds no twin ({TWIN_CARD}, or folders ARM.twin).")
     if arm is None and len(homes) > 1:
         raise CheckpointError(f"'{folder}' holds {len(homes)} twins; choose one with --arm: {', '.join(homes)}.")
-    name = next(iter(homes)) if arm is None else quote(arm, safe="")
+    name = next(iter(homes)) if arm is None else arm
     if name not in homes:
-        raise CheckpointError(f"No twin of arm '{arm}' in '{folder}'{nearest(name, homes)}")
+        raise CheckpointError(f"No twin of arm '{name}' in '{folder}'{nearest(name, homes)}")
     return load(homes[name])

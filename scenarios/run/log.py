@@ -218,10 +218,10 @@ def check_format(run: Mapping[str, Any], folder: Path) -> None:
     Raises:
         FleetError: it is of another format or environment.
     """
-    environment = run.get("environment", "allocation_v0")
-    if (run["format"], environment) != (RUN_FORMAT, VERSION):
+    version, environment = run["format"], run.get("environment", "allocation_v0")
+    if (version, environment) != (RUN_FORMAT, VERSION):
         raise FleetError(
-            f"'{folder}' is a run of format {run['format']} in {environment}; this "
+            f"'{folder}' is a run of format {version} in {environment}; this "
             f"version reads {RUN_FORMAT}, {VERSION}. Run the scenario again."
         )
 

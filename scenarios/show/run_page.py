@@ -49,7 +49,7 @@ def verdict(log: ShiftLog) -> Verdict:
     contacts = sum(event.kind == "contact" for event in log.events)
     about = {_fault(fault, plan): fault for fault in faults[:MOST_FAULTS]}
     moments = {sentence: _before(fault) for sentence, fault in about.items()}
-    sentences = [*_jobs(metrics)]
+    sentences = [*_jobs(metrics), *_outside_shift(log.card.get("scenario") or {})]
     for sentence, fault in about.items():
         sentences += [sentence, *_cause(fault, plan, offers)]
     if len(faults) > MOST_FAULTS:
@@ -90,6 +90,14 @@ def _jobs(metrics: Mapping[str, Any]) -> Iterable[str]:
     if on_time is not None and finished:
         late = ", all on time" if on_time == finished else f", {on_time} of them on time"
     yield f"{finished}{of} jobs finished{late}."
+
+
+def _outside_shift(scenario: Mapping[str, Any]) -> Iterable[str]:
+    """How many jobs of tables and traces never arrive."""
+    horizon_s, arrivals = scenario.get("horizon_s", math.inf), [each["arrivals"] for each in scenario.get("jobs", ())]
+    times_s = [each["start_s"] + time_s for each in arrivals for time_s in each["times_s"] or ()]
+    if count := sum(time_s >= horizon_s for time_s in times_s):
+        yield f"{count} of {len(times_s)} jobs of tables and traces never arrived: their times are outside the shift."
 
 
 def _hottest(metrics: Mapping[str, Any]) -> str:

@@ -15,14 +15,17 @@ from difflib import get_close_matches
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
-from itertools import islice
+from itertools import chain, islice
 from math import inf, isfinite, nextafter
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from fleet.bus.protocol.auction import JobSpec
+from msgspec.structs import replace
+
+from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus
 from fleet.errors import ScenarioError, check_names, nearest, printable
+from fleet.files import decode_text
 from fleet.job import BOUNDS, DWELL_S, KINDS, check_alternatives, check_bounds, check_duration, check_dwell
 from scenarios.spec.units import question
 
@@ -36,8 +39,6 @@ MOST_COLUMNS = 100
 DAY_S = 86_400.0
 DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
 _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
-_NOT_IN_NAMES = re.compile(r"[/\\\[\]]")
-"""Percent-encoded, as in keys of the bus."""
 _ARROW, _OR = re.compile(r"\s*(?:->|→|>|,|;)\s*"), re.compile(r"\s*[|;,]\s*")
 _THOUSANDS = re.compile(r"[1-9]\d{0,2}(\.\d{3})+")
 _GERMAN_DATE = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}) +(\d{1,2}:\d{2}.*)")
@@ -45,6 +46,7 @@ _FLAGS = {
     **dict.fromkeys(("yes", "true", "1", "hard", "ja", "wahr"), True),
     **dict.fromkeys(("no", "false", "0", "soft", "nein", "falsch"), False),
 }
+Told = TypeVar("Told", Admission, JobStatus)
 Cell = Any
 """A text, number, date, list or None, according to the file."""
 Rows = Iterator[tuple[int, Sequence[Cell]]]
@@ -128,13 +130,9 @@ def seconds_of(given: object, begin: datetime | None, horizon_s: float) -> float
     return _seconds(given, _Dialect(begin, False, horizon_s))
 
 
-def _name(cell: Cell, _: object = None) -> str:
-    return _NOT_IN_NAMES.sub(lambda found: f"%{ord(found[0]):02X}", _text(cell))
-
-
 def _names(cell: Cell, _: object) -> tuple[str, ...]:
     parts = cell if isinstance(cell, list) else _OR.split(_text(cell))
-    return tuple(_name(part) for part in parts if _text(part))
+    return tuple(_text(part) for part in parts if _text(part))
 
 
 def _kind(cell: Cell, _: object) -> str:
@@ -170,7 +168,7 @@ def _is_empty(cell: Cell) -> bool:
 
 
 _COLUMNS: Mapping[str, tuple[str, Callable[[Cell, _Dialect], object], object]] = {
-    "name": ("name", _name, ""),
+    "name": ("name", lambda cell, _: _text(cell), ""),
     "kind": ("kind", _kind, ""),
     "places": ("every_places", _places, ()),
     "payload": ("payload_kg", _number, 0.0),
@@ -216,28 +214,33 @@ class _Faults(dict[tuple[str, str], list[int]]):
 
 
 def read_job_table(
-    path: Path,
+    file: Path | bytes,
     where: str = "",
     *,
     begin: datetime | None = None,
     horizon_s: float = inf,
     places: Collection[str] | None = None,
-) -> list[JobSpec]:
-    """The jobs of a table in the order of its rows; times count from the begin of the shift.
+    closed: bool = False,
+) -> dict[int, JobSpec]:
+    """The jobs of a table by the numbers of their rows, in order; times count from the begin of the shift.
 
     Args:
+        file: Its path, or the content of a CSV file.
         where: Name of the table in errors; by default the path.
         begin: Of the shift, with its zone; needed for dates.
         horizon_s: Length of the shift; a time of day before its begin must be within it on the next day.
-        places: Places of the cell; `places` must name some of them, and `after` rows of the table. None: not checked.
+        places: Of the cell; None: not checked.
+        closed: Whether `after` must name rows of the table.
 
     Raises:
         ScenarioError: the file cannot be read, or rows are wrong: all faults, each with its row and column.
         MissingExtra: the library for an XLSX file is not installed.
     """
-    where, faults, jobs = where or str(path), _Faults(), list[JobSpec]()
-    lines, decimal_comma = _rows(path, where)
+    where, faults, jobs = where or str(file), _Faults(), dict[int, JobSpec]()
+    lines, decimal_comma = _rows(file, where)
     number, head = next(lines, (1, ()))
+    if len(head) > MOST_COLUMNS:
+        raise ScenarioError(f"{where} has {len(head)} columns; a job table has at most {MOST_COLUMNS}.")
     columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma, horizon_s)
     faults.raise_any(where)
     no_place = cache(lambda name: f"no place '{printable(name)}'{nearest(name, places or ())}")
@@ -259,10 +262,9 @@ def read_job_table(
             faults.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
         elif not wrong:
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
-            jobs.append(JobSpec(**{name: value for name, value in fields.items() if name != "every_places"}))
+            jobs[number] = JobSpec(**{name: value for name, value in fields.items() if name != "every_places"})
         rows.setdefault(row.name, (number, row))
-    if places is not None:
-        _check_after(rows, faults)
+    _check_after(rows, faults, closed=closed)
     faults.raise_any(where)
     if not jobs:
         raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
@@ -316,7 +318,7 @@ def _problems(row: Row, wrong: Collection[str]) -> Iterator[tuple[str, str]]:
     """Field and sentence of each fault in the values of a row, at most one a field."""
     checks: list[tuple[str, Callable[[], None]]] = [
         *((field, lambda field=field: check_bounds(row, field)) for field in BOUNDS if hasattr(row, field)),
-        *((field, lambda field=field: check_names(row, field)) for field in ("name", "after")),
+        *((field, lambda field=field: check_names(row, field, of_jobs=True)) for field in ("name", "after")),
         ("every_places", lambda: check_names(row, "places")),
         ("every_places", lambda: check_alternatives(row, row.kind, row.every_places) if row.kind else None),
         ("dwell_s", lambda: check_dwell(row, row.kind, row.dwell_s)),
@@ -347,8 +349,23 @@ def _check_force(row: Row) -> None:
         raise ValueError(f"only a press has a contact force (got {row.force_n:g} N for a {row.kind})")
 
 
-def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults) -> None:
-    for number, row in rows.values():
+def with_cell(told: Told, jobs: Mapping[str, tuple[str, JobSpec]]) -> Told:
+    """A decision or status whose reason, if any, begins with the row of the job and the column that it quotes.
+
+    Args:
+        jobs: The jobs of a table by name, each after its row.
+    """
+    if not told.reason or told.job not in jobs:
+        return told
+    row, job = jobs[told.job]
+    columns = {"places": chain.from_iterable(job.every_places), "after": job.after, "name": (job.name,)}
+    quoted = (column for column, names in columns.items() if any(f"'{name}'" in told.reason for name in names))
+    place = ", column ".join([row, *islice(quoted, 1)])
+    return replace(told, reason=f"{place}: {told.reason}")
+
+
+def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults, *, closed: bool) -> None:
+    for number, row in rows.values() if closed else ():
         for name in row.after:
             if name not in rows:
                 faults.add(number, "after", f"there is no job '{printable(name)}' in this table")
@@ -365,27 +382,21 @@ def cycle_of(after: Mapping[str, Sequence[str]]) -> list[str]:
     return []
 
 
-def _rows(path: Path, where: str) -> tuple[Rows, bool]:
+def _rows(file: Path | bytes, where: str) -> tuple[Rows, bool]:
     """Rows of a file that are not empty, and whether a comma in them may be a decimal point."""
-    try:
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise ScenarioError(f"{where} has {size} bytes; a job table has at most {MOST_BYTES}.")
-        match path.suffix.lower():
-            case ".parquet":
-                rows, decimal_comma = _parquet_rows(path, where), False
-            case ".xlsx":
-                rows, decimal_comma = _xlsx_rows(path, where), False
-            case _:
-                rows, decimal_comma = _csv_rows(path.read_bytes(), where)
-    except FileNotFoundError as error:
-        raise ScenarioError(f"{where}: there is no file '{path}'.") from error
-    except OSError as error:
-        raise ScenarioError(f"{where}: cannot read '{path}': {error.strerror}.") from error
+    content = file if isinstance(file, bytes) else read_bytes(file, where)
+    match "" if isinstance(file, bytes) else file.suffix.lower():
+        case ".parquet":
+            rows, decimal_comma = _parquet_rows(content, where), False
+        case ".xlsx":
+            rows, decimal_comma = _xlsx_rows(content, where), False
+        case _:
+            rows, decimal_comma = _csv_rows(content, where)
     return ((number, cells) for number, cells in rows if not all(map(_is_empty, cells))), decimal_comma
 
 
 def _csv_rows(content: bytes, where: str) -> tuple[Rows, bool]:
-    text, skipped, delimiter = decode_text(content, where), 0, ""
+    text, skipped, delimiter = text_of(content, where), 0, ""
     first, _, rest = text.partition("\n")
     if declared := re.fullmatch(r"sep=(.)", first.strip('"\r')):  # written by Excel
         text, skipped, delimiter = rest, 1, declared[1]
@@ -407,40 +418,51 @@ def _csv_rows(content: bytes, where: str) -> tuple[Rows, bool]:
     return rows(), delimiter != ","
 
 
-def decode_text(content: bytes, where: str) -> str:
-    """The text of a file: UTF-16 with a byte order mark, UTF-8, or else Windows-1252, which old spreadsheets write.
+def read_bytes(path: Path, where: str) -> bytes:
+    """The content of a file; raises a ScenarioError if it cannot be read or is too large."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except FileNotFoundError as error:
+        raise ScenarioError(f"{where}: there is no file '{path}'.") from error
+    except OSError as error:
+        raise ScenarioError(f"{where}: cannot read '{path}': {error.strerror}.") from error
+    if len(content) > MOST_BYTES:
+        raise ScenarioError(f"{where} has more than {MOST_BYTES} bytes.")
+    return content
 
-    Raises:
-        ScenarioError: it has another encoding.
-    """
-    is_utf16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-    for encoding in ("utf-16",) if is_utf16 else () if b"\x00" in content else ("utf-8-sig", "cp1252"):
-        with suppress(UnicodeDecodeError):
-            return content.decode(encoding)
-    raise ScenarioError(f"{where} is not a UTF-8 text file. Save it as UTF-8.")
+
+def text_of(content: bytes, where: str) -> str:
+    """The text of a file, as `decode_text` reads it; raises a ScenarioError for other data."""
+    if "\0" in (text := decode_text(content)):
+        raise ScenarioError(f"{where} is not a text file in UTF-8: it has NUL bytes. Save it as UTF-8.")
+    return text
 
 
-def _parquet_rows(path: Path, where: str) -> Rows:
+def _parquet_rows(content: bytes, where: str) -> Rows:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        if (count := pq.ParquetFile(path).metadata.num_rows) > MOST_ROWS:
+        file = pq.ParquetFile(pa.BufferReader(content))
+        if (count := file.metadata.num_rows) > MOST_ROWS:
             raise ScenarioError(f"{where} has {count} rows; a job table has at most {MOST_ROWS}.")
-        table = pq.read_table(path)
+        table = file.read()
     except (pa.ArrowException, OSError) as error:
         raise ScenarioError(f"{where} is not a Parquet file ({str(error).splitlines()[0]}).") from error
     yield 0, table.column_names
     yield from enumerate(zip(*(column.to_pylist() for column in table.columns), strict=True), start=1)
 
 
-def _xlsx_rows(path: Path, where: str) -> Rows:
+def _xlsx_rows(content: bytes, where: str) -> Rows:
     from scenarios.extras import require_extra
 
     require_extra("xlsx")
     openpyxl = import_module("openpyxl")
     try:
-        values, written = (openpyxl.load_workbook(path, data_only=data_only) for data_only in (True, False))
+        values, written = (
+            openpyxl.load_workbook(io.BytesIO(content), data_only=data_only) for data_only in (True, False)
+        )
     except Exception as error:  # also those of zipfile and of an XML parser
         raise ScenarioError(f"{where} is not an XLSX file ({error}).") from error
     if not values.worksheets:
@@ -463,8 +485,12 @@ def _xlsx_rows(path: Path, where: str) -> Rows:
     yield from enumerate(sheet.iter_rows(values_only=True), start=1)
 
 
-def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:
-    """The job as fields of a `JobStream` with one arrival; without a due date it is due at the end of the shift."""
+def stream_fields(job: JobSpec, horizon_s: float, row: str) -> dict[str, object]:
+    """The job as fields of a `JobStream` with one arrival; without a due date it is due at the end of the shift.
+
+    Args:
+        row: File and row of the job, for errors.
+    """
     gap_s = max(0.0, (horizon_s if job.due_s is None else job.due_s) - job.release_s)
     close = (gap_s, nextafter(gap_s, inf), nextafter(gap_s, 0.0))  # release + one of these is exactly the due date
     return {
@@ -476,6 +502,7 @@ def stream_fields(job: JobSpec, horizon_s: float) -> dict[str, object]:
         "due_s": next((each for each in close if job.release_s + each == job.due_s), gap_s),
         "due": "hard" if job.expires else "soft",
         "numbered": False,
+        "row": row,
     }
 
 

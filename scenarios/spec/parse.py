@@ -23,7 +23,7 @@ import numpy as np
 
 from fleet.errors import ScenarioError, nearest, printable
 from scenarios.spec.calendar import check_breaks, with_calendar, zone_of
-from scenarios.spec.job_table import cycle_of, decode_text, read_job_table, shift_begin, stream_fields
+from scenarios.spec.job_table import cycle_of, read_bytes, read_job_table, shift_begin, stream_fields, text_of
 from scenarios.spec.schema import JobStream, Scenario
 from scenarios.spec.units import check_times, check_units
 
@@ -221,21 +221,27 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
         return raw
     tables = [place for place in places if isinstance(place, Mapping)] if isinstance(places, list) else []
     names = [place["name"] for place in tables if isinstance(place.get("name"), str)]
-    streams: list[object] = []
+    streams, more, faults = list(jobs), list[object](), list[str]()
     for i, each in enumerate(jobs):
         if not isinstance(each, Mapping) or "table" not in each:
-            streams.append(each)
             continue
         where = f"{path.name}: jobs[{i}]"
         if len(each) > 1 or not isinstance(each["table"], str):
             raise ScenarioError(f'{where}: a job table is table = "FILE", without other keys (got {", ".join(each)}).')
         file = path.parent / each["table"]
-        rows = read_job_table(
-            file, f"{where}.table: '{file.name}'", begin=begin, horizon_s=horizon_s or inf, places=names
-        )
-        check_times([row.release_s for row in rows], horizon_s, f"{where}.table: '{file.name}'")
-        streams += [stream_fields(row, horizon_s) for row in rows]
-    return {**raw, "jobs": streams}
+        where = f"{where}.table: '{file.name}'"
+        try:
+            rows = read_job_table(file, where, begin=begin, horizon_s=horizon_s or inf, places=names, closed=True)
+            check_times([row.release_s for row in rows.values()], horizon_s, where)
+        except ScenarioError as error:
+            faults.append(str(error))
+            continue
+        # The others follow at the end, so that each entry of the file keeps its index.
+        streams[i], *rest = [stream_fields(row, horizon_s, f"'{file.name}', row {n}") for n, row in rows.items()]
+        more += rest
+    if faults:
+        raise ScenarioError("\n".join(faults))
+    return {**raw, "jobs": streams + more}
 
 
 def override(scenario: Scenario, **changes: object) -> Scenario:
@@ -299,12 +305,16 @@ def _check(scenario: Scenario, path: Path) -> None:
         raise ScenarioError(f"{file}: arms: there are no arms; give at least one [[arms]].")
     if not scenario.jobs:
         raise ScenarioError(f"{file}: jobs: there are no jobs; give at least one [[jobs]].")
-    for kind in ("arms", "places", "jobs", "fixtures"):
-        names = set[str]()
+    faults = list[str]()
+    for kind in ("arms", "places", "fixtures", "jobs"):
+        first = dict[str, str]()
         for i, item in enumerate(getattr(scenario, kind)):
-            if (name := item.name) in names:
-                raise ScenarioError(f"{file}: {kind}[{i}].name: '{name}' is given twice; names must be unique.")
-            names.add(name)
+            place = item.place_of(i, "name") if isinstance(item, JobStream) else f"{kind}[{i}].name"
+            if item.name in first:
+                faults.append(f"{place}: '{item.name}' is given twice, as in {first[item.name]}; names must be unique.")
+            first.setdefault(item.name, place)
+        if faults and kind != "jobs":
+            raise ScenarioError(f"{file}: {faults[0]}")
     for (i, one), (j, other) in combinations(enumerate(scenario.arms), 2):
         apart = dist(one.position_m, other.position_m)
         if apart < APART_M:
@@ -314,22 +324,25 @@ def _check(scenario: Scenario, path: Path) -> None:
             )
     places = [place.name for place in scenario.places]
     streams = [stream.name for stream in scenario.jobs]
-    known_streams = frozenset(streams)
+    rows, known_streams = {stream.name for stream in scenario.jobs if not stream.numbered}, frozenset(streams)
     for i, stream in enumerate(scenario.jobs):
         for name in chain.from_iterable(stream.alternatives):
             if name not in places:
-                raise ScenarioError(f"{file}: jobs[{i}].places: no place '{name}'{nearest(name, places)}")
+                faults.append(f"{stream.place_of(i, 'places')}: no place '{name}'{nearest(name, places)}")
         for name in stream.after:
-            if name not in (streams[:i] if stream.numbered else known_streams):
+            if name not in ({*streams[:i], *rows} if stream.numbered else known_streams):
                 known = nearest(name, streams[:i]) if i else "."
-                raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
-    if cycle := cycle_of({stream.name: stream.after for stream in scenario.jobs}):
-        raise ScenarioError(f"{file}: jobs: jobs wait for each other in a cycle: {' → '.join(cycle)}.")
+                faults.append(f"{stream.place_of(i, 'after')}: there is no stream '{name}' above this one{known}")
+    if not faults and (cycle := cycle_of({stream.name: stream.after for stream in scenario.jobs})):
+        faults.append(f"jobs: jobs wait for each other in a cycle: {' → '.join(cycle)}.")
     numbered = {stream.name for stream in scenario.jobs if stream.numbered}
-    for name in streams if numbered else ():
+    for i, name in enumerate(streams if numbered else ()):
         stream, _, number = name.rpartition("-")
         if name not in numbered and stream in numbered and len(number) >= 3 and number.isdecimal():
-            raise ScenarioError(f"{file}: jobs: '{name}' is also a job of the stream '{stream}'; rename one of them.")
+            place = scenario.jobs[i].place_of(i, "name")
+            faults.append(f"{place}: '{name}' is also a job of the stream '{stream}'; rename one of them.")
+    if faults:
+        raise ScenarioError("\n".join(f"{file}: {fault}" for fault in faults))
     check_breaks(scenario, file)
     try:
         scenario.bus.channel().check([arm.name for arm in scenario.arms])
@@ -366,12 +379,7 @@ def _with_traces(scenario: Scenario, path: Path) -> Scenario:
 
 
 def _trace(where: Path, place: str) -> tuple[float, ...]:
-    try:
-        lines = decode_text(where.read_bytes(), f"{place}: '{where.name}'").splitlines()
-    except FileNotFoundError as error:
-        raise ScenarioError(f"{place}: there is no file '{where}'.") from error
-    except OSError as error:
-        raise ScenarioError(f"{place}: cannot read '{where}': {error.strerror}.") from error
+    lines = text_of(read_bytes(where, place), f"{place}: '{where.name}'").splitlines()
     times: list[float] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -403,6 +411,8 @@ def scenario_content(value: Any) -> Any:
         return value
     content: dict[str, Any] = {}
     for field in fields(value):
+        if not field.compare:
+            continue
         given = getattr(value, field.name)
         default = field.default_factory() if field.default_factory is not MISSING else field.default
         if given != default:

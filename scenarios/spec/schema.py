@@ -112,6 +112,12 @@ class JobStream:
     """Streams whose job of the same number must finish first."""
     numbered: bool = True
     """Whether the names of its jobs have a number after that of the stream. False for a row of a job table."""
+    row: str = field(default="", compare=False)
+    """File and row of a job of a job table, as errors name it."""
+
+    def place_of(self, index: int, name: str) -> str:
+        """Place of a field in its file, for errors; `index` is that of the stream in the scenario."""
+        return f"{self.row}, column {name}" if self.row else f"jobs[{index}].{name}"
 
     @property
     def alternatives(self) -> tuple[tuple[str, ...], ...]:
@@ -369,9 +375,10 @@ class Scenario:
                 f"(got {latest_s:.15g})"
             )
         check_names(self, "name")
-        for each in (*self.arms, *self.places, *self.fixtures, *self.jobs):
+        for each in (*self.arms, *self.places, *self.fixtures):
             check_names(each, "name")
         for stream in self.jobs:
+            check_names(stream, "name", of_jobs=True)
             if stream.numbered and len(stream.name) > MAX_NAME - _NUMBER:
                 raise ValueError(
                     f"JobStream.name must have at most {MAX_NAME - _NUMBER} characters, as its jobs have a number "

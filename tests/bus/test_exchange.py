@@ -113,6 +113,11 @@ def test_only_the_default_is_perfect():
         ({"loss": 1.5}, "loss must be 0 to 1"),
         ({"loss": np.nan}, "loss must be 0 to 1"),
         ({"radius": -1.0}, "radius must be 0 to 2"),
+        ({"radius": 0.3}, r"radius is for the topology random_geometric \(got 0.3 and complete\): give this topology"),
+        (
+            {"topology": "ring", "topology_seed": 3},
+            r"topology_seed is for the topology random_geometric \(got 3 and ring",
+        ),
         ({"topology_seed": -1}, "topology_seed must be 0 to 4294967295"),
     ],
 )

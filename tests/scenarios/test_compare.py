@@ -1,6 +1,7 @@
 """Comparisons of policies and sources: paired by seed, the same on any number of cores, and their page."""
 
 import base64
+import csv
 import gzip
 import io
 import json
@@ -36,6 +37,7 @@ from scenarios.prepare.randomisation import Randomisation
 from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
+from scenarios.table import Table
 
 POLICIES = ("random", "round_robin")
 
@@ -317,11 +319,11 @@ def test_charts_place_points_by_value():
 def test_a_comparison_is_one_table_in_every_form(study: Study):
     (result,) = judged(study, rows_of(study), {}).results
     figure = result.figures["wsept"]["reward"]
-    text, html, markdown, csv = printed(result), result.table.html(), result.table.markdown(), result.table.csv()
+    text, html, markdown, lines = printed(result), result.table.html(), result.table.markdown(), result.table.csv()
     assert re.search(rf"^  wsept +{figure.mean:.1f} ", text, re.MULTILINE)
     assert f"<td>{figure.mean:.1f}</td>" in html
     assert f"| wsept | {figure.mean:.1f} |" in markdown
-    assert f"reward,wsept,{figure.mean:.1f}," in csv
+    assert f"reward,wsept,{figure.mean:.1f}," in lines
     assert result._repr_html_() == html
 
 
@@ -336,6 +338,14 @@ def test_an_exported_figure_is_a_number_and_a_name_is_no_formula(study: Study):
     assert mean == pytest.approx(result.figures["wsept"]["reward"].mean, rel=1e-5)
     assert (rows[-1][0].value, rows[-1][0].data_type) == ("=1+1", "s")
     assert table.content(".csv").decode().count("\n") == 1 + len(table.rows)
+
+
+def test_only_texts_that_a_spreadsheet_would_compute_get_an_apostrophe():
+    formulas = ("=1+1", "+49 30", "-2+3", "@SUM(A1)", " =x", '=HYPERLINK("a")')
+    plain = ("-3.5", "+1", "-12 %", "-1,234.5", "1e-5", "4711/10", "–", "a=b", "")
+    table = Table(head=("name",), rows=tuple((cell,) for cell in (*formulas, *plain)))
+    _, *cells = csv.reader(io.StringIO(table.csv()))
+    assert [text for (text,) in cells if text] == [*(f"'{text}" for text in formulas), *filter(None, plain)]
 
 
 def test_the_command_line_has_what_is_no_default():

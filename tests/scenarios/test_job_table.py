@@ -25,6 +25,7 @@ from scenarios.run.shift import run
 from scenarios.spec.job_table import read_job_table
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.load import library, load
+from scenarios.spec.parse import scenario_hash
 from scenarios.spec.schema import Scenario
 from tests.scenarios.conftest import SMALL
 
@@ -117,7 +118,7 @@ def test_seconds_clock_times_and_dates_in_any_zone_name_one_moment(tmp_path_fact
     ]
     rows = [f"job {i},hold,here,,,{form},,,," for i, form in enumerate(forms)]
     (folder / "jobs.csv").write_text("\n".join([SHORT, *rows]), encoding="utf-8")
-    assert {job.release_s for job in read_job_table(folder / "jobs.csv", begin=BEGIN)} == {float(seconds)}
+    assert {job.release_s for job in read_job_table(folder / "jobs.csv", begin=BEGIN).values()} == {float(seconds)}
 
 
 def test_without_a_date_of_the_begin_clock_times_count_from_it(tmp_path):
@@ -139,9 +140,9 @@ def test_a_row_without_due_date_is_due_at_the_end_of_the_shift_and_defaults_are_
     assert (job.due_s, job.value, job.repetitions, job.release_s, job.expires) == (180.0, 1.0, 1, 0.0, False)
 
 
-def test_names_keep_spaces_and_have_slashes_percent_encoded_as_on_keys(tmp_path):
-    first, second = drawn(small_table(tmp_path, f"{SHORT}\nA 1/2,hold,bench,,,,,,,\nb,hold,shelf,,,,,,,A 1/2\n"), 0)
-    assert (first.name, second.after) == ("A 1%2F2", ("A 1%2F2",))
+def test_names_are_those_of_the_table(tmp_path):
+    first, second = drawn(small_table(tmp_path, f"{SHORT}\n[A] 1/2,hold,bench,,,,,,,\nb,hold,shelf,,,,,,,[A] 1/2\n"), 0)
+    assert (first.name, second.after) == ("[A] 1/2", ("[A] 1/2",))
 
 
 def test_names_may_continue_those_of_other_rows(tmp_path):
@@ -167,7 +168,7 @@ def test_rows_may_wait_for_rows_below_them(tmp_path):
 def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path):
     csv_file = tmp_path / "jobs.csv"
     csv_file.write_text("\n".join([SHORT, *ROWS]), encoding="utf-8")
-    jobs = read_job_table(csv_file)
+    jobs = list(read_job_table(csv_file).values())
     columns = {
         "name": ["load 1", "hold 1"], "kind": ["sort", "hold"],
         "places": [[["shelf", "bench"]], [["bench"], ["shelf"]]],
@@ -175,7 +176,7 @@ def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path):
         "hard": [True, None], "value": [2.0, None], "after": [[], ["load 1"]], "# customer": ["x", "y"],
     }  # fmt: skip
     pq.write_table(pa.table(columns), tmp_path / "jobs.parquet")
-    assert read_job_table(tmp_path / "jobs.parquet") == jobs
+    assert list(read_job_table(tmp_path / "jobs.parquet").values()) == jobs
     try:
         from openpyxl import Workbook
     except ModuleNotFoundError:
@@ -187,7 +188,7 @@ def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path):
     for row in csv.reader([SHORT, *ROWS]):
         book.active.append([time_of(cell) if ":" in cell else cell for cell in row])
     book.save(tmp_path / "jobs.xlsx")
-    assert read_job_table(tmp_path / "jobs.xlsx") == jobs
+    assert list(read_job_table(tmp_path / "jobs.xlsx").values()) == jobs
 
 
 def time_of(cell: str) -> clock:
@@ -198,7 +199,7 @@ def test_a_submitted_table_gives_the_jobs_of_the_scenario(tmp_path):
     scenario = small_table(
         tmp_path, "\n".join([SHORT, "a,sort,shelf > bench,0.2,3,0:01,90,yes,2,", "b,hold,bench,2,,,99,,,a"])
     )
-    jobs = {job.name: job for job in read_jobs(str(tmp_path / "jobs.csv"))}
+    jobs = {job.name: job for job in read_jobs(str(tmp_path / "jobs.csv")).values()}
     assert jobs == {job.name: job_spec(job) for job in drawn(scenario, 0)}
     with pytest.raises(FleetError, match=r"--shift-begin is for a job table, a file that ends in \.csv, .*got x\.json"):
         read_jobs("x.json", "2026-11-23T06:00Z")
@@ -305,7 +306,7 @@ def test_a_wrong_head_is_told(tmp_path, head, sentence):
 def test_a_file_that_is_no_table_is_told(tmp_path):
     for name, content, sentence in (
         ("jobs.parquet", b"PAR1", "'jobs.parquet' is not a Parquet file ("),
-        ("jobs.csv", b"\x00\x01", "'jobs.csv' is not a UTF-8 text file. Save it as UTF-8."),
+        ("jobs.csv", b"\x00\x01", "'jobs.csv' is not a text file in UTF-8: it has NUL bytes. Save it as UTF-8."),
         ("none.csv", None, "'none.csv': there is no file '"),
     ):
         if content:
@@ -320,8 +321,14 @@ def test_a_file_that_is_no_table_is_told(tmp_path):
 def test_excel_may_name_its_separator_in_the_first_row(tmp_path):
     text = "sep=;\nName;Kind;Places;Payload (kg);Release [min]\nä;hold;bench;1,5;0,5\n"
     (tmp_path / "jobs.csv").write_bytes(text.encode("cp1252"))
-    (job,) = read_job_table(tmp_path / "jobs.csv")
+    (job,) = read_job_table(tmp_path / "jobs.csv").values()
     assert (job.name, job.payload_kg, job.release_s) == ("ä", 1.5, 30.0)
+
+
+def test_rows_of_several_programs_may_have_several_encodings(tmp_path):
+    rows = [f"{name},hold,bench".encode(code) for name, code in (("Öl", "utf-8"), ("Maß", "cp1252"), ("€", "cp1252"))]
+    (tmp_path / "jobs.csv").write_bytes(b"\n".join([b"name,kind,places", *rows, b"\x81,hold,bench"]))
+    assert [job.name for job in read_job_table(tmp_path / "jobs.csv").values()] == ["Öl", "Maß", "€", "\ufffd"]
 
 
 def test_a_thousand_rows_are_read_and_all_their_faults_told_within_a_second(tmp_path):
@@ -336,12 +343,58 @@ def test_a_thousand_rows_are_read_and_all_their_faults_told_within_a_second(tmp_
     assert time.perf_counter() - begin_s < 1.0
 
 
-def test_rows_outside_the_shift_are_counted_and_a_name_of_a_streams_job_is_refused(tmp_path, caplog):
+def test_rows_outside_the_shift_are_counted_and_a_name_of_a_streams_job_is_refused(tmp_path, caplog, plans):
     rows = [f"j{i},hold,bench,,,{i * 60},,,," for i in range(5)]
-    small_table(tmp_path, "\n".join([SHORT, *rows]))
+    scenario = small_table(tmp_path, "\n".join([SHORT, *rows]))
+    log = run(prepare(scenario, difficulty="blind", cache=plans), policy="edd", difficulty="blind")
+    assert "2 of 5 jobs of tables and traces never arrived: their times are outside the shift." in log.page()
     assert "'jobs.csv': 2 of 5 times are outside the shift, which ends at horizon_s = 180" in caplog.text
     assert "gives no job: its only time is outside" in faults_of(tmp_path, f"{SHORT}\na,hold,bench,,,180,,,,\n")
     (tmp_path / "jobs.csv").write_text(f"{SHORT}\nsort-001,hold,bench,,,,,,,\n", encoding="utf-8")
     (tmp_path / "both.toml").write_text(f'{SMALL}\n[[jobs]]\ntable = "jobs.csv"\n', encoding="utf-8")
-    with pytest.raises(ScenarioError, match="'sort-001' is also a job of the stream 'sort'; rename one of them"):
+    with pytest.raises(ScenarioError) as error:
         load(tmp_path / "both.toml")
+    place = "both.toml: 'jobs.csv', row 2, column name"
+    assert str(error.value) == f"{place}: 'sort-001' is also a job of the stream 'sort'; rename one of them."
+
+
+def test_faults_found_after_reading_name_file_row_and_column_all_at_once(tmp_path, plans):
+    for name, rows in {
+        "a.csv": ["x,hold,bench", "sort,hold,bench"],
+        "b.csv": ["x,hold,bench", "y,hold,bench", "sort-001,hold,bench"],
+    }.items():
+        (tmp_path / name).write_text("\n".join(["name,kind,places", *rows]), encoding="utf-8")
+    tables = '[[jobs]]\ntable = "a.csv"\n[[jobs]]\ntable = "b.csv"\n'
+    both = SMALL.replace("[[jobs]]", f"{tables}[[jobs]]", 1)
+    (tmp_path / "both.toml").write_text(both, encoding="utf-8")
+    with pytest.raises(ScenarioError) as error:
+        load(tmp_path / "both.toml")
+    assert str(error.value).splitlines() == [
+        "both.toml: 'b.csv', row 2, column name: 'x' is given twice, as in 'a.csv', row 2, column name; names must be "
+        "unique.",
+        "both.toml: 'a.csv', row 3, column name: 'sort' is given twice, as in jobs[3].name; names must be unique.",
+        "both.toml: 'b.csv', row 4, column name: 'sort-001' is also a job of the stream 'sort'; rename one of them.",
+    ]
+    (tmp_path / "both.toml").write_text(both.replace("[2.0]", "[-2.0]"), encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"jobs\[2\]\.payload_kg must be between 0 and 10 kg \(got -2\.0\)"):
+        load(tmp_path / "both.toml")
+    far = SMALL.replace("position_m = [0.0, -0.2, 0.25]", "position_m = [9.0, 0.0, 0.25]")
+    (tmp_path / "jobs.csv").write_text(
+        "name,kind,places,payload\n\na,hold,bench,2\nb,hold,shelf,2\nc,hold,bench,9\nd,hold,shelf,0\n", encoding="utf-8"
+    )
+    with pytest.raises(ScenarioError) as error:
+        prepare(with_table(tmp_path / "cell.toml", far, "jobs.csv"), difficulty="blind", cache=plans)
+    assert [line.partition(" (")[0] for line in str(error.value).splitlines()] == [
+        "cell.toml: 'jobs.csv', row 4, column places: no arm can do 'b' with 2 kg",
+        "cell.toml: 'jobs.csv', row 5, column payload: no arm can do 'c' with 9 kg",
+        "cell.toml: 'jobs.csv', row 6, column places: no arm can do 'd' with 0 kg",
+    ]
+
+
+def test_the_name_of_a_table_and_blank_rows_change_no_hash(tmp_path):
+    text = "name,kind,places\na,hold,bench\n"
+    first = small_table(tmp_path, text)
+    (tmp_path / "other.csv").write_text(f"\n{text}", encoding="utf-8")
+    other = with_table(tmp_path / "cell.toml", SMALL, "other.csv")
+    assert first.jobs[0].row != other.jobs[0].row
+    assert scenario_hash(first) == scenario_hash(other)

@@ -425,6 +425,20 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         code, out, _ = thermofleet("job", "submit", file, *at)
         assert code == 1
         assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
+        table = tmp_path / "jobs.csv"
+        table.write_text("name,kind,places,after\nc,hold,moon,\nd,hold,belt,\ne,hold,mars,\n")
+        code, out, err = thermofleet("job", "submit", table, *at)
+        assert (code, out) == (2, "")
+        assert f"{table} has 2 faults:\n  row 2, column places: no place 'moon'. Allowed: " in err
+        assert "row 4, column places: no place 'mars'" in err
+        table.write_text("name,kind,places,after\na,hold,belt,\nd,hold,belt,\ne,hold,belt,no/one\n")
+        code, out, _ = thermofleet("job", "submit", table, *at)
+        assert (code, out.splitlines()) == (1, [
+            f"a: refused: {table}, row 2, column name: Another job has the name 'a'; names must be unique.",
+            "d: accepted",
+            f"e: refused: {table}, row 4, column after: It waits for 'no/one', which is unknown or was not accepted.",
+        ])  # fmt: skip
+        thermofleet("job", "cancel", "d", *at)
         code, _, err = thermofleet(
             "bus", "auctioneer", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other"
         )
@@ -442,7 +456,7 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0
-        assert "0 of 1 jobs finished" in out
+        assert "0 of 2 jobs finished" in out
         assert "Continuing from" in err
 
 
@@ -462,8 +476,8 @@ def test_jobs_are_read_from_lines_or_a_list(tmp_path):
     lines, listed = tmp_path / "jobs.jsonl", tmp_path / "jobs.json"
     lines.write_text(f"{json.dumps(HOLD)}\n\n{json.dumps(other)}\n", encoding="utf-8")
     listed.write_text(json.dumps([HOLD, other], indent=1), encoding="utf-8")
-    assert [word.name for word in read_jobs(str(lines))] == ["a", "b"]
-    assert read_jobs(str(lines)) == read_jobs(str(listed))
+    assert {line: job.name for line, job in read_jobs(str(lines)).items()} == {1: "a", 3: "b"}
+    assert [*read_jobs(str(lines)).values()] == [*read_jobs(str(listed)).values()]
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ WRONG = [
     (put("arms", 0, "name", "a b"), "arms[0].name must be non-empty, without any of / * $ ? # @ or space"),
     (put("arms", 0, "name", 3), "arms[0].name: expected a text, got a whole number (3)."),
     (drop("arms", 0, "name"), "arms[0]: 'name' is missing."),
-    (put("arms", 1, "name", "left"), "arms[1].name: 'left' is given twice; names must be unique."),
+    (put("arms", 1, "name", "left"), "arms[1].name: 'left' is given twice, as in arms[0].name; names must be unique."),
     (
         put("arms", 1, "position_m", [-0.45, 0.0, 0.05]),
         "arms[1].position_m: 'right' is 0.05 m from 'left' (arms[0]); bases must be at least 0.2 m apart.",
@@ -118,7 +118,10 @@ WRONG = [
         put("places", 0, "position_m", [0.0, math.nan, 0.0]),
         "places[0].position_m[1]: expected a finite number, got nan",
     ),
-    (put("places", 1, "name", "bench"), "places[1].name: 'bench' is given twice; names must be unique."),
+    (
+        put("places", 1, "name", "bench"),
+        "places[1].name: 'bench' is given twice, as in places[0].name; names must be unique.",
+    ),
     (put("jobs", 0, "payload_kg", [-1.0]), "jobs[0].payload_kg must be between 0 and 10 kg (got -1.0)."),
     (put("jobs", 0, "payload_kg", 1.0), "jobs[0].payload_kg: expected a list, got a number (1.0)."),
     (put("jobs", 0, "value", math.inf), "jobs[0].value: expected a finite number, got inf."),
@@ -186,7 +189,7 @@ WRONG = [
     ),
     (
         put("fixtures", [{"name": "oven", "position_m": [0, 0, i / 10], "size_m": [1, 1, 1]} for i in (1, 3)]),
-        "fixtures[1].name: 'oven' is given twice; names must be unique.",
+        "fixtures[1].name: 'oven' is given twice, as in fixtures[0].name; names must be unique.",
     ),
     (put("fixtures", [{"name": "", "position_m": [0, 0, 1], "size_m": [1, 1, 1]}]), "fixtures[0].name must not be"),
     (put("fixtures", [{"name": "x", "size": 1}]), "fixtures[0]: unknown key 'size'; did you mean 'size_m'?"),
@@ -322,7 +325,7 @@ TRACES = [
     (b"-1\n", "must be >= 0 and in order (-1.0 s is not)."),
     (b"0\nnan\n5\n", "must be >= 0 and in order (nan s is not)."),
     (b"0\ninf\n", "must be >= 0 and in order (inf s is not)."),
-    (b"\xff\xfe\x00", "'times.txt' is not a UTF-8 text file."),
+    (b"\xff\xfe\x00", "line 1 of 'times.txt' is not a number of seconds"),
 ]
 
 

@@ -254,11 +254,21 @@ def test_at_a_constant_pace_the_time_left_is_exact(first, pace, spent_s, began_s
     assert clock.left_s(began_s + spent_s) == pytest.approx((1.0 - now) / pace, rel=1e-3)
 
 
+def test_what_processes_work_on_is_taken_for_half_done():
+    """Two processes make four models of one pace: after the first, 1.5 of the work are done."""
+    clock = StageClock()
+    clock.update("training", Count(0, 4, 2), 0.0)
+    clock.update("training", Count(1, 4, 2), 30.0)
+    assert clock.left_s(30.0) == pytest.approx(30.0 * 2.5 / 1.5)
+    clock.update("training", Count(4, 4, 2), 90.0)
+    assert clock.left_s(90.0) == 0.0
+
+
 def test_a_stage_whose_name_counts_is_one_stage():
     clock = StageClock()
     assert [clock.update(f"iteration {n}, best {n / 7:.1f}", n / 9, n) for n in range(3)] == [True, False, False]
     assert clock.line(2.0) == "Iteration 2, best 0.3: 22%, for 2 s."
-    assert clock.line(8.0) == "Iteration 2, best 0.3: 22%, about 28 s left."
+    assert clock.line(8.0) == "Iteration 2, best 0.3: 22%, about 28 s left of this stage."
 
 
 def test_an_interruption_says_what_is_kept_and_where_or_that_nothing_was(monkeypatch, tmp_path):

@@ -112,6 +112,24 @@ def test_what_happens_to_a_followed_file_is_named(motion, tmp_path):
         GrowingLog(tmp_path / "telemetry.parquet")
 
 
+def test_what_is_dropped_from_a_growing_log_is_said_once(motion, tmp_path, caplog):
+    head, *lines = csv_of(log_of(motion, seconds=4.0)).splitlines(keepends=True)
+    path = tmp_path / "grows.csv"
+    path.write_text(f"note,{head}")
+    with GrowingLog(path, damaged="skip") as growing:
+        for damage, line in zip(
+            ("", "1,2,oops\n", "3,4\n", "5,0,x,0\n" + "5,0,x" + ",0" * 27 + "\n"), lines, strict=False
+        ):
+            with path.open("a") as out:
+                out.write(f"7,{line}{damage}")
+            growing.read(-np.inf)
+    assert [record.message.partition(" dropped: ")[2] for record in caplog.records] == [
+        "its columns note are unknown to a plain log (said once)",
+        "line 4: 3 fields where the header has 30 (said once)",
+        "line 9: field 3, 'x', is not a number (said once)",
+    ]
+
+
 def test_the_command_prints_a_line_per_window_until_ctrl_c(twin, motion, tmp_path):
     save(twin, tmp_path / "twin")
     path, lines = tmp_path / "grows.csv", csv_of(log_of(motion)).splitlines(keepends=True)

@@ -3,6 +3,7 @@
 import os
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from fleet.bus.protocol.messages import Info, State
 from fleet.bus.router import Router
 from fleet.live.arm.body import ReplayBody, SensorLog
 from fleet.live.monitor.snapshot import ArmSnapshot
+from scenarios.live.arm import replayed_arm
 from scenarios.show.watch import arm_line
 from tests.commands import start
 from tests.twin.test_follow import csv_of, log_of
@@ -71,6 +73,16 @@ def test_impossible_readings_give_no_scores_and_are_forgotten(twin):
     for d, expected_c in scores:
         assert all(-100 < each < 500 for each in expected_c)
         assert d is None or 0 <= d <= 7
+
+
+def test_a_replayed_arm_reads_its_models_once(twin, motion, tmp_path, monkeypatch):
+    save(twin, tmp_path / "twin")
+    (tmp_path / "log.csv").write_text(csv_of(log_of(motion, seconds=60.0)))
+    opened = list[Path]()
+    monkeypatch.setattr("scenarios.prepare.twins.open_twin", lambda folder: opened.append(folder) or twin)
+    arm = replayed_arm("museum", tmp_path / "log.csv", tmp_path / "twin")
+    assert arm.body(0.0, 0.5).read_sensors().motion_difficulty is None
+    assert (arm.model.version, opened) == (f"d:{twin.version}", [tmp_path / "twin"])
 
 
 def test_a_replayed_arm_publishes_d_and_expected_temperatures(twin, motion, tmp_path):

@@ -202,6 +202,8 @@ def test_a_saved_model_is_the_same_model(tmp_path: Path) -> None:
     [
         (lambda card: b"{", "truncated"),
         (lambda card: card | {"format": 2}, "format 2 is not supported, only 3"),
+        (lambda card: card | {"format": "3.1"}, "format '3.1' is not supported, only 3"),
+        (lambda card: [], "Expected `object`, got `array`"),
         (lambda card: card | {"model": card["model"] | {"offset": -9.0}}, "content has changed"),
         (lambda card: card | {"model": card["model"] | {"of_start": "warm"}}, "of_start"),
         (lambda card: card | {"extra": 1}, "extra"),

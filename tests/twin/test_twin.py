@@ -17,6 +17,7 @@ from sklearn.metrics import roc_auc_score
 
 from fleet.errors import CheckpointError
 from fleet.motion import Phase
+from scenarios.prepare.twins import open_twin, save_twins
 from tests.profiles import examples
 from twin.baselines import untrained_config
 from twin.vae.config import TwinConfig
@@ -364,6 +365,17 @@ def swings(rng: np.random.Generator, count: int, *, mixed_up: bool = False) -> n
 def twin_of(windows: np.ndarray, config: TwinConfig, seed: int) -> Twin:
     records = list(windows.transpose(0, 1, 3, 2))
     return train(records, config, np.random.SeedSequence(seed), arm="swing")
+
+
+def test_a_twin_of_several_is_chosen_by_the_name_of_its_arm_as_it_is_written(twin, tmp_path):
+    twins = [replace(twin, arm=arm) for arm in ("Halle 1", "Öl 50%")]
+    save_twins(twins, tmp_path, "by hand")
+    for each in twins:
+        assert open_twin(tmp_path, each.arm).arm == each.arm
+    with pytest.raises(CheckpointError, match="holds 2 twins; choose one with --arm: Öl 50%, Halle 1"):
+        open_twin(tmp_path)
+    with pytest.raises(CheckpointError, match=r"No twin of arm 'Halle' in .*; did you mean 'Halle 1'"):
+        open_twin(tmp_path, "Halle")
 
 
 @pytest.mark.ci_slow

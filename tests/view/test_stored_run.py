@@ -71,10 +71,11 @@ def test_an_absent_arm_keeps_its_last_posture() -> None:
     assert arrays["mode"][1].tolist() == [[-1, 1, 1, 1, 1, 1], [1, 1, -1, -1, 1, 1]]
 
 
-@pytest.mark.parametrize("damage", ["jobs.parquet", "telemetry.parquet", "run.json"])
+@pytest.mark.parametrize("damage", ["jobs.parquet", "telemetry.parquet", "run.json", "list"])
 def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, damage: str) -> None:
     copied = shutil.copytree(run_folder, tmp_path / "run")
-    (copied / damage).write_bytes(b"PAR1 cut short")
+    name, content = ("run.json", b"[6]") if damage == "list" else (damage, b"PAR1 cut short")
+    (copied / name).write_bytes(content)
     with pytest.raises(FleetError, match="no complete folder of `thermofleet run`"):
         open_run(copied)
 

@@ -1,6 +1,5 @@
 """Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet."""
 
-import codecs
 import gzip
 import logging
 import os
@@ -21,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet.errors import LogError, nearest
+from fleet.files import decode_text
 from fleet.readings import judge, repeats
 from fleet.robot import JOINTS
 from twin.logs.recording import GAP_S, READINGS, Recording
@@ -154,27 +154,20 @@ def read_csv(path: Path) -> LogTable:
         raise LogError(str(path), None, "ends in .gz but holds no gzip data; was it unpacked or downloaded as a page?")
     if not data.strip():
         raise LogError(str(path), None, f"holds no text ({broken})." if broken else "is empty.")
-    lines = _as_utf8(data).split(b"\n")
+    lines = decode_text(data).split("\n")
     first = next((i for i, raw in enumerate(lines) if not _IGNORED.fullmatch(raw)), 0)
     columns = _header(path, first + 1, lines[first])
     values, where, damage = _rows(lines[first + 1 : -1], columns, first=first + 2)
     if len(lines) > first + 1 and not _IGNORED.fullmatch(lines[-1]):
         # The last number may have lost digits even if all fields are present.
         cut = f"the {'gzip data end' if broken else 'file ends'} in the middle of this line"
-        damage.append(Damage(len(lines), _NUL_BYTES if b"\0" in lines[-1] else cut))
+        damage.append(Damage(len(lines), _NUL_BYTES if "\0" in lines[-1] else cut))
     return LogTable(columns.named, values, where, tuple(damage), (broken,) if broken else ())
 
 
 _NUL_BYTES = "holds NUL bytes, as after a power failure"
-_IGNORED = re.compile(rb"\s*(#[^\0]*|sep=.\s*)?")
+_IGNORED = re.compile(r"\s*(#[^\0]*|sep=.\s*)?")
 """Blank lines, comments, and the line with the separator for Excel; also before the header."""
-
-
-def _as_utf8(data: bytes) -> bytes:
-    """The text in UTF-8 without a byte order mark, if it begins with a mark of UTF-16 or UTF-8."""
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return data.decode("utf-16", errors="replace").encode()
-    return data.removeprefix(codecs.BOM_UTF8)
 
 
 class _Columns(NamedTuple):
@@ -190,7 +183,7 @@ class _Columns(NamedTuple):
         return tuple(name for name in self.names if name and not name.startswith("Unnamed: "))
 
 
-def _rows(lines: Sequence[bytes], columns: _Columns, *, first: int) -> tuple[Array, Array, list[Damage]]:
+def _rows(lines: Sequence[str], columns: _Columns, *, first: int) -> tuple[Array, Array, list[Damage]]:
     """Numbers of the good lines, [row, named column], the line of each, [row], and the others.
 
     Args:
@@ -203,7 +196,7 @@ def _rows(lines: Sequence[bytes], columns: _Columns, *, first: int) -> tuple[Arr
         if _IGNORED.fullmatch(raw):
             continue
         try:
-            if b"\0" in raw:
+            if "\0" in raw:
                 raise ValueError(_NUL_BYTES)
             rows.append(_numbers(raw, columns.names, columns.separator))
             where.append(line)
@@ -229,12 +222,7 @@ def _decompress(data: bytes) -> tuple[bytes, str | None]:
     return b"".join(parts), f"the gzip data are {reason}"
 
 
-def _header(path: Path, line: int, raw: bytes) -> _Columns:
-    try:
-        text = raw.decode("utf-8")
-    except UnicodeDecodeError as error:
-        reason = f"is not text in UTF-8 (byte {error.start}); save it as CSV in UTF-8."
-        raise LogError(str(path), line, reason) from error
+def _header(path: Path, line: int, text: str) -> _Columns:
     if "\0" in text:
         raise LogError(str(path), line, "holds NUL bytes; is it UTF-16? Save it as CSV in UTF-8.")
     separator = "\t" if "\t" in text else ","
@@ -244,16 +232,13 @@ def _header(path: Path, line: int, raw: bytes) -> _Columns:
     return _Columns(names, separator)
 
 
-def _numbers(raw: bytes, names: Sequence[str], separator: str) -> list[float]:
+def _numbers(line: str, names: Sequence[str], separator: str) -> list[float]:
     """The numbers of a line, 0 in columns without a name; a date is in seconds since 1970.
 
     Raises:
         ValueError: the line has no such numbers; the reason.
     """
-    try:
-        cells = raw.decode("utf-8").replace('"', "").split(separator)
-    except UnicodeDecodeError as error:
-        raise ValueError(f"is not text in UTF-8 (byte {error.start} of the line)") from error
+    cells = line.replace('"', "").split(separator)
     if len(cells) != len(names):
         raise ValueError(f"{len(cells)} fields where the header has {len(names)}")
     numbers: list[float] = []
@@ -429,6 +414,9 @@ def read_arms(path: Path) -> dict[str, LogTable]:
         table = pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
         raise LogError(str(path), None, f"is not a complete parquet file ({str(error).splitlines()[0]}).") from error
+    if "tick" in table.column_names:
+        reason = "is part of the recording of a fleet. A recording is a folder: publish it again with"
+        raise LogError(str(path), None, f"{reason} `thermofleet bus replay`, or look at it with `thermofleet report`.")
     if ARM not in table.column_names or len(table.column_names) == 1:
         missing = "time_s" if ARM in table.column_names else ARM
         raise LogError(str(path), None, f"lacks the column {missing} of a telemetry.parquet.")
@@ -539,14 +527,16 @@ def _name(path: Path) -> str:
 
 
 def _recording(
-    path: Path, name: str, table: LogTable, damaged: Damaged, *, measured: bool = True, part: bool = False
+    path: Path, name: str, table: LogTable, damaged: Damaged, *, measured: bool = True, warned: set[str] | None = None
 ) -> Recording:
     """A recording from the good rows of a table.
 
     Args:
         measured: As in `read`.
-        part: Of a growing log: with damaged="skip", most of its rows may be wrong.
+        warned: Of a part of a growing log: what was dropped from earlier parts, which is not said again. With
+            damaged="skip", most rows of a part may be wrong.
     """
+    part = warned is not None
     is_csv = path.suffix != ".parquet"
     try:
         layout = format_of(table.names) if is_csv else PLAIN
@@ -586,7 +576,11 @@ def _recording(
         remedy = "" if broken or not first.remedy else f"{first.remedy} "
         raise LogError(str(path), line, f'{reason}{more}. {remedy}Use damaged="skip" to read the undamaged lines.')
     for sentence in dropped:
-        log.warning("%s: dropped: %s", path, sentence)
+        what = _kind(re.sub(r"^lines? [\d to]+: ", "", sentence))
+        if warned is None or what not in warned:
+            log.warning("%s: dropped: %s%s", path, sentence, " (said once)" if part else "")
+        if warned is not None:
+            warned.add(what)
     kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
     time_s = time_s[keep]
     if is_csv and measured and not part and (held := repeats(time_s, kept, GAP_S)):
@@ -627,6 +621,7 @@ class GrowingLog:
             raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
         self._path, self._first_s, self._begun = path, first_s, b""
         self._damaged: Damaged = damaged
+        self._warned = set[str]()
         self._lines = 0
         """Complete lines so far."""
         self._columns: _Columns | None = None
@@ -656,7 +651,7 @@ class GrowingLog:
                 return None
             self._append(block)
         assert self._table is not None
-        recording = _recording(self._path, _name(self._path), self._table, self._damaged, part=True)
+        recording = _recording(self._path, _name(self._path), self._table, self._damaged, warned=self._warned)
         if not len(recording.time_s):
             empty = np.zeros(0, int)
             self._table = LogTable(self._table.names, self._table.values[empty], empty, ())
@@ -685,12 +680,13 @@ class GrowingLog:
         return len(time_s) > (self._last_s > -np.inf) and bool(time_s[-1] >= until_s)
 
     def _append(self, block: bytes) -> None:
-        *lines, self._begun = (self._begun + block).split(b"\n")
+        *complete, self._begun = (self._begun + block).split(b"\n")
+        lines = [decode_text(line) for line in complete]
         if len(self._begun) > BLOCK_BYTES:
             raise LogError(str(self._path), self._lines + 1, f"has a line of more than {BLOCK_BYTES:,} bytes.")
         while self._columns is None and lines:
             self._lines += 1
-            raw = lines.pop(0).removeprefix(codecs.BOM_UTF8)
+            raw = lines.pop(0)
             if not _IGNORED.fullmatch(raw):
                 self._columns = _header(self._path, self._lines, raw)
                 names = self._columns.named

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, IdentificationError
 from fleet.heat.motor import Motors, friction_heat, reference_current
 
 Array = np.ndarray
@@ -326,7 +326,10 @@ def heat_logs(recording: Recording, motors: Motors, source: CurrentSource, *, st
 
     Raises:
         ValueError: a recording without temperatures, or without currents where they are the source.
+        IdentificationError: it has other joints than the thermal network.
     """
+    if recording.joints != (joints := motors.torque_per_amp.shape[-1]):
+        raise IdentificationError(f"'{recording.name}' has {recording.joints} joints, the thermal network {joints}.")
     if recording.temp_c is None:
         raise ValueError(f"Recording '{recording.name}' has no motor temperatures.")
     terms, friction = _current_terms(recording, motors, source), _friction_terms(recording, motors)

@@ -11,11 +11,11 @@ import numpy as np
 from fleet.errors import CheckpointError
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import thermal_model
+from fleet.json_file import check_version, read_card, write_card
 from fleet.robot import JOINTS
 from twin.logs.recording import CurrentSource
 from twin.thermal.identify import HeatModel, Identified, Parameter
 from twin.thermal.thermal_twin import PeakCurve
-from twin.vae.json_file import check_version, read_card, write_card
 
 FORMAT = 2
 CARD, CURVE = "rc.json", "saturation_curve.json"

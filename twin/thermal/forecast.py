@@ -19,7 +19,6 @@ from fleet.errors import FleetError
 from fleet.heat.motor import Motors, magnet_factor
 from fleet.heat.thermal import HOUSING, WINDING, temperature_steps
 from fleet.motion import Drive
-from fleet.robot import JOINTS
 from twin.logs.recording import HEAT_GAP_S, STEP_S, HeatLog, Recording, check_recordings, heat_logs, source_of
 from twin.thermal.identify import (
     AMBIENT_C,
@@ -214,7 +213,6 @@ def _parameters(network: Identified | None) -> ParameterVector:
 
 def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLog, Array]:
     """The last stretch of a log without a gap, in at most `MOST_STEPS` steps, and its last motor temperatures."""
-    check_seven_joints(so_far)
     if so_far.temp_c is None:
         raise FleetError(f"The log '{so_far.name}' has no motor temperatures, from which a forecast starts.")
     late = so_far.part(so_far.time_s >= so_far.time_s[-1] - MEMORY_S)
@@ -233,15 +231,8 @@ def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLo
     return logs[-1], so_far.temp_c[-1]
 
 
-def check_seven_joints(recording: Recording) -> None:
-    """Raise a FleetError unless a recording has the joints of the thermal network."""
-    if recording.joints != JOINTS:
-        raise FleetError(f"'{recording.name}' has {recording.joints} joints, the thermal network {JOINTS}.")
-
-
 def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:
     """The heat of a repetition, in every interval between samples."""
-    check_seven_joints(plan)
     silent = replace(plan, temp_c=np.zeros_like(plan.q))  # of no use here
     logs = heat_logs(silent, motors, source_of([plan]), step_s=0.0)
     if len(plan.time_s) < LEAST_SAMPLES:

@@ -573,10 +573,6 @@ def _check_recordings(recordings: Sequence[Recording]) -> None:
     if twice := sorted(name for name, count in Counter(r.name for r in recordings).items() if count > 1):
         raise IdentificationError(f"Names of recordings must differ; given more than once: {', '.join(twice)}.")
     for recording in recordings:
-        if recording.joints != JOINTS:
-            raise IdentificationError(
-                f"Recording '{recording.name}' has {recording.joints} joints, the thermal network {JOINTS}."
-            )
         if recording.temp_c is None:
             raise IdentificationError(
                 f"Recording '{recording.name}' has no motor temperatures. Record temperature_motor of every joint "

@@ -17,11 +17,11 @@ from safetensors.numpy import load_file, save_file
 from fleet.difficulty import Difficulty, heat_weights
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
+from fleet.json_file import check_version, read_card, write_card
 from fleet.motion import CHANNELS, Plan
 from fleet.robot import JOINTS
 from twin.vae.config import TwinConfig
 from twin.vae.inference import Networks, Weights, shapes
-from twin.vae.json_file import check_version, read_card, write_card
 from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, latent_moments, measures_of, moments
 from twin.vae.window import PHASES, PlanCache, Scaler, check_jobs, cut_phases
 

@@ -114,6 +114,12 @@ class Channel:
 
     def __post_init__(self) -> None:
         check(self)
+        for name in ("radius", "topology_seed"):
+            if self.topology != "random_geometric" and (given := getattr(self, name)) != getattr(type(self), name):
+                raise ValueError(
+                    f"{name} is for the topology random_geometric (got {given:g} and {self.topology}): give this "
+                    f"topology, too, or leave {name} out."
+                )
         object.__setattr__(self, "partitions", tuple(self.partitions))
 
     @property

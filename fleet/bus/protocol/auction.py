@@ -88,7 +88,8 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
         return shared_stations(self.every_places)
 
     def __post_init__(self) -> None:
-        check_names(self, "name", "places", "after", "alternatives")
+        check_names(self, "name", "after", of_jobs=True)
+        check_names(self, "places", "alternatives")
         check_alternatives(self, self.kind, self.every_places)
         check_bounds(self, "repetitions", "payload_kg", "dwell_s", "force_n", "release_s", "due_s", "value")
         check_dwell(self, self.kind, self.dwell_s)

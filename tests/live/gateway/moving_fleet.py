@@ -63,7 +63,7 @@ class MovingFleet:
             link.reply_to(keys.of_arm(fleet, arm, "quote"), bus.QuoteRequest, lambda r, arm=arm: self.quote(arm, r))
             link.reply_to(keys.of_arm(fleet, arm, "reset"), ResetRequest, lambda r, arm=arm: self.reset(arm, r))
         link.declare_token(keys.of_auction(fleet, "auctioneer", "alive"))
-        link.reply_to(keys.of_jobs(fleet, "submit"), bus.Submission, self.submit)
+        link.reply_to(keys.of_jobs(fleet, "submit"), bus.Submission, lambda request: self.submit(request))
         link.reply_to(keys.of_jobs(fleet, "status"), bus.StatusRequest, self.status)
         link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self.control)
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self.clear)

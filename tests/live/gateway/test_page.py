@@ -16,12 +16,13 @@ from pathlib import Path
 
 import pytest
 
-from fleet.bus.protocol.auction import Status
+from fleet.bus.protocol.auction import Admission, Status, SubmissionReply
 from fleet.bus.protocol.operator import Cancel, ControlRequest, Operation, Pause, ResetRequest, Resume
 from fleet.bus.router import Router
+from fleet.errors import Refused
 from fleet.live.monitor.snapshot import FleetView
 from scenarios.live.fleet_processes import page_of
-from scenarios.live.gateway import FILES, MAX_BYTES, PAGE, LivePage, scene_of
+from scenarios.live.gateway import FILES, MAX_BYTES, MAX_TABLE_BYTES, PAGE, LivePage, scene_of
 from scenarios.spec.load import load
 from tests import commands
 from tests.live.gateway.moving_fleet import MovingFleet
@@ -30,6 +31,7 @@ from tests.waiting import PATIENCE_S, wait_until
 
 BROWSER = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
+CSV = {"Content-Type": "text/csv; charset=utf-8"}
 WATCHER, BOSS = "watcher-watcher-watcher", "operator-operator-operator"
 
 
@@ -232,6 +234,12 @@ def test_jobs_are_submitted_and_quoted(gateway, arm):
         ("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
         ("POST", "/v4/ask", {"jobs": []}, {}, 422, "length >= 1"),
         ("POST", "/v4/jobs", b" " * (MAX_BYTES + 1), {}, 413, "at most"),
+        ("POST", "/v4/jobs", b" " * (MAX_TABLE_BYTES + 1), CSV, 413, "at most 1000000 bytes"),
+        ("POST", "/v4/jobs", b"", CSV, 422, "The table has 1 fault:\n  row 1: no column name and no column kind"),
+        ("POST", "/v4/jobs", b"\x00", CSV, 422, "The table is not a text file in UTF-8"),
+        ("POST", "/v4/jobs", "a" + "," * 100, CSV, 422, "The table has 101 columns; a job table has at most 100"),
+        ("POST", "/v4/jobs?shift_begin=6", b"", CSV, 422, "shift_begin must be a date with time and zone, as"),
+        ("POST", "/v4/ask", b"", CSV, 415, "application/json"),
         ("GET", "/v4/nothing", None, {}, 404, "Not Found"),
         ("DELETE", "/v4/jobs", None, {}, 405, "Not Allowed"),
         ("GET", "/v4/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
@@ -243,6 +251,53 @@ def test_an_error_is_a_problem_document(gateway, method, path, body, headers, st
     assert (got, kind) == (status, "application/problem+json")
     assert told["status"] == status
     assert says in told["detail"]
+
+
+def test_a_table_is_submitted_in_messages_or_all_its_faults_are_told(gateway, arm):
+    head, before = "name;kind;places;payload;release;after", len(arm.requests)
+    rows = [f"{i}/Teil;pick_place;conveyor > pallet;0,5;2026-11-23 06:{i % 60:02};{i + 1}/Teil" for i in range(199)]
+    table = "\n".join([head, *rows, "199/Teil;hold;pallet;;;"])
+    path = "/v4/jobs?shift_begin=2026-11-23T06:00%2B01:00&by=plan"
+    status, _, told = gateway.ask("POST", path, table.encode("cp1252"), CSV)
+    assert status == 200
+    assert all(each["accepted"] for each in told["jobs"])
+    sent = arm.requests[before:]
+    assert [len(request.jobs) for request in sent] == [64, 64, 64, 8]
+    assert {request.by for request in sent} == {"plan"}
+    jobs = [job for request in sent for job in request.jobs]
+    assert [job.name for job in jobs] == [f"{i}/Teil" for i in range(199, -1, -1)]  # each after those it waits for
+    assert {job.name: job.release_s for job in jobs if job.name != "199/Teil"} == {
+        f"{i}/Teil": 60.0 * (i % 60) for i in range(199)
+    }
+    wrong = f"{head}\na;hold;moon;;;\nb;hold;mars;;;\n"
+    status, kind, told = gateway.ask("POST", path, wrong, CSV)
+    assert (status, kind, len(arm.requests)) == (422, "application/problem+json", before + 4)
+    assert "The table has 2 faults:\n  row 2, column places: no place 'moon'" in told["detail"]
+    assert "row 3, column places: no place 'mars'" in told["detail"]
+    status, _, told = gateway.ask("POST", path, f"{head}\na;hld;pallet;two;;\n", CSV)
+    assert (status, told["detail"].count("row 2, column ")) == (422, 2)
+
+
+def test_jobs_of_a_table_that_are_refused_are_named_by_row_and_what_was_accepted_is_said(gateway, arm, monkeypatch):
+    def submit(request, own=arm.submit):
+        reply = own(request)
+        if len(request.jobs) == 1:  # what waits is sent last
+            raise Refused("The journal has no room.")
+        stuck = Admission("j1", False, "It waits for 'no/one'.")
+        return SubmissionReply("auctioneer", tuple(stuck if each.job == "j1" else each for each in reply.jobs))
+
+    monkeypatch.setattr(arm, "submit", submit)
+    rows = [f"j{i},hold,pallet,{'no/one' * (i == 1)}" for i in range(65)]
+    text = "\n".join(["name,kind,places,after", *rows])
+    status, _, told = gateway.ask("POST", "/v4/jobs", text[: text.index("j64")], CSV)
+    assert (status, [each["reason"] for each in told["jobs"] if not each["accepted"]]) == (
+        200,
+        ["row 3, column after: It waits for 'no/one'."],
+    )
+    status, _, told = gateway.ask("POST", "/v4/jobs", text, CSV)
+    assert status == 503
+    accepted = ", ".join(f"row {number}" for number in (2, *range(4, 67)))
+    assert told["detail"].endswith(f"The journal has no room. Accepted before: {accepted}.")
 
 
 def test_a_body_of_unknown_length_is_limited_too(gateway):

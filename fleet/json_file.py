@@ -1,5 +1,6 @@
 """JSON files of a fixed format version, written atomically and checked when read."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,10 +15,10 @@ Card = TypeVar("Card")
 class _Head(msgspec.Struct):
     """The part that is read first."""
 
-    format: int
+    format: object
 
 
-def write_card(card: msgspec.Struct, path: Path) -> None:
+def write_card(card: msgspec.Struct | Mapping[str, object], path: Path) -> None:
     """Write a card atomically; its folder is made if need be."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as draft:
@@ -34,7 +35,9 @@ def read_card(path: Path, kind: type[Card], *, format_: int, what: str) -> Card:
         text = path.read_bytes()
         head = msgspec.json.decode(text, type=_Head)
         if head.format != format_:
-            raise CheckpointError(f"{path}: format {head.format} is not supported, only {format_}.")
+            raise CheckpointError(
+                f"{path}: format {head.format!r} is not supported, only {format_}. Make it again with this version."
+            )
         return msgspec.json.decode(text, type=kind)
     except FileNotFoundError:
         raise CheckpointError(f"No {what} in {path.parent}: {path.name} is missing.") from None
