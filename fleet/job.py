@@ -4,10 +4,14 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from math import inf, pi
 from typing import Literal, NamedTuple, get_args
 
+import numpy as np
+
 from fleet.errors import check_coordinates
+from fleet.surface import Surface, convex_parts
 
 Kind = Literal["pick_place", "hold", "press", "sort"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -165,7 +169,10 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Fixture:
-    """A solid box that stands in the cell, for example a table, an oven or a conveyor.
+    """A solid that stands in the cell, for example a table, an oven or a conveyor: a box, or a mesh within it.
+
+    A scenario file gives the sizes of a box, or `mesh`, a file with the fixture's shape (`scenarios.spec.mesh_file`).
+    Of a mesh, distances use the convex hull of each connected part.
 
     No link of an arm and no payload may touch it. At a place above a table the tool point must therefore be higher
     than the table by the diameter of the heaviest payload, see `payload_radius_m`.
@@ -178,6 +185,8 @@ class Fixture:
     """Full lengths along the box's own x, y and z axes, m."""
     tilt_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw about the fixed world axes x, y, z, deg."""
+    surface: Surface | None = None
+    """Of a mesh, about the centre; None for a box."""
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -190,6 +199,18 @@ class Fixture:
         check_coordinates(self, "position_m")
         if not all(abs(angle) <= 360 for angle in self.tilt_deg):
             raise ValueError(f"Fixture.tilt_deg must be between -360 and 360 (got {list(self.tilt_deg)}).")
+        if self.surface is not None:
+            try:
+                convex_parts(self.surface)
+            except ValueError as error:
+                raise ValueError(f"Fixture.surface cannot be used: {error}.") from error
+
+    @property
+    def parts_m(self) -> tuple[np.ndarray, ...]:
+        """Corners of each convex part about the centre, m, [corner, 3]: of the box, or of the hulls of a mesh."""
+        if self.surface is not None:
+            return convex_parts(self.surface)
+        return (np.array(list(product((-0.5, 0.5), repeat=3))) * self.size_m,)
 
 
 def payload_radius_m(payload_kg: float) -> float:

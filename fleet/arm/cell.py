@@ -2,19 +2,29 @@
 
 import base64
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
+from pathlib import Path
 from types import TracebackType
 from typing import Any  # plain values of JSON
 
 import mujoco
 import numpy as np
 
-from fleet.arm.model import build_cell, payload_bodies, quaternion, set_payload_balls
+from fleet.arm.model import (
+    FIXTURE_RGB,
+    HIDDEN,
+    build_cell,
+    payload_bodies,
+    quaternion,
+    set_payload_balls,
+    supports,
+)
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.job import MOST_PAYLOAD_M, PAYLOAD_KG_PER_M3, Fixture, Place
 from fleet.robot import JOINTS, Mount, Robot, rotation
+from fleet.surface import arrays_of
 
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -28,9 +38,11 @@ SHAPES = {
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
 """Kinds of shapes; sizes as in MuJoCo: radius, half length along z, or half lengths along x, y and z."""
-HIDDEN = 3
-"""MuJoCo's geom group of the primitives that meshes replace."""
 DIGITS = 5
+MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
+"""Radius of the drum of a cool motor and of one at the error limit: a hotter motor is also larger."""
+DRUM = 0.8
+"""Half length of a drum along the axis of its joint, in radii."""
 
 
 def cell_model(
@@ -48,9 +60,10 @@ def cell_model(
     Returns:
         `links`: the bodies of one arm in the order of the chain, each with the index of its parent (-1 for the
         mount), its pose in the parent's frame, whether it turns about its z axis (joints in the order of the links),
-        and its shapes. `hand`: pose of the flange in the last link's frame. `arms`, `places`, `fixtures`: names and
-        poses in the world. `meshes`: the surfaces that shapes of the kind "mesh" name. Positions and sizes are in m,
-        quaternions w, x, y, z.
+        and its shapes. `motor`: radii of the drum round a joint, and its half length. `hand`: pose of the flange in the
+        last link's frame. `arms`, `places`, `fixtures`: names and poses in the world; of fixtures also full lengths,
+        and the `mesh` of those that have one. `supports`: the boxes that carry the arms. `meshes`: the surfaces that
+        shapes and fixtures name by index, see `mesh_arrays`. Positions and sizes are in m, quaternions w, x, y, z.
 
     Raises:
         FleetError: the meshes are not available.
@@ -72,17 +85,28 @@ def cell_model(
                 "shapes": shapes,
             }
         )
+    surfaces = [_mesh(*asset_arrays(model, mesh)) for mesh in range(model.nmesh)]
+    solids: list[dict[str, Any]] = []
+    for each in fixtures:
+        solid = {"name": each.name, "size": list(each.size_m), **_pose(each.position_m, rotation(each.tilt_deg))}
+        if each.surface is not None:
+            solid["mesh"] = len(surfaces)
+            surfaces.append(_mesh(*arrays_of(each.surface)))
+        solids.append(solid)
     hand = {"position": _rounded(model.body_pos[payload]), "quaternion": _rounded(model.body_quat[payload])}
     return {
         "links": links,
         "hand": hand,
         "arms": [{"name": robot.name, **_pose(robot.mount.position_m, robot.mount.rotation())} for robot in robots],
         "places": [{"name": place.name, **_pose(place.position_m, rotation(place.tool_deg))} for place in places],
-        "fixtures": [
-            {"name": box.name, "size": list(box.size_m), **_pose(box.position_m, rotation(box.tilt_deg))}
-            for box in fixtures
+        "fixtures": solids,
+        "fixture_colour": list(FIXTURE_RGB),
+        "supports": [
+            {"size": _rounded(each.size_m), "colour": list(each.rgba), **_pose(each.position_m, each.turn)}
+            for each in supports(robots)
         ],
-        "meshes": [_mesh(model, mesh) for mesh in range(model.nmesh)],
+        "meshes": surfaces,
+        "motor": {"cool_m": MOTOR_M, "hot_m": HOT_MOTOR_M, "half_length": DRUM},
         "load": {"most_m": MOST_PAYLOAD_M, "kg_per_m3": PAYLOAD_KG_PER_M3},
     }
 
@@ -98,19 +122,71 @@ def _shape(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
     }
 
 
-def _mesh(model: mujoco.MjModel, mesh: int) -> dict[str, Any]:
-    """A surface: coordinates of its points as int16 in `unit_m`, points of its triangles as uint32; base64."""
+def asset_arrays(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points, m, [point, 3], and triangles, int [triangle, 3], of a mesh of a model."""
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     points = model.mesh_vert[first : first + count]
-    unit_m = float(np.abs(points).max()) / np.iinfo(np.int16).max
     first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    triangles = model.mesh_face[first : first + count].astype("<u4")
-    encoded = (np.rint(points / unit_m).astype("<i2"), triangles)
+    return points, model.mesh_face[first : first + count]
+
+
+def model_solids(file: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Points, m, [point, 3], and triangles, int [triangle, 3], of each solid in a file of MJCF or URDF.
+
+    Solids are the shapes that collide, or all if none does, in the model's first posture, without planes and terrain.
+
+    Raises:
+        ValueError: MuJoCo cannot read the file, or it has a shape that is none of `SHAPES`.
+    """
+    model = mujoco.MjSpec.from_file(str(file)).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    collides = (model.geom_contype | model.geom_conaffinity) != 0
+    for geom in np.flatnonzero(collides if collides.any() else ~collides).tolist():
+        kind = mujoco.mjtGeom(model.geom_type[geom])
+        if kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
+            continue
+        if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            points, triangles = asset_arrays(model, model.geom_dataid[geom])
+        elif kind in SHAPES:
+            solid = solid_of(SHAPES[kind], model.geom_size[geom])
+            points, triangles = solid.vertices, solid.faces
+        else:
+            raise ValueError(f"it has an {kind.name.removeprefix('mjGEOM_').lower()}; give its mesh instead")
+        yield points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom], triangles
+
+
+def _mesh(points: np.ndarray, triangles: np.ndarray) -> dict[str, Any]:
+    """A surface: coordinates of its points as int16 in `unit_m`, points of its triangles as uint32; base64."""
+    unit_m = float(np.abs(points).max()) / np.iinfo(np.int16).max
+    encoded = (np.rint(points / unit_m).astype("<i2"), triangles.astype("<u4"))
     coordinates, corners = (base64.b64encode(values.tobytes()).decode("ascii") for values in encoded)
     return {"unit_m": unit_m, "points": coordinates, "triangles": corners}
 
 
-def _pose(position_m: Sequence[float], matrix: np.ndarray) -> dict[str, Any]:
+def mesh_arrays(mesh: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Points, m, [point, 3], and triangles, int [triangle, 3], of one of the `meshes` of a `cell_model`."""
+    points = np.frombuffer(base64.b64decode(mesh["points"]), "<i2").reshape(-1, 3) * mesh["unit_m"]
+    return points, np.frombuffer(base64.b64decode(mesh["triangles"]), "<u4").reshape(-1, 3)
+
+
+def solid_of(kind: str, size: Sequence[float] | np.ndarray) -> Any:
+    """A trimesh of one of `SHAPES` other than a mesh, in its own frame; flat sides do not share points."""
+    from trimesh import creation
+
+    if kind == "sphere":
+        return creation.icosphere(subdivisions=2, radius=size[0])
+    if kind == "capsule":
+        return creation.capsule(radius=size[0], height=2 * size[1], count=[24, 12])
+    if kind == "box":
+        solid = creation.box(extents=[2 * length for length in size])
+    else:
+        solid = creation.cylinder(radius=size[0], height=2 * size[1], sections=32)
+    solid.unmerge_vertices()  # edges stay sharp
+    return solid
+
+
+def _pose(position_m: Sequence[float] | np.ndarray, matrix: np.ndarray) -> dict[str, Any]:
     return {"position": _rounded(position_m), "quaternion": _rounded(quaternion(matrix))}
 
 
@@ -153,7 +229,7 @@ class CellPlayer:
         *,
         meshes: bool = False,
     ) -> None:
-        self.model = build_cell(robots, places, fixtures, meshes=meshes)
+        self.model = build_cell(robots, places, fixtures, meshes=meshes, drawn=True)
         self.data = mujoco.MjData(self.model)
         self._payloads = payload_bodies(self.model, robots)
         self._mounts_m = np.array([robot.mount.position_m for robot in robots])
@@ -166,17 +242,19 @@ class CellPlayer:
         sites = [f"{robot.name}/motor_{joint + 1}" for robot in robots for joint in range(JOINTS)]
         self._motors = np.array([self.model.site(name).id for name in sites])
         self.model.site_group[self._motors] = 0
+        self.model.site_type[self._motors] = mujoco.mjtGeom.mjGEOM_CYLINDER
 
     def show(self, q: Array, motor_rgb: Array, motor_m: Array, payload_kg: Array) -> None:
-        """Set postures [arm, joint] in rad and payloads [arm] in kg, with a sphere at each motor.
+        """Set postures [arm, joint] in rad and payloads [arm] in kg, with a drum at each motor.
 
         Args:
-            motor_rgb: Colours of the spheres, 0 to 1, [arm, joint, 3].
+            motor_rgb: Colours of the drums, 0 to 1, [arm, joint, 3].
             motor_m: Their radius, m, [arm, joint].
         """
         self.data.qpos[:] = q.ravel()
         self.model.site_rgba[self._motors, :3] = motor_rgb.reshape(-1, 3)
         self.model.site_size[self._motors, 0] = motor_m.ravel()
+        self.model.site_size[self._motors, 1] = DRUM * motor_m.ravel()
         set_payload_balls(self.model, self._payloads, payload_kg)
         mujoco.mj_forward(self.model, self.data)
 
@@ -301,6 +379,9 @@ class ContactFinder:
         self._data = mujoco.MjData(self._model)
         self._payloads = payload_bodies(model, robots)
         self._names = [_described(model.geom(g).name) for g in range(model.ngeom)]
+        first = {name: g for g, name in reversed([*enumerate(self._names)])}
+        self._solid = [first[name] for name in self._names]
+        """The first geom of the solid of which each geom is a part."""
         self.reset()
 
     def reset(self) -> None:
@@ -346,6 +427,7 @@ class ContactFinder:
         if not data.ncon:
             return depth_m
         for (a, b), distance_m in zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True):
+            a, b = self._solid[a], self._solid[b]
             pair = (min(a, b), max(a, b))
             if distance_m < 0:
                 depth_m[pair] = max(depth_m.get(pair, 0.0), -distance_m)
@@ -361,7 +443,7 @@ class ContactFinder:
 
 def _described(geom: str) -> tuple[str, str]:
     """Name of a geom for an event, and its arm, if any."""
-    owner, _, name = geom.partition("/")
+    owner, name, *_ = [*geom.split("/"), ""]
     if not name:
         return f"the {geom}", ""
     return (f"the fixture '{name}'", "") if owner == "fixture" else (f"{name} of {owner}", owner)

@@ -1,6 +1,7 @@
 """MuJoCo models: the cell with all its arms, with primitives or Kinova's shells, and the dynamics of a single arm."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import combinations
 from pathlib import Path
@@ -12,11 +13,14 @@ from fleet.arm.gen3 import GRAVITY_M_S2, gen3_xml
 from fleet.errors import FleetError, install
 from fleet.job import MOST_PAYLOAD_M, Fixture, Place, payload_radius_m
 from fleet.robot import GEN3, JOINTS, Robot, rotation
+from fleet.surface import arrays_of
 
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
 
 
+HIDDEN = 3
+"""MuJoCo's geom group of the shapes that others replace in pictures."""
 MESH_OF_GEOM = {
     "base": "base_link",
     "shoulder": "shoulder_link",
@@ -31,7 +35,7 @@ MESH_OF_GEOM = {
 
 
 def use_meshes(spec: mujoco.MjSpec) -> None:
-    """Render a Gen3 with meshes: adds meshes without mass and moves the primitives to the hidden geom group 3.
+    """Render a Gen3 with meshes: adds meshes without mass and moves the primitives to the geom group `HIDDEN`.
 
     Raises:
         FleetError: the package `mujoco-menagerie` or its files are missing.
@@ -50,8 +54,8 @@ def use_meshes(spec: mujoco.MjSpec) -> None:
             group=2,
             mass=0.0,
         )
-        geom.group = 3
-    spec.geom("camera").group = 3
+        geom.group = HIDDEN
+    spec.geom("camera").group = HIDDEN
 
 
 def mesh_folder() -> Path:
@@ -92,18 +96,21 @@ def build_cell(
     *,
     timestep_s: float = 0.002,
     meshes: bool = False,
+    drawn: bool = False,
 ) -> mujoco.MjModel:
-    """Model of all arms on their mounts above one floor, with the places as sites and the fixtures as boxes.
+    """Model of all arms on their mounts above one floor, with the places as sites and the fixtures as boxes or hulls.
 
     Names: all elements of an arm have the prefix `{robot.name}/` (`joint_1`..`joint_7` for joints and their
     position servos, sites `motor_1`..`motor_7` and `tool`, bodies `hand` and `payload`, camera `wrist`); a place is
-    the site `station/{place.name}`, a fixture the geom `fixture/{fixture.name}`. Servos clip at `GEN3.torque_clip`.
+    the site `station/{place.name}`, a box the geom `fixture/{fixture.name}`, and part i of a mesh the geom
+    `fixture/{fixture.name}/{i}`. Servos clip at `GEN3.torque_clip`.
 
     Links and payloads collide with those of other arms, the floor and the fixtures, not within an arm. All hands are
     empty; `set_payload_balls` gives them payloads.
 
     Args:
         meshes: Render Kinova's shells instead of primitives (optional package `mujoco-menagerie`).
+        drawn: For pictures: adds `supports`, and the surfaces of fixtures instead of their hulls. Neither collides.
 
     Raises:
         ValueError: no arms, two arms, places or fixtures with one name, or two arms at the same place.
@@ -139,17 +146,86 @@ def build_cell(
             rgba=(0.95, 0.55, 0.10, 1.0),
         )
     for fixture in fixtures:
+        _add_fixture(spec, fixture, drawn=drawn)
+    for support in supports(robots) if drawn else ():
         world.add_geom(
-            name=f"fixture/{fixture.name}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=fixture.position_m,
-            quat=quaternion(rotation(fixture.tilt_deg)),
-            size=[length / 2 for length in fixture.size_m],
-            rgba=(0.55, 0.50, 0.43, 1.0),
+            pos=support.position_m,
+            quat=quaternion(support.turn),
+            size=support.size_m / 2,
+            rgba=support.rgba,
+            **UNTOUCHED,
         )
     model = spec.compile()
     set_payload_balls(model, payload_bodies(model, robots), np.zeros(len(robots)))
     return model
+
+
+FIXTURE_RGB = (0.55, 0.50, 0.43)
+UNTOUCHED = {"contype": 0, "conaffinity": 0, "mass": 0.0}
+"""Options of geoms that are only drawn."""
+
+
+def _add_fixture(spec: mujoco.MjSpec, fixture: Fixture, *, drawn: bool) -> None:
+    """Add a box, or the hulls of a mesh."""
+    name = f"fixture/{fixture.name}"
+    look = {
+        "pos": fixture.position_m,
+        "quat": quaternion(rotation(fixture.tilt_deg)),
+        "rgba": (*FIXTURE_RGB, 1.0),
+    }
+    if fixture.surface is None:
+        half_m = [length / 2 for length in fixture.size_m]
+        spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_m, **look)
+        return
+    mesh: dict[str, object] = {"type": mujoco.mjtGeom.mjGEOM_MESH, **look}
+    for i, corners in enumerate(fixture.parts_m):
+        part = f"{name}/{i}"
+        spec.add_mesh(name=part, uservert=corners.ravel())
+        spec.worldbody.add_geom(name=part, meshname=part, group=HIDDEN if drawn else 0, **mesh)
+    if drawn:
+        points_m, triangles = arrays_of(fixture.surface)
+        shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # it may be open
+        spec.add_mesh(name=name, uservert=points_m.ravel(), userface=triangles.ravel(), inertia=shell)
+        spec.worldbody.add_geom(meshname=name, **mesh, **UNTOUCHED)
+
+
+UPRIGHT = 0.5
+"""Sine of the elevation from which a base stands or hangs; between, a wall holds it."""
+PLATE_RGBA, POST_RGBA, WALL_RGBA = (0.60, 0.63, 0.65, 1.0), (0.73, 0.74, 0.76, 1.0), (0.73, 0.74, 0.76, 0.35)
+PLATE_M, WALL_M = 0.02, 0.06
+"""Thickness of the plate under a base, and of a wall or ceiling."""
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """A box that carries an arm in pictures."""
+
+    position_m: Array
+    """Centre in the world, [3]."""
+    turn: Array
+    """Rotation to the world, [3, 3]."""
+    size_m: Array
+    """Full lengths, [3]."""
+    rgba: tuple[float, float, float, float]
+
+
+def supports(robots: Sequence[Robot]) -> Iterator[Support]:
+    """A plate under each base, and what holds it: a post on the floor, a piece of wall, or of a ceiling."""
+    for robot in robots:
+        base, turn = np.array(robot.mount.position_m), robot.mount.rotation()
+        axis, behind = turn[:, 2], base - (PLATE_M + WALL_M / 2) * turn[:, 2]
+        yield Support(base - PLATE_M / 2 * axis, turn, np.array((0.16, 0.16, PLATE_M)), PLATE_RGBA)
+        if axis[2] <= -UPRIGHT:
+            yield Support(behind, turn, np.array((0.5, 0.5, WALL_M)), WALL_RGBA)
+        elif behind[2] > 0 and axis[2] < UPRIGHT:
+            top_m = base[2] + 0.25
+            across = rotation((0.0, 0.0, float(np.degrees(np.arctan2(axis[1], axis[0])))))
+            size = np.array((WALL_M, 0.5, top_m))
+            yield Support(np.array((behind[0], behind[1], top_m / 2)), across, size, WALL_RGBA)
+        elif behind[2] > 0:
+            size = np.array((0.1, 0.1, behind[2]))
+            yield Support(np.array((behind[0], behind[1], behind[2] / 2)), np.eye(3), size, POST_RGBA)
 
 
 def payload_bodies(model: mujoco.MjModel, robots: Sequence[Robot]) -> Array:
@@ -183,7 +259,7 @@ class ArmModel:
     """Rigid-body kinematics and dynamics of a single arm on its mount; torques include the reflected rotor inertia.
 
     Args:
-        fixtures: Boxes in the cell; they matter for distances only.
+        fixtures: Solids in the cell; they matter for distances only.
     """
 
     def __init__(self, robot: Robot, fixtures: Sequence[Fixture] = ()) -> None:

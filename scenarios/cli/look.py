@@ -289,7 +289,7 @@ def _play(what: str, shot: Shot) -> None:
         scenario = load(what)
         robots = [arm.robot() for arm in scenario.arms]
         player = CellPlayer(robots, scenario.places, scenario.fixtures, meshes=shot.meshes)
-        home = np.array([robot.home_q for robot in robots])
+        home = np.array([robot.home_q() for robot in robots])
         ambient_c = np.full(home.shape, 20.0)
 
         def update() -> object:

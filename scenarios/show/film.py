@@ -13,7 +13,7 @@ from fleet.errors import FleetError, install, visible
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES
 from scenarios.run.log import RunLog
-from scenarios.show.moments import motor_spheres
+from scenarios.show.moments import motor_drums
 from scenarios.show.words import clock
 from scenarios.spec.options import Shot
 
@@ -49,7 +49,7 @@ def times(run: RunLog, shot: Shot) -> Array:
 
 def show_heat(player: CellPlayer, q: Array, temp_c: Array, payload_kg: Array, limits: ThermalLimits) -> None:
     """Put a cell into postures [arm, joint] in rad, with motors coloured by temperatures [arm, joint] in °C."""
-    player.show(q, *motor_spheres(temp_c, limits), payload_kg)
+    player.show(q, *motor_drums(temp_c, limits), payload_kg)
 
 
 class Film:

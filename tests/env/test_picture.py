@@ -319,7 +319,7 @@ def test_a_fixture_is_drawn_around_its_centre_and_as_large_as_its_shadow(positio
         arms=("a",), mounts_m=((0.0, 0.0, 0.0),), kinds=("floor",), stations=(("s", (2.0, 1.0, 0.0)),), fixtures=(box,)
     )
     plan = floor_plan(cell)
-    (outline,) = plan.fixtures
+    ((outline,),) = plan.fixtures
     px_per_m = (plan.stations[0, 0] - plan.bases[0, 0]) / 2.0
     centre = (outline.min(axis=0) + outline.max(axis=0)) / 2
     np.testing.assert_allclose((centre - plan.bases[0]) / px_per_m, [position_m[0], -position_m[1]], atol=0.05)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from scenarios.run.log import RunLog
 from scenarios.show.gltf import LONGEST_TURN_RAD, SAME_RAD, Z_UP, divided, keys_of
-from scenarios.show.moments import motor_spheres
+from scenarios.show.moments import motor_drums
 
 SPEED = 60.0
 NEAR_M = 1e-4
@@ -106,7 +106,7 @@ def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path
                 node = reader.json["nodes"][reader.index[shown[0]]]
                 primitive = reader.json["meshes"][node["mesh"]]["primitives"][0]
                 colour = reader.json["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorFactor"][:3]
-                rgb, radius_m = motor_spheres(np.array(band_c), run.scenario.limits)
+                rgb, radius_m = motor_drums(np.array(band_c), run.scenario.limits)
                 assert np.power(colour, 1 / 2.2) == pytest.approx(rgb, abs=0.03)  # sRGB is nearly a power of 2.2
                 assert nodes[reader.index[shown[0]]]["scale"] == pytest.approx([float(radius_m)] * 3)
 
