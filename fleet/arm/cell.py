@@ -1,9 +1,9 @@
 """A cell in MuJoCo: plain values for every way to show it, pictures and viewer of recorded postures, and contacts."""
 
-import base64
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any  # plain values of JSON
@@ -11,20 +11,12 @@ from typing import Any  # plain values of JSON
 import mujoco
 import numpy as np
 
-from fleet.arm.model import (
-    FIXTURE_RGB,
-    HIDDEN,
-    build_cell,
-    payload_bodies,
-    quaternion,
-    set_payload_balls,
-    supports,
-)
+from fleet.arm.model import PLACE_M, RGB, build_cell, payload_bodies, quaternion, set_payload_balls, supports
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.job import MOST_PAYLOAD_M, PAYLOAD_KG_PER_M3, Fixture, Place
 from fleet.robot import JOINTS, Mount, Robot, rotation
-from fleet.surface import arrays_of
+from fleet.surface import Surface, surface_of
 
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -38,7 +30,10 @@ SHAPES = {
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
 """Kinds of shapes; sizes as in MuJoCo: radius, half length along z, or half lengths along x, y and z."""
+HIDDEN = 3
+"""MuJoCo's geom group of the primitives that meshes replace."""
 DIGITS = 5
+Points = Sequence[float] | np.ndarray
 MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
 """Radius of the drum of a cool motor and of one at the error limit: a hotter motor is also larger."""
 DRUM = 0.8
@@ -61,9 +56,10 @@ def cell_model(
         `links`: the bodies of one arm in the order of the chain, each with the index of its parent (-1 for the
         mount), its pose in the parent's frame, whether it turns about its z axis (joints in the order of the links),
         and its shapes. `motor`: radii of the drum round a joint, and its half length. `hand`: pose of the flange in the
-        last link's frame. `arms`, `places`, `fixtures`: names and poses in the world; of fixtures also full lengths,
-        and the `mesh` of those that have one. `supports`: the boxes that carry the arms. `meshes`: the surfaces that
-        shapes and fixtures name by index, see `mesh_arrays`. Positions and sizes are in m, quaternions w, x, y, z.
+        last link's frame. `arms`: names and poses of bases in the world. `places`, `fixtures`, and the `supports` that
+        carry the arms: names, poses, full lengths, colours, and the `mesh` of a fixture that has one. `meshes`: the
+        surfaces that shapes and fixtures name by index, fields of `fleet.surface.Surface`. `load`: of payloads.
+        Positions and sizes are in m, quaternions w, x, y, z.
 
     Raises:
         FleetError: the meshes are not available.
@@ -85,29 +81,24 @@ def cell_model(
                 "shapes": shapes,
             }
         )
-    surfaces = [_mesh(*asset_arrays(model, mesh)) for mesh in range(model.nmesh)]
+    surfaces = [vars(_asset(model, mesh)) for mesh in range(model.nmesh)]
     solids: list[dict[str, Any]] = []
     for each in fixtures:
-        solid = {"name": each.name, "size": list(each.size_m), **_pose(each.position_m, rotation(each.tilt_deg))}
+        solids.append(_solid(each.name, each.position_m, rotation(each.tilt_deg), each.size_m, RGB["fixture"]))
         if each.surface is not None:
-            solid["mesh"] = len(surfaces)
-            surfaces.append(_mesh(*arrays_of(each.surface)))
-        solids.append(solid)
+            solids[-1]["mesh"] = len(surfaces)
+            surfaces.append(vars(replace(each.surface, parts=())))
     hand = {"position": _rounded(model.body_pos[payload]), "quaternion": _rounded(model.body_quat[payload])}
     return {
         "links": links,
         "hand": hand,
         "arms": [{"name": robot.name, **_pose(robot.mount.position_m, robot.mount.rotation())} for robot in robots],
-        "places": [{"name": place.name, **_pose(place.position_m, rotation(place.tool_deg))} for place in places],
+        "places": [_solid(p.name, p.position_m, rotation(p.tool_deg), [PLACE_M] * 3, RGB["place"]) for p in places],
         "fixtures": solids,
-        "fixture_colour": list(FIXTURE_RGB),
-        "supports": [
-            {"size": _rounded(each.size_m), "colour": list(each.rgba), **_pose(each.position_m, each.turn)}
-            for each in supports(robots)
-        ],
+        "supports": [_solid(str(number), *each) for number, each in enumerate(supports(robots))],
         "meshes": surfaces,
         "motor": {"cool_m": MOTOR_M, "hot_m": HOT_MOTOR_M, "half_length": DRUM},
-        "load": {"most_m": MOST_PAYLOAD_M, "kg_per_m3": PAYLOAD_KG_PER_M3},
+        "load": {"most_m": MOST_PAYLOAD_M, "kg_per_m3": PAYLOAD_KG_PER_M3, "colour": RGB["payload"]},
     }
 
 
@@ -122,55 +113,47 @@ def _shape(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
     }
 
 
-def asset_arrays(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points, m, [point, 3], and triangles, int [triangle, 3], of a mesh of a model."""
+def _asset(model: mujoco.MjModel, mesh: int) -> Surface:
+    """A mesh of a model."""
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     points = model.mesh_vert[first : first + count]
     first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    return points, model.mesh_face[first : first + count]
+    return surface_of(points, model.mesh_face[first : first + count])
 
 
-def model_solids(file: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Points, m, [point, 3], and triangles, int [triangle, 3], of each solid in a file of MJCF or URDF.
+def model_solid(file: Path) -> Any:
+    """The shapes in a file of MJCF or URDF as one trimesh, in the first posture of the model.
 
-    Solids are the shapes that collide, or all if none does, in the model's first posture, without planes and terrain.
+    The shapes are those that collide, or all if none does, without planes and terrain.
 
     Raises:
-        ValueError: MuJoCo cannot read the file, or it has a shape that is none of `SHAPES`.
+        ValueError: MuJoCo cannot read the file, or a shape is none of `SHAPES`.
     """
+    import trimesh
+
     model = mujoco.MjSpec.from_file(str(file)).compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    solids: list[Any] = []
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     for geom in np.flatnonzero(collides if collides.any() else ~collides).tolist():
         kind = mujoco.mjtGeom(model.geom_type[geom])
         if kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
             continue
-        if kind == mujoco.mjtGeom.mjGEOM_MESH:
-            points, triangles = asset_arrays(model, model.geom_dataid[geom])
-        elif kind in SHAPES:
-            solid = solid_of(SHAPES[kind], model.geom_size[geom])
-            points, triangles = solid.vertices, solid.faces
-        else:
+        if kind not in SHAPES:
             raise ValueError(f"it has an {kind.name.removeprefix('mjGEOM_').lower()}; give its mesh instead")
-        yield points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom], triangles
+        if SHAPES[kind] == "mesh":
+            surface = _asset(model, model.geom_dataid[geom])
+            solids.append(trimesh.Trimesh(surface.points_m, surface.corners))
+        else:
+            solids.append(solid_of(SHAPES[kind], model.geom_size[geom]))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+        solids[-1].apply_transform(pose)
+    return trimesh.util.concatenate(solids)
 
 
-def _mesh(points: np.ndarray, triangles: np.ndarray) -> dict[str, Any]:
-    """A surface: coordinates of its points as int16 in `unit_m`, points of its triangles as uint32; base64."""
-    unit_m = float(np.abs(points).max()) / np.iinfo(np.int16).max
-    encoded = (np.rint(points / unit_m).astype("<i2"), triangles.astype("<u4"))
-    coordinates, corners = (base64.b64encode(values.tobytes()).decode("ascii") for values in encoded)
-    return {"unit_m": unit_m, "points": coordinates, "triangles": corners}
-
-
-def mesh_arrays(mesh: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Points, m, [point, 3], and triangles, int [triangle, 3], of one of the `meshes` of a `cell_model`."""
-    points = np.frombuffer(base64.b64decode(mesh["points"]), "<i2").reshape(-1, 3) * mesh["unit_m"]
-    return points, np.frombuffer(base64.b64decode(mesh["triangles"]), "<u4").reshape(-1, 3)
-
-
-def solid_of(kind: str, size: Sequence[float] | np.ndarray) -> Any:
+def solid_of(kind: str, size: Points) -> Any:
     """A trimesh of one of `SHAPES` other than a mesh, in its own frame; flat sides do not share points."""
     from trimesh import creation
 
@@ -186,11 +169,15 @@ def solid_of(kind: str, size: Sequence[float] | np.ndarray) -> Any:
     return solid
 
 
-def _pose(position_m: Sequence[float] | np.ndarray, matrix: np.ndarray) -> dict[str, Any]:
+def _solid(name: str, position_m: Points, turn: np.ndarray, size_m: Points, colour: Sequence[float]) -> dict[str, Any]:
+    return {"name": name, "size": _rounded(size_m), "colour": list(colour), **_pose(position_m, turn)}
+
+
+def _pose(position_m: Points, matrix: np.ndarray) -> dict[str, Any]:
     return {"position": _rounded(position_m), "quaternion": _rounded(quaternion(matrix))}
 
 
-def _rounded(values: Sequence[float] | np.ndarray) -> list[float]:
+def _rounded(values: Points) -> list[float]:
     return [round(float(value), DIGITS) for value in values]
 
 
@@ -207,8 +194,6 @@ ROOM_M = 0.12
 """Margin of the view around the middle of a link."""
 LABEL_M = 0.08
 """Distance of the name of an arm from its base."""
-PLACE_RGB = (0.48, 0.36, 0.65)
-"""Colour of places, unlike that of any motor."""
 
 
 class CellPlayer:
@@ -237,8 +222,6 @@ class CellPlayer:
         """Positions of the names of the arms, m, [arm, 3]."""
         self._fixed_m = np.array([thing.position_m for thing in (*places, *fixtures)]).reshape(-1, 3)
         self.model.geom("floor").size[:2] = 0.0  # drawn without an edge
-        for place in places:
-            self.model.site(f"station/{place.name}").rgba[:3] = PLACE_RGB
         sites = [f"{robot.name}/motor_{joint + 1}" for robot in robots for joint in range(JOINTS)]
         self._motors = np.array([self.model.site(name).id for name in sites])
         self.model.site_group[self._motors] = 0

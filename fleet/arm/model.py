@@ -1,7 +1,6 @@
 """MuJoCo models: the cell with all its arms, with primitives or Kinova's shells, and the dynamics of a single arm."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from itertools import combinations
 from pathlib import Path
@@ -13,14 +12,11 @@ from fleet.arm.gen3 import GRAVITY_M_S2, gen3_xml
 from fleet.errors import FleetError, install
 from fleet.job import MOST_PAYLOAD_M, Fixture, Place, payload_radius_m
 from fleet.robot import GEN3, JOINTS, Robot, rotation
-from fleet.surface import arrays_of
 
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
 
 
-HIDDEN = 3
-"""MuJoCo's geom group of the shapes that others replace in pictures."""
 MESH_OF_GEOM = {
     "base": "base_link",
     "shoulder": "shoulder_link",
@@ -35,7 +31,7 @@ MESH_OF_GEOM = {
 
 
 def use_meshes(spec: mujoco.MjSpec) -> None:
-    """Render a Gen3 with meshes: adds meshes without mass and moves the primitives to the geom group `HIDDEN`.
+    """Render a Gen3 with meshes: adds meshes without mass and moves the primitives to the hidden geom group 3.
 
     Raises:
         FleetError: the package `mujoco-menagerie` or its files are missing.
@@ -54,8 +50,8 @@ def use_meshes(spec: mujoco.MjSpec) -> None:
             group=2,
             mass=0.0,
         )
-        geom.group = HIDDEN
-    spec.geom("camera").group = HIDDEN
+        geom.group = 3
+    spec.geom("camera").group = 3
 
 
 def mesh_folder() -> Path:
@@ -89,6 +85,12 @@ BELOW_FLOOR_M = 0.005
 """With a base deeper than this below z = 0, the height of the floor is unknown, and nothing touches it."""
 
 
+RGB = {"place": (0.48, 0.36, 0.65), "fixture": (0.55, 0.50, 0.43), "payload": (0.36, 0.52, 0.70)}
+"""Colours unlike that of any motor."""
+PLACE_M = 0.03
+"""Size of the mark at a place."""
+
+
 def build_cell(
     robots: Sequence[Robot],
     places: Sequence[Place] = (),
@@ -110,7 +112,7 @@ def build_cell(
 
     Args:
         meshes: Render Kinova's shells instead of primitives (optional package `mujoco-menagerie`).
-        drawn: For pictures: adds `supports`, and the surfaces of fixtures instead of their hulls. Neither collides.
+        drawn: For pictures only: with `supports`, and the surfaces of meshes in place of their hulls.
 
     Raises:
         ValueError: no arms, two arms, places or fixtures with one name, or two arms at the same place.
@@ -142,52 +144,32 @@ def build_cell(
             name=f"station/{place.name}",
             pos=place.position_m,
             quat=quaternion(rotation(place.tool_deg)),
-            size=(0.015, 0.015, 0.015),
-            rgba=(0.95, 0.55, 0.10, 1.0),
+            size=[PLACE_M / 2] * 3,
+            rgba=(*RGB["place"], 1.0),
         )
     for fixture in fixtures:
         _add_fixture(spec, fixture, drawn=drawn)
-    for support in supports(robots) if drawn else ():
-        world.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=support.position_m,
-            quat=quaternion(support.turn),
-            size=support.size_m / 2,
-            rgba=support.rgba,
-            **UNTOUCHED,
-        )
+    for position_m, turn, size_m, rgba in supports(robots) if drawn else ():
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        world.add_geom(type=box, pos=position_m, quat=quaternion(turn), size=size_m / 2, rgba=rgba)
     model = spec.compile()
     set_payload_balls(model, payload_bodies(model, robots), np.zeros(len(robots)))
     return model
 
 
-FIXTURE_RGB = (0.55, 0.50, 0.43)
-UNTOUCHED = {"contype": 0, "conaffinity": 0, "mass": 0.0}
-"""Options of geoms that are only drawn."""
-
-
 def _add_fixture(spec: mujoco.MjSpec, fixture: Fixture, *, drawn: bool) -> None:
-    """Add a box, or the hulls of a mesh."""
-    name = f"fixture/{fixture.name}"
-    look = {
-        "pos": fixture.position_m,
-        "quat": quaternion(rotation(fixture.tilt_deg)),
-        "rgba": (*FIXTURE_RGB, 1.0),
-    }
-    if fixture.surface is None:
+    """Add a box, or the hulls of a mesh, or its surface if it is `drawn`."""
+    name, surface = f"fixture/{fixture.name}", fixture.surface
+    look = {"pos": fixture.position_m, "quat": quaternion(rotation(fixture.tilt_deg)), "rgba": (*RGB["fixture"], 1.0)}
+    if surface is None:
         half_m = [length / 2 for length in fixture.size_m]
         spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_m, **look)
         return
-    mesh: dict[str, object] = {"type": mujoco.mjtGeom.mjGEOM_MESH, **look}
-    for i, corners in enumerate(fixture.parts_m):
-        part = f"{name}/{i}"
-        spec.add_mesh(name=part, uservert=corners.ravel())
-        spec.worldbody.add_geom(name=part, meshname=part, group=HIDDEN if drawn else 0, **mesh)
-    if drawn:
-        points_m, triangles = arrays_of(fixture.surface)
-        shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # it may be open
-        spec.add_mesh(name=name, uservert=points_m.ravel(), userface=triangles.ravel(), inertia=shell)
-        spec.worldbody.add_geom(meshname=name, **mesh, **UNTOUCHED)
+    shapes = [(surface.points_m, surface.corners)] if drawn else [(part, np.empty(0)) for part in surface.parts_m]
+    for i, (points, corners) in enumerate(shapes):
+        part, open_too = f"{name}/{i}", mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        spec.add_mesh(name=part, uservert=points.ravel(), userface=corners.ravel(), inertia=open_too)
+        spec.worldbody.add_geom(name=part, meshname=part, type=mujoco.mjtGeom.mjGEOM_MESH, **look)
 
 
 UPRIGHT = 0.5
@@ -195,19 +177,8 @@ UPRIGHT = 0.5
 PLATE_RGBA, POST_RGBA, WALL_RGBA = (0.60, 0.63, 0.65, 1.0), (0.73, 0.74, 0.76, 1.0), (0.73, 0.74, 0.76, 0.35)
 PLATE_M, WALL_M = 0.02, 0.06
 """Thickness of the plate under a base, and of a wall or ceiling."""
-
-
-@dataclass(frozen=True, eq=False)
-class Support:
-    """A box that carries an arm in pictures."""
-
-    position_m: Array
-    """Centre in the world, [3]."""
-    turn: Array
-    """Rotation to the world, [3, 3]."""
-    size_m: Array
-    """Full lengths, [3]."""
-    rgba: tuple[float, float, float, float]
+Support = tuple[Array, Array, Array, tuple[float, ...]]
+"""A box that carries an arm in pictures: centre, m, rotation to the world, full lengths, m, and RGBA."""
 
 
 def supports(robots: Sequence[Robot]) -> Iterator[Support]:
@@ -215,17 +186,15 @@ def supports(robots: Sequence[Robot]) -> Iterator[Support]:
     for robot in robots:
         base, turn = np.array(robot.mount.position_m), robot.mount.rotation()
         axis, behind = turn[:, 2], base - (PLATE_M + WALL_M / 2) * turn[:, 2]
-        yield Support(base - PLATE_M / 2 * axis, turn, np.array((0.16, 0.16, PLATE_M)), PLATE_RGBA)
+        yield base - PLATE_M / 2 * axis, turn, np.array((0.16, 0.16, PLATE_M)), PLATE_RGBA
         if axis[2] <= -UPRIGHT:
-            yield Support(behind, turn, np.array((0.5, 0.5, WALL_M)), WALL_RGBA)
-        elif behind[2] > 0 and axis[2] < UPRIGHT:
-            top_m = base[2] + 0.25
-            across = rotation((0.0, 0.0, float(np.degrees(np.arctan2(axis[1], axis[0])))))
-            size = np.array((WALL_M, 0.5, top_m))
-            yield Support(np.array((behind[0], behind[1], top_m / 2)), across, size, WALL_RGBA)
+            yield behind, turn, np.array((0.5, 0.5, WALL_M)), WALL_RGBA
         elif behind[2] > 0:
-            size = np.array((0.1, 0.1, behind[2]))
-            yield Support(np.array((behind[0], behind[1], behind[2] / 2)), np.eye(3), size, POST_RGBA)
+            is_wall, yaw_deg = axis[2] < UPRIGHT, float(np.degrees(np.arctan2(axis[1], axis[0])))
+            high_m = base[2] + 0.25 if is_wall else behind[2]
+            size = np.array((WALL_M, 0.5, high_m) if is_wall else (0.1, 0.1, high_m))
+            upright = rotation((0.0, 0.0, yaw_deg if is_wall else 0.0))
+            yield np.array((*behind[:2], high_m / 2)), upright, size, WALL_RGBA if is_wall else POST_RGBA
 
 
 def payload_bodies(model: mujoco.MjModel, robots: Sequence[Robot]) -> Array:
@@ -356,7 +325,7 @@ def _arm_spec(robot: Robot, *, meshes: bool) -> mujoco.MjSpec:
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
         size=(MOST_PAYLOAD_M, 0.0, 0.0),
         pos=(0.0, 0.0, MOST_PAYLOAD_M),
-        rgba=(0.36, 0.52, 0.70, 1.0),
+        rgba=(*RGB["payload"], 1.0),
         contype=1,
         conaffinity=1,
         mass=0.0,

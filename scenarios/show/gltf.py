@@ -16,9 +16,10 @@ from typing import Any  # plain values of JSON
 
 import numpy as np
 
-from fleet.arm.cell import mesh_arrays, solid_of
+from fleet.arm.cell import solid_of
 from fleet.env.render.heat import heat_marks
 from fleet.robot import JOINTS
+from fleet.surface import Surface
 from scenarios.progress import Progress, quiet
 from scenarios.show.moments import Moments, motor_drums
 
@@ -33,8 +34,6 @@ LONGEST_TURN_RAD = 2.0
 """Largest turn of a joint between two keys: a turn of more than π would go the other way round."""
 Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 """Rotation from z up, as here, to y up, as in glTF; x, y, z, w."""
-PLACE_M = 0.03
-PLACE_RGB, LOAD_RGB = (0.95, 0.55, 0.10), (0.25, 0.45, 0.71)
 Json = dict[str, Any]
 
 VERTICES, INDICES = 34962, 34963
@@ -98,24 +97,13 @@ class _GltfFile:
         }
         return {"attributes": attributes, "indices": self.buffer.add(solid.faces.ravel(), target=INDICES)}
 
-    def _surface(self, points: Array, triangles: Array) -> Json:
-        """A surface without a material. It has no normals, so that viewers draw its triangles flat."""
-        attributes = {"POSITION": self.buffer.add(points, target=VERTICES, bounds=True)}
-        return {"attributes": attributes, "indices": self.buffer.add(triangles.ravel(), target=INDICES)}
-
     def _mesh(self, geometry: Json, rgba: Sequence[float], *, unlit: bool = False) -> int:
         """Index of a new mesh of one colour (RGB, or RGBA, from 0 to 1, as on a screen)."""
         linear = [((c + 0.055) / 1.055) ** 2.4 if c > 0.04045 else c / 12.92 for c in rgba[:3]]
         alpha = [*rgba[3:], 1.0][0]
-        material: Json = {
-            "pbrMetallicRoughness": {
-                "baseColorFactor": [*linear, alpha],
-                "metallicFactor": 0.0,
-                "roughnessFactor": 0.7,
-            }
-        }
-        material |= {"extensions": {"KHR_materials_unlit": {}}} if unlit else {}
-        self.materials.append(material | ({"alphaMode": "BLEND"} if alpha < 1 else {}))
+        plain: Json = {"baseColorFactor": [*linear, alpha], "metallicFactor": 0.0, "roughnessFactor": 0.7}
+        material: Json = {"pbrMetallicRoughness": plain, "alphaMode": "OPAQUE" if alpha == 1 else "BLEND"}
+        self.materials.append(material | ({"extensions": {"KHR_materials_unlit": {}}} if unlit else {}))
         self.meshes.append({"primitives": [geometry | {"material": len(self.materials) - 1}]})
         return len(self.meshes) - 1
 
@@ -184,10 +172,10 @@ class _GltfFile:
             self._switch(node, self.heat_s, np.where(band == number, float(radius_m), 0.0))
 
     def _add_payload(self, hand: int, name: str, index: int) -> None:
-        radius_m = self.moments.payload_m[:, index][self.moments.poses]
+        radius_m, rgb = self.moments.payload_m[:, index][self.moments.poses], self.moments.model["load"]["colour"]
         if not radius_m.any():
             return
-        node = self._node(hand, f"{name}/payload", mesh=self._once("payload", self._ball, LOAD_RGB))
+        node = self._node(hand, f"{name}/payload", mesh=self._once("payload", self._ball, rgb))
         changed = self._switch(node, self.pose_s, radius_m)
         centres = np.zeros((len(changed), 3))
         centres[:, 2] = radius_m[changed]
@@ -207,20 +195,19 @@ class _GltfFile:
     def add_surroundings(self) -> None:
         """Places, fixtures, and what carries the arms."""
         model = self.moments.model
-        for place in model["places"]:
-            self._add_box(f"place/{place['name']}", place, [PLACE_M] * 3, PLACE_RGB)
-        for number, box in enumerate(model["supports"]):
-            self._add_box(f"support/{number}", box, box["size"], box["colour"])
-        for solid in model["fixtures"]:
-            name, rgb = f"fixture/{solid['name']}", model["fixture_colour"]
-            if "mesh" in solid:
-                surface = self._surface(*mesh_arrays(model["meshes"][solid["mesh"]]))
-                self._node(0, name, solid, mesh=self._mesh(surface, rgb))
-            else:
-                self._add_box(name, solid, solid["size"], rgb)
-
-    def _add_box(self, name: str, pose: Json, size: Sequence[float], rgba: Sequence[float]) -> None:
-        self._node(0, name, pose, mesh=self._once("box", self._box, rgba), scale=list(size))
+        for group in ("places", "fixtures", "supports"):
+            for solid in model[group]:
+                name, scale = f"{group[:-1]}/{solid['name']}", solid["size"]
+                if "mesh" in solid:
+                    surface, scale = Surface(**model["meshes"][solid["mesh"]]), [1.0] * 3
+                    geometry = {  # without normals, viewers draw flat triangles
+                        "attributes": {"POSITION": self.buffer.add(surface.points_m, target=VERTICES, bounds=True)},
+                        "indices": self.buffer.add(surface.corners.ravel(), target=INDICES),
+                    }
+                    mesh = self._mesh(geometry, solid["colour"])
+                else:
+                    mesh = self._once("box", self._box, solid["colour"])
+                self._node(0, name, solid, mesh=mesh, scale=scale)
 
     def write(self, path: Path) -> None:
         run, limits = self.moments.run, self.moments.limits

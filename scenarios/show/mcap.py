@@ -13,7 +13,7 @@ from typing import Any  # rosbags makes its classes at run time
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from fleet.arm.cell import DRUM, mesh_arrays
+from fleet.arm.cell import DRUM
 from fleet.bus.protocol.messages import State
 from fleet.ros2.cdr import (
     DIAGNOSTICS,
@@ -28,6 +28,7 @@ from fleet.ros2.cdr import (
     write_joints,
 )
 from fleet.ros2.conversion import Joints, diagnostics_of, joint_names, plain_name
+from fleet.surface import Surface
 from fleet.telemetry import MODES
 from scenarios.progress import Progress, quiet
 from scenarios.show.moments import Moments, ahead, motor_drums
@@ -44,8 +45,6 @@ WORLD = "world"
 NS = 1_000_000_000
 LATCHED = "- reliability: 1\n  durability: 1\n  history: 1\n  depth: 1\n"
 """Quality of service of topics that are sent once, for `ros2 bag play`."""
-PLACE_COLOUR, LOAD_COLOUR = (0.95, 0.55, 0.1), (0.25, 0.45, 0.7)
-PLACE_M = 0.03
 CHUNK_BYTES = 1 << 20
 ORIGIN = {"position": (0.0, 0.0, 0.0), "quaternion": (1.0, 0.0, 0.0, 0.0)}
 
@@ -106,17 +105,14 @@ class _McapFile:
             for link, frame in zip(model["links"], frames, strict=True):
                 for shape in link["shapes"]:
                     markers += shape_markers(shape, frame, arm, len(markers))
-        for place in model["places"]:
-            size = (PLACE_M, PLACE_M, PLACE_M)
-            markers.append(marker(CUBE, WORLD, "places", len(markers), place, size, PLACE_COLOUR))
-        for box in model["supports"]:
-            markers.append(marker(CUBE, WORLD, "supports", len(markers), box, box["size"], box["colour"]))
-        for solid in model["fixtures"]:
-            kind, size = (TRIANGLES, (1.0,) * 3) if "mesh" in solid else (CUBE, solid["size"])
-            markers.append(marker(kind, WORLD, "fixtures", len(markers), solid, size, model["fixture_colour"]))
-            if kind == TRIANGLES:
-                points, triangles = mesh_arrays(model["meshes"][solid["mesh"]])
-                markers[-1].points = [_point(corner) for corner in points[triangles.ravel()].tolist()]
+        for group in ("places", "fixtures", "supports"):
+            for solid in model[group]:
+                kind, size = (TRIANGLES, [1.0] * 3) if "mesh" in solid else (CUBE, solid["size"])
+                markers.append(marker(kind, WORLD, group, len(markers), solid, size, solid["colour"]))
+                if kind == TRIANGLES:
+                    surface = Surface(**model["meshes"][solid["mesh"]])
+                    points_m = surface.points_m[surface.corners.ravel()]
+                    markers[-1].points = [_point(corner) for corner in points_m.tolist()]
         self.put("/cell", MARKERS, begin_s, write(message(MARKERS, markers=markers), MARKERS), LATCHED)
         for name in ("warning", "error"):
             limit_c = getattr(moments.limits, f"{name}_c")
@@ -201,14 +197,14 @@ class _McapFile:
     def write_loads(self) -> None:
         """The balls in the hands, whenever one changes."""
         moments, time_s = self.moments, self.moments.run.readings.time_s
-        radii, hand = moments.payload_m, moments.model["hand"]
+        radii, hand, colour = moments.payload_m, moments.model["hand"], moments.model["load"]["colour"]
         changed = np.flatnonzero(np.any(np.diff(radii, axis=0, prepend=-1.0) != 0.0, axis=1))
         for sample in changed.tolist():
             balls = []
             for arm, (name, radius_m) in enumerate(zip(self.arms, radii[sample].tolist(), strict=True)):
                 # The ball touches the flange, whose z axis points out of the hand.
                 pose = {"position": ahead(hand, radius_m), "quaternion": hand["quaternion"]}
-                ball = marker(SPHERE, self.frames[arm][-1], name, 0, pose, (2 * max(radius_m, 1e-3),) * 3, LOAD_COLOUR)
+                ball = marker(SPHERE, self.frames[arm][-1], name, 0, pose, (2 * max(radius_m, 1e-3),) * 3, colour)
                 ball.action = 0 if radius_m else DELETE
                 ball.header.stamp = stamp(float(time_s[sample]))
                 balls.append(ball)
@@ -253,12 +249,7 @@ def transform(parent: str, child: str, position: Sequence[float], quaternion: Se
 def marker(
     kind: int, frame: str, group: str, number: int, pose: Any, size: Sequence[float], colour: Sequence[float]
 ) -> Any:
-    """A visualization_msgs/Marker that follows its frame, until it is replaced.
-
-    Args:
-        size: Full lengths, m.
-        colour: RGB, or RGBA, from 0 to 1.
-    """
+    """A visualization_msgs/Marker that follows its frame, until it is replaced; full lengths in m, RGB or RGBA."""
     red, green, blue, alpha = [*map(float, colour), 1.0][:4]
     return message(
         "visualization_msgs/msg/Marker",

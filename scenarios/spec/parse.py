@@ -22,9 +22,8 @@ import msgspec
 import numpy as np
 
 from fleet.errors import ScenarioError, nearest, printable
-from fleet.job import Fixture
 from scenarios.spec.job_table import cycle_of, decode_text, read_job_table, shift_begin, stream_fields
-from scenarios.spec.mesh_file import MESH_KEYS, with_meshes
+from scenarios.spec.mesh_file import with_meshes
 from scenarios.spec.schema import JobStream, Scenario
 from scenarios.spec.units import check_times, check_units
 
@@ -196,7 +195,7 @@ def parse_cell(content: bytes, path: Path) -> Scenario:
 
 def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
     """The scenario of a parsed TOML file; `path` names the file in errors and locates the files it refers to."""
-    raw = with_meshes(_with_tables(raw, path), path)
+    raw = _with_tables(raw, path)
     _known_keys(raw, Scenario, path.name, "")
     check_finite(raw, path.name)
     check_units(raw, path.name)
@@ -206,7 +205,7 @@ def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
     except msgspec.ValidationError as error:
         raise ScenarioError(f"{path.name}: {readable_error(error, raw, Scenario)}") from error
     _check(scenario, path)
-    return _with_traces(scenario, path)
+    return with_meshes(_with_traces(scenario, path), path)
 
 
 def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
@@ -267,10 +266,6 @@ def _plain(value: object) -> object:
     raise TypeError(f"expected numbers, texts, lists and tables, got {value!r}")
 
 
-_FILE_KEYS: Mapping[object, tuple[str, ...]] = {JobStream: ("table",), Fixture: MESH_KEYS}
-"""Keys of a file that are replaced before the fields of a dataclass are read."""
-
-
 def _known_keys(raw: object, kind: Any, file: str, place: str) -> None:
     """Check that the dataclass `kind` (an annotation, hence Any) has all the keys, at every depth."""
     kind = plain_kind(kind)
@@ -280,7 +275,7 @@ def _known_keys(raw: object, kind: Any, file: str, place: str) -> None:
     if not dataclasses.is_dataclass(kind) or not isinstance(raw, Mapping):
         return
     hints = _hints(kind)
-    allowed = [*hints, *_FILE_KEYS.get(kind, ())]
+    allowed = [*hints, "table"] if kind is JobStream else list(hints)
     for key, value in raw.items():
         if key not in allowed:
             where = f"{file}: {place}" if place else file

@@ -56,8 +56,7 @@ function makeCell(place, model) {
   const decoded = (text, Kind) => new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
   const surfaces = model.meshes.map((mesh) => {
     const surface = new THREE.BufferGeometry();
-    surface.setAttribute("position", new THREE.BufferAttribute(
-      Float32Array.from(decoded(mesh.points, Int16Array), (value) => value * mesh.unit_m), 3));
+    surface.setAttribute("position", new THREE.BufferAttribute(decoded(mesh.points, Float32Array), 3));
     surface.setIndex(new THREE.BufferAttribute(decoded(mesh.triangles, Uint32Array), 1));
     surface.computeVertexNormals();
     return surface;
@@ -86,19 +85,19 @@ function makeCell(place, model) {
     shapes: link.shapes.map((shape) => ({ local: pose(shape), mesh: instanced(geometry(shape), colourOf(shape.colour)) })),
     motor: link.turns ? instanced(new THREE.CylinderGeometry(1, 1, 2 * model.motor.half_length, 20).rotateX(Math.PI / 2), "#ffffff") : null, // a drum round the axis of the joint
   }));
-  const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 14, 9), colourOf([0.36, 0.52, 0.7]));
+  const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 14, 9), colourOf(model.load.colour));
   const mounts = model.arms.map((arm) => pose(arm));
   const points = mounts.flatMap((mount) => [0, STANDING_M].map((z) => new THREE.Vector3(0, 0, z).applyMatrix4(mount)));
   for (const one of model.places) {
     points.push(vector(one.position));
-    const mark = new THREE.Mesh(new THREE.OctahedronGeometry(0.03), material("#7a5ba6"));
+    const mark = new THREE.Mesh(new THREE.OctahedronGeometry(0.03), material(colourOf(one.colour)));
     mark.applyMatrix4(pose(one));
     scene.add(mark);
   }
   for (const one of model.fixtures) {
     const shape = "mesh" in one ? surfaces[one.mesh].toNonIndexed() : new THREE.BoxGeometry(...one.size);
     shape.computeVertexNormals(); // without shared points: triangles are flat
-    const solid = new THREE.Mesh(shape, material(colourOf(model.fixture_colour), 1, { side: THREE.DoubleSide })); // it may be open
+    const solid = new THREE.Mesh(shape, material(colourOf(one.colour), 1, { side: THREE.DoubleSide })); // it may be open
     solid.applyMatrix4(pose(one));
     points.push(vector(one.position));
     scene.add(solid);
