@@ -20,6 +20,9 @@ from scenarios.spec.load import load
 from scenarios.spec.parse import override, scenario_hash
 from scenarios.spec.schema import Scenario
 
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """Corners of each side of a box, counted in binary."""
 
