@@ -175,23 +175,24 @@ def _add_fixture(spec: mujoco.MjSpec, fixture: Fixture, *, drawn: bool) -> None:
 UPRIGHT = 0.5
 """Sine of the elevation from which a base stands or hangs; between, a wall holds it."""
 PLATE_RGBA, POST_RGBA, WALL_RGBA = (0.60, 0.63, 0.65, 1.0), (0.73, 0.74, 0.76, 1.0), (0.73, 0.74, 0.76, 0.35)
-PLATE_M, WALL_M = 0.02, 0.06
-"""Thickness of the plate under a base, and of a wall or ceiling."""
-Support = tuple[Array, Array, Array, tuple[float, ...]]
-"""A box that carries an arm in pictures: centre, m, rotation to the world, full lengths, m, and RGBA."""
+PLATE_M, RISE_M, WALL_M = 0.02, 0.006, 0.06
+"""Thickness of the plate under a base, its height above the floor or wall, and thickness of a wall or ceiling."""
 
 
-def supports(robots: Sequence[Robot]) -> Iterator[Support]:
-    """A plate under each base, and what holds it: a post on the floor, a piece of wall, or of a ceiling."""
+def supports(robots: Sequence[Robot]) -> Iterator[tuple[Array, Array, Array, tuple[float, ...]]]:
+    """A plate under each base, and what holds it in pictures: a post on the floor, a piece of wall, or of a ceiling.
+
+    Each is a box: centre, m, rotation to the world [3, 3], full lengths, m, and RGBA.
+    """
     for robot in robots:
         base, turn = np.array(robot.mount.position_m), robot.mount.rotation()
-        axis, behind = turn[:, 2], base - (PLATE_M + WALL_M / 2) * turn[:, 2]
-        yield base - PLATE_M / 2 * axis, turn, np.array((0.16, 0.16, PLATE_M)), PLATE_RGBA
+        axis, behind = turn[:, 2], base - (PLATE_M - RISE_M + WALL_M / 2) * turn[:, 2]
+        yield base - (PLATE_M / 2 - RISE_M) * axis, turn, np.array((0.16, 0.16, PLATE_M)), PLATE_RGBA
         if axis[2] <= -UPRIGHT:
             yield behind, turn, np.array((0.5, 0.5, WALL_M)), WALL_RGBA
         elif behind[2] > 0:
             is_wall, yaw_deg = axis[2] < UPRIGHT, float(np.degrees(np.arctan2(axis[1], axis[0])))
-            high_m = base[2] + 0.25 if is_wall else behind[2]
+            high_m = base[2] + 0.15 if is_wall else behind[2]
             size = np.array((WALL_M, 0.5, high_m) if is_wall else (0.1, 0.1, high_m))
             upright = rotation((0.0, 0.0, yaw_deg if is_wall else 0.0))
             yield np.array((*behind[:2], high_m / 2)), upright, size, WALL_RGBA if is_wall else POST_RGBA

@@ -13,8 +13,6 @@ from fleet.robot import rotation
 from fleet.surface import surface_of
 from scenarios.spec.schema import Scenario
 
-Array = np.ndarray
-
 UNITS = {"m": 1.0, "mm": 0.001}
 MESHES, MODELS = (".stl", ".obj", ".glb"), (".xml", ".mjcf", ".urdf")
 MOST_BYTES, MOST_TRIANGLES, MOST_PARTS = 64_000_000, 100_000, 64
@@ -89,7 +87,7 @@ def _read(file: Path, where: str) -> Any:
     return mesh
 
 
-def _convex_parts(mesh: Any, where: str) -> list[Array]:
+def _convex_parts(mesh: Any, where: str) -> list[np.ndarray]:
     """Corners of the convex hull of each connected part, m, [corner, 3]; none of them lies inside another.
 
     Triangles are connected if they alone share an edge, so solids that touch stay apart.
@@ -97,7 +95,7 @@ def _convex_parts(mesh: Any, where: str) -> list[Array]:
     import trimesh
 
     solids: list[Any] = []
-    flat: list[Array] = []
+    flat: list[np.ndarray] = []
     for faces in trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces))):
         points = mesh.vertices[np.unique(mesh.faces[faces])]
         try:
@@ -121,7 +119,7 @@ def _convex_parts(mesh: Any, where: str) -> list[Array]:
     return [hull.points[hull.vertices] for hull in kept]
 
 
-def _is_inside(points: Array, hulls: list[Any]) -> bool:
+def _is_inside(points: np.ndarray, hulls: list[Any]) -> bool:
     """Whether points are all inside one of some convex hulls."""
     return any(
         (points > hull.min_bound - INSIDE_M).all()

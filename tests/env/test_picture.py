@@ -329,6 +329,16 @@ def test_a_fixture_is_drawn_around_its_centre_and_as_large_as_its_shadow(positio
     assert area / px_per_m**2 == pytest.approx(faces @ np.abs(rotation(tilt_deg)[2]), rel=0.02, abs=1e-6)
 
 
+def test_a_fixture_beyond_the_floor_covers_nothing_beside_it() -> None:
+    cell, wide = row(2), Fixture(name="hall", position_m=(0.5, 0.25, 0.3), size_m=(9.0, 9.0, 0.6))
+    with_hall, without = (draw(scene(each)).copy() for each in (replace(cell, fixtures=(wide,)), cell))
+    left, top, right, bottom = map(int, FLOOR)
+    assert not np.array_equal(with_hall, without)
+    for frame in (with_hall, without):
+        frame[top - 1 : bottom + 1, left : right + 1] = 0
+    np.testing.assert_array_equal(with_hall, without)
+
+
 @given(st.lists(points, min_size=1, max_size=6))
 def test_distances_on_the_floor_plan_are_to_scale(stations) -> None:
     """One scale for both directions, x to the right and y up."""

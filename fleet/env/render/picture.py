@@ -213,7 +213,7 @@ def _draw_cell(axes: Axes, scene: Scene, plan: FloorPlan) -> None:
     floor = axes.add_patch(Rectangle((left, top), right - left, bottom - top, facecolor=GROUND))
     for fixture, parts in zip(scene.cell.fixtures, plan.fixtures, strict=True):
         for outline in parts:
-            axes.add_patch(Polygon(outline, facecolor=BOX, edgecolor=FAINT, clip_path=floor))
+            axes.add_patch(Polygon(outline, facecolor=BOX, edgecolor=FAINT)).set_clip_path(floor)
         points = np.concatenate(parts)
         low, high = (np.clip(end, (left, top), (right, bottom)) for end in (points.min(axis=0), points.max(axis=0)))
         if high[1] - low[1] > 2 * TEXT:
