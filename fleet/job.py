@@ -4,10 +4,14 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from math import inf, pi
 from typing import Literal, NamedTuple, get_args
 
+import numpy as np
+
 from fleet.errors import check_coordinates
+from fleet.surface import Surface
 
 Kind = Literal["pick_place", "hold", "press", "sort"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -165,24 +169,33 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Fixture:
-    """A solid box that stands in the cell, for example a table, an oven or a conveyor.
+    """A solid that stands in the cell, for example a table, an oven or a conveyor: a box, or the shape in a file.
 
     No link of an arm and no payload may touch it. At a place above a table the tool point must therefore be higher
-    than the table by the diameter of the heaviest payload, see `payload_radius_m`.
+    than the table by the diameter of the heaviest payload, see `payload_radius_m`. Of a file, each connected part
+    counts as its convex hull.
     """
 
     name: str
     position_m: tuple[float, float, float]
-    """Centre in the world, m."""
-    size_m: tuple[float, float, float]
-    """Full lengths along the box's own x, y and z axes, m."""
+    """Centre of a box, or origin of a file, in the world, m."""
+    size_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Full lengths along the box's own x, y and z axes, m; not with `mesh`."""
     tilt_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw about the fixed world axes x, y, z, deg."""
+    mesh: str | None = None
+    """File of a scenario file's fixture, relative to it: STL, OBJ, GLB, MJCF or URDF. It becomes a `surface`."""
+    unit: Literal["m", "mm"] = "m"
+    """Of the coordinates in that file."""
+    surface: Surface | None = None
+    """Of a file that has been read, about the centre of the box around it."""
 
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError("Fixture.name must not be empty.")
-        if not all(LEAST_FIXTURE_M <= length <= MOST_FIXTURE_M for length in self.size_m):
+        if self.mesh is not None and any(self.size_m):
+            raise ValueError(f"Fixture.size_m must be left out beside `mesh` (got {list(self.size_m)}).")
+        if self.mesh is None and not all(LEAST_FIXTURE_M <= length <= MOST_FIXTURE_M for length in self.size_m):
             raise ValueError(
                 f"Fixture.size_m must be three lengths between {LEAST_FIXTURE_M:g} and {MOST_FIXTURE_M:g} m "
                 f"(got {list(self.size_m)})."
@@ -190,6 +203,13 @@ class Fixture:
         check_coordinates(self, "position_m")
         if not all(abs(angle) <= 360 for angle in self.tilt_deg):
             raise ValueError(f"Fixture.tilt_deg must be between -360 and 360 (got {list(self.tilt_deg)}).")
+
+    @property
+    def parts_m(self) -> tuple[np.ndarray, ...]:
+        """Corners of each convex part about the centre, m, [corner, 3]: of the box, or of the hulls of a mesh."""
+        if self.surface is not None:
+            return self.surface.parts_m
+        return (np.array(list(product((-0.5, 0.5), repeat=3))) * self.size_m,)
 
 
 def payload_radius_m(payload_kg: float) -> float:

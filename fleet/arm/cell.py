@@ -1,20 +1,22 @@
 """A cell in MuJoCo: plain values for every way to show it, pictures and viewer of recorded postures, and contacts."""
 
-import base64
 import threading
 from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any  # plain values of JSON
 
 import mujoco
 import numpy as np
 
-from fleet.arm.model import build_cell, payload_bodies, quaternion, set_payload_balls
+from fleet.arm.model import PLACE_M, RGB, build_cell, payload_bodies, quaternion, set_payload_balls, supports
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.job import MOST_PAYLOAD_M, PAYLOAD_KG_PER_M3, Fixture, Place
 from fleet.robot import JOINTS, Mount, Robot, rotation
+from fleet.surface import Surface, surface_of
 
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -31,6 +33,11 @@ SHAPES = {
 HIDDEN = 3
 """MuJoCo's geom group of the primitives that meshes replace."""
 DIGITS = 5
+Points = Sequence[float] | np.ndarray
+MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
+"""Radius of the drum of a cool motor and of one at the error limit: a hotter motor is also larger."""
+DRUM = 0.8
+"""Half length of a drum along the axis of its joint, in radii."""
 
 
 def cell_model(
@@ -48,9 +55,11 @@ def cell_model(
     Returns:
         `links`: the bodies of one arm in the order of the chain, each with the index of its parent (-1 for the
         mount), its pose in the parent's frame, whether it turns about its z axis (joints in the order of the links),
-        and its shapes. `hand`: pose of the flange in the last link's frame. `arms`, `places`, `fixtures`: names and
-        poses in the world. `meshes`: the surfaces that shapes of the kind "mesh" name. Positions and sizes are in m,
-        quaternions w, x, y, z.
+        and its shapes. `motor`: radii of the drum round a joint, and its half length. `hand`: pose of the flange in the
+        last link's frame. `arms`: names and poses of bases in the world. `places`, `fixtures`, and the `supports` that
+        carry the arms: names, poses, full lengths, colours, and the `mesh` of a fixture that has one. `meshes`: the
+        surfaces that shapes and fixtures name by index, fields of `fleet.surface.Surface`. `load`: of payloads.
+        Positions and sizes are in m, quaternions w, x, y, z.
 
     Raises:
         FleetError: the meshes are not available.
@@ -72,18 +81,24 @@ def cell_model(
                 "shapes": shapes,
             }
         )
+    surfaces = [vars(_asset(model, mesh)) for mesh in range(model.nmesh)]
+    solids: list[dict[str, Any]] = []
+    for each in fixtures:
+        solids.append(_solid(each.name, each.position_m, rotation(each.tilt_deg), each.size_m, RGB["fixture"]))
+        if each.surface is not None:
+            solids[-1]["mesh"] = len(surfaces)
+            surfaces.append(vars(replace(each.surface, parts=())))
     hand = {"position": _rounded(model.body_pos[payload]), "quaternion": _rounded(model.body_quat[payload])}
     return {
         "links": links,
         "hand": hand,
         "arms": [{"name": robot.name, **_pose(robot.mount.position_m, robot.mount.rotation())} for robot in robots],
-        "places": [{"name": place.name, **_pose(place.position_m, rotation(place.tool_deg))} for place in places],
-        "fixtures": [
-            {"name": box.name, "size": list(box.size_m), **_pose(box.position_m, rotation(box.tilt_deg))}
-            for box in fixtures
-        ],
-        "meshes": [_mesh(model, mesh) for mesh in range(model.nmesh)],
-        "load": {"most_m": MOST_PAYLOAD_M, "kg_per_m3": PAYLOAD_KG_PER_M3},
+        "places": [_solid(p.name, p.position_m, rotation(p.tool_deg), [PLACE_M] * 3, RGB["place"]) for p in places],
+        "fixtures": solids,
+        "supports": [_solid(str(number), *each) for number, each in enumerate(supports(robots))],
+        "meshes": surfaces,
+        "motor": {"cool_m": MOTOR_M, "hot_m": HOT_MOTOR_M, "half_length": DRUM},
+        "load": {"most_m": MOST_PAYLOAD_M, "kg_per_m3": PAYLOAD_KG_PER_M3, "colour": RGB["payload"]},
     }
 
 
@@ -98,23 +113,71 @@ def _shape(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
     }
 
 
-def _mesh(model: mujoco.MjModel, mesh: int) -> dict[str, Any]:
-    """A surface: coordinates of its points as int16 in `unit_m`, points of its triangles as uint32; base64."""
+def _asset(model: mujoco.MjModel, mesh: int) -> Surface:
+    """A mesh of a model."""
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     points = model.mesh_vert[first : first + count]
-    unit_m = float(np.abs(points).max()) / np.iinfo(np.int16).max
     first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    triangles = model.mesh_face[first : first + count].astype("<u4")
-    encoded = (np.rint(points / unit_m).astype("<i2"), triangles)
-    coordinates, corners = (base64.b64encode(values.tobytes()).decode("ascii") for values in encoded)
-    return {"unit_m": unit_m, "points": coordinates, "triangles": corners}
+    return surface_of(points, model.mesh_face[first : first + count])
 
 
-def _pose(position_m: Sequence[float], matrix: np.ndarray) -> dict[str, Any]:
+def model_solid(file: Path) -> Any:
+    """The shapes in a file of MJCF or URDF as one trimesh, in the first posture of the model.
+
+    The shapes are those that collide, or all if none does, without planes and terrain.
+
+    Raises:
+        ValueError: MuJoCo cannot read the file, or a shape is none of `SHAPES`.
+    """
+    import trimesh
+
+    model = mujoco.MjSpec.from_file(str(file)).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    solids: list[Any] = []
+    collides = (model.geom_contype | model.geom_conaffinity) != 0
+    for geom in np.flatnonzero(collides if collides.any() else ~collides).tolist():
+        kind = mujoco.mjtGeom(model.geom_type[geom])
+        if kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
+            continue
+        if kind not in SHAPES:
+            raise ValueError(f"it has an {kind.name.removeprefix('mjGEOM_').lower()}; give its mesh instead")
+        if SHAPES[kind] == "mesh":
+            surface = _asset(model, model.geom_dataid[geom])
+            solids.append(trimesh.Trimesh(surface.points_m, surface.corners))
+        else:
+            solids.append(solid_of(SHAPES[kind], model.geom_size[geom]))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+        solids[-1].apply_transform(pose)
+    return trimesh.util.concatenate(solids)
+
+
+def solid_of(kind: str, size: Points) -> Any:
+    """A trimesh of one of `SHAPES` other than a mesh, in its own frame; flat sides do not share points."""
+    from trimesh import creation
+
+    if kind == "sphere":
+        return creation.icosphere(subdivisions=2, radius=size[0])
+    if kind == "capsule":
+        return creation.capsule(radius=size[0], height=2 * size[1], count=[24, 12])
+    if kind == "box":
+        solid = creation.box(extents=[2 * length for length in size])
+    else:
+        solid = creation.cylinder(radius=size[0], height=2 * size[1], sections=32)
+    solid.unmerge_vertices()  # edges stay sharp
+    return solid
+
+
+def _solid(name: str, position_m: Points, turn: np.ndarray, size_m: Points, colour: Sequence[float]) -> dict[str, Any]:
+    return {"name": name, "size": _rounded(size_m), "colour": list(colour), **_pose(position_m, turn)}
+
+
+def _pose(position_m: Points, matrix: np.ndarray) -> dict[str, Any]:
     return {"position": _rounded(position_m), "quaternion": _rounded(quaternion(matrix))}
 
 
-def _rounded(values: Sequence[float] | np.ndarray) -> list[float]:
+def _rounded(values: Points) -> list[float]:
     return [round(float(value), DIGITS) for value in values]
 
 
@@ -131,8 +194,6 @@ ROOM_M = 0.12
 """Margin of the view around the middle of a link."""
 LABEL_M = 0.08
 """Distance of the name of an arm from its base."""
-PLACE_RGB = (0.48, 0.36, 0.65)
-"""Colour of places, unlike that of any motor."""
 
 
 class CellPlayer:
@@ -153,7 +214,7 @@ class CellPlayer:
         *,
         meshes: bool = False,
     ) -> None:
-        self.model = build_cell(robots, places, fixtures, meshes=meshes)
+        self.model = build_cell(robots, places, fixtures, meshes=meshes, drawn=True)
         self.data = mujoco.MjData(self.model)
         self._payloads = payload_bodies(self.model, robots)
         self._mounts_m = np.array([robot.mount.position_m for robot in robots])
@@ -161,22 +222,22 @@ class CellPlayer:
         """Positions of the names of the arms, m, [arm, 3]."""
         self._fixed_m = np.array([thing.position_m for thing in (*places, *fixtures)]).reshape(-1, 3)
         self.model.geom("floor").size[:2] = 0.0  # drawn without an edge
-        for place in places:
-            self.model.site(f"station/{place.name}").rgba[:3] = PLACE_RGB
         sites = [f"{robot.name}/motor_{joint + 1}" for robot in robots for joint in range(JOINTS)]
         self._motors = np.array([self.model.site(name).id for name in sites])
         self.model.site_group[self._motors] = 0
+        self.model.site_type[self._motors] = mujoco.mjtGeom.mjGEOM_CYLINDER
 
     def show(self, q: Array, motor_rgb: Array, motor_m: Array, payload_kg: Array) -> None:
-        """Set postures [arm, joint] in rad and payloads [arm] in kg, with a sphere at each motor.
+        """Set postures [arm, joint] in rad and payloads [arm] in kg, with a drum at each motor.
 
         Args:
-            motor_rgb: Colours of the spheres, 0 to 1, [arm, joint, 3].
+            motor_rgb: Colours of the drums, 0 to 1, [arm, joint, 3].
             motor_m: Their radius, m, [arm, joint].
         """
         self.data.qpos[:] = q.ravel()
         self.model.site_rgba[self._motors, :3] = motor_rgb.reshape(-1, 3)
         self.model.site_size[self._motors, 0] = motor_m.ravel()
+        self.model.site_size[self._motors, 1] = DRUM * motor_m.ravel()
         set_payload_balls(self.model, self._payloads, payload_kg)
         mujoco.mj_forward(self.model, self.data)
 
@@ -301,6 +362,9 @@ class ContactFinder:
         self._data = mujoco.MjData(self._model)
         self._payloads = payload_bodies(model, robots)
         self._names = [_described(model.geom(g).name) for g in range(model.ngeom)]
+        first = {name: g for g, name in reversed([*enumerate(self._names)])}
+        self._solid = [first[name] for name in self._names]
+        """The first geom of the solid of which each geom is a part."""
         self.reset()
 
     def reset(self) -> None:
@@ -346,6 +410,7 @@ class ContactFinder:
         if not data.ncon:
             return depth_m
         for (a, b), distance_m in zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True):
+            a, b = self._solid[a], self._solid[b]
             pair = (min(a, b), max(a, b))
             if distance_m < 0:
                 depth_m[pair] = max(depth_m.get(pair, 0.0), -distance_m)
@@ -361,7 +426,7 @@ class ContactFinder:
 
 def _described(geom: str) -> tuple[str, str]:
     """Name of a geom for an event, and its arm, if any."""
-    owner, _, name = geom.partition("/")
+    owner, name, *_ = [*geom.split("/"), ""]
     if not name:
         return f"the {geom}", ""
     return (f"the fixture '{name}'", "") if owner == "fixture" else (f"{name} of {owner}", owner)

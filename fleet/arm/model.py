@@ -1,6 +1,6 @@
 """MuJoCo models: the cell with all its arms, with primitives or Kinova's shells, and the dynamics of a single arm."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from itertools import combinations
 from pathlib import Path
@@ -85,6 +85,12 @@ BELOW_FLOOR_M = 0.005
 """With a base deeper than this below z = 0, the height of the floor is unknown, and nothing touches it."""
 
 
+RGB = {"place": (0.48, 0.36, 0.65), "fixture": (0.55, 0.50, 0.43), "payload": (0.36, 0.52, 0.70)}
+"""Colours unlike that of any motor."""
+PLACE_M = 0.03
+"""Size of the mark at a place."""
+
+
 def build_cell(
     robots: Sequence[Robot],
     places: Sequence[Place] = (),
@@ -92,18 +98,21 @@ def build_cell(
     *,
     timestep_s: float = 0.002,
     meshes: bool = False,
+    drawn: bool = False,
 ) -> mujoco.MjModel:
-    """Model of all arms on their mounts above one floor, with the places as sites and the fixtures as boxes.
+    """Model of all arms on their mounts above one floor, with the places as sites and the fixtures as boxes or hulls.
 
     Names: all elements of an arm have the prefix `{robot.name}/` (`joint_1`..`joint_7` for joints and their
     position servos, sites `motor_1`..`motor_7` and `tool`, bodies `hand` and `payload`, camera `wrist`); a place is
-    the site `station/{place.name}`, a fixture the geom `fixture/{fixture.name}`. Servos clip at `GEN3.torque_clip`.
+    the site `station/{place.name}`, a box the geom `fixture/{fixture.name}`, and part i of a mesh the geom
+    `fixture/{fixture.name}/{i}`. Servos clip at `GEN3.torque_clip`.
 
     Links and payloads collide with those of other arms, the floor and the fixtures, not within an arm. All hands are
     empty; `set_payload_balls` gives them payloads.
 
     Args:
         meshes: Render Kinova's shells instead of primitives (optional package `mujoco-menagerie`).
+        drawn: For pictures only: with `supports`, and the surfaces of meshes in place of their hulls.
 
     Raises:
         ValueError: no arms, two arms, places or fixtures with one name, or two arms at the same place.
@@ -135,21 +144,58 @@ def build_cell(
             name=f"station/{place.name}",
             pos=place.position_m,
             quat=quaternion(rotation(place.tool_deg)),
-            size=(0.015, 0.015, 0.015),
-            rgba=(0.95, 0.55, 0.10, 1.0),
+            size=[PLACE_M / 2] * 3,
+            rgba=(*RGB["place"], 1.0),
         )
     for fixture in fixtures:
-        world.add_geom(
-            name=f"fixture/{fixture.name}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=fixture.position_m,
-            quat=quaternion(rotation(fixture.tilt_deg)),
-            size=[length / 2 for length in fixture.size_m],
-            rgba=(0.55, 0.50, 0.43, 1.0),
-        )
+        _add_fixture(spec, fixture, drawn=drawn)
+    for position_m, turn, size_m, rgba in supports(robots) if drawn else ():
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        world.add_geom(type=box, pos=position_m, quat=quaternion(turn), size=size_m / 2, rgba=rgba)
     model = spec.compile()
     set_payload_balls(model, payload_bodies(model, robots), np.zeros(len(robots)))
     return model
+
+
+def _add_fixture(spec: mujoco.MjSpec, fixture: Fixture, *, drawn: bool) -> None:
+    """Add a box, or the hulls of a mesh, or its surface if it is `drawn`."""
+    name, surface = f"fixture/{fixture.name}", fixture.surface
+    look = {"pos": fixture.position_m, "quat": quaternion(rotation(fixture.tilt_deg)), "rgba": (*RGB["fixture"], 1.0)}
+    if surface is None:
+        half_m = [length / 2 for length in fixture.size_m]
+        spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_m, **look)
+        return
+    shapes = [(surface.points_m, surface.corners)] if drawn else [(part, np.empty(0)) for part in surface.parts_m]
+    for i, (points, corners) in enumerate(shapes):
+        part, open_too = f"{name}/{i}", mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        spec.add_mesh(name=part, uservert=points.ravel(), userface=corners.ravel(), inertia=open_too)
+        spec.worldbody.add_geom(name=part, meshname=part, type=mujoco.mjtGeom.mjGEOM_MESH, **look)
+
+
+UPRIGHT = 0.5
+"""Sine of the elevation from which a base stands or hangs; between, a wall holds it."""
+PLATE_RGBA, POST_RGBA, WALL_RGBA = (0.60, 0.63, 0.65, 1.0), (0.73, 0.74, 0.76, 1.0), (0.73, 0.74, 0.76, 0.35)
+PLATE_M, RISE_M, WALL_M = 0.02, 0.006, 0.06
+"""Thickness of the plate under a base, its height above the floor or wall, and thickness of a wall or ceiling."""
+
+
+def supports(robots: Sequence[Robot]) -> Iterator[tuple[Array, Array, Array, tuple[float, ...]]]:
+    """A plate under each base, and what holds it in pictures: a post on the floor, a piece of wall, or of a ceiling.
+
+    Each is a box: centre, m, rotation to the world [3, 3], full lengths, m, and RGBA.
+    """
+    for robot in robots:
+        base, turn = np.array(robot.mount.position_m), robot.mount.rotation()
+        axis, behind = turn[:, 2], base - (PLATE_M - RISE_M + WALL_M / 2) * turn[:, 2]
+        yield base - (PLATE_M / 2 - RISE_M) * axis, turn, np.array((0.16, 0.16, PLATE_M)), PLATE_RGBA
+        if axis[2] <= -UPRIGHT:
+            yield behind, turn, np.array((0.5, 0.5, WALL_M)), WALL_RGBA
+        elif behind[2] > 0:
+            is_wall, yaw_deg = axis[2] < UPRIGHT, float(np.degrees(np.arctan2(axis[1], axis[0])))
+            high_m = base[2] + 0.15 if is_wall else behind[2]
+            size = np.array((WALL_M, 0.5, high_m) if is_wall else (0.1, 0.1, high_m))
+            upright = rotation((0.0, 0.0, yaw_deg if is_wall else 0.0))
+            yield np.array((*behind[:2], high_m / 2)), upright, size, WALL_RGBA if is_wall else POST_RGBA
 
 
 def payload_bodies(model: mujoco.MjModel, robots: Sequence[Robot]) -> Array:
@@ -183,7 +229,7 @@ class ArmModel:
     """Rigid-body kinematics and dynamics of a single arm on its mount; torques include the reflected rotor inertia.
 
     Args:
-        fixtures: Boxes in the cell; they matter for distances only.
+        fixtures: Solids in the cell; they matter for distances only.
     """
 
     def __init__(self, robot: Robot, fixtures: Sequence[Fixture] = ()) -> None:
@@ -280,7 +326,7 @@ def _arm_spec(robot: Robot, *, meshes: bool) -> mujoco.MjSpec:
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
         size=(MOST_PAYLOAD_M, 0.0, 0.0),
         pos=(0.0, 0.0, MOST_PAYLOAD_M),
-        rgba=(0.36, 0.52, 0.70, 1.0),
+        rgba=(*RGB["payload"], 1.0),
         contype=1,
         conaffinity=1,
         mass=0.0,

@@ -176,7 +176,7 @@ class CollisionChecker:
         ]
         obstacles = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0 and model.geom_contype[g]]
         for g in obstacles:
-            kind, _, own = model.geom(g).name.partition("/")
+            kind, own, *_ = [*model.geom(g).name.split("/"), ""]
             label = f"{kind} '{own}'" if own else kind
             # The base stands on the floor or on a fixture.
             self._pairs += [(label, g, link, geom, GAP_M) for link, geom in geoms.items() if link != "base"]

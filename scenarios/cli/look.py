@@ -273,7 +273,8 @@ def _play(what: str, shot: Shot) -> None:
 
     from fleet.arm.cell import CellPlayer
     from scenarios.run.log import open_run
-    from scenarios.show.film import Film, show_heat
+    from scenarios.show.film import Film
+    from scenarios.show.moments import motor_drums
     from scenarios.spec.load import load
 
     if (Path(what) / "run.json").exists():
@@ -289,11 +290,11 @@ def _play(what: str, shot: Shot) -> None:
         scenario = load(what)
         robots = [arm.robot() for arm in scenario.arms]
         player = CellPlayer(robots, scenario.places, scenario.fixtures, meshes=shot.meshes)
-        home = np.array([robot.home_q for robot in robots])
+        home = np.array([robot.home_q() for robot in robots])
         ambient_c = np.full(home.shape, 20.0)
 
         def update() -> object:
-            return show_heat(player, home, ambient_c, np.zeros(len(robots)), scenario.limits)
+            return player.show(home, *motor_drums(ambient_c, scenario.limits), np.zeros(len(robots)))
 
     say(f"Showing '{what}'; close the window to end.", out_console)
     player.open_viewer(update)

@@ -10,10 +10,9 @@ from PIL import Image, ImageDraw, ImageFont
 from fleet.arm.cell import CellCamera, CellPlayer
 from fleet.env.render.heat import heat_colour, heat_marks
 from fleet.errors import FleetError, install, visible
-from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES
 from scenarios.run.log import RunLog
-from scenarios.show.moments import motor_spheres
+from scenarios.show.moments import motor_drums
 from scenarios.show.words import clock
 from scenarios.spec.options import Shot
 
@@ -47,11 +46,6 @@ def times(run: RunLog, shot: Shot) -> Array:
     return np.arange(begin_s, end_s + 1e-9, shot.speed / shot.fps)
 
 
-def show_heat(player: CellPlayer, q: Array, temp_c: Array, payload_kg: Array, limits: ThermalLimits) -> None:
-    """Put a cell into postures [arm, joint] in rad, with motors coloured by temperatures [arm, joint] in °C."""
-    player.show(q, *motor_spheres(temp_c, limits), payload_kg)
-
-
 class Film:
     """A recorded shift in a MuJoCo model of its cell.
 
@@ -78,7 +72,7 @@ class Film:
         length_s = readings.time_s[row] - readings.time_s[before]
         share = np.clip((time_s - readings.time_s[before]) / length_s, 0.0, 1.0) if length_s else 1.0
         q, temp_c = ((1 - share) * v[before] + share * v[row] for v in (readings.q, readings.temp_c))
-        show_heat(self.player, q, temp_c, self._load_kg[row], self._limits)
+        self.player.show(q, *motor_drums(temp_c, self._limits), self._load_kg[row])
         return temp_c, readings.mode[row]
 
     def postures(self, at_s: Array) -> Array:

@@ -1,8 +1,8 @@
-"""A recorded shift as a glTF file (.glb): arms that move, and motors as spheres in the colour of their temperature.
+"""A recorded shift as a glTF file (.glb): arms that move, and motors as drums in the colour of their temperature.
 
 Viewers of augmented reality and of the web open it: model-viewer, Scene Viewer, three.js, Babylon.js, Blender. The
 movement is one animation: a rotation per joint. glTF 2.0 itself cannot animate a colour, and few viewers have the
-extension that can (KHR_animation_pointer). So each motor has a sphere for every band of `BAND_K` of the colour scale,
+extension that can (KHR_animation_pointer). So each motor has a drum for every band of `BAND_K` of the colour scale,
 and the animation gives all but one the scale 0, which is how the specification hides a node.
 
 Source: Khronos Group, glTF 2.0 specification (ISO/IEC 12113:2022), sections 3.6 (binary data) and 4 (GLB).
@@ -16,10 +16,12 @@ from typing import Any  # plain values of JSON
 
 import numpy as np
 
+from fleet.arm.cell import solid_of
 from fleet.env.render.heat import heat_marks
 from fleet.robot import JOINTS
+from fleet.surface import Surface
 from scenarios.progress import Progress, quiet
-from scenarios.show.moments import Moments, motor_spheres
+from scenarios.show.moments import Moments, motor_drums
 
 Array = np.ndarray
 
@@ -32,13 +34,11 @@ LONGEST_TURN_RAD = 2.0
 """Largest turn of a joint between two keys: a turn of more than π would go the other way round."""
 Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 """Rotation from z up, as here, to y up, as in glTF; x, y, z, w."""
-PLACE_M = 0.03
-PLACE_RGB, FIXTURE_RGB, LOAD_RGB = (0.95, 0.55, 0.10), (0.55, 0.50, 0.43), (0.25, 0.45, 0.71)
 Json = dict[str, Any]
 
 VERTICES, INDICES = 34962, 34963
 """Targets of buffer views."""
-_COMPONENT = {"<f4": 5126, "<u2": 5123}
+_COMPONENT = {"<f4": 5126, "<u2": 5123, "<u4": 5125}
 _TYPE = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 ALIGNMENT = 4
@@ -48,7 +48,7 @@ def write_gltf(path: Path, moments: Moments, speed: float, progress: Progress = 
     """Write a shift.
 
     Nodes: `ARM`, its links `ARM/link_0` to `ARM/link_7` one below the other, and below each link that a joint turns
-    `ARM/motor_J/BAND`; `ARM/payload`, `place/NAME`, `fixture/NAME`.
+    `ARM/motor_J/BAND`; `ARM/payload`, `place/NAME`, `fixture/NAME`, `support/NUMBER`.
 
     Args:
         speed: Shift seconds per second of the animation.
@@ -77,8 +77,9 @@ class _GltfFile:
             for link in moments.model["links"]
         ]
         self._ball, self._box = self._geometry("sphere", [1.0]), self._geometry("box", [0.5] * 3)
-        self._made: dict[tuple[str, float], int] = {}
-        """Meshes by kind, and the temperature of a band."""
+        self._drum = self._geometry("cylinder", [1.0, moments.model["motor"]["half_length"]])
+        self._made: dict[tuple[object, ...], int] = {}
+        """Meshes by kind and colour."""
         limits = moments.limits
         marks = heat_marks(limits.warning_c, limits.error_c)
         self._edges_c = np.arange(np.ceil(marks[0] / BAND_K), np.floor(marks[-1] / BAND_K) + 1) * BAND_K
@@ -89,28 +90,28 @@ class _GltfFile:
 
     def _geometry(self, kind: str, size: Sequence[float]) -> Json:
         """A primitive without a material."""
-        solid = _solid(kind, size)
+        solid = solid_of(kind, size)
         attributes = {
             "POSITION": self.buffer.add(solid.vertices, target=VERTICES, bounds=True),
             "NORMAL": self.buffer.add(solid.vertex_normals, target=VERTICES),
         }
         return {"attributes": attributes, "indices": self.buffer.add(solid.faces.ravel(), target=INDICES)}
 
-    def _mesh(self, geometry: Json, rgb: Sequence[float], *, unlit: bool = False) -> int:
-        """Index of a new mesh of one colour (RGB from 0 to 1, as on a screen)."""
-        linear = [((c + 0.055) / 1.055) ** 2.4 if c > 0.04045 else c / 12.92 for c in rgb]
-        plain: Json = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7}
-        self.materials.append(
-            {"pbrMetallicRoughness": plain} | ({"extensions": {"KHR_materials_unlit": {}}} if unlit else {})
-        )
+    def _mesh(self, geometry: Json, rgba: Sequence[float], *, unlit: bool = False) -> int:
+        """Index of a new mesh of one colour (RGB, or RGBA, from 0 to 1, as on a screen)."""
+        linear = [((c + 0.055) / 1.055) ** 2.4 if c > 0.04045 else c / 12.92 for c in rgba[:3]]
+        alpha = [*rgba[3:], 1.0][0]
+        plain: Json = {"baseColorFactor": [*linear, alpha], "metallicFactor": 0.0, "roughnessFactor": 0.7}
+        material: Json = {"pbrMetallicRoughness": plain, "alphaMode": "OPAQUE" if alpha == 1 else "BLEND"}
+        self.materials.append(material | ({"extensions": {"KHR_materials_unlit": {}}} if unlit else {}))
         self.meshes.append({"primitives": [geometry | {"material": len(self.materials) - 1}]})
         return len(self.meshes) - 1
 
-    def _once(self, kind: str, geometry: Json, rgb: Sequence[float], temp_c: float = 0.0) -> int:
-        """Index of the mesh of a kind, made at its first use."""
-        if (kind, temp_c) not in self._made:
-            self._made[kind, temp_c] = self._mesh(geometry, rgb, unlit=kind == "motor")
-        return self._made[kind, temp_c]
+    def _once(self, kind: str, geometry: Json, rgba: Sequence[float]) -> int:
+        """Index of the mesh of a kind and colour, made at its first use."""
+        if (kind, *rgba) not in self._made:
+            self._made[kind, *rgba] = self._mesh(geometry, rgba, unlit=kind == "motor")
+        return self._made[kind, *rgba]
 
     def _node(self, parent: int, name: str, given: Mapping[str, Any] | None = None, **more: Any) -> int:
         """Index of a new node; `given` is a pose with a quaternion w, x, y, z."""
@@ -162,19 +163,19 @@ class _GltfFile:
             self._animate(node, "rotation", time_s[kept], rotations, "LINEAR")
 
     def _add_motor(self, link: int, name: str, band: Array) -> None:
-        """One sphere per temperature band of a motor; only the current one is visible."""
+        """One drum per temperature band of a motor; only the current one is visible."""
         for number in np.unique(band).tolist():
             temp_c = float(self._edges_c[0]) + (number - 0.5) * BAND_K
-            rgb, radius_m = motor_spheres(np.array(temp_c), self.moments.limits)
-            mesh = self._once("motor", self._ball, rgb.tolist(), temp_c)
+            rgb, radius_m = motor_drums(np.array(temp_c), self.moments.limits)
+            mesh = self._once("motor", self._drum, rgb.tolist())
             node = self._node(link, f"{name}/{temp_c:g}", mesh=mesh)
             self._switch(node, self.heat_s, np.where(band == number, float(radius_m), 0.0))
 
     def _add_payload(self, hand: int, name: str, index: int) -> None:
-        radius_m = self.moments.payload_m[:, index][self.moments.poses]
+        radius_m, rgb = self.moments.payload_m[:, index][self.moments.poses], self.moments.model["load"]["colour"]
         if not radius_m.any():
             return
-        node = self._node(hand, f"{name}/payload", mesh=self._once("payload", self._ball, LOAD_RGB))
+        node = self._node(hand, f"{name}/payload", mesh=self._once("payload", self._ball, rgb))
         changed = self._switch(node, self.pose_s, radius_m)
         centres = np.zeros((len(changed), 3))
         centres[:, 2] = radius_m[changed]
@@ -192,11 +193,21 @@ class _GltfFile:
         return changed
 
     def add_surroundings(self) -> None:
-        """Places and fixtures."""
-        for kind, rgb in (("place", PLACE_RGB), ("fixture", FIXTURE_RGB)):
-            for box in self.moments.model[f"{kind}s"]:
-                mesh = self._once(kind, self._box, rgb)
-                self._node(0, f"{kind}/{box['name']}", box, mesh=mesh, scale=box.get("size", [PLACE_M] * 3))
+        """Places, fixtures, and what carries the arms."""
+        model = self.moments.model
+        for group in ("places", "fixtures", "supports"):
+            for solid in model[group]:
+                name, scale = f"{group[:-1]}/{solid['name']}", solid["size"]
+                if "mesh" in solid:
+                    surface, scale = Surface(**model["meshes"][solid["mesh"]]), [1.0] * 3
+                    geometry = {  # without normals, viewers draw flat triangles
+                        "attributes": {"POSITION": self.buffer.add(surface.points_m, target=VERTICES, bounds=True)},
+                        "indices": self.buffer.add(surface.corners.ravel(), target=INDICES),
+                    }
+                    mesh = self._mesh(geometry, solid["colour"])
+                else:
+                    mesh = self._once("box", self._box, solid["colour"])
+                self._node(0, name, solid, mesh=mesh, scale=scale)
 
     def write(self, path: Path) -> None:
         run, limits = self.moments.run, self.moments.limits
@@ -257,22 +268,6 @@ def keys_of(time_s: Array, angle_rad: Array, same_rad: float = SAME_RAD) -> Arra
     return np.array(kept)
 
 
-def _solid(kind: str, size: Sequence[float]) -> Any:
-    """A trimesh of a shape in its own frame."""
-    from trimesh import creation
-
-    if kind == "sphere":
-        return creation.icosphere(subdivisions=2, radius=size[0])
-    if kind == "capsule":
-        return creation.capsule(radius=size[0], height=2 * size[1], count=[24, 12])
-    if kind == "box":
-        solid = creation.box(extents=[2 * length for length in size])
-    else:
-        solid = creation.cylinder(radius=size[0], height=2 * size[1], sections=32)
-    solid.unmerge_vertices()  # edges stay sharp
-    return solid
-
-
 class Buffer:
     """The buffer of a file, filled array by array."""
 
@@ -286,11 +281,12 @@ class Buffer:
         """Append an array and return the index of its accessor.
 
         Args:
-            values: [element] or [element, component], of 1, 3 or 4 components; float32 or uint16 in the file.
+            values: [element] or [element, component], of 1, 3 or 4 components; float32, uint16 or, for large indices,
+                uint32 in the file.
             target: `VERTICES` or `INDICES`; None for animations.
             bounds: State least and largest values, which positions and times of animations need.
         """
-        kind = "<u2" if values.dtype.kind in "iu" else "<f4"
+        kind = ("<u2" if values.max() < np.iinfo("<u2").max else "<u4") if values.dtype.kind in "iu" else "<f4"
         packed = np.ascontiguousarray(values, dtype=kind)
         raw = packed.tobytes()
         padded = raw + b"\0" * (-len(raw) % ALIGNMENT)

@@ -13,6 +13,7 @@ from typing import Any  # rosbags makes its classes at run time
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from fleet.arm.cell import DRUM
 from fleet.bus.protocol.messages import State
 from fleet.ros2.cdr import (
     DIAGNOSTICS,
@@ -27,9 +28,10 @@ from fleet.ros2.cdr import (
     write_joints,
 )
 from fleet.ros2.conversion import Joints, diagnostics_of, joint_names, plain_name
+from fleet.surface import Surface
 from fleet.telemetry import MODES
 from scenarios.progress import Progress, quiet
-from scenarios.show.moments import Moments, ahead, motor_spheres
+from scenarios.show.moments import Moments, ahead, motor_drums
 
 Array = np.ndarray
 
@@ -37,14 +39,12 @@ TRANSFORMS, MARKERS = "tf2_msgs/msg/TFMessage", "visualization_msgs/msg/MarkerAr
 TEMPERATURE, LOG = "sensor_msgs/msg/Temperature", "rcl_interfaces/msg/Log"
 LEVELS = {"info": 20, "warning": 30, "error": 40}
 """Severities of rcl_interfaces/Log."""
-CUBE, SPHERE, CYLINDER, DELETE = 1, 2, 3, 2
+CUBE, SPHERE, CYLINDER, TRIANGLES, DELETE = 1, 2, 3, 11, 2
 """Constants of visualization_msgs/Marker."""
 WORLD = "world"
 NS = 1_000_000_000
 LATCHED = "- reliability: 1\n  durability: 1\n  history: 1\n  depth: 1\n"
 """Quality of service of topics that are sent once, for `ros2 bag play`."""
-PLACE_COLOUR, FIXTURE_COLOUR, LOAD_COLOUR = (0.95, 0.55, 0.1), (0.55, 0.5, 0.43), (0.25, 0.45, 0.7)
-PLACE_M = 0.03
 CHUNK_BYTES = 1 << 20
 ORIGIN = {"position": (0.0, 0.0, 0.0), "quaternion": (1.0, 0.0, 0.0, 0.0)}
 
@@ -105,11 +105,14 @@ class _McapFile:
             for link, frame in zip(model["links"], frames, strict=True):
                 for shape in link["shapes"]:
                     markers += shape_markers(shape, frame, arm, len(markers))
-        for place in model["places"]:
-            size = (PLACE_M, PLACE_M, PLACE_M)
-            markers.append(marker(CUBE, WORLD, "places", len(markers), place, size, PLACE_COLOUR))
-        for box in model["fixtures"]:
-            markers.append(marker(CUBE, WORLD, "fixtures", len(markers), box, box["size"], FIXTURE_COLOUR))
+        for group in ("places", "fixtures", "supports"):
+            for solid in model[group]:
+                kind, size = (TRIANGLES, [1.0] * 3) if "mesh" in solid else (CUBE, solid["size"])
+                markers.append(marker(kind, WORLD, group, len(markers), solid, size, solid["colour"]))
+                if kind == TRIANGLES:
+                    surface = Surface(**model["meshes"][solid["mesh"]])
+                    points_m = surface.points_m[surface.corners.ravel()]
+                    markers[-1].points = [_point(corner) for corner in points_m.tolist()]
         self.put("/cell", MARKERS, begin_s, write(message(MARKERS, markers=markers), MARKERS), LATCHED)
         for name in ("warning", "error"):
             limit_c = getattr(moments.limits, f"{name}_c")
@@ -148,31 +151,32 @@ class _McapFile:
                 self.put(f"{topic}/joint_states", JOINT_STATE, time_s, write_joints(Joints(time_s, names, *values)))
 
     def write_heat(self) -> None:
-        """Temperatures, the spheres of the motors, and diagnostics."""
+        """Temperatures, the drums of the motors, and diagnostics."""
         moments, readings = self.moments, self.moments.run.readings
         turned = moments.joint_links
-        spheres = [
+        drums = [
             [
-                marker(SPHERE, frames[link], arm, joint, ORIGIN, (0.1,) * 3, (1.0,) * 3)
+                marker(CYLINDER, frames[link], arm, joint, ORIGIN, (0.1,) * 3, (1.0,) * 3)
                 for joint, link in enumerate(turned)
             ]
             for arm, frames in zip(self.arms, self.frames, strict=True)
         ]
-        everything = message(MARKERS, markers=[sphere for arm in spheres for sphere in arm])
+        everything = message(MARKERS, markers=[drum for arm in drums for drum in arm])
         readout = message(TEMPERATURE)
         heat_s = readings.time_s[moments.heats]
         jobs = [moments.jobs(arm, heat_s) for arm in self.arms]
         fleet = moments.run.scenario.name
         for done, sample in enumerate(moments.heats.tolist()):
             time_s, temp_c = float(heat_s[done]), readings.temp_c[sample].astype(float)
-            colours, radii = motor_spheres(temp_c, moments.limits)
+            colours, radii = motor_drums(temp_c, moments.limits)
             now = stamp(time_s)
             statuses: list[Any] = []
             for arm, name in enumerate(self.arms):
-                for joint, sphere in enumerate(spheres[arm]):
-                    sphere.header.stamp = now
-                    sphere.scale.x = sphere.scale.y = sphere.scale.z = 2 * float(radii[arm, joint])
-                    sphere.color.r, sphere.color.g, sphere.color.b = colours[arm, joint].tolist()
+                for joint, drum in enumerate(drums[arm]):
+                    drum.header.stamp = now
+                    drum.scale.x = drum.scale.y = 2 * float(radii[arm, joint])
+                    drum.scale.z = DRUM * drum.scale.x
+                    drum.color.r, drum.color.g, drum.color.b = colours[arm, joint].tolist()
                     readout.header = header(time_s, self.frames[arm][turned[joint]])
                     readout.temperature = float(temp_c[arm, joint])
                     topic = f"{self.topics[arm]}/joint_{joint + 1}/temperature"
@@ -193,14 +197,14 @@ class _McapFile:
     def write_loads(self) -> None:
         """The balls in the hands, whenever one changes."""
         moments, time_s = self.moments, self.moments.run.readings.time_s
-        radii, hand = moments.payload_m, moments.model["hand"]
+        radii, hand, colour = moments.payload_m, moments.model["hand"], moments.model["load"]["colour"]
         changed = np.flatnonzero(np.any(np.diff(radii, axis=0, prepend=-1.0) != 0.0, axis=1))
         for sample in changed.tolist():
             balls = []
             for arm, (name, radius_m) in enumerate(zip(self.arms, radii[sample].tolist(), strict=True)):
                 # The ball touches the flange, whose z axis points out of the hand.
                 pose = {"position": ahead(hand, radius_m), "quaternion": hand["quaternion"]}
-                ball = marker(SPHERE, self.frames[arm][-1], name, 0, pose, (2 * max(radius_m, 1e-3),) * 3, LOAD_COLOUR)
+                ball = marker(SPHERE, self.frames[arm][-1], name, 0, pose, (2 * max(radius_m, 1e-3),) * 3, colour)
                 ball.action = 0 if radius_m else DELETE
                 ball.header.stamp = stamp(float(time_s[sample]))
                 balls.append(ball)
@@ -245,8 +249,8 @@ def transform(parent: str, child: str, position: Sequence[float], quaternion: Se
 def marker(
     kind: int, frame: str, group: str, number: int, pose: Any, size: Sequence[float], colour: Sequence[float]
 ) -> Any:
-    """A visualization_msgs/Marker that follows its frame, until it is replaced; sizes are full lengths, m."""
-    red, green, blue = map(float, colour)
+    """A visualization_msgs/Marker that follows its frame, until it is replaced; full lengths in m, RGB or RGBA."""
+    red, green, blue, alpha = [*map(float, colour), 1.0][:4]
     return message(
         "visualization_msgs/msg/Marker",
         header=header(0.0, frame),
@@ -255,11 +259,11 @@ def marker(
         type=kind,
         pose=message(
             "geometry_msgs/msg/Pose",
-            position=message("geometry_msgs/msg/Point", **_xyz(pose["position"])),
+            position=_point(pose["position"]),
             orientation=_turn(pose["quaternion"]),
         ),
         scale=message("geometry_msgs/msg/Vector3", **_xyz(size)),
-        color=message("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
+        color=message("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha),
         frame_locked=True,
     )
 
@@ -278,6 +282,10 @@ def shape_markers(shape: Any, frame: str, group: str, number: int) -> list[Any]:
             pose = {"position": ahead(shape, end), "quaternion": shape["quaternion"]}
             parts.append(marker(SPHERE, frame, group, number + i, pose, (across,) * 3, colour))
     return parts
+
+
+def _point(values: Sequence[float]) -> Any:
+    return message("geometry_msgs/msg/Point", **_xyz(values))
 
 
 def _xyz(values: Sequence[float]) -> dict[str, float]:

@@ -8,6 +8,7 @@ from typing import Any  # plain values of a cell model
 
 import numpy as np
 
+from fleet.arm.cell import HOT_MOTOR_M, MOTOR_M
 from fleet.env.render.heat import heat_colour, heat_marks
 from fleet.job import payload_radius_m
 from fleet.robot import ThermalLimits
@@ -22,11 +23,7 @@ MOST_POSES, MOST_HEATS = 250_000, 40_000
 so that a file stays below 100 MB."""
 
 
-MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
-"""Radius of the sphere of a cool motor and of one at the error limit: a hotter motor is also larger."""
-
-
-def motor_spheres(temp_c: Array, limits: ThermalLimits) -> tuple[Array, Array]:
+def motor_drums(temp_c: Array, limits: ThermalLimits) -> tuple[Array, Array]:
     """Colours (RGB from 0 to 1, [..., 3]) and radii (m, [...]) of motors at temperatures in °C, [...]."""
     coolest_c = heat_marks(limits.warning_c, limits.error_c)[0]
     heat = np.clip((temp_c - coolest_c) / (limits.error_c - coolest_c), 0.0, 1.0)

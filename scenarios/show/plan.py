@@ -14,7 +14,7 @@ from matplotlib.patches import Circle, Polygon
 from matplotlib.transforms import IdentityTransform, ScaledTranslation
 
 from fleet.arm.kinematics import FOREARM_M, HAND_M, REACH_M, UPPER_ARM_M
-from fleet.env.render.picture import FAULT, INK, outline
+from fleet.env.render.picture import FAULT, INK, outlines
 from fleet.env.render.scene import mount_kind
 from scenarios.show.comparison_page import COLOURS
 from scenarios.show.layout import LayoutReport, shoulder_m
@@ -102,8 +102,8 @@ def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Lab
     """The cell from above, x to the right and y up; returns the names of arms and places, to be written."""
     labels = list[Label]()
     height_m = float(np.mean([place.position_m[2] for place in scenario.places])) if scenario.places else 0.0
-    for fixture in scenario.fixtures:
-        axes.add_patch(Polygon(outline(fixture), facecolor="#e4e0d8", edgecolor="#c9c9c9", zorder=0))
+    for outline in (each for fixture in scenario.fixtures for each in outlines(fixture)):
+        axes.add_patch(Polygon(outline, facecolor="#e4e0d8", edgecolor="#c9c9c9", zorder=0))
     at = {place.name: place.position_m for place in scenario.places}
     for i, spec in enumerate(scenario.arms):
         robot, colour = spec.robot(), COLOURS[i % len(COLOURS)]

@@ -24,6 +24,7 @@ import numpy as np
 from fleet.errors import ScenarioError, nearest, printable
 from scenarios.spec.calendar import check_breaks, with_calendar, zone_of
 from scenarios.spec.job_table import cycle_of, read_bytes, read_job_table, shift_begin, stream_fields, text_of
+from scenarios.spec.mesh_file import with_meshes
 from scenarios.spec.schema import JobStream, Scenario
 from scenarios.spec.units import check_times, check_units
 
@@ -205,7 +206,7 @@ def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
     except msgspec.ValidationError as error:
         raise ScenarioError(f"{path.name}: {readable_error(error, raw, Scenario)}") from error
     _check(scenario, path)
-    return _with_traces(scenario, path)
+    return with_meshes(_with_traces(scenario, path), path)
 
 
 def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:

@@ -1,4 +1,4 @@
-"""Every tutorial runs, and the page on job tables: commands, files and programs in order, with the outputs of the page.
+"""Every tutorial runs, and pages on files of a scenario: commands, files and programs in order, with their outputs.
 
 A block of `sh` is run in a shell, one of `python` by Python; with a title it is a file instead. A block of `text` is
 the output of the block before it, where … matches anything. After `<!-- background -->` a command keeps running.
@@ -19,7 +19,10 @@ from typing import NamedTuple
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = [*sorted((DOCS / "tutorials").glob("*.md")), DOCS / "how_to" / "job_table.md"]
+PAGES = [
+    *sorted((DOCS / "tutorials").glob("*.md")),
+    *(DOCS / "how_to" / f"{name}.md" for name in ("job_table", "mesh")),
+]
 _BLOCK = re.compile(
     r'^(?P<behind><!-- background -->\n)?```(?P<kind>\w+)(?: title="(?P<title>[\w.]+)")?\n(?P<text>.*?)^```$',
     re.DOTALL | re.MULTILINE,

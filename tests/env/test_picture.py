@@ -319,7 +319,7 @@ def test_a_fixture_is_drawn_around_its_centre_and_as_large_as_its_shadow(positio
         arms=("a",), mounts_m=((0.0, 0.0, 0.0),), kinds=("floor",), stations=(("s", (2.0, 1.0, 0.0)),), fixtures=(box,)
     )
     plan = floor_plan(cell)
-    (outline,) = plan.fixtures
+    ((outline,),) = plan.fixtures
     px_per_m = (plan.stations[0, 0] - plan.bases[0, 0]) / 2.0
     centre = (outline.min(axis=0) + outline.max(axis=0)) / 2
     np.testing.assert_allclose((centre - plan.bases[0]) / px_per_m, [position_m[0], -position_m[1]], atol=0.05)
@@ -327,6 +327,16 @@ def test_a_fixture_is_drawn_around_its_centre_and_as_large_as_its_shadow(positio
     area = abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
     faces = np.array([size_m[1] * size_m[2], size_m[0] * size_m[2], size_m[0] * size_m[1]])
     assert area / px_per_m**2 == pytest.approx(faces @ np.abs(rotation(tilt_deg)[2]), rel=0.02, abs=1e-6)
+
+
+def test_a_fixture_beyond_the_floor_covers_nothing_beside_it() -> None:
+    cell, wide = row(2), Fixture(name="hall", position_m=(0.5, 0.25, 0.3), size_m=(9.0, 9.0, 0.6))
+    with_hall, without = (draw(scene(each)).copy() for each in (replace(cell, fixtures=(wide,)), cell))
+    left, top, right, bottom = map(int, FLOOR)
+    assert not np.array_equal(with_hall, without)
+    for frame in (with_hall, without):
+        frame[top - 1 : bottom + 1, left : right + 1] = 0
+    np.testing.assert_array_equal(with_hall, without)
 
 
 @given(st.lists(points, min_size=1, max_size=6))

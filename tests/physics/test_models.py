@@ -234,7 +234,7 @@ def test_a_page_gets_the_surfaces_of_the_meshes():
     assert {shape["kind"] for link in shown["links"] for shape in link["shapes"]} == {"mesh"}
     shape = shown["links"][0]["shapes"][0]
     mesh = shown["meshes"][shape["mesh"]]
-    points = np.frombuffer(base64.b64decode(mesh["points"]), "<i2").reshape(-1, 3) * mesh["unit_m"]
+    points = np.frombuffer(base64.b64decode(mesh["points"]), "<f4").reshape(-1, 3)
     triangles = np.frombuffer(base64.b64decode(mesh["triangles"]), "<u4")
     turned = np.empty(9)
     mujoco.mju_quat2Mat(turned, np.array(shape["quaternion"]))

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from scenarios.run.log import RunLog
 from scenarios.show.gltf import LONGEST_TURN_RAD, SAME_RAD, Z_UP, divided, keys_of
-from scenarios.show.moments import motor_spheres
+from scenarios.show.moments import motor_drums
 
 SPEED = 60.0
 NEAR_M = 1e-4
@@ -90,7 +90,7 @@ def test_the_motors_are_where_mujoco_has_them(file: Path, run: RunLog, motors_in
         assert np.abs(found - motors_in_mujoco(float(time_s))).max() < NEAR_M
 
 
-def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path, run: RunLog) -> None:
+def test_each_motor_shows_one_drum_of_the_colour_of_its_temperature(file: Path, run: RunLog) -> None:
     reader, readings = Reader(file), run.readings
     hottest = readings.temp_c.max(axis=(1, 2)).argmax()
     for sample in (0, hottest // 10 * 10, len(readings.time_s) // 20 * 10):
@@ -105,8 +105,13 @@ def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path
                 assert abs(band_c - temp_c) <= 2.5 + 1e-6
                 node = reader.json["nodes"][reader.index[shown[0]]]
                 primitive = reader.json["meshes"][node["mesh"]]["primitives"][0]
+                # The scale is the radius, and z the axis of the joint.
+                extent = np.ptp(reader.array(primitive["attributes"]["POSITION"]), axis=0)
+                assert extent == pytest.approx(
+                    (2.0, 2.0, 1.6), abs=0.02
+                )  # its radius is the scale, its axis the joint's
                 colour = reader.json["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorFactor"][:3]
-                rgb, radius_m = motor_spheres(np.array(band_c), run.scenario.limits)
+                rgb, radius_m = motor_drums(np.array(band_c), run.scenario.limits)
                 assert np.power(colour, 1 / 2.2) == pytest.approx(rgb, abs=0.03)  # sRGB is nearly a power of 2.2
                 assert nodes[reader.index[shown[0]]]["scale"] == pytest.approx([float(radius_m)] * 3)
 

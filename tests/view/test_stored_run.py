@@ -132,6 +132,8 @@ def test_the_cell_takes_the_recorded_postures_and_heat(run: RunLog) -> None:
     motors = [model.site(f"{arm}/motor_{j + 1}").id for arm in run.arms for j in range(7)]
     red = model.site_rgba[motors, 0] - model.site_rgba[motors, 1]
     size = model.site_size[motors, 0]
+    assert model.site_size[motors, 1] == pytest.approx(0.8 * size)
+    assert (model.site_type[motors] == mujoco.mjtGeom.mjGEOM_CYLINDER).all()  # pyright: ignore[reportAttributeAccessIssue]
     for shows in (red, size):
         assert shows[temp_c.argmax()] > shows[temp_c.argmin()]
     shown.show(float(readings.time_s[hottest : hottest + 2].mean()))
@@ -272,12 +274,14 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(
             move, turn = each.transform.translation, each.transform.rotation
             parents[each.child_frame_id] = each.header.frame_id
             poses[each.child_frame_id] = ([move.x, move.y, move.z], [turn.w, turn.x, turn.y, turn.z])
-    spheres = next(content for at_s, content in messages["/motors"] if at_s == time_s).markers
-    found = np.array([along(parents, poses, sphere.header.frame_id) for sphere in spheres])
+    drums = next(content for at_s, content in messages["/motors"] if at_s == time_s).markers
+    found = np.array([along(parents, poses, drum.header.frame_id) for drum in drums])
     assert found == pytest.approx(motors_in_mujoco(time_s).reshape(-1, 3), abs=1e-4)
+    shapes = [(drum.type, drum.scale.z / drum.scale.x, drum.scale.y / drum.scale.x) for drum in drums]
+    assert shapes == [pytest.approx((3, 0.8, 1.0))] * len(drums)  # cylinders along z
     hottest, coolest = readings.temp_c[sample].argmax(), readings.temp_c[sample].argmin()
-    assert spheres[hottest].scale.x > spheres[coolest].scale.x
-    assert spheres[hottest].color.r - spheres[hottest].color.g > spheres[coolest].color.r - spheres[coolest].color.g
+    assert drums[hottest].scale.x > drums[coolest].scale.x
+    assert drums[hottest].color.r - drums[hottest].color.g > drums[coolest].color.r - drums[coolest].color.g
     statuses = {each.hardware: each for each in dict(messages["/diagnostics"])[time_s]}
     for index, arm in enumerate(run.arms):
         assert dict(statuses[f"quickstart/{arm}"].values)["mode"] == MODES[readings.mode[sample, index]]

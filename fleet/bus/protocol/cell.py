@@ -27,7 +27,7 @@ class CellPlace(msgspec.Struct, frozen=True):
 
 
 class CellFixture(msgspec.Struct, frozen=True):
-    """A box that stands in the cell; no arm may touch it."""
+    """A solid that stands in the cell, by the box around it; no arm may touch it."""
 
     name: Name
     position_m: Point

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 from os.path import commonprefix
 from typing import Any  # options of matplotlib
 
@@ -72,8 +71,8 @@ class FloorPlan:
     """[station, 2]."""
     labels: tuple[tuple[str, float, float], ...]
     """Station names with enough room: text, left end of its middle line."""
-    fixtures: tuple[Array, ...]
-    """Outline of each fixture from above, [corner, 2]; it may reach beyond the floor."""
+    fixtures: tuple[tuple[Array, ...], ...]
+    """Outlines of each fixture from above, see `outlines`; they may reach beyond the floor."""
 
     @property
     def motor(self) -> int:
@@ -107,15 +106,15 @@ def floor_plan(cell: CellMap) -> FloorPlan:
     bases, stations = np.split(on_floor(points), [arms])
     centres = _spread_apart(bases, stations, (corner, other), reach, below)
     labels = _place_labels([name for name, _ in cell.stations], centres, stations, reach, below)
-    fixtures = tuple(on_floor(outline(fixture)) for fixture in cell.fixtures)
+    fixtures = tuple(tuple(map(on_floor, outlines(fixture))) for fixture in cell.fixtures)
     return FloorPlan(reach, bases, centres, stations, labels, fixtures)
 
 
-def outline(fixture: Fixture) -> Array:
-    """Corners of a fixture's shadow on the floor, m, [corner, 2]."""
-    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * fixture.size_m @ rotation(fixture.tilt_deg).T
-    shadow = (corners + fixture.position_m)[:, :2]
-    return shadow[ConvexHull(shadow).vertices]
+def outlines(fixture: Fixture) -> list[Array]:
+    """Corners of the shadow of each convex part of a fixture on the floor, m, [corner, 2]."""
+    turn = rotation(fixture.tilt_deg)
+    shadows = [(corners @ turn.T + fixture.position_m)[:, :2] for corners in fixture.parts_m]
+    return [shadow[ConvexHull(shadow).vertices] for shadow in shadows]
 
 
 def _spread_apart(bases: Array, stations: Array, corners: tuple[Array, Array], reach: int, below: int) -> Array:
@@ -212,9 +211,11 @@ def _draw_cell(axes: Axes, scene: Scene, plan: FloorPlan) -> None:
     """Fixtures, stations, and lines from the arms to the stations they occupy."""
     left, top, right, bottom = FLOOR
     floor = axes.add_patch(Rectangle((left, top), right - left, bottom - top, facecolor=GROUND))
-    for fixture, outline in zip(scene.cell.fixtures, plan.fixtures, strict=True):
-        axes.add_patch(Polygon(outline, facecolor=BOX, edgecolor=FAINT, clip_path=floor))
-        low, high = (np.clip(end, (left, top), (right, bottom)) for end in (outline.min(axis=0), outline.max(axis=0)))
+    for fixture, parts in zip(scene.cell.fixtures, plan.fixtures, strict=True):
+        for outline in parts:
+            axes.add_patch(Polygon(outline, facecolor=BOX, edgecolor=FAINT)).set_clip_path(floor)
+        points = np.concatenate(parts)
+        low, high = (np.clip(end, (left, top), (right, bottom)) for end in (points.min(axis=0), points.max(axis=0)))
         if high[1] - low[1] > 2 * TEXT:
             x, y = (low + high) / 2
             _write(axes, x, y, shorten(fixture.name, high[0] - low[0] - TEXT), FAINT, ha="center")

@@ -1,4 +1,4 @@
-// The cell in three dimensions: draws what fleet/physics/cell_model.py describes, with three.js.
+// The cell in three dimensions: draws what fleet/arm/cell.py describes, with three.js.
 // One instanced mesh per shape of a link, with one instance per arm: the number of draws does not grow with the fleet.
 "use strict";
 
@@ -50,14 +50,13 @@ function makeCell(place, model) {
   const pose = (what, scale) => new THREE.Matrix4().compose(
     vector(what.position), new THREE.Quaternion(what.quaternion[1], what.quaternion[2], what.quaternion[3],
       what.quaternion[0]), scale || new THREE.Vector3(1, 1, 1));
-  const material = (colour) => new THREE.MeshLambertMaterial({ color: colour });
+  const material = (colour, opacity = 1, more) => new THREE.MeshLambertMaterial({ color: colour, opacity, transparent: opacity < 1, ...more });
   const colourOf = (rgb) => new THREE.Color(...rgb).convertSRGBToLinear();
 
   const decoded = (text, Kind) => new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
   const surfaces = model.meshes.map((mesh) => {
     const surface = new THREE.BufferGeometry();
-    surface.setAttribute("position", new THREE.BufferAttribute(
-      Float32Array.from(decoded(mesh.points, Int16Array), (value) => value * mesh.unit_m), 3));
+    surface.setAttribute("position", new THREE.BufferAttribute(decoded(mesh.points, Float32Array), 3));
     surface.setIndex(new THREE.BufferAttribute(decoded(mesh.triangles, Uint32Array), 1));
     surface.computeVertexNormals();
     return surface;
@@ -74,8 +73,8 @@ function makeCell(place, model) {
     }
   }
 
-  function instanced(shape, colour) {
-    const mesh = new THREE.InstancedMesh(shape, material(colour), arms);
+  function instanced(shape, colour, opacity = 1, count = arms) {
+    const mesh = new THREE.InstancedMesh(shape, material(colour, opacity), count);
     mesh.frustumCulled = false;
     scene.add(mesh);
     return mesh;
@@ -84,30 +83,29 @@ function makeCell(place, model) {
   const links = model.links.map((link) => ({
     parent: link.parent, turns: link.turns, local: pose(link),
     shapes: link.shapes.map((shape) => ({ local: pose(shape), mesh: instanced(geometry(shape), colourOf(shape.colour)) })),
-    motor: link.turns ? instanced(new THREE.CylinderGeometry(1, 1, 1.6, 20).rotateX(Math.PI / 2), "#ffffff") : null, // a drum round the axis of the joint
+    motor: link.turns ? instanced(new THREE.CylinderGeometry(1, 1, 2 * model.motor.half_length, 20).rotateX(Math.PI / 2), "#ffffff") : null, // a drum round the axis of the joint
   }));
-  const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 14, 9), colourOf([0.36, 0.52, 0.7]));
+  const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 14, 9), colourOf(model.load.colour));
   const mounts = model.arms.map((arm) => pose(arm));
-  // A plate under each base, and a post down to the floor, unless the arm hangs.
-  const plates = instanced(new THREE.BoxGeometry(0.16, 0.16, 0.02), "#9aa0a6"), posts = instanced(new THREE.BoxGeometry(0.1, 0.1, 1), "#b9bdc2");
-  mounts.forEach((mount, arm) => {
-    const below = new THREE.Vector3(0, 0, -0.07).applyMatrix4(mount), long = mount.elements[10] > -0.5 ? Math.max(1e-6, below.z) : 1e-6;
-    plates.setMatrixAt(arm, mount.clone().multiply(new THREE.Matrix4().makeTranslation(0, 0, -0.01)));
-    posts.setMatrixAt(arm, new THREE.Matrix4().makeTranslation(below.x, below.y, below.z - long / 2).scale(new THREE.Vector3(1, 1, long)));
-  });
-
   const points = mounts.flatMap((mount) => [0, STANDING_M].map((z) => new THREE.Vector3(0, 0, z).applyMatrix4(mount)));
   for (const one of model.places) {
     points.push(vector(one.position));
-    const mark = new THREE.Mesh(new THREE.OctahedronGeometry(0.03), material("#7a5ba6"));
+    const mark = new THREE.Mesh(new THREE.OctahedronGeometry(0.03), material(colourOf(one.colour)));
     mark.applyMatrix4(pose(one));
     scene.add(mark);
   }
   for (const one of model.fixtures) {
-    const block = new THREE.Mesh(new THREE.BoxGeometry(...one.size), material("#8c8069"));
-    block.applyMatrix4(pose(one));
+    const shape = "mesh" in one ? surfaces[one.mesh].toNonIndexed() : new THREE.BoxGeometry(...one.size);
+    shape.computeVertexNormals(); // without shared points: triangles are flat
+    const solid = new THREE.Mesh(shape, material(colourOf(one.colour), 1, { side: THREE.DoubleSide })); // it may be open
+    solid.applyMatrix4(pose(one));
     points.push(vector(one.position));
-    scene.add(block);
+    scene.add(solid);
+  }
+  for (const look of new Set(model.supports.map((one) => String(one.colour)))) {
+    const alike = model.supports.filter((one) => String(one.colour) === look), [red, green, blue, opacity] = alike[0].colour;
+    const boxes = instanced(new THREE.BoxGeometry(1, 1, 1), colourOf([red, green, blue]), opacity, alike.length);
+    alike.forEach((one, i) => boxes.setMatrixAt(i, pose(one, vector(one.size))));
   }
   const box = new THREE.Box3().setFromPoints(points);
   const across = Math.max(1, ...box.getSize(new THREE.Vector3()).toArray());
@@ -149,7 +147,8 @@ function makeCell(place, model) {
     return new THREE.Color().lerpColors(scale[i - 1], scale[i], share).convertSRGBToLinear();
   }
   // A hotter motor is also larger, for people who see no colours.
-  const radius = (tempC) => 0.052 + 0.022 * Math.min(1, Math.max(0, (tempC - marks[0]) / (model.heat.error_c - marks[0])));
+  const { cool_m, hot_m } = model.motor;
+  const radius = (tempC) => cool_m + (hot_m - cool_m) * Math.min(1, Math.max(0, (tempC - marks[0]) / (model.heat.error_c - marks[0])));
 
   const radii = new Float32Array(arms * turning).fill(radius(marks[0]));
   const work = new THREE.Matrix4(), turn = new THREE.Matrix4();
