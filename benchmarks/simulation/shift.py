@@ -1,8 +1,9 @@
 """One simulated life of a fleet: jobs and faults by one seed, rules after every event, and all settled at the end.
 
 Rules besides those of `simulated_fleet`: after the faults every job is finished, given up for the reasons that the
-product names, or unfinished because an arm stopped in its last cycle; every wait ends; arms that are idle at home take
-no space; requests of people have their effect (`steering`); the recording has every result once (`recording`).
+product names, or unfinished because an arm stopped in its last cycle; every wait ends, and has a reason that is told;
+arms that are idle at home take no space; requests of people have their effect (`steering`); the recording has every
+result once (`recording`).
 """
 
 from collections.abc import Mapping
@@ -116,6 +117,23 @@ class Shift(Fleet):
         self.jobs.append(spec)
         self.work_s += (20.0 + spec.repetitions * (spec.dwell_s + 10.0)) / self.speed
         self.submit(spec)
+        self._check_reasons()
+
+    def _check_reasons(self) -> None:
+        """Check that every waiting job has a reason.
+
+        Raises:
+            Violation: one has none.
+        """
+        if self.alone:
+            nodes = [node for name in self.arms if (node := self.node(name)) is not None]
+            known = [status for node in nodes for status in node.work_source.statuses()]
+        else:
+            node = self.node(AUCTIONEER)
+            known = [] if node is None else node.auctioneer.status()
+        for status in known:
+            if status.state == "waiting" and not status.reason:
+                raise Violation(f"'{status.job}' waits, and nothing says why.")
 
     def _fault(self) -> None:
         fault = self.rng.choice(self.possible)

@@ -19,6 +19,8 @@ from scenarios.show.watch import arm_table, format_time, jobs_line, space_line
 from scenarios.terminal import echo, out_console, say
 
 PROBE_EVERY_S, REPLY_S = 0.3, 1.0
+BETWEEN = 5
+"""Snapshots between the first and the last of two in which a job waits in vain."""
 _COLORS = {"fault": "red", "warning": "yellow"}
 
 
@@ -83,9 +85,11 @@ def examine(
     with BusClient(endpoint, fleet) as link:
         listener = FleetListener(link)
         end_s = time.monotonic() + seconds
+        snapshots: list[FleetSnapshot] = []
         while time.monotonic() < end_s:
             probe_clock(link)
             listener.serve(min(end_s, time.monotonic() + PROBE_EVERY_S))
+            snapshots.append(listener.view.snapshot(time.monotonic()))
         now_s = time.monotonic()
         snapshot = listener.view.snapshot(now_s)
         problems = {"malformed": link.malformed, "complaints": tuple(link.rejections), "overrun": link.overrun}
@@ -99,6 +103,7 @@ def examine(
         secure=secure,
         expected=expected,
         other_versions=others,
+        earlier=snapshots[-BETWEEN] if len(snapshots) >= BETWEEN else None,
         **problems,
     )
     return snapshot, report

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Clock, ClockRequest
+from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus
 from fleet.bus.protocol.messages import State
 from fleet.bus.router import Router
 from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
@@ -50,6 +50,37 @@ def test_an_absent_arm_that_keeps_its_space_is_a_warning():
 def faults(now, *probes, **more):
     found = check_health(now, 101.505, probes or [ASKED], **more)
     return [finding.what for finding in found.findings if finding.level == "fault"], found
+
+
+WAY = "It waits until gone one is out of the way."
+
+
+@pytest.mark.parametrize(
+    ("reason", "level", "counts", "before", "says"),
+    [
+        (WAY, "fault", {}, 2, f"2 jobs wait though no arm works and a is idle. {WAY}"),
+        ("The policy lets it wait: a could begin it.", "warning", {}, 2, "2 jobs wait though no arm works"),
+        (WAY, "fault", {"awarded": 1}, 2, None),
+        (WAY, "fault", {}, 0, None),  # they have just come
+        ("It is released at 90 s of fleet time.", "fault", {}, 2, None),
+        ("a has a break.", "fault", {}, 2, None),
+    ],
+)  # fmt: skip
+def test_jobs_that_wait_in_vain_are_a_fault(reason, level, counts, before, says):
+    jobs = tuple(JobStatus(name, "waiting", reason=reason) for name in ("j", "k"))
+    now = msgspec.structs.replace(fleet(arm(), counts={"waiting": 2, **counts}), jobs=jobs)
+    found = check_health(now, 101.505, [ASKED], earlier=msgspec.structs.replace(now, jobs=jobs[:before])).findings
+    assert [(finding.level, finding.what[: len(says or "")]) for finding in found] == ([(level, says)] if says else [])
+
+
+def test_space_of_an_arm_that_has_gone_is_a_fault_if_jobs_wait_for_it():
+    jobs = (JobStatus("j", "waiting", reason=WAY),)
+    gone = arm(arm="gone one", token=False, present=False, state_age_s=5.2)
+    now = msgspec.structs.replace(fleet(arm(), gone, counts={"waiting": 1}), jobs=jobs, space={"gone one": ("s",)})
+    output, _ = faults(now, earlier=now)
+    assert any("not present for 5 s; 1 job(s) wait for it" in each for each in output)
+    assert any(each.endswith("thermofleet arm clear 'gone one'") for each in output)
+    assert sum(WAY in each for each in output) == 1
 
 
 def test_a_healthy_fleet_has_no_findings():

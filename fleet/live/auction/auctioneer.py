@@ -423,19 +423,20 @@ class Auctioneer:
 
     def status(self, names: Iterable[str] = ()) -> tuple[JobStatus, ...]:
         """Return the status of jobs, with the last reported progress."""
-        return tuple(map(self._with_progress, self.ledger.status(names)))
+        busy = self.ledger.busy_stations()
+        return tuple(self._with_progress(status, busy) for status in self.ledger.status(names))
 
     # Leases
 
-    def _with_progress(self, status: JobStatus) -> JobStatus:
+    def _with_progress(self, status: JobStatus, busy: Container[str]) -> JobStatus:
         lease = self._writer.leases.get(status.award)
         cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
         waits = status.state == "waiting"
-        note = self.rounds.note(status.job) if waits else ""
+        note = self.rounds.reason_to_wait(self.ledger.jobs[status.job].spec, busy) if waits else ""
         planned = not waits or self.rounds.is_planned(status.job)
         state = self.rounds.states.get(status.arm) if status.state in ("awarded", "finishing") else None
         finish_s = state.time_s + state.busy_s if state is not None and state.job == status.job else None
-        reason = status.reason or note
+        reason = " ".join(filter(None, (status.reason, note)))
         return replace(status, cycles=cycles, reason=reason, finish_s=finish_s, not_planned=not planned)
 
     def _is_open(self, entry: LeaseEntry, arm: str) -> bool:

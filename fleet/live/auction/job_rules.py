@@ -204,6 +204,19 @@ def ready_jobs(
     return ready
 
 
+def why_not_ready(job: JobSpec, time_s: float, finished: Callable[[str], bool], busy: Container[str]) -> str:
+    """Return why a waiting job cannot be begun by any arm now; "" if it can. Arguments as of `ready_jobs`."""
+    if job.release_s > time_s:
+        return f"It is released at {job.release_s:.0f} s of fleet time."
+    for before in job.after:
+        if not finished(before):
+            return f"It waits for '{before}'."
+    for place in job.stations:
+        if place in busy:
+            return f"Its place '{place}' is in use."
+    return ""
+
+
 def with_terms(status: JobStatus, job: JobSpec | None) -> JobStatus:
     """Return a status with what the job itself says, if that is known."""
     if job is None:

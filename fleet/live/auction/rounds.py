@@ -12,7 +12,7 @@ Rounds of an auction: which jobs are offered when, to whom, and what is awarded.
 import logging
 import math
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -36,7 +36,7 @@ from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ALL_ARMS, ClearRequest, Operation
 from fleet.errors import JournalFull, Refused
-from fleet.live.auction.job_rules import is_same_work
+from fleet.live.auction.job_rules import is_same_work, why_not_ready
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted, JobChange, Operated
 from fleet.live.clock import CLOCK_DRIFT
@@ -236,18 +236,36 @@ def no_arm_can(reasons: Mapping[str, str]) -> str:
     return f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in sorted(reasons.items()))}."[:MAX_REASON]
 
 
-def infeasible_jobs(quotes: Mapping[str, Quote]) -> dict[str, str]:
-    """Return the jobs that every arm with a quote calls infeasible, with the reasons of the arms."""
-    reasons: dict[str, dict[str, str]] = {}
-    for arm, quote in sorted(quotes.items()):
-        for offer in quote.estimates:
-            if not offer.feasible:
-                reasons.setdefault(offer.job, {})[arm] = offer.reason or "infeasible"
-    return {
-        job: no_arm_can(by_arm)
-        for job, by_arm in reasons.items()
-        if len(by_arm) == len(quotes) and NOT_PLANNED not in by_arm.values()
-    }
+def reason_to_wait(bidding: Bidding, job: str) -> str:
+    """Return why no arm begins a job whose stations are free, by the quotes of a round that has just closed."""
+    quotes = {**bidding.quotes, **bidding.full}
+    estimates = {arm: each for arm, quote in sorted(quotes.items()) for each in quote.estimates if each.job == job}
+    if not estimates:
+        return "No arm has answered whether it can do it."
+    able = {arm: each.plans for arm, each in estimates.items() if each.feasible}
+    if any(bidding.plans(arm, job) for arm in able):
+        free = ", ".join(arm for arm in able if bidding.plans(arm, job))
+        return f"The policy lets it wait: {free} could begin it."[:MAX_REASON]
+    refusals = {arm: each.reason or "infeasible" for arm, each in estimates.items() if not each.feasible}
+    if NOT_PLANNED in refusals.values():
+        return "Arms are planning its motion."
+    if not able:
+        return no_arm_can(refusals)
+    plans = [(arm, plan) for arm in able.keys() & bidding.quotes for plan in able[arm]]
+    in_way = {other for arm, plan in plans for other in bidding.in_the_way(arm, plan.space)}
+    reasons = [f"It waits until {', '.join(sorted(in_way))} is out of the way."] if in_way else []
+    taken = [f"{arm} {_why_without_capacity(bidding, arm)}" for arm in able if arm in bidding.full]
+    reasons += [f"{', '.join(taken)}."] if taken else []
+    return " ".join(reasons)[:MAX_REASON]
+
+
+def _why_without_capacity(bidding: Bidding, arm: str) -> str:
+    quote, state = bidding.full[arm], bidding.states.get(arm)
+    if quote.mode == "faulted":
+        return "is faulted"
+    if state is not None and state.break_in_s == 0.0:
+        return "has a break"
+    return "is above its warning limit" if quote.headroom_k <= 0.0 else "has a job"
 
 
 def planned_jobs(quotes: Mapping[str, Quote]) -> set[str]:
@@ -432,24 +450,6 @@ def _stated_space(quote: Quote) -> frozenset[str]:
     return frozenset(quote.space)
 
 
-def waits_for_space(bidding: Bidding) -> dict[str, str]:
-    """Return why no plan for a job has free space, by job."""
-    waits: dict[str, set[str]] = {}
-    open_jobs: set[str] = set()
-    for arm, quote in {**bidding.quotes, **bidding.full}.items():
-        for offer in quote.estimates:
-            for plan in offer.plans:
-                in_way = bidding.in_the_way(arm, plan.space)
-                waits.setdefault(offer.job, set()).update(in_way)
-                if not in_way:
-                    open_jobs.add(offer.job)
-    return {
-        job: f"It waits until {', '.join(sorted(arms))} is out of the way."[:MAX_REASON]
-        for job, arms in waits.items()
-        if arms and job not in open_jobs
-    }
-
-
 def stated_spaces(ledger: Ledger, closing: Round, time_s: float) -> list[SpaceTaken]:
     """Return what the quotes of a round change in the space that arms take.
 
@@ -511,6 +511,7 @@ def cleared_space(
 
 SCAN_S = 0.05
 """Real seconds between two checks for jobs that have become ready."""
+NOT_OFFERED = "It has not been offered yet: at most {} jobs are at a time, the oldest first."
 
 
 class Rounds:
@@ -538,7 +539,8 @@ class Rounds:
         self._later_s: dict[str, float] = {}
         """Real second from which a job may be offered again."""
         self._notes: dict[str, str] = {}
-        """Why no arm can do a job."""
+        """Why no arm began a job that was offered, by job."""
+        self._time_s = -math.inf
         self._planned: set[str] = set()
         """Waiting jobs for which arms have plans, or have said that there is none."""
         self._scan_s = self._space_s = -math.inf
@@ -547,6 +549,7 @@ class Rounds:
 
     def step(self, real_s: float, time_s: float) -> None:
         """Open or close a round if that is due."""
+        self._time_s = time_s
         if self.open is None:
             if real_s >= self._scan_s:
                 self._scan_s = real_s + SCAN_S
@@ -558,11 +561,21 @@ class Rounds:
         """Open the next round with the next step."""
         self._scan_s = -math.inf
 
-    def note(self, job: str) -> str:
-        """Return why no arm begins a job; "" if an arm may."""
-        if (pauser := self._writer.ledger.paused.get(ALL_ARMS)) is not None:
+    def reason_to_wait(self, job: JobSpec, busy: Container[str]) -> str:
+        """Return why no arm begins a waiting job.
+
+        Args:
+            busy: Stations at which an arm may be at work.
+        """
+        ledger = self._writer.ledger
+        if (pauser := ledger.paused.get(ALL_ARMS)) is not None:
             return f"All arms are paused by '{pauser}'."
-        return self._notes.get(job, "")
+        if not self.present:
+            return "No arm is present."
+        if all(map(ledger.is_paused, self.present)):
+            return "All present arms are paused."
+        reason = why_not_ready(job, self._time_s, ledger.is_finished, busy)
+        return reason or self._notes.get(job.name, NOT_OFFERED.format(self._timing.max_jobs))
 
     def is_planned(self, job: str) -> bool:
         """Return whether an arm has a plan for a waiting job, or all have said that there is none."""
@@ -654,10 +667,8 @@ class Rounds:
             taken=self._writer.ledger.taken_space(),
             excludes=self._excludes,
         )
-        for job in closing.jobs if quotes else ():
-            self._notes.pop(job.name, None)
         self._planned |= planned_jobs(quotes)
-        self._notes |= infeasible_jobs(quotes) | waits_for_space(bidding)
+        self._notes |= {job.name: reason_to_wait(bidding, job.name) for job in jobs}
         allocation = drop_invalid(bidding, self.allocate(bidding)) if bidding.quotes and jobs else {}
         try:
             self._award(bidding, allocation, real_s, time_s)

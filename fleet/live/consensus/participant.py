@@ -34,10 +34,27 @@ from fleet.bus.protocol.operator import ALL_ARMS, Controlled, ControlRequest, Op
 from fleet.errors import JournalFull
 from fleet.live.arm.node import ArmNode
 from fleet.live.auction.auctioneer import ALREADY_DONE, job_of, next_step, objection, was_carried_out
-from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs, with_terms
+from fleet.live.auction.job_rules import (
+    EXPIRED,
+    SHIFT_ENDED,
+    is_late,
+    job_order,
+    lost_jobs,
+    ready_jobs,
+    why_not_ready,
+    with_terms,
+)
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.ledger import MAX_SETTLED
-from fleet.live.auction.rounds import Bidding, Choice, Timing, no_arm_can, resolve_claims
+from fleet.live.auction.rounds import (
+    NOT_OFFERED,
+    Bidding,
+    Choice,
+    Timing,
+    no_arm_can,
+    reason_to_wait,
+    resolve_claims,
+)
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
 from fleet.live.consensus.jobs import MAX_AWARDS, MAX_NOTES, Register
 from fleet.live.monitor.snapshot import FRESH_S
@@ -207,15 +224,27 @@ class KnownJobs:
         states: Mapping[str, State],
         real_s: float,
         time_s: float,
-        present: Set[str] = frozenset(),
+        present: Set[str],
+        why: Callable[[str], str],
     ) -> list[JobStatus]:
-        """Return the status of all known jobs, and of `later` ones that are not offered yet."""
+        """Return the status of all known jobs, and of `later` ones that are not offered yet.
+
+        Args:
+            why: Why no arm begins a job that is ready and that an arm can do.
+        """
         jobs = self.current | {job.name: job for job in later}
         lost = self._lost(jobs, real_s, time_s)
         names = dict.fromkeys([*jobs, *self._register.settled])
         found = [self._status(name, jobs.get(name), lost, states, real_s) for name in names]
+        busy = self._granter.busy_stations(real_s)
+
+        def reasons(status: JobStatus) -> str:
+            not_ready = why_not_ready(jobs[status.job], time_s, self._register.is_finished, busy)
+            note = self._refusal(status.job, present) or not_ready or why(status.job)
+            return " ".join(filter(None, (status.reason, note)))
+
         return [
-            replace(each, reason=each.reason or self._refusal(each.job, present)) if each.state == "waiting" else each
+            replace(each, reason=reasons(each)) if each.state == "waiting" and each.job in jobs else each
             for each in found
         ]
 
@@ -483,7 +512,19 @@ class Participant:
 
     def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
         """Return the status of all known jobs, and of `later` ones that are not offered yet."""
-        return self.known.status(later, self.states, real_s, self._time_s, self._present)
+        bids = self._fresh_bids(real_s)
+        offered = {offer.job for bid in bids.values() for offer in bid.estimates}
+        bidding = self._bidding(bids, offered, real_s) if bids else None
+        fewer = len(self._present | {self.name}) < self.claimant.majority
+
+        def why(job: str) -> str:
+            if fewer:
+                return f"A majority of the arms, {self.claimant.majority}, must be present."
+            if bidding is None or job not in offered:
+                return NOT_OFFERED.format(self._slots)
+            return reason_to_wait(bidding, job)
+
+        return self.known.status(later, self.states, real_s, self._time_s, self._present, why)
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""

@@ -1,7 +1,9 @@
 """Health of a fleet: findings from a snapshot, clock replies and malformed messages."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from shlex import quote
 from statistics import median
 from typing import Literal
 
@@ -10,6 +12,10 @@ import msgspec
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
 
+EXPECTED = ("It is released at", "It waits for", "are paused", "has not been offered", "has a break")
+"""Parts of the reasons of jobs that wait in order."""
+BY_POLICY = "The policy lets it wait"
+MOST_REASONS = 5
 OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
@@ -64,6 +70,7 @@ def check_health(
     secure: bool = False,
     expected: Sequence[str] = (),
     other_versions: Sequence[str] = (),
+    earlier: FleetSnapshot | None = None,
 ) -> HealthReport:
     """Check a fleet that was listened to for a while.
 
@@ -75,6 +82,7 @@ def check_health(
         secure: Whether the listener used a certificate; one that the router does not know receives nothing.
         expected: Arms that should be present: one that left earlier leaves no trace.
         other_versions: A sentence on each participant that uses another version of the bus.
+        earlier: Snapshot of a second before or more; None: whether jobs wait in vain is not checked.
     """
     trips_s = [probe.answered_s - probe.asked_s for probe in probes]
     clock = best_clock(probes)
@@ -104,15 +112,7 @@ def check_health(
     if given_up := fleet.counts.get("given_up", 0):
         findings.append(Finding("warning", f"{given_up} job(s) are abandoned; their status names the reason."))
     findings += [Finding("fault", sentence) for sentence in other_versions]
-    present = {arm.arm for arm in fleet.arms if arm.present}
-    findings += [
-        Finding(
-            "warning",
-            f"The space of {arm} stays closed to other arms, as {arm} is not present. If you have seen that it is at "
-            f"home or removed, and is switched off: thermofleet arm clear {arm}",
-        )
-        for arm in sorted(fleet.space.keys() - present)
-    ]
+    findings += [*check_progress(fleet, earlier), *check_space(fleet)]
     return HealthReport(
         fleet=fleet.fleet,
         round_trip_s=median(trips_s) if trips_s else None,
@@ -121,6 +121,48 @@ def check_health(
         malformed=malformed,
         findings=tuple(findings),
     )
+
+
+def check_progress(fleet: FleetSnapshot, earlier: FleetSnapshot | None) -> list[Finding]:
+    """Check that no job waits while arms are idle and none works, by the reasons that the fleet gives."""
+    if earlier is None or _at_work(fleet) or _at_work(earlier):
+        return []
+    before = {status.job for status in earlier.jobs if status.state == "waiting"}
+    waiting = [status for status in fleet.jobs if status.state == "waiting" and status.job in before]
+    reasons = Counter(status.reason for status in waiting if not any(known in status.reason for known in EXPECTED))
+    idle = [arm.arm for arm in fleet.arms if arm.present and arm.mode == "idle" and not arm.job]
+    return [
+        Finding(
+            "warning" if reason.startswith(BY_POLICY) else "fault",
+            f"{f'{count} jobs wait' if count > 1 else '1 job waits'} though no arm works and "
+            f"{f'{len(idle)} arms are' if idle[1:] else f'{idle[0]} is'} idle. {reason}",
+        )
+        for reason, count in reasons.most_common(MOST_REASONS if idle else 0)
+    ]
+
+
+def _at_work(fleet: FleetSnapshot) -> int:
+    """Number of jobs that arms have."""
+    return fleet.counts.get("awarded", 0) + fleet.counts.get("finishing", 0)
+
+
+def check_space(fleet: FleetSnapshot) -> list[Finding]:
+    """Check that no arm that is not present keeps space closed; a fault if jobs wait for it."""
+    present = {arm.arm for arm in fleet.arms if arm.present}
+    silent_s = {arm.arm: arm.state_age_s for arm in fleet.arms if arm.state_age_s is not None}
+    findings: list[Finding] = []
+    for arm in sorted(fleet.space.keys() - present):
+        waits = sum(status.state == "waiting" and f"until {arm}" in status.reason for status in fleet.jobs)
+        since = f" for {silent_s[arm]:.0f} s" if arm in silent_s else ""
+        findings.append(
+            Finding(
+                "fault" if waits else "warning",
+                f"The space of {arm} stays closed to other arms, as {arm} is not present{since}"
+                f"{f'; {waits} job(s) wait for it' if waits else ''}. If you have seen that it is at home or removed, "
+                f"and is switched off: thermofleet arm clear {quote(arm)}",
+            )
+        )
+    return findings
 
 
 def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted: bool = True) -> list[Finding]:

@@ -1,0 +1,75 @@
+"""Why a job waits: one sentence for each cause, and always the true one."""
+
+from typing import Any
+
+import pytest
+
+from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote, Quote
+from fleet.bus.protocol.messages import State
+from fleet.live.auction.job_rules import why_not_ready
+from fleet.live.auction.rounds import Bidding, reason_to_wait
+
+JOB = JobSpec(name="j", kind="hold", places=("bench",))
+NEAR = PlanQuote(plan=0, space="near", duration_s=10.0)
+
+
+def quote(arm: str, *, plans: tuple[PlanQuote, ...] = (NEAR,), reason: str = "", **more: Any) -> Quote:
+    estimate = JobEstimate("j", plans, reason)
+    fields = {"mode": "idle", "headroom_k": 9.0, "capacity": 1, "space": ()} | more
+    return Quote(arm, "r", "q", 3.0, "t", 0.0, estimates=(estimate,), **fields)
+
+
+def state(arm: str, **more: Any) -> State:
+    return State(arm, 1, 0.0, "idle", (30.0,) * 7, 30.0, **more)
+
+
+def bidding(*quotes: Quote, **more: Any) -> Bidding:
+    return Bidding(
+        "r", 0.0, (JOB,), {each.arm: each for each in quotes if each.capacity},
+        {each.arm: each for each in quotes if not each.capacity},
+        excludes=lambda arm, space, other, other_space: "far" not in (space, other_space), **more,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (bidding(quote("a"), quote("b", capacity=0)), "The policy lets it wait: a could begin it."),
+        (
+            bidding(quote("a"), quote("b", plans=(), reason="too far"), taken={"c": frozenset(["near"])}),
+            "It waits until c is out of the way.",
+        ),
+        (
+            bidding(quote("a"), quote("b", capacity=0), taken={"b": frozenset(["near"])}),
+            "It waits until b is out of the way. b has a job.",
+        ),
+        (
+            bidding(
+                quote("a", capacity=0, mode="faulted"), quote("b", capacity=0, headroom_k=-0.5),
+                quote("c", capacity=0), quote("d", plans=(), reason="too far"),
+                states={"c": state("c", break_in_s=0.0)},
+            ),
+            "a is faulted, b is above its warning limit, c has a break.",
+        ),
+        (bidding(quote("a", plans=(), reason="too far")), "No arm can do it: a: too far."),
+        (
+            bidding(quote("a", plans=(), reason=NOT_PLANNED), quote("b", plans=(), reason="too far")),
+            "Arms are planning its motion.",
+        ),
+        (bidding(), "No arm has answered whether it can do it."),
+    ],
+)  # fmt: skip
+def test_the_reason_names_what_is_in_the_way(given, expected) -> None:
+    assert reason_to_wait(given, "j") == expected
+
+
+def test_a_job_that_cannot_be_begun_yet_says_why() -> None:
+    job = JobSpec(name="j", kind="pick_place", places=("u", "v"), release_s=90.0, after=("one", "two"))
+
+    def why(time_s: float, finished: set[str], busy: set[str]) -> str:
+        return why_not_ready(job, time_s, finished.__contains__, busy)
+
+    assert why(89.0, set(), {"u"}) == "It is released at 90 s of fleet time."
+    assert why(90.0, {"one"}, {"u"}) == "It waits for 'two'."
+    assert why(90.0, {"one", "two"}, {"v"}) == "Its place 'v' is in use."
+    assert why(90.0, {"one", "two"}, set()) == ""
