@@ -1,15 +1,19 @@
 """Commands that steer a live fleet: `thermofleet job` and `thermofleet arm pause | reset | clear`."""
 
-from typing import Literal
+from contextlib import suppress
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, Refused, nearest
 from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
 from scenarios.table import Table
 from scenarios.terminal import out_console, print_json
+
+if TYPE_CHECKING:  # the bus, which other commands do not load
+    from fleet.bus.protocol.auction import JobStatus
 
 _RANGES = {name: {"low": bounds.low, "high": bounds.high} for name, bounds in BOUNDS.items()}
 _ONE = "One job instead of a file"
@@ -80,26 +84,52 @@ def submit_command(
         raise typer.Exit(1)
 
 
-def list_command(endpoint: str = options.ENDPOINT, fleet: str = options.FLEET, as_json: bool = options.JSON) -> None:
-    """List the jobs of a fleet by name, with state, arm, cycles and reason."""
+def list_command(
+    names: list[str] | None = argument("Names of jobs; by default all.", None),
+    endpoint: str = options.ENDPOINT,
+    fleet: str = options.FLEET,
+    as_json: bool = options.JSON,
+) -> None:
+    """List jobs of a fleet by name: state, arm, cycles, age, end and reason.
+
+    The age counts from the release. The end is the predicted one of a job that
+    an arm has, and the true one of a finished job.
+    """
     import time
 
-    from fleet.bus.client import BusClient
+    from fleet.bus.client import BusClient, NoReply
+    from fleet.bus.protocol import keys
+    from fleet.bus.protocol.auction import SETTLED, Status, StatusRequest
     from fleet.live.monitor.snapshot import FleetListener
     from scenarios.cli.options import the_fleet
+    from scenarios.show.words import clock, duration
 
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         listener = FleetListener(link)
         listener.serve(time.monotonic() + LISTEN_S)
-        jobs = sorted(listener.view.snapshot(time.monotonic()).jobs, key=lambda status: status.job)
+        snapshot = listener.view.snapshot(time.monotonic())
+        known = {job.job: job for job in snapshot.jobs if not names or job.job in names}
+        with suppress(NoReply, Refused):  # results tell neither predicted ends nor why jobs wait
+            now = link.ask(keys.of_jobs(link.fleet, "status"), StatusRequest(), Status, timeout_s=LISTEN_S)
+            known |= {job.job: job for job in now.jobs if job.job in known}
+    jobs = sorted(known.values(), key=lambda status: status.job)
+    if unknown := sorted({*(names or ())} - {job.job for job in jobs}):
+        near = nearest(unknown[0], [job.job for job in snapshot.jobs])
+        raise FleetError(f"The fleet knows no job '{unknown[0]}'{near}")
     if as_json:
         print_json(jobs)
         return
-    rows = tuple(
-        (each.job, each.state.replace("_", " "), each.arm, f"{each.cycles} of {each.repetitions}", each.reason)
-        for each in jobs
-    )
-    out_console.print(Table(head=("job", "state", "arm", "cycles", "reason"), rows=rows, numbers=False))
+    now_s = max((arm.time_s or 0.0 for arm in snapshot.arms), default=0.0)
+
+    def row(job: "JobStatus") -> tuple[str, ...]:
+        end_s = job.finish_s if job.finished_s is None else job.finished_s
+        is_open = job.release_s is not None and job.state not in SETTLED and now_s > job.release_s
+        age = duration(now_s - (job.release_s or 0.0)) if is_open else ""
+        cycles, end = f"{job.cycles} of {job.repetitions}", "" if end_s is None else clock(end_s)
+        return job.job, job.state.replace("_", " "), job.arm, cycles, age, end, job.reason
+
+    head = ("job", "state", "arm", "cycles", "age", "end", "reason")
+    out_console.print(Table(head=head, rows=tuple(map(row, jobs)), numbers=False))
 
 
 def cancel_command(

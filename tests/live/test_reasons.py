@@ -57,6 +57,7 @@ def bidding(*quotes: Quote, **more: Any) -> Bidding:
             "Arms are planning its motion.",
         ),
         (bidding(), "No arm has answered whether it can do it."),
+        (bidding(quote("a"), busy=frozenset(["bench"])), "Its place was in use when it was last offered."),
     ],
 )  # fmt: skip
 def test_the_reason_names_what_is_in_the_way(given, expected) -> None:

@@ -340,6 +340,8 @@ class JobStatus(msgspec.Struct, frozen=True):
     """Due date; null for none. A `Change` changes it."""
     value: Number | None = None
     """As in `JobSpec`; null for unknown. A `Change` changes it."""
+    release_s: Number | None = None
+    """As in `JobSpec`; null for unknown."""
     not_planned: bool = False
     """It waits, and no arm has a plan for it yet: it is unknown whether one can do it. Only
     `jobs/status` has it: it is false in a `Result`."""

@@ -221,7 +221,7 @@ def with_terms(status: JobStatus, job: JobSpec | None) -> JobStatus:
     """Return a status with what the job itself says, if that is known."""
     if job is None:
         return status
-    return replace(status, repetitions=job.repetitions, due_s=job.due_s, value=job.value)
+    return replace(status, repetitions=job.repetitions, due_s=job.due_s, value=job.value, release_s=job.release_s)
 
 
 def status_reply(

@@ -237,7 +237,9 @@ def no_arm_can(reasons: Mapping[str, str]) -> str:
 
 
 def reason_to_wait(bidding: Bidding, job: str) -> str:
-    """Return why no arm begins a job whose stations are free, by the quotes of a round that has just closed."""
+    """Return why no arm begins a job, by the quotes of a round that has just closed."""
+    if any(each.name == job and not bidding.has_free_stations(each) for each in bidding.jobs):
+        return "Its place was in use when it was last offered."
     quotes = {**bidding.quotes, **bidding.full}
     estimates = {arm: each for arm, quote in sorted(quotes.items()) for each in quote.estimates if each.job == job}
     if not estimates:
