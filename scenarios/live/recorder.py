@@ -175,9 +175,12 @@ class Recorder:
             kind, row = to_row(record)
             rows[kind].append(row)
         for kind in KINDS:
+            part = part_file(self.folder, kind, self.parts + 1)
             if rows[kind]:
-                with self._draft(part_file(self.folder, kind, self.parts + 1)) as draft:
+                with self._draft(part) as draft:
                     pq.write_table(to_table(kind, rows[kind]), draft, write_page_checksum=True)
+            else:  # of an attempt that a crash ended before it wrote the card
+                part.unlink(missing_ok=True)
         card = RecordingCard(
             format=RECORDING_FORMAT,
             status=status,

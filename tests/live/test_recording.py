@@ -168,6 +168,21 @@ def test_a_recording_is_readable_meanwhile_and_can_be_continued(tmp_path):
     assert read_card(tmp_path).status == "recording"
 
 
+def test_a_part_that_a_crash_left_without_its_card_is_not_read_later(tmp_path):
+    """The next part of the same number has no operations; the message then comes again."""
+    before = Recorder.open(tmp_path, "f")
+    before.add("boss", operation(0))
+    card = (tmp_path / CARD).read_bytes()
+    before.write()
+    (tmp_path / CARD).write_bytes(card)  # as if it had crashed before it wrote this one
+    again = Recorder.open(tmp_path, "f")
+    again.add("a", state("a", 1))
+    again.write()
+    again.add("boss", operation(0))
+    again.write()
+    assert len(read_parts(tmp_path, "operations").to_pylist()) == 1
+
+
 def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     recorder = Recorder.open(tmp_path, "f")
     recorder.add("a", state("a", 0))
