@@ -26,7 +26,7 @@ from fleet.heat.thermal import (
 from fleet.motion import RATE_HZ, Drive, drive, drives
 from fleet.robot import JOINTS
 from scenarios.prepare.oracle import peaks
-from twin.logs.recording import READINGS, Recording, heat_logs
+from twin.logs.recording import READINGS, Recording, heat_logs, without_repeats
 from twin.thermal.checkpoint import CARD, load, load_curve, save, save_curve
 from twin.thermal.identify import (
     PRIOR_SD,
@@ -457,6 +457,23 @@ def test_white_noise_has_no_memory_and_a_random_walk_has(rng):
     np.testing.assert_allclose(found.steps[:2], 1.0, atol=0.3)
     assert (found.steps[2:] > 50).all()
     np.testing.assert_allclose(found.sd_k[:2], 0.1, rtol=0.05)
+
+
+def test_rows_that_a_late_logger_repeats_are_no_readings(rng):
+    """The heat of each third row, repeated twice, is that of these rows alone; no gap arises, and no rest is cut."""
+    recording, _ = logged(nominal_heat_model(), rng, 5.0)
+
+    def repeated(rows):
+        readings = {name: getattr(recording, name)[rows] for name in READINGS}
+        return replace(recording, **readings)
+
+    late, stale = repeated(np.arange(301) // 3 * 3), repeated(np.minimum(np.arange(301), 200))
+    fresh = heat_logs(recording.part(slice(None, None, 3)), gen3_motors(), "current")[0]
+    got = heat_logs(late, gen3_motors(), "current")[0]
+    np.testing.assert_allclose(got.current_terms, fresh.current_terms)
+    np.testing.assert_allclose(got.temp_c, fresh.temp_c)
+    assert len(without_repeats(stale).time_s) == 301
+    assert len(without_repeats(replace(late, temp_c=None)).time_s) == 301
 
 
 def test_logs_split_at_gaps_and_keep_the_mean_heat(rng):

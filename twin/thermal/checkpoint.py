@@ -38,6 +38,8 @@ class NetworkCard(msgspec.Struct, forbid_unknown_fields=True):
     motors: dict[str, float | list[float]]
     capacity_j_per_k: dict[str, float]
     conductance_w_per_k: list[tuple[str, str, float]]
+    information: bytes | None = None
+    """Of `Identified`, float32 in little-endian order; None in files of earlier versions."""
     saturation: None = None
     """Kept because stored files name it; P(saturation) is in `saturation_curve.json`."""
 
@@ -54,6 +56,7 @@ def save(identified: Identified, folder: Path) -> None:
         motors={name: np.asarray(value).tolist() for name, value in vars(identified.heat_model.motors).items()},
         capacity_j_per_k={name: node["capacity_j_per_k"] for name, node in network.nodes.items() if node},
         conductance_w_per_k=list(network.edges(data="conductance_w_per_k")),
+        information=None if identified.information is None else identified.information.astype("<f4").tobytes(),
         **{name: getattr(identified, name) for name in _SHARED},
     )
     write_card(card, folder / CARD)
@@ -83,7 +86,12 @@ def load(folder: Path) -> Identified:
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: {error}") from error
     shared = {name: getattr(card, name) for name in _SHARED}
-    identified = Identified(heat_model=HeatModel(motors, graph), **shared)
+    information = None if card.information is None else np.frombuffer(card.information, "<f4")
+    if information is not None:
+        if information.size != len(card.parameters) ** 2 or not np.isfinite(information).all():
+            raise CheckpointError(f"{path}: information must have {len(card.parameters)}² finite numbers.")
+        information = information.reshape(len(card.parameters), -1)
+    identified = Identified(heat_model=HeatModel(motors, graph), information=information, **shared)
     check_version(path, card.version, identified.version)
     return identified
 
