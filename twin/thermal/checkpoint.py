@@ -63,13 +63,13 @@ def save(identified: Identified, folder: Path) -> None:
 
 
 def load(folder: Path) -> Identified:
-    """The identified arm that `save` wrote.
+    """The identified arm that `save` wrote; the folder, or the file in it.
 
     Raises:
         CheckpointError: the file is missing, damaged, of another format or for another number of joints, or its
             numbers are not those that were saved.
     """
-    path = folder / CARD
+    path = folder if folder.name == CARD else folder / CARD
     card = read_card(path, NetworkCard, format_=FORMAT, what="identified arm")
     widths = {name: len(value) for name, value in card.motors.items() if isinstance(value, list)}
     if wrong := {name: width for name, width in widths.items() if width != JOINTS}:
