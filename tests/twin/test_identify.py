@@ -529,6 +529,7 @@ def test_a_round_trip_keeps_every_number_and_a_change_is_noticed(rng, tmp_path):
         ('"format": 2', '"format": 9', "format 9 is not supported, only 2"),
         ('"winding_3":', '"winding_x":', "unknown nodes: winding_x"),
         ('"seconds":', '"secs":', "secs"),
+        ('"information": "', '"information": "AAAA', "buffer size must be a multiple"),
         (f'"arm": "{got.arm}"', '"arm": "right"', "has changed since it was saved"),
     ):
         assert old in text

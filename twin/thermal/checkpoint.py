@@ -80,17 +80,18 @@ def load(folder: Path) -> Identified:
         graph.add_node(name, capacity_j_per_k=value)
     graph.add_weighted_edges_from(card.conductance_w_per_k, weight="conductance_w_per_k")
     values = {name: np.array(value) if isinstance(value, list) else value for name, value in card.motors.items()}
+    information, free = None, len(card.parameters)
     try:
+        if card.information is not None:
+            information = np.frombuffer(card.information, "<f4").reshape(free, free)
+            np.linalg.cholesky(information.T.astype(float) @ information)  # raises LinAlgError if it is singular
+            if not np.isfinite(information).all():
+                raise ValueError("information must be finite.")
         thermal_model(graph)
         motors = cast("Callable[..., Motors]", Motors)(**values)  # names and values of a file, checked by Motors
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: {error}") from error
     shared = {name: getattr(card, name) for name in _SHARED}
-    information = None if card.information is None else np.frombuffer(card.information, "<f4")
-    if information is not None:
-        if information.size != len(card.parameters) ** 2 or not np.isfinite(information).all():
-            raise CheckpointError(f"{path}: information must have {len(card.parameters)}² finite numbers.")
-        information = information.reshape(len(card.parameters), -1)
     identified = Identified(heat_model=HeatModel(motors, graph), information=information, **shared)
     check_version(path, card.version, identified.version)
     return identified

@@ -181,7 +181,8 @@ def forecast(
     run_s = repetitions * cycle_s
     if run_s > MOST_S:
         raise FleetError(f"The run takes {run_s / 3600:.0f} h; at most {MOST_S / 3600:.0f} h can be forecast.")
-    problem = Problem([log], ambient_c, 0.0, vector, _noise(log, vector), OBSERVED)
+    problem = Problem([log], ambient_c, 0.0, vector, _noise(log, vector))
+    problem.relative_sd = OBSERVED
     likely, rng = solve(problem, vector.mean), np.random.default_rng(np.random.SeedSequence(seed))
     x = problem.samples(likely, SAMPLES, rng)
     start_c = np.stack([problem.temperatures(each, rng)[0][-1] for each in x])

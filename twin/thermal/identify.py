@@ -284,25 +284,17 @@ class Problem:
     """Weighted residuals and their Jacobian for `scipy.optimize.least_squares`."""
 
     def __init__(
-        self,
-        logs: Sequence[HeatLog],
-        ambient_c: float,
-        ambient_sd_k: float,
-        vector: ParameterVector,
-        noise: Noise,
-        relative_sd: float = 1.0,
+        self, logs: Sequence[HeatLog], ambient_c: float, ambient_sd_k: float, vector: ParameterVector, noise: Noise
     ) -> None:
         """
         Args:
             ambient_c: Ambient temperature, °C.
             ambient_sd_k: Its standard deviation from log to log; 0 if it was measured.
-            noise: Gives the weights of the residuals.
-            relative_sd: Observed over assumed standard deviation of a residual; gives the spread of samples (sandwich
-                estimate: Huber 1967).
         """
         self.logs, self.ambient_c, self.ambient_sd_k = tuple(logs), ambient_c, ambient_sd_k
         self.vector, self.noise = vector, noise
-        self._relative_sd = relative_sd
+        self.relative_sd = 1.0
+        """Observed over assumed standard deviation of a residual, for samples (sandwich estimate: Huber 1967)."""
         self.winding_c = [log.middle_c for log in logs]
         """For the resistance, [step, joint] per log."""
         self.housing_c = self.winding_c
@@ -328,11 +320,7 @@ class Problem:
         return np.concatenate([*parts, self.vector.information])
 
     def samples(self, likely: Array, count: int, rng: np.random.Generator) -> Array:
-        """Samples of the logarithms in pairs around the most probable ones, [sample, parameter].
-
-        Args:
-            count: Even number of samples.
-        """
+        """Samples of the logarithms, an even number, in pairs around the most probable ones, [sample, parameter]."""
         jacobian = self.jacobian(likely)
         scatter = np.concatenate([*(each.scatter for each in self._unknowns(likely)), np.ones(len(likely))])
         noise = scatter * rng.standard_normal((count // 2, len(scatter)))
@@ -395,7 +383,7 @@ class Problem:
         matrix = np.concatenate([(effect * self.noise.weight[:, None]).reshape(-1, unknowns), prior])
         wanted = np.concatenate([missing.reshape(-1), likely])
         basis, upper = np.linalg.qr(matrix)
-        scatter = np.append(np.full(log.temp_c.size, self._relative_sd), np.ones(len(prior)))
+        scatter = np.append(np.full(log.temp_c.size, self.relative_sd), np.ones(len(prior)))
         return _Unknowns(matrix, wanted, basis, upper, np.linalg.solve(upper, basis.T @ wanted), scatter)
 
 
