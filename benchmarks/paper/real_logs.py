@@ -387,15 +387,17 @@ def forecast_tables(rows: Sequence[Row]) -> dict[str, Table]:
         cells = (
             f"{q:.2f}" for each in (of_files[:, 1], of_files.max(axis=1)) for q in np.percentile(each, (50, 95, 100))
         )
-        low, high = (ends[name][part][:, i] if name in ends else None for i in (0, 2))
-        inside = "" if low is None or high is None else f"{((low <= 0) & (high >= 0)).mean():.1%}"
-        lines.append((f"{length} ({len(part)})", name, *cells, inside))
+        interval = ("", "")
+        if name in ends:
+            low, high = (ends[name][part][:, i] for i in (0, 2))
+            interval = (f"{((low <= 0) & (high >= 0)).mean():.1%}", f"{(high - low).mean():.2f}")
+        lines.append((f"{length} ({len(part)})", name, *cells, *interval))
     heads = (
         "files",
         "forecast",
         *(f"{what}, {q}" for what in ("joint 2", "worst joint") for q in ("median", "p95", "worst")),
     )
-    return {"forecast": table_of((*heads, "in the interval"), lines)}
+    return {"forecast": table_of((*heads, "in the interval", "its mean width"), lines)}
 
 
 LENGTHS = ("shortest third", "middle third", "longest third")

@@ -75,6 +75,7 @@ LOG = option("A log of a real arm, or a folder of logs: .csv, .csv.gz, .parquet.
 SKIP_DAMAGED = option("Skip damaged lines of a log.", False)
 TWINS = argument("A folder that `thermofleet twin train` wrote.")
 TWIN_ARM = option("Name of the arm, if the folder contains several twins.", None)
+NETWORK = option("A folder that `thermofleet twin identify` wrote. Default: a nominal Gen3.", None)
 SCENARIO_ARM = option("Arm of the scenario; default: the first.", None)
 LOG_ARM = option(
     "Name of the arm; in a log of several arms (telemetry.parquet), the one to choose.", None, is_name=True

@@ -100,9 +100,7 @@ def forecast_command(
         "scenario.",
         MISSING,
     ),
-    network: Path | None = option(
-        "A folder that `thermofleet twin identify` wrote. Default: a nominal Gen3, with the spread of real ones.", None
-    ),
+    network: Path | None = options.NETWORK,
     repeat: int = option("Number of repetitions.", 1, low=1, high=1_000_000),
     ambient: float | None = option(
         "Ambient temperature, °C; default: as in the identification, or 22.", None, low=-40, high=60
@@ -124,10 +122,9 @@ def forecast_command(
         check_file(out, (".html",), overwrite)
     from scenarios.prepare.planned_motion import motion_of
     from scenarios.show import forecast_page
-    from twin.thermal.checkpoint import CARD, load
     from twin.thermal.forecast import forecast
 
-    identified = None if network is None else load(network.parent if network.name == CARD else network)
+    identified = network_of(network)
     so_far = one_of(options.arm_recordings(log, arm, skip_damaged), log)
     path = Path(plan)
     if path.exists():
@@ -170,6 +167,7 @@ def generate_command(
     out: Path = option("Folder of the motions and generated.json.", Path("runs/generated")),
     arm: str | None = options.SCENARIO_ARM,
     twins: Path | None = KNOWN_TWINS,
+    network: Path | None = options.NETWORK,
     count: int = option("Number of motions.", 20, low=1, high=10_000),
     strength: float = option(
         "Perturbation in posterior standard deviations; 0 reconstructs.", 1.0, flag="--s", low=0, high=100
@@ -189,7 +187,8 @@ def generate_command(
     chosen = load(scenario)
     check_free(out, GENERATED, overwrite=overwrite)
     with progress_bar() as progress:
-        known = known_arm(chosen, arm, twin=twin_of(twins, arm or chosen.arms[0].name), progress=progress)
+        models = {"twin": twin_of(twins, arm or chosen.arms[0].name), "network": network_of(network)}
+        known = known_arm(chosen, arm, **models, progress=progress)
         how: Any = {"verification": known.verification, "fixtures": chosen.fixtures, "seed": seed}
         how |= {"s": strength, "count": count, "progress": partial(progress, "generating")}
         made = generate(known.twin, known.arm, known.sources, **how)
@@ -209,6 +208,7 @@ def recover_command(
     out: Path = option("Folder of the temperatures and recovery.json.", Path("runs/recovery")),
     arm: str | None = options.SCENARIO_ARM,
     twins: Path | None = KNOWN_TWINS,
+    network: Path | None = options.NETWORK,
     payload: float = option("Payload held, kg.", 2.0, low=0, high=100),
     posture: str = option(f"{', '.join(POSTURES)}, or seven angles in degrees.", "raised"),
     warm: float = option("Temperature of the hottest motor at the start, °C.", 50.0, low=-40, high=200),
@@ -234,7 +234,8 @@ def recover_command(
     check_free(out, recover.RECOVERY, overwrite=overwrite)
     recover.check_hold(model, q, payload, hold_s, recover.Nearby())  # before the training
     with progress_bar() as progress:
-        known = recover.known_arm(chosen, spec.name, twin=twin_of(twins, spec.name), progress=progress)
+        models = {"twin": twin_of(twins, spec.name), "network": network_of(network)}
+        known = recover.known_arm(chosen, spec.name, **models, progress=progress)
         progress("recovering", 0.0)
         start_c = recover.hold_until(known.arm, q, payload, ambient_c=known.verification.ambient_c, until_c=warm)
         how: Any = {"verification": known.verification, "fixtures": chosen.fixtures, "seed": seed}
@@ -275,6 +276,13 @@ def twin_of(folder: Path | None, arm: str) -> "Twin | None":
     from scenarios.prepare.twins import open_twin
 
     return None if folder is None else open_twin(folder, arm)
+
+
+def network_of(folder: Path | None) -> "Identified | None":
+    """The thermal network of --network; None without a folder."""
+    from twin.thermal.checkpoint import load
+
+    return None if folder is None else load(folder)
 
 
 def train_command(

@@ -16,7 +16,7 @@ observes its motors for `Nearby.watch_s`.
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import repeat
 from operator import attrgetter
@@ -52,6 +52,7 @@ from scenarios.progress import Progress, quiet
 from scenarios.result_folder import ResultKind, new_folder
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario
+from twin.thermal.identify import Identified
 from twin.vae.measures import Features
 from twin.vae.twin import Twin
 from twin.vae.window import PHASES
@@ -502,7 +503,7 @@ class KnownArm:
     twin: Twin
     sources: tuple[Plan, ...]
     verification: Verification
-    """With a nominal Gen3's thermal parameters, at the rehearsal's ambient temperature, horizon and limit."""
+    """With what the arm knows of its motors, at the rehearsal's ambient temperature, horizon and limit."""
 
 
 def known_arm(
@@ -510,12 +511,14 @@ def known_arm(
     name: str | None = None,
     *,
     twin: Twin | None = None,
+    network: Identified | None = None,
     cache: Path | None = None,
     progress: Progress = quiet,
 ) -> KnownArm:
     """An arm of a scenario by name; without one, the first.
 
     Args:
+        network: Its thermal network, for predictions; by default that of a nominal Gen3 with the arm's cooling.
         twin: Its twin; by default that with which the arm works in the scenario's fleet, trained or from the cache.
 
     Raises:
@@ -533,6 +536,9 @@ def known_arm(
     sources = require_cool_plans(planned.all_plans, planned.hardware, scenario)
     spec = scenario.twin
     verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
+    if network is not None:
+        model = network.heat_model
+        verification = replace(verification, motors=model.motors, thermal=model.thermal())
     return KnownArm(bare_arm(robot, motors, thermal), twin, sources, verification)
 
 

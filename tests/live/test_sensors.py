@@ -1,15 +1,19 @@
 """Bad motor sensors of live arms: the last possible temperature, growing doubt, and no jobs."""
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import Quote
 from fleet.bus.protocol.messages import State
+from fleet.heat.motor import gen3_motors, reference_current
+from fleet.heat.thermal import drive_heat, gen3_network, thermal_model
 from fleet.live.monitor.health import check_arm
 from fleet.live.monitor.snapshot import FleetView
 from fleet.live.sensors import ArmSensors
 from fleet.readings import TemperatureFilter
+from fleet.robot import JOINTS
 from scenarios.show.watch import arm_line
 
 GOOD_C = (30.0, 41.0, 33.0, 38.0, 31.0, 40.0, 39.0)
@@ -75,6 +79,29 @@ def test_the_longer_side_of_a_jump_counts_unless_it_repeats():
         long.check(state(tick, 41.0))
     for tick in range(3000, 4000):
         assert long.check(state(tick, 12.0 + 0.01 * (tick % 3))).temp_c[1] == 41.0
+
+
+def test_the_network_bounds_the_doubt_of_an_arm_whose_torques_are_known():
+    """An arm with 30 % more heat than a nominal one stands idle for two hours, then holds a load outstretched."""
+    motors, thermal, sensors = gen3_motors(), thermal_model(gen3_network()), ArmSensors()
+    nodes_c, warned = np.array([*GOOD_C, *GOOD_C]), False
+    for tick in range(1, 8400):
+        tau = np.array([0.0, 50.0, 0.0, 21.0, 0.0, 1.0, 0.0]) * (tick > 7200)
+        heat_w = 1.3 * drive_heat(
+            nodes_c, reference_current(tau, np.zeros(JOINTS), motors) ** 2, np.zeros(JOINTS), motors
+        )
+        nodes_c = thermal.step(nodes_c, heat_w, 24.0, 1.0)
+        true_c = nodes_c[:JOINTS]
+        temp_c = (*true_c[:1], *(true_c[1:2] if tick < 10 else [0.0]), *true_c[2:])
+        before = State("arm", tick, float(tick), "idle", temp_c, 60.0 - max(temp_c), tau=tuple(tau))
+        checked = sensors.check(before)
+        assert checked.headroom_k <= 60.0 - true_c.max() + 1e-6
+        warned |= checked.headroom_k < 0
+        if tick == 7200:
+            assert checked.temp_c[1] == pytest.approx(true_c[1], abs=6.0)
+            assert sensors.check_quote(quote()).capacity == 1
+            assert not warned
+    assert sensors.check_quote(quote()).capacity == 0
 
 
 def test_people_see_the_bad_sensor():

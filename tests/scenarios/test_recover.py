@@ -117,6 +117,7 @@ def test_the_documented_command_recovers_an_arm(thermofleet, small_toml, subject
         ("--payload", 50, "rated for a payload of 0 … 4.5 kg"),
         ("--posture", "rised", "No posture 'rised'; did you mean 'raised'"),
         ("--warm", 190, "does not get warm"),
+        ("--network", tmp_path / "none", "No identified arm in"),
     ):
         wrong = thermofleet(*recover_left, option, value, "--out", tmp_path / "other")
         assert wrong.code == 2, option

@@ -205,6 +205,11 @@ def test_an_arm_begins_from_what_it_found_to_stay_cool(small_toml, plans):
         assert plan.arm == "left"
         peak_c = peak_of(plan, known.arm.motors, known.arm.thermal, asked.ambient_c, asked.horizon_s)
         assert np.all(peak_c <= 40.0)
+    model = nominal_heat_model("immersion")
+    network: Any = SimpleNamespace(heat_model=model)
+    own = known_arm(load(small_toml), twin=LEFT, network=network, cache=plans)
+    peak_c = peak_of(own.sources[0], model.motors, model.thermal(), 22.0, 1800.0)
+    np.testing.assert_array_equal(own.verification.peak_c(own.sources[0]), peak_c)
 
 
 def test_an_unknown_arm_anothers_twin_and_no_cool_motion_are_refused(small_toml, plans):

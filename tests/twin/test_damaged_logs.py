@@ -355,6 +355,45 @@ def test_a_sound_log_is_never_refused(start, swing, rate_hz, seed, kg):
     assert [found.what for found in judge(log.time_s, readings, degrees=False)] == []
 
 
+@given(
+    angle=st.lists(st.floats(-0.08, 0.08), min_size=7, max_size=7),
+    swing=st.sampled_from([0.0, 0.02]),
+    seed=st.integers(0, 1000),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_an_arm_on_a_wall_near_zero_is_not_asked_about_radians(angle, swing, seed):
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(ROWS) / 2.0
+    q = np.array(angle) + swing * np.sin(np.outer(time_s, rng.uniform(0.1, 0.4, 7))) + rng.normal(0, 1e-5, (ROWS, 7))
+    tau = gravity_terms(q) @ [1.0, 0.0, 0.0, 0.7, 0.0, 0.0] + rng.normal(0, 0.15, q.shape)
+    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": tau}
+    assert not any("radians" in found.remedy for found in judge(time_s, readings, degrees=True))
+
+
+@pytest.mark.parametrize("pair", [(2, 4), (3, 5), (3, 6)])
+def test_swapped_joints_of_an_arm_with_a_light_load_are_named(pair):
+    log = sound(rows=600, swing=0.3, kg=0.0).plain()
+    order = list(range(7))
+    order[pair[0]], order[pair[1]] = pair[::-1]
+    readings = {name: values[:, order] for name, values in zip(READINGS, log.groups.values(), strict=True)}
+    names = f"joints {pair[0] + 1} and {pair[1] + 1} swapped"
+    assert any(names in found.remedy for found in judge(log.time_s, readings, degrees=True))
+
+
+@pytest.mark.parametrize("every_s", [2.5, 5.0, 8.0])
+def test_a_slow_log_of_short_moves_is_read(every_s):
+    """Two short moves, whose velocity is that of one sample each."""
+    time_s = np.arange(0.0, 1800.0, 0.1)
+    moves = 1.0 * (abs(time_s - 600.0) < 0.75) - 1.0 * (abs(time_s - 1200.0) < 0.75)
+    qd = 0.5 * moves[:, None] * (np.arange(7) == 3) + np.zeros((1, 7))
+    q = np.cumsum(qd, axis=0) * 0.1 + 0.3
+    rng = np.random.default_rng(0)
+    tau = ARM.inverse_dynamics(q, qd, np.zeros_like(q), 0.7) + rng.normal(0, 0.15, q.shape)
+    rows = slice(None, None, round(every_s * 10))
+    readings = {"q": q[rows], "qd": qd[rows], "tau": tau[rows]}
+    assert judge(time_s[rows], readings, degrees=False) == []
+
+
 @given(st.lists(st.floats(-3, 3), min_size=7, max_size=7), st.floats(0, 5))
 def test_gravity_is_that_of_the_model(q, kg):
     terms = gravity_terms(np.array([q]))[0]

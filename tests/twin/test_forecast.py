@@ -11,8 +11,8 @@ from fleet.heat.thermal import NODES
 from fleet.robot import JOINTS
 from tests.twin.test_identify import AIR_C, FULL_REACH_NM, own_arm, working
 from twin.logs.recording import Recording
-from twin.thermal.forecast import MOST_S, RISK, SAMPLES, ThermalForecast, forecast
-from twin.thermal.identify import identify
+from twin.thermal.forecast import DRIFT_K, FROM_LOG_TO_LOG, MOST_S, RISK, SAMPLES, ThermalForecast, forecast
+from twin.thermal.identify import Identified, Parameter, ParameterVector, identify, nominal_heat_model
 from twin.thermal.thermal_twin import RcTwin
 
 CYCLE_S = 40.0
@@ -61,6 +61,35 @@ def test_arms_unlike_the_nominal_one_end_in_the_intervals_near_the_median() -> N
         change_k.append(abs(end_c - nodes[-1, :JOINTS])[1])
     assert np.mean(inside) >= 0.9
     assert max(error_k) < 0.15 * np.median(change_k)
+
+
+def test_intervals_hold_95_percent_of_the_ends_of_arms_that_vary_as_assumed() -> None:
+    """Parameters by the network's covariance and from log to log, and another ambient temperature in the run."""
+    rng, vector, sd = np.random.default_rng(7), ParameterVector(nominal_heat_model()), 0.08
+    spread = [
+        Parameter(name=name, joint=None if j is None else j + 1, value=1, low=1, high=1, prior=1, prior_sd=1, sd=sd)
+        for name, j in vector.names
+    ]
+    about = {"arm": "own", "rms_k": {}, "memory_s": (), "seconds": 0.0, "data_hash": "", "source": "current"}
+    network = Identified(
+        heat_model=vector.nominal,
+        parameters=tuple(spread),
+        information=np.eye(len(vector)) / sd,
+        ambient_c=AIR_C,
+        ambient_sd_k=0.0,
+        **about,
+    )
+    inside = []
+    for _ in range(16):
+        x = vector.mean + np.hypot(sd, FROM_LOG_TO_LOG) * rng.standard_normal(len(vector))
+        arm = RcTwin(arm="own", heat_model=vector.heat_model(x), ambient_c=AIR_C, base="true")
+        log, nodes = working(arm, 10.0, rng)
+        warmer = replace(arm, ambient_c=AIR_C + DRIFT_K * rng.standard_normal())
+        end_c = course(warmer, nodes[-1], FULL_REACH_NM, 20 * CYCLE_S)[-1, :JOINTS]
+        low, _, high = (each[-1] for each in forecast(log, held(FULL_REACH_NM), 20, network=network).interval())
+        inside.append((low <= end_c) & (end_c <= high))
+    # 112 ends, of which those of an arm are correlated.
+    assert 0.9 <= np.mean(inside) <= 0.99
 
 
 def test_an_identified_network_narrows_the_interval() -> None:

@@ -26,7 +26,7 @@ from fleet.heat.thermal import (
 from fleet.motion import RATE_HZ, Drive, drive, drives
 from fleet.robot import JOINTS
 from scenarios.prepare.oracle import peaks
-from twin.logs.recording import READINGS, Recording, heat_logs
+from twin.logs.recording import READINGS, Recording, heat_logs, without_repeats
 from twin.thermal.checkpoint import CARD, load, load_curve, save, save_curve
 from twin.thermal.identify import (
     PRIOR_SD,
@@ -459,6 +459,23 @@ def test_white_noise_has_no_memory_and_a_random_walk_has(rng):
     np.testing.assert_allclose(found.sd_k[:2], 0.1, rtol=0.05)
 
 
+def test_rows_that_a_late_logger_repeats_are_no_readings(rng):
+    """The heat of each third row, repeated twice, is that of these rows alone; no gap arises, and no rest is cut."""
+    recording, _ = logged(nominal_heat_model(), rng, 5.0)
+
+    def repeated(rows):
+        readings = {name: getattr(recording, name)[rows] for name in READINGS}
+        return replace(recording, **readings)
+
+    late, stale = repeated(np.arange(301) // 3 * 3), repeated(np.minimum(np.arange(301), 200))
+    fresh = heat_logs(recording.part(slice(None, None, 3)), gen3_motors(), "current")[0]
+    got = heat_logs(late, gen3_motors(), "current")[0]
+    np.testing.assert_allclose(got.current_terms, fresh.current_terms)
+    np.testing.assert_allclose(got.temp_c, fresh.temp_c)
+    assert len(without_repeats(stale).time_s) == 301
+    assert len(without_repeats(replace(late, temp_c=None)).time_s) == 301
+
+
 def test_logs_split_at_gaps_and_keep_the_mean_heat(rng):
     recording, _ = logged(nominal_heat_model(), rng, 5.0)
     whole = heat_logs(recording, gen3_motors(), "current")[0]
@@ -503,7 +520,8 @@ def test_a_round_trip_keeps_every_number_and_a_change_is_noticed(rng, tmp_path):
     recording, _ = logged(prior_draw(rng), rng, 10.0)
     got = identify([recording], arm="left", ambient_sd_k=0.0)
     save(got, tmp_path)
-    back = load(tmp_path)
+    back = load(tmp_path / CARD)
+    np.testing.assert_array_equal(back.information, got.information)
     assert (back.version, back.arm, back.parameters, back.rms_k) == (got.version, "left", got.parameters, got.rms_k)
     np.testing.assert_array_equal(thermal_model(back.heat_model.network).laplacian, got.heat_model.thermal().laplacian)
     text = (tmp_path / CARD).read_text()
@@ -511,6 +529,7 @@ def test_a_round_trip_keeps_every_number_and_a_change_is_noticed(rng, tmp_path):
         ('"format": 2', '"format": 9', "format 9 is not supported, only 2"),
         ('"winding_3":', '"winding_x":', "unknown nodes: winding_x"),
         ('"seconds":', '"secs":', "secs"),
+        ('"information": "', '"information": "AAAA', "buffer size must be a multiple"),
         (f'"arm": "{got.arm}"', '"arm": "right"', "has changed since it was saved"),
     ):
         assert old in text

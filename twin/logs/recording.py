@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from fleet import readings
 from fleet.errors import FleetError, IdentificationError
 from fleet.heat.motor import Motors, friction_heat, reference_current
 
@@ -317,8 +318,25 @@ def source_of(recordings: Sequence[Recording]) -> CurrentSource:
     return "current" if all(r.current_a is not None for r in recordings) else "torque"
 
 
+def without_repeats(recording: Recording) -> Recording:
+    """The recording without rows that repeat the one before in every reading, temperatures included.
+
+    A logger that is late repeats its last reading. Held on, a single reading in motion would count for seconds; without
+    the repeated rows the heat in between is that of the readings on either side. Runs longer than `HEAT_GAP_S` and the
+    last row stay, and so do all rows of a recording without temperatures, in which an arm at rest repeats.
+    """
+    if recording.temp_c is None:
+        return recording
+    rows = np.concatenate([values for name in READINGS if (values := getattr(recording, name)) is not None], axis=1)
+    time_s, kept = recording.time_s, np.ones(len(rows), dtype=bool)
+    for first, end in readings.runs(np.concatenate([[False], (np.diff(rows, axis=0) == 0).all(axis=1)])):
+        last = min(end, len(rows) - 1)
+        kept[first:last] = time_s[last] - time_s[first - 1] > HEAT_GAP_S
+    return recording.part(kept)
+
+
 def heat_logs(recording: Recording, motors: Motors, source: CurrentSource, *, step_s: float = STEP_S) -> list[HeatLog]:
-    """The stretches of a recording between gaps, each at least two steps long.
+    """The stretches of a recording between gaps, each at least two steps long, without repeated rows.
 
     Args:
         motors: Its torque constant, efficiency and friction speed; its friction coefficients are not used.
@@ -330,6 +348,7 @@ def heat_logs(recording: Recording, motors: Motors, source: CurrentSource, *, st
     """
     if recording.joints != (joints := motors.torque_per_amp.shape[-1]):
         raise IdentificationError(f"'{recording.name}' has {recording.joints} joints, the thermal network {joints}.")
+    recording = without_repeats(recording)
     if recording.temp_c is None:
         raise ValueError(f"Recording '{recording.name}' has no motor temperatures.")
     terms, friction = _current_terms(recording, motors, source), _friction_terms(recording, motors)

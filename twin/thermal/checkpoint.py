@@ -38,6 +38,8 @@ class NetworkCard(msgspec.Struct, forbid_unknown_fields=True):
     motors: dict[str, float | list[float]]
     capacity_j_per_k: dict[str, float]
     conductance_w_per_k: list[tuple[str, str, float]]
+    information: bytes | None = None
+    """Of `Identified`, float32 in little-endian order; None in files of earlier versions."""
     saturation: None = None
     """Kept because stored files name it; P(saturation) is in `saturation_curve.json`."""
 
@@ -54,19 +56,20 @@ def save(identified: Identified, folder: Path) -> None:
         motors={name: np.asarray(value).tolist() for name, value in vars(identified.heat_model.motors).items()},
         capacity_j_per_k={name: node["capacity_j_per_k"] for name, node in network.nodes.items() if node},
         conductance_w_per_k=list(network.edges(data="conductance_w_per_k")),
+        information=None if identified.information is None else identified.information.astype("<f4").tobytes(),
         **{name: getattr(identified, name) for name in _SHARED},
     )
     write_card(card, folder / CARD)
 
 
 def load(folder: Path) -> Identified:
-    """The identified arm that `save` wrote.
+    """The identified arm that `save` wrote; the folder, or the file in it.
 
     Raises:
         CheckpointError: the file is missing, damaged, of another format or for another number of joints, or its
             numbers are not those that were saved.
     """
-    path = folder / CARD
+    path = folder if folder.name == CARD else folder / CARD
     card = read_card(path, NetworkCard, format_=FORMAT, what="identified arm")
     widths = {name: len(value) for name, value in card.motors.items() if isinstance(value, list)}
     if wrong := {name: width for name, width in widths.items() if width != JOINTS}:
@@ -77,13 +80,19 @@ def load(folder: Path) -> Identified:
         graph.add_node(name, capacity_j_per_k=value)
     graph.add_weighted_edges_from(card.conductance_w_per_k, weight="conductance_w_per_k")
     values = {name: np.array(value) if isinstance(value, list) else value for name, value in card.motors.items()}
+    information, free = None, len(card.parameters)
     try:
+        if card.information is not None:
+            information = np.frombuffer(card.information, "<f4").reshape(free, free)
+            np.linalg.cholesky(information.T.astype(float) @ information)  # raises LinAlgError if it is singular
+            if not np.isfinite(information).all():
+                raise ValueError("information must be finite.")
         thermal_model(graph)
         motors = cast("Callable[..., Motors]", Motors)(**values)  # names and values of a file, checked by Motors
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: {error}") from error
     shared = {name: getattr(card, name) for name in _SHARED}
-    identified = Identified(heat_model=HeatModel(motors, graph), **shared)
+    identified = Identified(heat_model=HeatModel(motors, graph), information=information, **shared)
     check_version(path, card.version, identified.version)
     return identified
 

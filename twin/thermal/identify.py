@@ -143,6 +143,8 @@ class ParameterVector:
         """Prior mean of the logarithms, [parameter]."""
         self.sd = np.concatenate([of_joint[name][: len(values)] for name, values in zip(free, centre, strict=True)])
         """Prior standard deviation of the logarithms, [parameter]."""
+        self.information: Array = np.diag(1.0 / self.sd)
+        """Root R of the prior information: RᵀR is the inverse covariance of the logarithms, [parameter, parameter]."""
         self.names = tuple(
             (name, joint if len(values) > 1 else None)
             for name, values in zip(free, centre, strict=True)
@@ -274,6 +276,8 @@ class _Unknowns:
     """Its coordinates in this basis, upper triangular, [unknown, unknown]."""
     solution: Array
     """Node temperatures at the start, °C, and the ambient offset, K, [unknown]."""
+    scatter: Array
+    """Observed over assumed standard deviation, [row]."""
 
 
 class Problem:
@@ -289,6 +293,8 @@ class Problem:
         """
         self.logs, self.ambient_c, self.ambient_sd_k = tuple(logs), ambient_c, ambient_sd_k
         self.vector, self.noise = vector, noise
+        self.relative_sd = 1.0
+        """Observed over assumed standard deviation of a residual, for samples (sandwich estimate: Huber 1967)."""
         self.winding_c = [log.middle_c for log in logs]
         """For the resistance, [step, joint] per log."""
         self.housing_c = self.winding_c
@@ -297,7 +303,7 @@ class Problem:
     def residual(self, x: Array) -> Array:
         """Of every log, then of the prior, [row]; half its square is the negative log posterior."""
         rows = [unknowns.wanted - unknowns.matrix @ unknowns.solution for unknowns in self._unknowns(x)]
-        return np.concatenate([*rows, (x - self.vector.mean) / self.vector.sd])
+        return np.concatenate([*rows, self.vector.information @ (x - self.vector.mean)])
 
     def jacobian(self, x: Array) -> Array:
         """Derivative of `residual` by the logarithms, [row, parameter]."""
@@ -311,18 +317,29 @@ class Problem:
             rows = np.zeros((len(unknowns.wanted), len(x)))
             rows[: log.temp_c.size] = -(slope * self.noise.weight).reshape(len(x), -1).T
             parts.append(rows - unknowns.basis @ (unknowns.basis.T @ rows))
-        return np.concatenate([*parts, np.diag(1.0 / self.vector.sd)])
+        return np.concatenate([*parts, self.vector.information])
+
+    def samples(self, likely: Array, count: int, rng: np.random.Generator) -> Array:
+        """Samples of the logarithms, an even number, in pairs around the most probable ones, [sample, parameter]."""
+        jacobian = self.jacobian(likely)
+        scatter = np.concatenate([*(each.scatter for each in self._unknowns(likely)), np.ones(len(likely))])
+        noise = scatter * rng.standard_normal((count // 2, len(scatter)))
+        change = np.linalg.solve(jacobian.T @ jacobian, (noise @ jacobian).T).T
+        return likely + np.concatenate([change, -change])
 
     def temperatures(self, x: Array, rng: np.random.Generator | None = None) -> list[Array]:
         """All node temperatures with the best unknowns of each log, °C, [step + 1, node] per log.
 
         Args:
-            rng: Samples the unknowns from their posterior distribution instead.
+            rng: Samples the unknowns from their distribution instead.
         """
         model, values = self.vector.models(x[None]), self.vector.values(x[None])
         out = []
         for i, each in enumerate(self._unknowns(x)):
-            change = 0.0 if rng is None else np.linalg.solve(each.upper, rng.standard_normal(len(each.upper)))
+            change = 0.0
+            if rng is not None:
+                noise = each.scatter * rng.standard_normal(len(each.scatter))
+                change = np.linalg.solve(each.upper, each.basis.T @ noise)
             out.append(self._temperatures(i, model, values, each.solution + change)[0])
         return out
 
@@ -366,7 +383,8 @@ class Problem:
         matrix = np.concatenate([(effect * self.noise.weight[:, None]).reshape(-1, unknowns), prior])
         wanted = np.concatenate([missing.reshape(-1), likely])
         basis, upper = np.linalg.qr(matrix)
-        return _Unknowns(matrix, wanted, basis, upper, np.linalg.solve(upper, basis.T @ wanted))
+        scatter = np.append(np.full(log.temp_c.size, self.relative_sd), np.ones(len(prior)))
+        return _Unknowns(matrix, wanted, basis, upper, np.linalg.solve(upper, basis.T @ wanted), scatter)
 
 
 AMBIENT_C = 22.0
@@ -419,10 +437,12 @@ class Identified:
     seconds: float
     """Length of the recordings used."""
     data_hash: str
+    information: Array | None = None
+    """Root R of the information: RᵀR is the inverse covariance of the logarithms, float32 [parameter, parameter]."""
 
     @cached_property
     def version(self) -> str:
-        """Hash of every number that a prediction depends on, and of the data."""
+        """Hash of the data and of every number but the information, which follows from them."""
         sources = [self.arm, self.data_hash, self.ambient_c, self.source, self.parameters]
         digest = hashlib.sha256(msgspec.json.encode(sources))
         for value in vars(self.heat_model.motors).values():
@@ -494,10 +514,13 @@ def identify(
     _check_logs(logs, nominal)
     vector = ParameterVector(nominal, free)
     problem, x = _fit(logs, ambient_c, sd_k, vector)
+    jacobian = problem.jacobian(x)
+    information = np.linalg.cholesky(jacobian.T @ jacobian).T
     return Identified(
         arm=arm,
         heat_model=vector.heat_model(x),
-        parameters=_parameters(problem, x),
+        parameters=_parameters(vector, x, information),
+        information=information.astype(np.float32),
         ambient_c=ambient_c,
         ambient_sd_k=sd_k,
         source=source,
@@ -536,9 +559,8 @@ def _step(logs: Sequence[HeatLog]) -> float:
     return float(np.median(np.concatenate([log.dt_s for log in logs])))
 
 
-def _parameters(problem: Problem, x: Array) -> tuple[Parameter, ...]:
-    vector, jacobian = problem.vector, problem.jacobian(x)
-    sd = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+def _parameters(vector: ParameterVector, x: Array, information: Array) -> tuple[Parameter, ...]:
+    sd = np.linalg.norm(np.linalg.inv(information), axis=1)
     value, low, high = (np.exp(x + shift * sd) for shift in (0.0, -_SIGMA_95, _SIGMA_95))
     prior = np.exp(vector.mean)
     columns = {"value": value, "low": low, "high": high, "prior": prior, "prior_sd": vector.sd, "sd": sd}
