@@ -15,7 +15,7 @@ from benchmarks.simulation.simulated_fleet import FIRST, Fleet, random_conflicts
 from benchmarks.simulation.steering import check_steering
 from benchmarks.simulation.world import Process, Violation, World
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec
+from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec, Result
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Action,
@@ -201,6 +201,9 @@ class Shift(Fleet):
             self.world.run(self.world.now_s + CHECK_S)
         self.unsure |= {job for builder in self.builders.values() for job in builder.unsure}
         states = self.statuses()
+        results = [each.status for each in self.sent.messages.values() if isinstance(each, Result)]
+        # A job that was given up may be finished after all, when those that wait for it have left already.
+        abandoned = {status.job for status in results if status.state in ABANDONED}
         for name, job in self.submitter.accepted.items():
             state, done = states[name], self.finished.get(name, 0)
             if state == "finished" and done != 1:
@@ -211,7 +214,7 @@ class Shift(Fleet):
                 raise Violation(f"'{name}' is unfinished, and no arm stopped in its last cycle.")
             if state == "cancelled" and name not in self.cancelled:
                 raise Violation(f"'{name}' is cancelled, and nobody asked for it.")
-            lost = any(states.get(before) in ABANDONED for before in job.after)
+            lost = any(before in abandoned or states.get(before) in ABANDONED for before in job.after)
             if state == "given_up" and not (
                 lost or name in self.cancelled or job.expires or reason_to_give_up(self.faults.get(name, ()))
             ):
