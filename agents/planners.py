@@ -235,7 +235,6 @@ class RollingHorizon(Wsept):
     """
 
     scope: ClassVar = "central"
-    only_choices = True
     horizon_s: ClassVar = 3600.0
     nodes: ClassVar = 100
     """Most nodes of the solver's branch and bound at each decision; nearly all end at the first."""

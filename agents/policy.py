@@ -317,9 +317,11 @@ def only_choices(policy: Policy) -> bool:
     """Whether calls of the policy can be skipped while no arm may claim a job, which is nine steps of ten.
 
     A class declares `only_choices = True` if it then returns WAIT for all arms, draws no random number and changes no
-    state. A subclass must declare it again.
+    state. The classes of this package inherit it; other subclasses must declare it again.
     """
-    return vars(_kind_of(policy)).get("only_choices") is True
+    kind = _kind_of(policy)
+    inherits = kind.__module__.startswith("agents.")
+    return (getattr(kind, "only_choices", False) if inherits else vars(kind).get("only_choices")) is True
 
 
 def reads_messages(policy: Policy) -> bool:

@@ -288,8 +288,6 @@ class BidPrice(CentralArrayPolicy):
 class BidPriceByMessages(BidPrice):
     """As `bid_price`, for bids that arrive by messages."""
 
-    only_choices = True
-
     @classmethod
     def ages_s(cls, seen: Observation) -> Array:
         """Age of the last message of each arm, [env, arm]."""

@@ -135,6 +135,8 @@ class CentralRule(CentralArrayPolicy):
     Ties go to the older job, then to the first arm. This is a sequential single-item auction with one job per arm.
     """
 
+    only_choices = True
+
     def actions(self, seen: Observation) -> Array:
         """The claims of the pairs."""
         return 1 + self.options(self.cost(seen), plans_of(seen))
@@ -167,7 +169,6 @@ class Wspt(CentralRule):
     1956), a strong rule on unrelated machines. It ignores temperatures.
     """
 
-    only_choices = True
     most_p = 1.0
     """Largest P(saturation) of a claim."""
 
@@ -183,7 +184,6 @@ class WsptCool(Wspt):
     Such a job waits until an arm has cooled.
     """
 
-    only_choices = True
     most_p = 0.5
 
 
@@ -312,8 +312,6 @@ def _mean(values: Array, where: Array, plans: int, otherwise: float = 0.0) -> Ar
 class Ssi(CentralRule):
     """Sequential single-item auction: the pair of arm and job with the least thermal cost first."""
 
-    only_choices = True
-
     def cost(self, seen: Observation) -> Array:
         """[env, arm, option]."""
         return thermal(seen)
@@ -322,13 +320,9 @@ class Ssi(CentralRule):
 class Matching(Matched, Ssi):
     """As many jobs as possible at the least total thermal cost: an optimal matching of arms and jobs."""
 
-    only_choices = True
-
 
 class QuickestSsi(CentralRule):
     """As `ssi`, by the time until the finish alone."""
-
-    only_choices = True
 
     def cost(self, seen: Observation) -> Array:
         """[env, arm, option]."""
@@ -337,8 +331,6 @@ class QuickestSsi(CentralRule):
 
 class QuickestMatching(Matched, QuickestSsi):
     """As `matching`, by the time until the finish alone."""
-
-    only_choices = True
 
 
 class Ahead:
@@ -373,8 +365,6 @@ class Ahead:
 
 class MatchingAhead(Ahead, Matching):
     """As `matching`, with arms that are home soon as well."""
-
-    only_choices = True
 
 
 def each_env(pairs: Callable[[Array], list[tuple[int, int]]], cost: Array, plans: int) -> Array:
@@ -424,8 +414,6 @@ TIME_DIGITS = 1
 class Fifo(CentralRule):
     """First in, first out: the oldest job of the queue first, to the arm that needs the least time for it."""
 
-    only_choices = True
-
     def index(self, seen: Observation) -> Array:
         """Place in the queue from its end, then the shorter duration, [env, arm, option]."""
         return _first_by(per_option(seen, np.arange(seen.offered.shape[-1])), seen.duration_s)
@@ -436,8 +424,6 @@ class Edd(CentralRule):
 
     Optimal for the largest lateness on one machine (Jackson 1955).
     """
-
-    only_choices = True
 
     def index(self, seen: Observation) -> Array:
         """Minus the time until the due date, then the shorter duration, [env, arm, option]."""
@@ -450,8 +436,6 @@ class Spt(QuickestSsi):
     Optimal for the sum of completion times on one machine (Smith 1956).
     """
 
-    only_choices = True
-
 
 class Atc(CentralRule):
     """Apparent tardiness cost: value per time, discounted by exp(−slack / (k · mean duration)) until the slack is 0.
@@ -461,7 +445,6 @@ class Atc(CentralRule):
     Source: Vepsalainen & Morton, Management Science 33, 1987; k = 2 as there for little congestion.
     """
 
-    only_choices = True
     look_ahead: ClassVar = 2.0
     """k."""
 

@@ -47,6 +47,8 @@ class TrainingLength:
     iterations: int | None = option(
         "Maximum number of iterations in total, those before a resume included.", None, low=1, high=1_000_000
     )
+    validate_every: int = 20
+    """Iterations from one validation to the next."""
     in_total: bool = False
     """Whether `minutes` include those before a resume, too, and a complete training is skipped."""
 

@@ -9,6 +9,7 @@ import json
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Self
 
 import zenoh
@@ -393,16 +394,11 @@ def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
     _, tls = identified(endpoint)
     if tls is not None:
         return (read_roster(tls.folder).fleet,) if (tls.folder / ROSTER).exists() else ()
-    found: set[str] = set()
-    with open_client(endpoint, timeout_s=timeout_s) as session:
-        for reply in session.liveliness().get(ALL_TOKENS, timeout=timeout_s):
-            if reply.ok is None:
-                continue
-            try:
-                found.add(keys.parse(str(reply.ok.key_expr)).fleet)
-            except ValueError:
-                continue  # a foreign token
-    return tuple(sorted(found))
+    fleets: set[str] = set()
+    for key in _tokens(endpoint, ALL_TOKENS, timeout_s):
+        with suppress(ValueError):  # a foreign token
+            fleets.add(keys.parse(key).fleet)
+    return tuple(sorted(fleets))
 
 
 def other_versions(endpoint: str, fleet: str, *, timeout_s: float = 2.0) -> tuple[str, ...]:
@@ -415,12 +411,15 @@ def other_versions(endpoint: str, fleet: str, *, timeout_s: float = 2.0) -> tupl
     """
     if identified(endpoint)[1] is not None:
         return ()
-    found: set[tuple[str, str]] = set()
-    with open_client(endpoint, timeout_s=timeout_s) as session:
-        for reply in session.liveliness().get(keys.tokens_of_all_versions(fleet), timeout=timeout_s):
-            peer = None if reply.ok is None else keys.other_version(str(reply.ok.key_expr))
-            found |= {peer} if peer else set()
+    peers = set(map(keys.other_version, _tokens(endpoint, keys.tokens_of_all_versions(fleet), timeout_s)))
     return tuple(
         f"'{name}' uses version {version} of the bus, and this program {OURS}: it takes no part. Use one version."
-        for name, version in sorted(found)
+        for name, version in sorted(peer for peer in peers if peer)
     )
+
+
+def _tokens(endpoint: str, expression: str, timeout_s: float) -> list[str]:
+    """Keys of the present liveliness tokens."""
+    with open_client(endpoint, timeout_s=timeout_s) as session:
+        replies = session.liveliness().get(expression, timeout=timeout_s)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from fleet.engine.tables import INFO, Tables
 from fleet.env.allocation_v2 import AHEAD_S, arm_spaces
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.random_actions import random_legal as random_legal
-from fleet.env.validation import Decisions, at_least_one, decisions_of, seeds_of, switch
+from fleet.env.validation import Decisions, at_least_one, check_choice, seeds_of, switch
 from fleet.observation import Layout, Observation
 from fleet.seeding import exchange_seed, shift_seeds
 
@@ -189,7 +189,8 @@ class BatchEnv:
         self._begun = False
         if exchanges is not None and len(exchanges) != num_envs:
             raise ValueError(f"exchanges must be one per env ({num_envs}, got {len(exchanges)}).")
-        self._events = decisions_of(decisions) == "events"
+        check_choice("decisions", decisions, get_args(Decisions))
+        self._events = decisions == "events"
         if self._events and exchanges is not None:
             raise ValueError("decisions='events' takes no exchanges: messages are exchanged once per interval.")
         self._elapsed_s = np.zeros(num_envs)
