@@ -248,12 +248,9 @@ class RollingHorizon(Wsept):
     firsts: ClassVar = 16
     """Plans per arm with the most worth that may be the first of a sequence; half as many may be the second."""
 
-    def __init__(self) -> None:
-        self.solution: Solution | None = None
-
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift."""
-        self.solution = None
+        self.solution: Solution | None = None
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The claims of the sequences whose first plan can begin now."""

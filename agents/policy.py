@@ -107,6 +107,9 @@ class ArrayPolicy:
 
     scope: ClassVar[str] = "central"
 
+    def __init__(self) -> None:
+        self.reset(np.random.default_rng(0))
+
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift; there is nothing to reset."""
 
@@ -197,9 +200,6 @@ class Shared(ArrayPolicy):
     scope: ClassVar = "arm"
     central: ClassVar[type[ArrayPolicy]]
     """The central policy; it must decide on arrays."""
-
-    def __init__(self) -> None:
-        self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift."""

@@ -31,9 +31,6 @@ class RandomLegal(ArrayPolicy):
     reads_messages: ClassVar = False
     only_choices = True
 
-    def __init__(self) -> None:
-        self.reset(np.random.default_rng(0))
-
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift."""
         self._rng = rng
@@ -57,9 +54,6 @@ class RoundRobin(CentralArrayPolicy):
     """The oldest job goes to the next able arm in turn."""
 
     only_choices = True
-
-    def __init__(self) -> None:
-        self._turn = 0
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift: the first arm's turn."""
@@ -469,9 +463,6 @@ class LeastLoaded(CentralArrayPolicy):
 
     only_choices = False
     """A lost claim becomes known in the next interval."""
-
-    def __init__(self) -> None:
-        self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift: no arm has worked."""

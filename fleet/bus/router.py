@@ -8,8 +8,9 @@ import ipaddress
 import json
 import logging
 import re
+import weakref
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any, Self
 
 import zenoh
@@ -24,7 +25,6 @@ from fleet.errors import BusError, NoRouter
 
 _LOG = logging.getLogger(__name__)
 
-_ATTEMPTS = 3
 _TURN_S = 1.0
 """Real seconds of one attempt while waiting for a router."""
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
@@ -110,23 +110,64 @@ def reached_at(host: str) -> str:
     return _ANY_ADDRESS.get(bare, f"[{bare}]" if ":" in bare else bare)
 
 
-def connect(endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None) -> zenoh.Session:
-    """A client session on the router at `endpoint`: once there is one, if `stopped` is given, instead of `timeout_s`.
+class Connection:
+    """A client session on a router: `with Connection(endpoint) as connection:`.
 
-    Raises:
-        BusError: as `open_client`, if waiting does not help, or stopped meanwhile.
+    Args:
+        endpoint: As of `open_client`.
+        timeout_s: How long the router may take to accept the connection.
+        stopped: Wait for a router until this is true, instead of `timeout_s`.
     """
-    if stopped is None:
-        return open_client(endpoint, timeout_s=timeout_s)
-    waits = False
-    while not stopped():
+
+    def __init__(self, endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None = None) -> None:
+        self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
+        self._session: zenoh.Session | None = None
+        self._resources = ExitStack()
+        # A process that exits without closing its session would hang.
+        self._at_exit = weakref.finalize(self, self._resources.close)
+
+    def open(self) -> Self:
+        """Connect; raises a BusError as `open_client`, if waiting does not help, or if stopped meanwhile."""
+        if self._session is None:
+            self._session = self._connected()
+            self._resources.callback(self._session.close)
+        return self
+
+    def close(self) -> None:
+        """Disconnect; may be called twice."""
+        self._session = None
         try:
-            return open_client(endpoint, timeout_s=_TURN_S)
-        except NoRouter as error:
-            if not waits:
-                _LOG.warning("Waiting for a router. %s", error)
-            waits = True
-    raise NoRouter(f"Stopped while waiting for a router at {endpoint}.")
+            self._resources.close()
+        except zenoh.ZError as error:
+            raise BusError(f"The session at {self._endpoint} did not close cleanly: {plain_reason(error)}.") from error
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _connected(self) -> zenoh.Session:
+        if self._stopped is None:
+            return open_client(self._endpoint, timeout_s=self._timeout_s)
+        waits = False
+        while not self._stopped():
+            try:
+                return open_client(self._endpoint, timeout_s=_TURN_S)
+            except NoRouter as error:
+                if not waits:
+                    _LOG.warning("Waiting for a router. %s", error)
+                waits = True
+        raise NoRouter(f"Stopped while waiting for a router at {self._endpoint}.")
+
+    def _open(self) -> zenoh.Session:
+        if self._session is None:
+            raise BusError(f"The {type(self).__name__} is not open. Use it as a context manager.")
+        return self._session
+
+    def _keep(self, entity: object) -> None:
+        """Keep a declared entity until the session is closed: Zenoh undeclares what is garbage-collected."""
+        self._resources.callback(lambda: entity)
 
 
 def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:
@@ -231,31 +272,18 @@ class Router:
         """
         if self._session is not None:
             return self
-        config = self._settings()
-        problem = BusError("The router did not open.")
-        # A second attempt only helps if the system chooses the port.
-        for attempt in range(1, 1 + (1 if self._port else _ATTEMPTS)):
-            try:
-                session = zenoh.open(config)
-            except zenoh.ZError as error:
-                where = (
-                    f"port {self._port} of {self._host}; is it in use?"
-                    if self._port
-                    else f"a free port of {self._host}."
-                )
-                problem = BusError(f"The router could not listen on {where} ({plain_reason(error)})")
-                problem.__cause__ = error
-                continue
-            try:
-                self._endpoint = self._where(session)
-            except BusError as error:
-                problem = error
-                session.close()
-                continue
-            self._session = session
-            _LOG.debug("Router at %s (attempt %d).", self._endpoint, attempt)
-            return self
-        raise problem
+        try:
+            session = zenoh.open(self._settings())
+        except zenoh.ZError as error:
+            where = f"port {self._port} of {self._host}; is it in use?" if self._port else f"a port of {self._host}."
+            raise BusError(f"The router could not listen on {where} ({plain_reason(error)})") from error
+        try:
+            self._endpoint = self._where(session)
+        except BusError:
+            session.close()
+            raise
+        self._session = session
+        return self
 
     def linked(self) -> int:
         """Number of other routers that it has a link to now."""

@@ -14,6 +14,7 @@ from agents.learned.ppo import PpoConfig, Trainer, imitate
 from fleet.engine.batch import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Library
+from fleet.fields import option
 from scenarios.evaluate.rollout import Act, acts_of, rollout
 from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.batch import library_of
@@ -36,7 +37,7 @@ VALIDATION_SEED = 2_000_000
 class TrainingPlan(TrainingLength):
     """Length of a training, and its validation."""
 
-    validation_envs: int = 32
+    validation_envs: int = option("Shifts of a validation.", 32, low=1, high=65_536)
 
 
 def train(

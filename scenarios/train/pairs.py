@@ -13,6 +13,7 @@ from agents.learned.evolution import Evolution, EvolutionConfig
 from agents.pairs import PARAMETERS, LearnedPrices, save_pairs
 from fleet.engine.batch import RewardWeights
 from fleet.env.vector import BatchEnv, Library
+from fleet.fields import option
 from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import acts_of, rollout
 from scenarios.prepare.batch import library_of
@@ -104,9 +105,10 @@ def rewards(instance: TrainingInstance, parameters: Array, seeds: Sequence[int])
 class PairPlan(TrainingLength):
     """Length of a training, and its validation."""
 
-    instances: int = 24
-    """Instances of an iteration, of different cells; all samples have the same shifts."""
-    validate_every: int = 5
+    instances: int = option(
+        "Instances of an iteration, of different cells; all samples have the same shifts.", 24, low=1, high=10_000
+    )
+    validate_every: int = option("Iterations from one validation to the next.", 5, low=1, high=1_000_000)
 
 
 def train_pairs(
