@@ -173,6 +173,12 @@ class Local(ArrayPolicy):
             )
 
     def __init__(self) -> None:
+        central = getattr(self, "central", None)
+        if not hasattr(central, "act"):
+            raise FleetError(
+                f"{type(self).__name__} has no central policy (got {central!r}). Add to the class: central = a class "
+                "with act(observations)."
+            )
         self._policy = self.central()
 
     def reset(self, rng: np.random.Generator) -> None:

@@ -150,7 +150,11 @@ class BusClient(Connection):
         self._participant: RosterEntry | None = None
 
     def open(self) -> Self:
-        """Connect; raises a BusError if no router accepts the connection."""
+        """Connect.
+
+        Raises:
+            BusError: no router accepts the connection, or `stopped` meanwhile.
+        """
         if self._session is None:
             super().open()
             self._participant = participant_at(self._endpoint)

@@ -110,8 +110,59 @@ def reached_at(host: str) -> str:
     return _ANY_ADDRESS.get(bare, f"[{bare}]" if ":" in bare else bare)
 
 
-class Connection:
-    """A client session on a router: `with Connection(endpoint) as connection:`.
+class Session:
+    """Base of what has a Zenoh session from `open` to `close`, or in a `with` block."""
+
+    def __init__(self) -> None:
+        self._session: zenoh.Session | None = None
+        self._resources = ExitStack()
+        # A process that exits without closing its session would hang.
+        self._at_exit = weakref.finalize(self, self._resources.close)
+
+    def open(self) -> Self:
+        """Open the session; does nothing if it is open.
+
+        Raises:
+            BusError: the session cannot be opened.
+        """
+        if self._session is None:
+            self._session = self._new_session()
+            self._resources.callback(self._session.close)
+        return self
+
+    def close(self) -> None:
+        """Close the session; may be called twice.
+
+        Raises:
+            BusError: it did not close cleanly.
+        """
+        self._session = None
+        try:
+            self._resources.close()
+        except zenoh.ZError as error:
+            raise BusError(f"The {type(self).__name__} did not close cleanly ({plain_reason(error)}).") from error
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _new_session(self) -> zenoh.Session:
+        raise NotImplementedError
+
+    def _open(self) -> zenoh.Session:
+        if self._session is None:
+            raise BusError(f"The {type(self).__name__} is not open. Use it as a context manager.")
+        return self._session
+
+    def _keep(self, entity: object) -> None:
+        """Keep a declared entity until the session is closed: Zenoh undeclares what is garbage-collected."""
+        self._resources.callback(lambda: entity)
+
+
+class Connection(Session):
+    """A client session on a router.
 
     Args:
         endpoint: As of `open_client`.
@@ -120,34 +171,10 @@ class Connection:
     """
 
     def __init__(self, endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None = None) -> None:
+        super().__init__()
         self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
-        self._session: zenoh.Session | None = None
-        self._resources = ExitStack()
-        # A process that exits without closing its session would hang.
-        self._at_exit = weakref.finalize(self, self._resources.close)
 
-    def open(self) -> Self:
-        """Connect; raises a BusError as `open_client`, if waiting does not help, or if stopped meanwhile."""
-        if self._session is None:
-            self._session = self._connected()
-            self._resources.callback(self._session.close)
-        return self
-
-    def close(self) -> None:
-        """Disconnect; may be called twice."""
-        self._session = None
-        try:
-            self._resources.close()
-        except zenoh.ZError as error:
-            raise BusError(f"The session at {self._endpoint} did not close cleanly: {plain_reason(error)}.") from error
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
-    def _connected(self) -> zenoh.Session:
+    def _new_session(self) -> zenoh.Session:
         if self._stopped is None:
             return open_client(self._endpoint, timeout_s=self._timeout_s)
         waits = False
@@ -159,15 +186,6 @@ class Connection:
                     _LOG.warning("Waiting for a router. %s", error)
                 waits = True
         raise NoRouter(f"Stopped while waiting for a router at {self._endpoint}.")
-
-    def _open(self) -> zenoh.Session:
-        if self._session is None:
-            raise BusError(f"The {type(self).__name__} is not open. Use it as a context manager.")
-        return self._session
-
-    def _keep(self, entity: object) -> None:
-        """Keep a declared entity until the session is closed: Zenoh undeclares what is garbage-collected."""
-        self._resources.callback(lambda: entity)
 
 
 def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:
@@ -200,7 +218,7 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
         raise (BusError if stays else NoRouter)(sentence) from error
 
 
-class Router:
+class Router(Session):
     """A router in this process, for the sessions of one fleet.
 
     `with Router() as router:` listens on a free port of 127.0.0.1 until the end of the block. Linked routers (Zenoh's
@@ -231,6 +249,7 @@ class Router:
         Raises:
             BusError: plain TCP beyond loopback, a link without TLS, or no endpoint of TLS.
         """
+        super().__init__()
         if not 0 <= port <= 65535:
             raise ValueError(f"A port is 0..65535 (got {port}).")
         if state_hz is not None and not 0 < state_hz < 1e6:
@@ -250,8 +269,7 @@ class Router:
                 "Start both with --tls."
             )
         self._connect = [reachable(endpoint, tls) for endpoint in connect]
-        self._session: zenoh.Session | None = None
-        self._endpoint: str | None = None
+        self._endpoint = ""
 
     @property
     def endpoint(self) -> str:
@@ -260,18 +278,11 @@ class Router:
         Raises:
             BusError: the router is not open.
         """
-        if self._endpoint is None:
-            raise BusError("The router is not open.")
+        self._open()
         return self._endpoint
 
-    def open(self) -> Self:
-        """Listen.
-
-        Raises:
-            BusError: the port is in use, none is free, or the router's certificate is not valid.
-        """
-        if self._session is not None:
-            return self
+    def _new_session(self) -> zenoh.Session:
+        """Listen; raises a BusError if the port is in use, none is free, or the certificate is not valid."""
         try:
             session = zenoh.open(self._settings())
         except zenoh.ZError as error:
@@ -282,32 +293,11 @@ class Router:
         except BusError:
             session.close()
             raise
-        self._session = session
-        return self
+        return session
 
     def linked(self) -> int:
         """Number of other routers that it has a link to now."""
         return 0 if self._session is None else len(self._session.info.routers_zid())
-
-    def close(self) -> None:
-        """Stop listening and close all connections; may be called twice.
-
-        Raises:
-            BusError: the router did not close cleanly.
-        """
-        session, self._session, self._endpoint = self._session, None, None
-        if session is None:
-            return
-        try:
-            session.close()
-        except zenoh.ZError as error:
-            raise BusError(f"The router did not close cleanly ({plain_reason(error)}).") from error
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def _settings(self) -> zenoh.Config:
         roster = None

@@ -141,14 +141,11 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             bids=switch("bids", bids),
         )
         first = arm_spaces(self.layout)
-        per_arm = [spaces_like(first) for _ in world.arms]
-        self.observation_spaces: dict[str, spaces.Space[Any]] = {
-            arm: own["observation"] if mask_in == "info" else own
-            for arm, (own, _) in zip(world.arms, per_arm, strict=True)
-        }
-        self.action_spaces: dict[str, spaces.Space[Any]] = {
-            arm: own for arm, (_, own) in zip(world.arms, per_arm, strict=True)
-        }
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {}
+        self.action_spaces: dict[str, spaces.Space[Any]] = {}
+        for arm in world.arms:
+            observation, self.action_spaces[arm] = spaces_like(first)
+            self.observation_spaces[arm] = observation["observation"] if mask_in == "info" else observation
         low, high = self.layout.bounds
         self.state_space = spaces.Box(np.tile(low, len(world.arms)), np.tile(high, len(world.arms)), dtype=np.float32)
         self._shift: ShiftRunner | None = None

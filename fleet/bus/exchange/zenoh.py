@@ -8,7 +8,6 @@ of a shift depends neither on the load of the machine nor on others on the bus.
 import logging
 import math
 import os
-import weakref
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import NoReturn, Self
@@ -68,8 +67,6 @@ class ZenohExchange(Exchange):
         self._published = 0
         """Steps, over all episodes."""
         self._resources = ExitStack()
-        # A process that exits without closing its router would hang.
-        self._at_exit = weakref.finalize(self, self._resources.close)
 
     def __getstate__(self) -> NoReturn:
         """Refuse to be copied or pickled.
@@ -154,8 +151,6 @@ class ZenohExchange(Exchange):
             self._resources.close()
         except (zenoh.ZError, BusError) as error:
             raise BusError(f"The exchange did not close cleanly: {error}") from error
-        finally:
-            self._at_exit.detach()
 
     def __enter__(self) -> Self:
         return self.open()

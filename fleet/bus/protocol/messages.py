@@ -67,6 +67,12 @@ def _float_fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
     return tuple(field.name for field in described.fields if holds_float(field.type))
 
 
+def _check_length(message: msgspec.Struct, field: str, item: str, count: int) -> None:
+    values = getattr(message, field)
+    if len(values) != count:
+        raise ValueError(f"{type(message).__name__}.{field} needs one value per {item} ({count}, got {len(values)}).")
+
+
 class State(FiniteStruct, frozen=True, omit_defaults=True):
     """Telemetry of an arm; only the newest is valid. Quantities that are not measured are omitted."""
 
@@ -117,9 +123,8 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("housing_c", "expected_c", "q", "qd", "tau", "current_a"):
-            values = getattr(self, name)
-            if values and len(values) != len(self.temp_c):
-                raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")
+            if getattr(self, name):
+                _check_length(self, name, "joint", len(self.temp_c))
 
 
 class DifficultyScores(FiniteStruct, frozen=True, omit_defaults=True):
@@ -160,15 +165,11 @@ class DifficultyScores(FiniteStruct, frozen=True, omit_defaults=True):
                 f"DifficultyScores.bid_duration_s needs equally many plans for each of {len(self.jobs)} job(s) (got "
                 f"{bids} values)."
             )
-        for name, least in (("bid_peak_c", bids), ("bid_p_saturation", 0)):
-            if (count := len(getattr(self, name))) not in (bids, least):
-                raise ValueError(f"DifficultyScores.{name} needs one value per plan ({bids}, got {count}).")
-        for name in ("difficulty", "p_saturation", "peak_c"):
-            values = getattr(self, name)
-            if len(values) != len(self.jobs) and (values or name != "peak_c"):
-                raise ValueError(
-                    f"DifficultyScores.{name} needs one value per job ({len(self.jobs)}, got {len(values)})."
-                )
+        _check_length(self, "bid_peak_c", "plan", bids)
+        if self.bid_p_saturation:
+            _check_length(self, "bid_p_saturation", "plan", bids)
+        for name in ("difficulty", "p_saturation", *(["peak_c"] if self.peak_c else [])):
+            _check_length(self, name, "job", len(self.jobs))
         if len(set(self.jobs)) != len(self.jobs):
             raise ValueError(f"DifficultyScores.jobs names a job twice (got {self.jobs}).")
 
