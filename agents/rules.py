@@ -153,7 +153,7 @@ class Matched:
 
     def options(self, cost: Array, plans: int) -> Array:
         """The option of each arm or NONE, int [env, arm], by costs of jobs with `plans` options each."""
-        return matched_options(cost, plans)
+        return each_env(matching, cost, plans)
 
 
 class Wspt(CentralRule):
@@ -377,11 +377,6 @@ def each_env(pairs: Callable[[Array], list[tuple[int, int]]], cost: Array, plans
         for arm, slot in pairs(least[env]):
             chosen[env, arm] = slot * plans + best[env, arm, slot]
     return chosen.reshape(cost.shape[:-1])
-
-
-def matched_options(cost: Array, plans: int) -> Array:
-    """As `matching`, the option of each arm or NONE, int [..., arm], by costs [..., arm, option]."""
-    return each_env(matching, cost, plans)
 
 
 def matching(cost: Array) -> list[tuple[int, int]]:

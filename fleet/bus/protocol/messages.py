@@ -10,7 +10,6 @@ from math import isfinite
 from typing import Annotated, TypeVar
 
 import msgspec
-from msgspec import inspect
 
 from fleet.errors import BusError
 from fleet.telemetry import Mode
@@ -40,31 +39,11 @@ class FiniteStruct(msgspec.Struct, frozen=True):
     """A message that refuses NaN and infinity, which JSON cannot express, when it is constructed."""
 
     def __post_init__(self) -> None:
-        for name in _float_fields(type(self)):
-            value: float | tuple[float | None, ...] | None = getattr(self, name)
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
             for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not isfinite(number):
+                if isinstance(number, float) and not isfinite(number):
                     raise ValueError(f"{type(self).__name__}.{name} must be finite (got {number}).")
-
-
-@cache
-def _float_fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
-    """Names of the fields that hold a float, None, or a tuple of these."""
-
-    def holds_float(of: inspect.Type) -> bool:
-        match of:
-            case inspect.FloatType():
-                return True
-            case inspect.VarTupleType(item_type):
-                return holds_float(item_type)
-            case inspect.UnionType(types):
-                return any(map(holds_float, types))
-            case _:
-                return False
-
-    described = inspect.type_info(kind)
-    assert isinstance(described, inspect.StructType)
-    return tuple(field.name for field in described.fields if holds_float(field.type))
 
 
 def _check_length(message: msgspec.Struct, field: str, item: str, count: int) -> None:
