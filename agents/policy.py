@@ -159,25 +159,17 @@ class Local(ArrayPolicy):
     central: ClassVar[type[Policy]]
     """The central policy."""
 
-    def __init_subclass__(cls) -> None:
-        """Refuse a policy that plans: an arm alone has no simulator of the cell.
+    def __init__(self) -> None:
+        """Make the central policy.
 
         Raises:
-            TypeError: names the policy.
+            FleetError: there is none, or it plans in a simulator, which an arm alone does not have.
         """
-        super().__init_subclass__()
-        if hasattr(getattr(cls, "central", None), "plan_in"):
-            raise TypeError(
-                f"{cls.__name__}: {cls.central.__name__} plans in a simulator of its cell, which an arm alone "
-                "does not have; take a central policy without plan_in()"
-            )
-
-    def __init__(self) -> None:
         central = getattr(self, "central", None)
-        if not hasattr(central, "act"):
+        if not hasattr(central, "act") or hasattr(central, "plan_in"):
             raise FleetError(
-                f"{type(self).__name__} has no central policy (got {central!r}). Add to the class: central = a class "
-                "with act(observations)."
+                f"{type(self).__name__} has no central policy that an arm can have alone (got {central!r}). Add to the "
+                "class: central = a class with act(observations), without plan_in()."
             )
         self._policy = self.central()
 

@@ -389,15 +389,12 @@ class HeatBudget:
     relaxation: Relaxation
 
     @cached_property
-    def base_c(self) -> tuple[Array, Array]:
-        """Temperatures with the smallest heat at every tick, [arm, tick + 1, node], and their integrals over every
-        interval, K·s, [arm, tick, node]."""
-        world = self.relaxation.world
-        heat_w = np.repeat(self.relaxation.base_w[:, None], world.ticks, axis=1)
-        return self._simulated(heat_w)
+    def base_integral(self) -> Array:
+        """As of `_integral`, with the smallest heat."""
+        return self._integral(np.repeat(self.relaxation.base_w[:, None], self.relaxation.world.ticks, axis=1))
 
-    def _simulated(self, heat_w: Array) -> tuple[Array, Array]:
-        """Temperatures and integrals as in `base_c` with this heat, W, [arm, tick, node]."""
+    def _integral(self, heat_w: Array) -> Array:
+        """Integral of the temperatures over every interval, K·s, [arm, tick, node], with some heat, W, likewise."""
         world, thermal = self.relaxation.world, self.relaxation.world.thermal
         temp_c = np.empty((heat_w.shape[0], world.ticks + 1, heat_w.shape[2]))
         temp_c[:, 0] = world.start_c
@@ -407,8 +404,7 @@ class HeatBudget:
             )
         load_w = heat_w + thermal.to_ambient[:, None] * world.ambient_c.T[..., None]
         stored_j = thermal.capacity[:, None] * np.diff(temp_c, axis=1)
-        integral = np.linalg.solve(thermal.laplacian[:, None], (world.dt_s * load_w - stored_j)[..., None])[..., 0]
-        return temp_c, integral
+        return np.linalg.solve(thermal.laplacian[:, None], (world.dt_s * load_w - stored_j)[..., None])[..., 0]
 
     @cached_property
     def highest_c(self) -> float:
@@ -441,7 +437,7 @@ class HeatBudget:
         tick_of = self.relaxation.edges_s / world.dt_s
         edges = np.round(tick_of).astype(int)
         period_of = np.searchsorted(edges, np.arange(world.ticks), side="right") - 1
-        _, integral = self._simulated(self._heat_of(shares)[:, period_of])
+        integral = self._integral(self._heat_of(shares)[:, period_of])
         budgets: list[tuple[Array, Array, float]] = []
         for arm in range(len(world.arms)):
             above = shares[self.relaxation.columns.above[arm]]
@@ -502,7 +498,7 @@ class HeatBudget:
         window = slice(first, last)
         above = np.full(last - first, warning_c - self.highest_c)
         ticks = np.round(edges_s[[first, last]] / world.dt_s).astype(int)
-        base = float(self.base_c[1][arm, ticks[0] : ticks[1], joint].sum())
+        base = float(self.base_integral[arm, ticks[0] : ticks[1], joint].sum())
         bound = warning_c * float(edges_s[last] - edges_s[first]) - base
         columns = np.concatenate([own, relaxation.columns.lost[arm], relaxation.columns.above[arm][window]])
         scale = float(edges_s[last] - edges_s[first])
