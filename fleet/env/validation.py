@@ -5,9 +5,6 @@ from typing import Literal, TypeGuard
 
 import numpy as np
 
-from fleet.engine.shift import Episode as Episode
-from fleet.engine.shift import EpisodeFactory as EpisodeFactory
-
 Decisions = Literal["interval", "events"]
 """Length of a step: one decision interval, or until an arm may claim a job or passes its warning limit at work."""
 

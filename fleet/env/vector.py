@@ -23,7 +23,6 @@ from fleet.engine.step import FINISHED, JOBS_DONE, OUTCOME, TICK, TOTAL
 from fleet.engine.tables import INFO, Tables
 from fleet.env.allocation_v2 import AHEAD_S, arm_spaces
 from fleet.env.lookahead import CellSimulator, Lookahead
-from fleet.env.random_actions import random_legal as random_legal
 from fleet.env.validation import Decisions, at_least_one, check_choice, seeds_of, switch
 from fleet.observation import Layout, Observation
 from fleet.seeding import exchange_seed, shift_seeds
