@@ -40,7 +40,7 @@ class FiniteStruct(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
-            value = getattr(self, name)
+            value: float | tuple[float, ...] | str | None = getattr(self, name)  # and others
             for number in value if isinstance(value, tuple) else (value,):
                 if isinstance(number, float) and not isfinite(number):
                     raise ValueError(f"{type(self).__name__}.{name} must be finite (got {number}).")
