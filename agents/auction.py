@@ -75,7 +75,6 @@ class Auction(Wsept):
     `wsept` makes as many pairs as possible first.
     """
 
-    only_choices = True
     relative_epsilon = 0.01
     """ε as a share of the largest benefit."""
 

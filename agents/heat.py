@@ -10,11 +10,11 @@ error limit follow from the observed headrooms.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from agents.policy import WAIT, ArmPolicy, CellLookahead, Local, PlanningPolicy, Policy, per_option, plans_of
+from agents.policy import WAIT, ArmPolicy, Local, PlanningPolicy, Policy, per_option, plans_of
 from agents.rules import Ahead, CentralRule, Matched
 from fleet.observation import LazyObservation, Observation
 from fleet.robot import RATING
@@ -165,26 +165,7 @@ class _GuardOfArm:
 class GuardedArm:
     """An arm policy whose claims pass a guard."""
 
-    def __init__(self, guard: Callable[[], Guard], policy: ArmPolicy) -> None:
-        self.scope = policy.scope
-        self._make_guard, self._policy = guard, policy
-        self._guard = _GuardOfArm(guard())
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Begin a shift."""
-        self._guard = _GuardOfArm(self._make_guard())
-        self._policy.reset(rng)
-
-    def choose(self, observation: Observation, place: int) -> int:
-        """The choice of the policy among the claims that the guard allows."""
-        narrowed = self._guard.narrow(observation)
-        return self._guard.decide(observation, self._policy.choose(narrowed, place))
-
-
-class GuardedFleet:
-    """A policy for all arms, with a guard for each of them."""
-
-    def __init__(self, guard: Callable[[], Guard], policy: Policy) -> None:
+    def __init__(self, guard: Callable[[], Guard], policy: Any) -> None:
         self.scope = policy.scope
         self._make_guard, self._policy = guard, policy
         self._guards: dict[str, _GuardOfArm] = {}
@@ -194,6 +175,21 @@ class GuardedFleet:
         self._guards = {}
         self._policy.reset(rng)
 
+    def choose(self, observation: Observation, place: int) -> int:
+        """The choice of the policy among the claims that the guard allows."""
+        guard = self._guards.setdefault("", _GuardOfArm(self._make_guard()))
+        return guard.decide(observation, self._policy.choose(guard.narrow(observation), place))
+
+
+class GuardedFleet(GuardedArm):
+    """A policy for all arms, with a guard for each of them. It plans if the policy does, in a simulator that knows of
+    no guards."""
+
+    def __init__(self, guard: Callable[[], Guard], policy: Any) -> None:
+        super().__init__(guard, policy)
+        if isinstance(policy, PlanningPolicy):
+            self.plan_in = policy.plan_in
+
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The actions of the policy among the claims that the guards allow."""
         for arm in observations:
@@ -201,26 +197,10 @@ class GuardedFleet:
         actions = self._policy.act({arm: self._guards[arm].narrow(seen) for arm, seen in observations.items()})
         return {arm: self._guards[arm].decide(seen, actions.get(arm, WAIT)) for arm, seen in observations.items()}
 
-    def choose(self, observation: Observation, place: int) -> int:
-        """The choice of one arm, of a policy of scope arm."""
-        return self.act({"": observation})[""]
-
-
-class GuardedPlanner(GuardedFleet):
-    """A policy that plans in a simulator, which knows of no guards, with a guard for each arm."""
-
-    def plan_in(self, cell: CellLookahead) -> None:
-        """Let the policy plan in the simulator of a shift."""
-        if isinstance(self._policy, PlanningPolicy):
-            self._policy.plan_in(cell)
-
 
 def guarded(guard: Callable[[], Guard], policy: Policy | ArmPolicy) -> Policy | ArmPolicy:
     """A policy, for one arm or for all, whose claims pass a guard."""
-    if hasattr(policy, "act"):
-        kind = GuardedPlanner if isinstance(policy, PlanningPolicy) else GuardedFleet
-        return kind(guard, policy)  # pyright: ignore  # hasattr does not narrow the type
-    return GuardedArm(guard, policy)  # pyright: ignore
+    return (GuardedFleet if hasattr(policy, "act") else GuardedArm)(guard, policy)  # pyright: ignore[reportReturnType]
 
 
 Floats = Array | float
@@ -233,8 +213,6 @@ class Thermometer(Matched, CentralRule):
     An arm may claim a job if the headroom of joints 1 to 4, in K, is at least the payload in kg times
     min(duration / 15 min, 1).
     """
-
-    only_choices = True
 
     def index(self, seen: Observation) -> Array:
         """Value per second of every option, [env, arm, option]; −inf for those that must not be claimed."""
@@ -281,7 +259,6 @@ class Wsept(Matched, CentralRule):
     & Morton, Management Science 33, 1987.
     """
 
-    only_choices = True
     fault_price: ClassVar = 20.0
     """In units of value; `thermofleet show` prints 14 to 27 for the scenarios of the library."""
     peak_sd_k: ClassVar = 4.0
@@ -376,8 +353,6 @@ class Wsept(Matched, CentralRule):
 
 class WseptAhead(Ahead, Wsept):
     """As `wsept`, with arms that are home soon as well: a job waits for such an arm if that is worth more per time."""
-
-    only_choices = True
 
 
 class WseptLocal(Local):

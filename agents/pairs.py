@@ -152,8 +152,6 @@ class LearnedPrices(BidPrice):
         parameters: float [PARAMETERS], as a training found them.
     """
 
-    only_choices = True
-
     def __init__(self, parameters: Array) -> None:
         self.parameters = np.asarray(parameters, dtype=float)
         learned = Prices(*self.parameters[: len(Prices._fields)].tolist())

@@ -35,7 +35,6 @@ those before it are done.
 Source: Ovacik & Uzsoy, International Journal of Production Research 32, 1994 (rolling horizons).
 """
 
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -209,8 +208,6 @@ class Solution(NamedTuple):
     worth: float
     gap: float
     """Relative distance of the worth to the bound of the solver, 0 if it is proven optimal."""
-    seconds: float
-    """Wall time of the decision."""
 
 
 class Sequences(NamedTuple):
@@ -235,7 +232,6 @@ class RollingHorizon(Wsept):
     """
 
     scope: ClassVar = "central"
-    only_choices = True
     horizon_s: ClassVar = 3600.0
     nodes: ClassVar = 100
     """Most nodes of the solver's branch and bound at each decision; nearly all end at the first."""
@@ -249,25 +245,21 @@ class RollingHorizon(Wsept):
     firsts: ClassVar = 16
     """Plans per arm with the most worth that may be the first of a sequence; half as many may be the second."""
 
-    def __init__(self) -> None:
-        self.solution: Solution | None = None
-
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift."""
-        self.solution = None
+        self.solution: Solution | None = None
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The claims of the sequences whose first plan can begin now."""
         if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
             return dict.fromkeys(observations, WAIT)
-        began_s, fleet = time.perf_counter(), list(observations.values())
+        fleet = list(observations.values())
         home_s = max((float(seen.busy_s) for seen in fleet if seen.working), default=0.0)
         found = [self.sequences(seen, home_s) for seen in fleet]
-        solution = pack(found, len(fleet[0].offered), plans_of(fleet[0]), self.time_limit_s, self.nodes)
-        self.solution = solution._replace(seconds=time.perf_counter() - began_s)
+        self.solution = pack(found, len(fleet[0].offered), plans_of(fleet[0]), self.time_limit_s, self.nodes)
         arm = np.repeat(np.arange(len(found)), [len(each.first) for each in found])
         first, waits = (np.concatenate([getattr(each, name) for each in found]) for name in ("first", "waits"))
-        actions = {list(observations)[arm[i]]: 1 + int(first[i]) for i in solution.chosen if not waits[i]}
+        actions = {list(observations)[arm[i]]: 1 + int(first[i]) for i in self.solution.chosen if not waits[i]}
         return dict.fromkeys(observations, WAIT) | actions
 
     def sequences(self, seen: Observation, home_s: float) -> Sequences:
@@ -347,7 +339,7 @@ def pack(sequences: Sequence[Sequences], slots: int, plans: int, time_limit_s: f
     counts = [len(each.first) for each in sequences]
     total = sum(counts)
     if not total:
-        return Solution([], 0.0, 0.0, 0.0)
+        return Solution([], 0.0, 0.0)
     arm = np.repeat(np.arange(len(sequences)), counts)
     first, second, worth = (np.concatenate([each[i] for each in sequences]) for i in (0, 1, 3))
     has_second = np.flatnonzero(second != NONE)
@@ -362,9 +354,9 @@ def pack(sequences: Sequence[Sequences], slots: int, plans: int, time_limit_s: f
         options={"time_limit": time_limit_s, "node_limit": nodes},
     )
     if result.x is None:  # no solution within the limits
-        return Solution(_greedy(arm, first // plans, second // plans, worth), 0.0, np.inf, 0.0)
+        return Solution(_greedy(arm, first // plans, second // plans, worth), 0.0, np.inf)
     chosen = np.flatnonzero(result.x > 0.5).tolist()
-    return Solution(chosen, float(-result.fun), float(result.mip_gap or 0.0), 0.0)
+    return Solution(chosen, float(-result.fun), float(result.mip_gap or 0.0))
 
 
 def _greedy(arm: Array, first: Array, second: Array, worth: Array) -> list[int]:

@@ -107,6 +107,9 @@ class ArrayPolicy:
 
     scope: ClassVar[str] = "central"
 
+    def __init__(self) -> None:
+        self.reset(np.random.default_rng(0))
+
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift; there is nothing to reset."""
 
@@ -156,20 +159,18 @@ class Local(ArrayPolicy):
     central: ClassVar[type[Policy]]
     """The central policy."""
 
-    def __init_subclass__(cls) -> None:
-        """Refuse a policy that plans: an arm alone has no simulator of the cell.
+    def __init__(self) -> None:
+        """Make the central policy.
 
         Raises:
-            TypeError: names the policy.
+            FleetError: there is none, or it plans in a simulator, which an arm alone does not have.
         """
-        super().__init_subclass__()
-        if hasattr(getattr(cls, "central", None), "plan_in"):
-            raise TypeError(
-                f"{cls.__name__}: {cls.central.__name__} plans in a simulator of its cell, which an arm alone "
-                "does not have; take a central policy without plan_in()"
+        central = getattr(self, "central", None)
+        if not hasattr(central, "act") or hasattr(central, "plan_in"):
+            raise FleetError(
+                f"{type(self).__name__} has no central policy that an arm can have alone (got {central!r}). Add to the "
+                "class: central = a class with act(observations), without plan_in()."
             )
-
-    def __init__(self) -> None:
         self._policy = self.central()
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -197,9 +198,6 @@ class Shared(ArrayPolicy):
     scope: ClassVar = "arm"
     central: ClassVar[type[ArrayPolicy]]
     """The central policy; it must decide on arrays."""
-
-    def __init__(self) -> None:
-        self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift."""
@@ -317,9 +315,11 @@ def only_choices(policy: Policy) -> bool:
     """Whether calls of the policy can be skipped while no arm may claim a job, which is nine steps of ten.
 
     A class declares `only_choices = True` if it then returns WAIT for all arms, draws no random number and changes no
-    state. A subclass must declare it again.
+    state. The classes of this package inherit it; other subclasses must declare it again.
     """
-    return vars(_kind_of(policy)).get("only_choices") is True
+    kind = _kind_of(policy)
+    inherits = kind.__module__.startswith("agents.")
+    return (getattr(kind, "only_choices", False) if inherits else vars(kind).get("only_choices")) is True
 
 
 def reads_messages(policy: Policy) -> bool:

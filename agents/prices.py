@@ -181,9 +181,6 @@ class BidPrice(CentralArrayPolicy):
     most_of_rate: float = MOST_OF_RATE
     """As in `price_of`."""
 
-    def __init__(self) -> None:
-        self.reset(np.random.default_rng(0))
-
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift: no job has been seen."""
         self._arms: tuple[str, ...] = ()
@@ -287,8 +284,6 @@ class BidPrice(CentralArrayPolicy):
 
 class BidPriceByMessages(BidPrice):
     """As `bid_price`, for bids that arrive by messages."""
-
-    only_choices = True
 
     @classmethod
     def ages_s(cls, seen: Observation) -> Array:

@@ -8,16 +8,27 @@ from typing import TYPE_CHECKING, Any
 from fleet.errors import nearest
 
 if TYPE_CHECKING:  # slow to import, and the help of commands needs names only
-    from agents.heat import Guard
-    from agents.policy import ArmPolicy, Policy
+    from agents.policy import Policy
 
 
 @dataclass(frozen=True)
-class BuiltInPolicy:
-    """One policy that comes with the project."""
+class BuiltIn:
+    """What comes with the project, by a name."""
 
     target: str
-    """MODULE:CLASS, the module in this package; it is imported when the policy is made."""
+    """MODULE:CLASS, the module in this package; it is imported when it is used."""
+
+    @cached_property
+    def kind(self) -> Any:
+        """Its class (Any: each subclass knows which)."""
+        module, _, name = self.target.partition(":")
+        return getattr(import_module(f"agents.{module}"), name)
+
+
+@dataclass(frozen=True)
+class BuiltInPolicy(BuiltIn):
+    """One policy that comes with the project."""
+
     cost: str
     """Cost that it minimises, for a table."""
     source: str = ""
@@ -25,17 +36,6 @@ class BuiltInPolicy:
     """See `agents.policy`."""
     plans: bool = False
     """Whether it plans in a simulator of its cell, which a live fleet does not have."""
-
-    @cached_property
-    def kind(self) -> "type[Policy] | type[ArmPolicy]":
-        """Its class."""
-        return _imported(self.target)
-
-
-def _imported(target: str) -> Any:
-    """The class of MODULE:CLASS (Any: each caller knows its kind)."""
-    module, _, name = target.partition(":")
-    return getattr(import_module(f"agents.{module}"), name)
 
 
 _RELATIVE, _THERMAL, _TIME = "difficulty relative to the fleet", "thermal", "time until the finish"
@@ -93,19 +93,12 @@ RULES: dict[str, BuiltInPolicy] = {
 
 
 @dataclass(frozen=True)
-class Wrapper:
+class Wrapper(BuiltIn):
     """A guard that comes with the project; `NAME:POLICY` wraps any policy in it."""
 
-    target: str
-    """MODULE:CLASS, as in `BuiltInPolicy`."""
     effect: str
     """Description, for a table."""
     source: str
-
-    @cached_property
-    def kind(self) -> "type[Guard]":
-        """Its class."""
-        return _imported(self.target)
 
 
 WRAPPERS: dict[str, Wrapper] = {

@@ -31,9 +31,6 @@ class RandomLegal(ArrayPolicy):
     reads_messages: ClassVar = False
     only_choices = True
 
-    def __init__(self) -> None:
-        self.reset(np.random.default_rng(0))
-
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift."""
         self._rng = rng
@@ -57,9 +54,6 @@ class RoundRobin(CentralArrayPolicy):
     """The oldest job goes to the next able arm in turn."""
 
     only_choices = True
-
-    def __init__(self) -> None:
-        self._turn = 0
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift: the first arm's turn."""
@@ -135,6 +129,8 @@ class CentralRule(CentralArrayPolicy):
     Ties go to the older job, then to the first arm. This is a sequential single-item auction with one job per arm.
     """
 
+    only_choices = True
+
     def actions(self, seen: Observation) -> Array:
         """The claims of the pairs."""
         return 1 + self.options(self.cost(seen), plans_of(seen))
@@ -157,7 +153,7 @@ class Matched:
 
     def options(self, cost: Array, plans: int) -> Array:
         """The option of each arm or NONE, int [env, arm], by costs of jobs with `plans` options each."""
-        return matched_options(cost, plans)
+        return each_env(matching, cost, plans)
 
 
 class Wspt(CentralRule):
@@ -167,7 +163,6 @@ class Wspt(CentralRule):
     1956), a strong rule on unrelated machines. It ignores temperatures.
     """
 
-    only_choices = True
     most_p = 1.0
     """Largest P(saturation) of a claim."""
 
@@ -183,7 +178,6 @@ class WsptCool(Wspt):
     Such a job waits until an arm has cooled.
     """
 
-    only_choices = True
     most_p = 0.5
 
 
@@ -312,8 +306,6 @@ def _mean(values: Array, where: Array, plans: int, otherwise: float = 0.0) -> Ar
 class Ssi(CentralRule):
     """Sequential single-item auction: the pair of arm and job with the least thermal cost first."""
 
-    only_choices = True
-
     def cost(self, seen: Observation) -> Array:
         """[env, arm, option]."""
         return thermal(seen)
@@ -322,13 +314,9 @@ class Ssi(CentralRule):
 class Matching(Matched, Ssi):
     """As many jobs as possible at the least total thermal cost: an optimal matching of arms and jobs."""
 
-    only_choices = True
-
 
 class QuickestSsi(CentralRule):
     """As `ssi`, by the time until the finish alone."""
-
-    only_choices = True
 
     def cost(self, seen: Observation) -> Array:
         """[env, arm, option]."""
@@ -337,8 +325,6 @@ class QuickestSsi(CentralRule):
 
 class QuickestMatching(Matched, QuickestSsi):
     """As `matching`, by the time until the finish alone."""
-
-    only_choices = True
 
 
 class Ahead:
@@ -374,8 +360,6 @@ class Ahead:
 class MatchingAhead(Ahead, Matching):
     """As `matching`, with arms that are home soon as well."""
 
-    only_choices = True
-
 
 def each_env(pairs: Callable[[Array], list[tuple[int, int]]], cost: Array, plans: int) -> Array:
     """The option of each arm or NONE, int [..., arm], by an assignment of arms and slots in each env.
@@ -393,11 +377,6 @@ def each_env(pairs: Callable[[Array], list[tuple[int, int]]], cost: Array, plans
         for arm, slot in pairs(least[env]):
             chosen[env, arm] = slot * plans + best[env, arm, slot]
     return chosen.reshape(cost.shape[:-1])
-
-
-def matched_options(cost: Array, plans: int) -> Array:
-    """As `matching`, the option of each arm or NONE, int [..., arm], by costs [..., arm, option]."""
-    return each_env(matching, cost, plans)
 
 
 def matching(cost: Array) -> list[tuple[int, int]]:
@@ -424,8 +403,6 @@ TIME_DIGITS = 1
 class Fifo(CentralRule):
     """First in, first out: the oldest job of the queue first, to the arm that needs the least time for it."""
 
-    only_choices = True
-
     def index(self, seen: Observation) -> Array:
         """Place in the queue from its end, then the shorter duration, [env, arm, option]."""
         return _first_by(per_option(seen, np.arange(seen.offered.shape[-1])), seen.duration_s)
@@ -436,8 +413,6 @@ class Edd(CentralRule):
 
     Optimal for the largest lateness on one machine (Jackson 1955).
     """
-
-    only_choices = True
 
     def index(self, seen: Observation) -> Array:
         """Minus the time until the due date, then the shorter duration, [env, arm, option]."""
@@ -450,8 +425,6 @@ class Spt(QuickestSsi):
     Optimal for the sum of completion times on one machine (Smith 1956).
     """
 
-    only_choices = True
-
 
 class Atc(CentralRule):
     """Apparent tardiness cost: value per time, discounted by exp(−slack / (k · mean duration)) until the slack is 0.
@@ -461,7 +434,6 @@ class Atc(CentralRule):
     Source: Vepsalainen & Morton, Management Science 33, 1987; k = 2 as there for little congestion.
     """
 
-    only_choices = True
     look_ahead: ClassVar = 2.0
     """k."""
 
@@ -486,9 +458,6 @@ class LeastLoaded(CentralArrayPolicy):
 
     only_choices = False
     """A lost claim becomes known in the next interval."""
-
-    def __init__(self) -> None:
-        self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift: no arm has worked."""

@@ -3,6 +3,8 @@
 import codecs
 import os
 import re
+import shutil
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -83,3 +85,21 @@ def atomic_path(path: Path) -> Iterator[Path]:
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def replace_folder(work: Path, place: Path) -> None:
+    """Rename the folder `work` to `place`; after an error the previous folder is still there."""
+    if not place.exists():
+        work.rename(place)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.old.", dir=place.parent))
+    old = aside / place.name
+    try:
+        place.rename(old)
+        work.rename(place)
+    except OSError:
+        if old.exists():
+            old.rename(place)
+        aside.rmdir()
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

@@ -19,7 +19,7 @@ import numpy as np
 
 from agents.heat import guarded
 from agents.pairs import PAIRS, load_pairs
-from agents.policy import SCOPES, ArmPolicy, Local, PlanningPolicy, Policy, for_all_arms, no_simulator
+from agents.policy import SCOPES, ArmPolicy, PlanningPolicy, Policy, for_all_arms, no_simulator
 from agents.registry import RULES, WRAPPERS, rule_of
 from fleet.errors import NAME_RULE, FleetError, is_name, nearest, printable
 from fleet.seeding import child
@@ -321,15 +321,6 @@ def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy],
     if missing:
         needed = " and ".join(f"{method}({arguments})" for method, arguments in METHODS[scope].items())
         raise FleetError(f"'{name}' is no policy: of scope {scope} it needs the methods {needed}.")
-    if (
-        isinstance(example, type)
-        and issubclass(example, Local)
-        and not hasattr(getattr(example, "central", None), "act")
-    ):
-        raise FleetError(
-            f"'{name}' has no central policy (got {getattr(example, 'central', None)!r}). Add to the class: central = "
-            "a class with act(observations)."
-        )
     return found, scope  # pyright: ignore[reportReturnType]  # by its scope and methods
 
 

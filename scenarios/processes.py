@@ -28,35 +28,34 @@ IDLE_S = 120.0
 Result = TypeVar("Result", covariant=True)  # of protocols and of frozen values
 
 
-class WorkUnit(Protocol[Result]):
-    """A piece of work for one process."""
+@dataclass(frozen=True, eq=False)
+class WorkUnit(Generic[Result]):
+    """Base of a piece of work for one process."""
+
+    deaths: int = field(default=0, kw_only=True)
+    """Number of processes that died during it."""
 
     @property
     def name(self) -> str:
         """Name in a sentence about a process that died."""
-        ...
+        raise NotImplementedError
 
     @property
     def group(self) -> object:
-        """Units of one group share what a process caches, such as a prepared fleet."""
-        ...
-
-    @property
-    def deaths(self) -> int:
-        """Number of processes that died during it."""
-        ...
+        """Units of one group share what a process caches, such as a prepared fleet, and start in their order."""
+        return "all"
 
     def __call__(self) -> Result:
         """Compute the result, in any process."""
-        ...
+        raise NotImplementedError
 
     def after_death(self) -> "Sequence[WorkUnit[Result]]":
         """The same work, perhaps in smaller units, each with one death more."""
-        ...
+        return [replace(self, deaths=self.deaths + 1)]
 
     def given_up(self) -> Result:
         """Result after `MOST_DEATHS`."""
-        ...
+        raise FleetError(f"The process that ran {self.name} died {MOST_DEATHS} times.")
 
 
 class Worker(Protocol):
@@ -184,7 +183,7 @@ def run_all(
 
 
 @dataclass(frozen=True, eq=False)
-class Call(Generic[Result]):
+class Call(WorkUnit[Result]):
     """A call of a function as a unit of work."""
 
     number: int
@@ -192,25 +191,13 @@ class Call(Generic[Result]):
     function: Callable[..., Result]
     arguments: Sequence[Any]
     options: dict[str, Any] = field(default_factory=dict)
-    deaths: int = 0
 
     @property
     def name(self) -> str:
         return getattr(self.function, "__qualname__", repr(self.function))
 
-    @property
-    def group(self) -> object:
-        """The same for all calls, so that they start in their order."""
-        return "calls"
-
     def __call__(self) -> Result:
         return self.function(*self.arguments, **self.options)
-
-    def after_death(self) -> "list[Call[Result]]":
-        return [replace(self, deaths=self.deaths + 1)]
-
-    def given_up(self) -> Result:
-        raise FleetError(f"The process that ran {self.name} died {MOST_DEATHS} times.")
 
 
 Delayed = tuple[Callable[..., Any], Sequence[Any], dict[str, Any]]

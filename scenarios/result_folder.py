@@ -11,7 +11,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from fleet.errors import FleetError
-from fleet.files import atomic_path
+from fleet.files import atomic_path, replace_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,23 +43,13 @@ def new_folder(out: Path, kind: ResultKind, *, overwrite: bool = False) -> Itera
         yield work
         with disk_errors(out):
             work.chmod(0o755)
-            _replace(target, work)
+            replace_folder(work, target)
     finally:
         if work.exists():
             shutil.rmtree(work)
             for parent in created:
                 with suppress(OSError):  # another process has put a file there in the meantime
                     parent.rmdir()
-
-
-def _replace(target: Path, work: Path) -> None:
-    if not target.exists():
-        work.rename(target)
-        return
-    old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
-    target.rename(old / target.name)
-    work.rename(target)
-    shutil.rmtree(old)
 
 
 @contextmanager

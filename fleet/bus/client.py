@@ -10,10 +10,9 @@ import logging
 import math
 import threading
 import time
-import weakref
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any, Generic, Self, TypeVar, TypeVarTuple
@@ -26,7 +25,7 @@ from fleet.bus.mailbox import Mailbox
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import BusChannel, Pattern, channel_for, channel_of
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode, encode, encoding
-from fleet.bus.router import connect, plain_reason
+from fleet.bus.router import Connection
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import participant_at
 from fleet.errors import BusError, Refused
@@ -116,7 +115,7 @@ def read_message(kind: type[Message], key: str, sent_encoding: str, payload: byt
     return sender.name, message
 
 
-class BusClient:
+class BusClient(Connection):
     """A participant's connection to the router, for one thread: `with BusClient(endpoint, fleet) as client:`.
 
     Attributes:
@@ -142,42 +141,32 @@ class BusClient:
             backlog: Maximum number of queued messages; a full queue drops the oldest.
             stopped: Wait for a router until this is true, instead of `timeout_s`.
         """
+        super().__init__(endpoint, timeout_s, stopped)
         self.fleet = fleet
         self.malformed = 0
         self.rejections: deque[str] = deque(maxlen=8)
         self.overrun = 0
-        self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
         self._calls: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox(backlog)
-        self._session: zenoh.Session | None = None
         self._participant: RosterEntry | None = None
-        self._resources = ExitStack()
-        # A process that exits without closing its session would hang.
-        self._at_exit = weakref.finalize(self, self._resources.close)
 
     def open(self) -> Self:
-        """Connect; raises a BusError if no router accepts the connection."""
+        """Connect.
+
+        Raises:
+            BusError: no router accepts the connection, or `stopped` meanwhile.
+        """
         if self._session is None:
-            self._session = connect(self._endpoint, self._timeout_s, self._stopped)
-            self._resources.callback(self._session.close)
+            super().open()
             self._participant = participant_at(self._endpoint)
         return self
 
     def close(self) -> None:
         """Disconnect; messages that were not handled are dropped. May be called twice."""
-        self._session = None
         try:
-            self._resources.close()
-        except zenoh.ZError as error:
-            raise BusError(f"The session at {self._endpoint} did not close cleanly: {plain_reason(error)}.") from error
+            super().close()
         finally:
             for _ in self._calls.take():
                 pass
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     # Handling what arrives
 
@@ -408,15 +397,6 @@ class BusClient:
         if participant.role not in allowed:
             needed = f"; that takes a certificate of the role {' or '.join(allowed)}" if allowed else ""
             raise BusError(f"'{participant.common_name}' may not query '{key}'{needed}.")
-
-    def _open(self) -> zenoh.Session:
-        if self._session is None:
-            raise BusError("The BusClient is not open. Use it as a context manager.")
-        return self._session
-
-    def _keep(self, entity: object) -> None:
-        """Keep a declared entity until the client is closed: Zenoh undeclares what is garbage-collected."""
-        self._resources.callback(lambda: entity)
 
     def _token(self, key: str, present: bool, handle: Callable[[str, bool], None]) -> None:
         try:

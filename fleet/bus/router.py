@@ -8,7 +8,9 @@ import ipaddress
 import json
 import logging
 import re
+import weakref
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from typing import Any, Self
 
 import zenoh
@@ -23,7 +25,6 @@ from fleet.errors import BusError, NoRouter
 
 _LOG = logging.getLogger(__name__)
 
-_ATTEMPTS = 3
 _TURN_S = 1.0
 """Real seconds of one attempt while waiting for a router."""
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
@@ -109,23 +110,82 @@ def reached_at(host: str) -> str:
     return _ANY_ADDRESS.get(bare, f"[{bare}]" if ":" in bare else bare)
 
 
-def connect(endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None) -> zenoh.Session:
-    """A client session on the router at `endpoint`: once there is one, if `stopped` is given, instead of `timeout_s`.
+class Session:
+    """Base of what has a Zenoh session from `open` to `close`, or in a `with` block."""
 
-    Raises:
-        BusError: as `open_client`, if waiting does not help, or stopped meanwhile.
-    """
-    if stopped is None:
-        return open_client(endpoint, timeout_s=timeout_s)
-    waits = False
-    while not stopped():
+    def __init__(self) -> None:
+        self._session: zenoh.Session | None = None
+        self._resources = ExitStack()
+        # A process that exits without closing its session would hang.
+        self._at_exit = weakref.finalize(self, self._resources.close)
+
+    def open(self) -> Self:
+        """Open the session; does nothing if it is open.
+
+        Raises:
+            BusError: the session cannot be opened.
+        """
+        if self._session is None:
+            self._session = self._new_session()
+            self._resources.callback(self._session.close)
+        return self
+
+    def close(self) -> None:
+        """Close the session; may be called twice.
+
+        Raises:
+            BusError: it did not close cleanly.
+        """
+        self._session = None
         try:
-            return open_client(endpoint, timeout_s=_TURN_S)
-        except NoRouter as error:
-            if not waits:
-                _LOG.warning("Waiting for a router. %s", error)
-            waits = True
-    raise NoRouter(f"Stopped while waiting for a router at {endpoint}.")
+            self._resources.close()
+        except zenoh.ZError as error:
+            raise BusError(f"The {type(self).__name__} did not close cleanly ({plain_reason(error)}).") from error
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _new_session(self) -> zenoh.Session:
+        raise NotImplementedError
+
+    def _open(self) -> zenoh.Session:
+        if self._session is None:
+            raise BusError(f"The {type(self).__name__} is not open. Use it as a context manager.")
+        return self._session
+
+    def _keep(self, entity: object) -> None:
+        """Keep a declared entity until the session is closed: Zenoh undeclares what is garbage-collected."""
+        self._resources.callback(lambda: entity)
+
+
+class Connection(Session):
+    """A client session on a router.
+
+    Args:
+        endpoint: As of `open_client`.
+        timeout_s: How long the router may take to accept the connection.
+        stopped: Wait for a router until this is true, instead of `timeout_s`.
+    """
+
+    def __init__(self, endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None = None) -> None:
+        super().__init__()
+        self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
+
+    def _new_session(self) -> zenoh.Session:
+        if self._stopped is None:
+            return open_client(self._endpoint, timeout_s=self._timeout_s)
+        waits = False
+        while not self._stopped():
+            try:
+                return open_client(self._endpoint, timeout_s=_TURN_S)
+            except NoRouter as error:
+                if not waits:
+                    _LOG.warning("Waiting for a router. %s", error)
+                waits = True
+        raise NoRouter(f"Stopped while waiting for a router at {self._endpoint}.")
 
 
 def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:
@@ -158,7 +218,7 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
         raise (BusError if stays else NoRouter)(sentence) from error
 
 
-class Router:
+class Router(Session):
     """A router in this process, for the sessions of one fleet.
 
     `with Router() as router:` listens on a free port of 127.0.0.1 until the end of the block. Linked routers (Zenoh's
@@ -189,6 +249,7 @@ class Router:
         Raises:
             BusError: plain TCP beyond loopback, a link without TLS, or no endpoint of TLS.
         """
+        super().__init__()
         if not 0 <= port <= 65535:
             raise ValueError(f"A port is 0..65535 (got {port}).")
         if state_hz is not None and not 0 < state_hz < 1e6:
@@ -208,8 +269,7 @@ class Router:
                 "Start both with --tls."
             )
         self._connect = [reachable(endpoint, tls) for endpoint in connect]
-        self._session: zenoh.Session | None = None
-        self._endpoint: str | None = None
+        self._endpoint = ""
 
     @property
     def endpoint(self) -> str:
@@ -218,67 +278,26 @@ class Router:
         Raises:
             BusError: the router is not open.
         """
-        if self._endpoint is None:
-            raise BusError("The router is not open.")
+        self._open()
         return self._endpoint
 
-    def open(self) -> Self:
-        """Listen.
-
-        Raises:
-            BusError: the port is in use, none is free, or the router's certificate is not valid.
-        """
-        if self._session is not None:
-            return self
-        config = self._settings()
-        problem = BusError("The router did not open.")
-        # A second attempt only helps if the system chooses the port.
-        for attempt in range(1, 1 + (1 if self._port else _ATTEMPTS)):
-            try:
-                session = zenoh.open(config)
-            except zenoh.ZError as error:
-                where = (
-                    f"port {self._port} of {self._host}; is it in use?"
-                    if self._port
-                    else f"a free port of {self._host}."
-                )
-                problem = BusError(f"The router could not listen on {where} ({plain_reason(error)})")
-                problem.__cause__ = error
-                continue
-            try:
-                self._endpoint = self._where(session)
-            except BusError as error:
-                problem = error
-                session.close()
-                continue
-            self._session = session
-            _LOG.debug("Router at %s (attempt %d).", self._endpoint, attempt)
-            return self
-        raise problem
+    def _new_session(self) -> zenoh.Session:
+        """Listen; raises a BusError if the port is in use, none is free, or the certificate is not valid."""
+        try:
+            session = zenoh.open(self._settings())
+        except zenoh.ZError as error:
+            where = f"port {self._port} of {self._host}; is it in use?" if self._port else f"a port of {self._host}."
+            raise BusError(f"The router could not listen on {where} ({plain_reason(error)})") from error
+        try:
+            self._endpoint = self._where(session)
+        except BusError:
+            session.close()
+            raise
+        return session
 
     def linked(self) -> int:
         """Number of other routers that it has a link to now."""
         return 0 if self._session is None else len(self._session.info.routers_zid())
-
-    def close(self) -> None:
-        """Stop listening and close all connections; may be called twice.
-
-        Raises:
-            BusError: the router did not close cleanly.
-        """
-        session, self._session, self._endpoint = self._session, None, None
-        if session is None:
-            return
-        try:
-            session.close()
-        except zenoh.ZError as error:
-            raise BusError(f"The router did not close cleanly ({plain_reason(error)}).") from error
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def _settings(self) -> zenoh.Config:
         roster = None
@@ -393,16 +412,11 @@ def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
     _, tls = identified(endpoint)
     if tls is not None:
         return (read_roster(tls.folder).fleet,) if (tls.folder / ROSTER).exists() else ()
-    found: set[str] = set()
-    with open_client(endpoint, timeout_s=timeout_s) as session:
-        for reply in session.liveliness().get(ALL_TOKENS, timeout=timeout_s):
-            if reply.ok is None:
-                continue
-            try:
-                found.add(keys.parse(str(reply.ok.key_expr)).fleet)
-            except ValueError:
-                continue  # a foreign token
-    return tuple(sorted(found))
+    fleets: set[str] = set()
+    for key in _tokens(endpoint, ALL_TOKENS, timeout_s):
+        with suppress(ValueError):  # a foreign token
+            fleets.add(keys.parse(key).fleet)
+    return tuple(sorted(fleets))
 
 
 def other_versions(endpoint: str, fleet: str, *, timeout_s: float = 2.0) -> tuple[str, ...]:
@@ -415,12 +429,15 @@ def other_versions(endpoint: str, fleet: str, *, timeout_s: float = 2.0) -> tupl
     """
     if identified(endpoint)[1] is not None:
         return ()
-    found: set[tuple[str, str]] = set()
-    with open_client(endpoint, timeout_s=timeout_s) as session:
-        for reply in session.liveliness().get(keys.tokens_of_all_versions(fleet), timeout=timeout_s):
-            peer = None if reply.ok is None else keys.other_version(str(reply.ok.key_expr))
-            found |= {peer} if peer else set()
+    peers = set(map(keys.other_version, _tokens(endpoint, keys.tokens_of_all_versions(fleet), timeout_s)))
     return tuple(
         f"'{name}' uses version {version} of the bus, and this program {OURS}: it takes no part. Use one version."
-        for name, version in sorted(found)
+        for name, version in sorted(peer for peer in peers if peer)
     )
+
+
+def _tokens(endpoint: str, expression: str, timeout_s: float) -> list[str]:
+    """Keys of the present liveliness tokens."""
+    with open_client(endpoint, timeout_s=timeout_s) as session:
+        replies = session.liveliness().get(expression, timeout=timeout_s)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]

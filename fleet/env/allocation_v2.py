@@ -27,7 +27,7 @@ from fleet.engine.step import FINISHED, OUTCOME, TICK, TOTAL
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import CellMap
-from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, decisions_of, seed_of, switch
+from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, check_choice, seed_of, switch
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
 from fleet.observation import Layout, Observation
@@ -111,11 +111,9 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         ahead_s: float = AHEAD_S,
         bids: bool = False,
     ) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            allowed = ", ".join(map(repr, RENDER_MODES))
-            raise ValueError(f"render_mode must be None or one of {allowed} (got {render_mode!r}).")
-        if mask_in not in get_args(MaskPlace):
-            raise ValueError(f"mask_in must be one of {', '.join(get_args(MaskPlace))} (got {mask_in!r}).")
+        check_choice("render_mode", render_mode, (None, *RENDER_MODES))
+        check_choice("mask_in", mask_in, get_args(MaskPlace))
+        check_choice("decisions", decisions, get_args(Decisions))
         self.render_mode = render_mode
         self.events: list[Event] = []
         self._make_episode = make_episode
@@ -125,7 +123,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self._watch = watch
         self._renderer = Renderer(cell)
         self._mask_in = mask_in
-        self._until_choice = decisions_of(decisions) == "events"
+        self._until_choice = decisions == "events"
         self._seeds = np.random.SeedSequence()
         self._episode = make_episode(np.random.SeedSequence(0))
         world = self._episode.world
@@ -143,14 +141,11 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             bids=switch("bids", bids),
         )
         first = arm_spaces(self.layout)
-        per_arm = [spaces_like(first) for _ in world.arms]
-        self.observation_spaces: dict[str, spaces.Space[Any]] = {
-            arm: own["observation"] if mask_in == "info" else own
-            for arm, (own, _) in zip(world.arms, per_arm, strict=True)
-        }
-        self.action_spaces: dict[str, spaces.Space[Any]] = {
-            arm: own for arm, (_, own) in zip(world.arms, per_arm, strict=True)
-        }
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {}
+        self.action_spaces: dict[str, spaces.Space[Any]] = {}
+        for arm in world.arms:
+            observation, self.action_spaces[arm] = spaces_like(first)
+            self.observation_spaces[arm] = observation["observation"] if mask_in == "info" else observation
         low, high = self.layout.bounds
         self.state_space = spaces.Box(np.tile(low, len(world.arms)), np.tile(high, len(world.arms)), dtype=np.float32)
         self._shift: ShiftRunner | None = None
@@ -184,11 +179,11 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Space of an agent's observation; the same object on every call."""
-        return self.observation_spaces[self._known(agent)]
+        return self.observation_spaces[agent_of(self.possible_agents, agent)]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """Space of an agent's action; the same object on every call."""
-        return self.action_spaces[self._known(agent)]
+        return self.action_spaces[agent_of(self.possible_agents, agent)]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -304,9 +299,6 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         if self._shift is None:
             raise RuntimeError(f"No episode has started: call reset() before {what}.")
         return self._shift
-
-    def _known(self, agent: str) -> str:
-        return agent_of(self.possible_agents, agent)
 
     def _observations(self) -> tuple[dict[str, Any], Array]:
         """Observations by agent, and the masks [arm, option + 2]; all in arrays of their own."""

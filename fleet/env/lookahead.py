@@ -44,16 +44,13 @@ class CellSimulator:
         tables: The fleet with the models that the arms have of themselves.
         arms, slots: Number of arms and of slots.
         weights: Of the reward terms.
-        compiled: As in `Engine`.
     """
 
-    def __init__(
-        self, tables: Tables, arms: int, slots: int, weights: RewardWeights, *, compiled: bool | None = None
-    ) -> None:
+    def __init__(self, tables: Tables, arms: int, slots: int, weights: RewardWeights) -> None:
         self._tables, self._weights = tables, weights
         layout = Layout(arms, slots, plans=tables.work.shape[3])
         own = tables._replace(ambient_c=tables.ambient_c.copy(), plans=tables.plans.copy())
-        self._engine = Engine(own, SIDE_BY_SIDE, layout, weights, compiled=compiled)
+        self._engine = Engine(own, SIDE_BY_SIDE, layout, weights)
         self._state: State | None = None
         none = np.zeros((0, 0))
         self._engine.play((none.astype(int), none.astype(int), none, none), np.zeros(0))  # compiles

@@ -1,12 +1,9 @@
 """Checks of what a caller of the environment gives."""
 
-from collections.abc import Mapping, Sequence
-from typing import Literal, TypeGuard, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal, TypeGuard
 
 import numpy as np
-
-from fleet.engine.shift import Episode as Episode
-from fleet.engine.shift import EpisodeFactory as EpisodeFactory
 
 Decisions = Literal["interval", "events"]
 """Length of a step: one decision interval, or until an arm may claim a job or passes its warning limit at work."""
@@ -63,16 +60,10 @@ def switch(name: str, value: object) -> bool:
     return bool(value)
 
 
-def decisions_of(value: object) -> Decisions:
-    """The length of a step.
-
-    Raises:
-        ValueError: none of the allowed ones.
-    """
-    for each in get_args(Decisions):
-        if value == each:
-            return each
-    raise ValueError(f"decisions must be one of {', '.join(map(repr, get_args(Decisions)))} (got {value!r}).")
+def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
+    """Raise a ValueError unless the value is one of the allowed ones."""
+    if value not in (allowed := tuple(allowed)):
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))} (got {value!r}).")
 
 
 def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:

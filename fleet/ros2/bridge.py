@@ -82,7 +82,7 @@ class Bridge:
         self._diagnostics = node.publisher(self._topic("/diagnostics", DIAGNOSTICS))
         self._due_s = time.monotonic()
         link.subscribe(
-            keys.of_every_arm(link.fleet, "difficulty"), DifficultyScores, self._receive_difficulty, history=True
+            keys.of_every_arm(link.fleet, "difficulty"), DifficultyScores, self._difficulty.__setitem__, history=True
         )
         link.subscribe(keys.of_every_arm(link.fleet, "state"), State, self._receive_state)
 
@@ -113,9 +113,6 @@ class Bridge:
             arm = self._arms[name] = _PublishedArm(publisher, state, 0.0)
         arm.state, arm.received_s = state, time.monotonic()
         arm.publisher.put(payload)
-
-    def _receive_difficulty(self, name: str, scores: DifficultyScores) -> None:
-        self._difficulty[name] = scores
 
     def _diagnose(self, now_s: float) -> None:
         for name, arm in list(self._arms.items()):
@@ -266,7 +263,8 @@ class Follower:
         link.reply_to(keys.of_arm(link.fleet, arm, "award"), Award, self._refuse)
         link.declare_token(keys.of_arm(link.fleet, arm, "alive"))
         for name, kind in zip(topics, (JOINT_STATE, DIAGNOSTICS), strict=True):
-            self._listen(node, Topic(name, kind, type_hash(kind), node.domain))
+            topic = Topic(name, kind, type_hash(kind), node.domain)
+            node.listen(topic, lambda kind, message, topic=topic: link.post(self._receive, topic, kind, message))
 
     def serve(self, until_s: float) -> None:
         """Read the arm's messages and publish its state, until the real second `until_s`."""
@@ -276,12 +274,6 @@ class Follower:
                 self._send_state(now_s)
                 self._sync.step(now_s)
             self._link.serve(min(until_s, self._due_s))
-
-    def _listen(self, node: Node, topic: Topic) -> None:
-        def receive(sent_hash: str, payload: bytes) -> None:
-            self._link.post(lambda: self._receive(topic, sent_hash, payload))
-
-        node.listen(topic, receive)
 
     def _receive(self, topic: Topic, sent_hash: str, payload: bytes) -> None:
         now_s = time.monotonic()

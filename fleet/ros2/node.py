@@ -9,16 +9,14 @@ and attachment_helpers.cpp in rmw_zenoh_cpp/src/detail; layout as of rmw_zenoh 0
 import re
 import struct
 import time
-import weakref
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any, Self
 
 import zenoh
 
-from fleet.bus.router import connect
+from fleet.bus.router import Connection
 from fleet.errors import BusError
 from fleet.ros2.conversion import plain_name
 
@@ -134,7 +132,7 @@ class Publisher:
         self._publisher.undeclare()
 
 
-class Node:
+class Node(Connection):
     """`with Node(endpoint, "name") as node:` is part of a ROS 2 domain until the end of the block.
 
     Args:
@@ -154,13 +152,9 @@ class Node:
         stopped: Callable[[], bool] | None = None,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
+        super().__init__(endpoint, timeout_s, stopped)
         self.name, self.domain = plain_name(name), domain
-        self._endpoint, self._timeout_s, self._stopped, self._now_ns = endpoint, timeout_s, stopped, now_ns
-        self._session: zenoh.Session | None = None
-        self._entities = 0
-        self._resources = ExitStack()
-        # A process that exits without closing its session would hang.
-        self._at_exit = weakref.finalize(self, self._resources.close)
+        self._now_ns, self._entities = now_ns, 0
 
     def open(self) -> Self:
         """Connect, and show the node in ROS 2.
@@ -169,27 +163,9 @@ class Node:
             BusError: no router replied.
         """
         if self._session is None:
-            self._session = connect(self._endpoint, self._timeout_s, self._stopped)
-            self._resources.callback(self._session.close)
-            token = self._session.liveliness().declare_token(
-                node_token(self.domain, str(self._session.zid()), self.name)
-            )
-            self._resources.callback(lambda: token)  # kept: a token without a reference is undeclared
+            session = super().open()._open()
+            self._keep(session.liveliness().declare_token(node_token(self.domain, str(session.zid()), self.name)))
         return self
-
-    def close(self) -> None:
-        """Leave the domain; does nothing if not open."""
-        self._session = None
-        try:
-            self._resources.close()
-        except zenoh.ZError as error:
-            raise BusError(f"The ROS 2 node at {self._endpoint} did not close: {error}") from error
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def publisher(self, topic: Topic) -> Publisher:
         """Publisher of a topic."""
@@ -210,10 +186,4 @@ class Node:
 
         # The stub of zenoh types handlers by their internals.
         direct: Any = zenoh.handlers.Callback(receive, indirect=False)
-        subscriber = self._open().declare_subscriber(topic.any_hash, direct)
-        self._resources.callback(lambda: subscriber)
-
-    def _open(self) -> zenoh.Session:
-        if self._session is None:
-            raise BusError("This ROS 2 node is not open.")
-        return self._session
+        self._keep(self._open().declare_subscriber(topic.any_hash, direct))

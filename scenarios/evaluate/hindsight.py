@@ -206,8 +206,6 @@ def hindsight(
     starts: Simulated,
     seed: np.random.SeedSequence,
     budget: Budget | None = None,
-    *,
-    stopped: Callable[[], bool] = lambda: False,
 ) -> Hindsight:
     """The best schedule found by large neighbourhood search, never worse than the starts.
 
@@ -236,7 +234,7 @@ def hindsight(
     if score > best:
         best, best_claims = score, result.claims[at]
     joint: list[Schedules] = []
-    while not stopped():
+    while True:
         spent_s, spent = time.process_time() - began_s, simulator.evaluations - begun
         used = max(spent_s / budget.seconds, spent / budget.evaluations)
         if used >= 1.0:

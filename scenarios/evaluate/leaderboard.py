@@ -381,16 +381,14 @@ def read_all(folder: Path, split: str) -> list[BoardResult]:
     return found
 
 
-def board_of(
-    split: str, submissions: Sequence[BoardResult], references: Mapping[Shift, ShiftReference] | None = None
-) -> Board | None:
+def board_of(split: str, submissions: Sequence[BoardResult]) -> Board | None:
     """The board of a split; None without results or without references.
 
     A failed shift counts as the mean of random.
     """
     entries = {each.name: each for each in submissions}
     rows = {name: each.study_rows() for name, each in entries.items()}
-    values = normalised(rows, split_references(split) if references is None else references, failed_as_random=True)
+    values = normalised(rows, split_references(split), failed_as_random=True)
     if values is None:
         return None
     bases = [name for name, each in entries.items() if (each.card.policy, each.card.policy_hash) == (BASELINE, "")] or [

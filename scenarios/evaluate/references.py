@@ -273,14 +273,14 @@ def _key(instance: str, scenario: str, seed: int, difficulty: str) -> str:
     return f"{instance} {scenario} {seed} {difficulty}"
 
 
-def load_references(path: Path, keys: Iterable[str] | None = None) -> list[ShiftReference]:
-    """The references in a file: all, or those of some keys.
+def load_references(path: Path) -> list[ShiftReference]:
+    """The references in a file.
 
     Raises:
         FleetError: the file has other rows, or damaged ones.
     """
     rows = Rows(path)
-    return _references_in(rows, rows.by_key if keys is None else keys)
+    return _references_in(rows, rows.by_key)
 
 
 def _references_in(rows: Rows, keys: Iterable[str]) -> list[ShiftReference]:

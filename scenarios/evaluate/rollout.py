@@ -19,7 +19,6 @@ from fleet.bus.exchange.memory import Exchange
 from fleet.env.lookahead import CellSimulator
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Obs
-from fleet.observation import Observation
 from scenarios.evaluate.statistics import FigureKind
 from scenarios.policy_loader import OnBus, failure, policy_at
 from scenarios.prepare.batch import library_of
@@ -236,15 +235,11 @@ def acts_of(
             return actions
         for e in envs.tolist():
             with guarded([e]):
-                actions[e] = actions_of(env.agents, policies[e].act(known_in(env, e, obs)))
+                known = env.layout.read_each(env.agents, obs["shared"][e], obs["own"][e], mask[e])
+                actions[e] = actions_of(env.agents, policies[e].act(known))
         return actions
 
     return act
-
-
-def known_in(env: BatchEnv, e: int, obs: Obs) -> dict[str, Observation]:
-    """What each arm of one env knows."""
-    return env.layout.read_each(env.agents, obs["shared"][e], obs["own"][e], obs["action_mask"][e])
 
 
 _library = lru_cache(maxsize=1)(library_of)

@@ -24,7 +24,7 @@ from scenarios.extras import require_extra
 from scenarios.policy_loader import error_text, is_built_in
 from scenarios.prepare.fleet import Fleet
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.processes import MOST_DEATHS, LocalWorker, Queue, Worker, run_all
+from scenarios.processes import MOST_DEATHS, LocalWorker, Queue, Worker, WorkUnit, run_all
 from scenarios.progress import Count, Progress, quiet
 from scenarios.run.log import code_hash
 from scenarios.spec.options import RiskName
@@ -99,12 +99,11 @@ def _row_of(key: RowKey, played: ShiftResult) -> Row:
 
 
 @dataclass(frozen=True)
-class UnitWork:
+class UnitWork(WorkUnit[list[Row]]):
     """A unit as a piece of work for a process."""
 
     unit: Unit
     settings: Settings
-    deaths: int = 0
 
     @property
     def name(self) -> str:
@@ -112,7 +111,6 @@ class UnitWork:
 
     @property
     def group(self) -> object:
-        """What shares plans and twins."""
         return self.unit.group
 
     def __call__(self) -> list[Row]:
@@ -122,7 +120,7 @@ class UnitWork:
         """Each shift alone, because the process may have died of one shift only."""
         case = self.unit.case
         parts = [replace(self.unit, case=replace(case, seeds=(seed,))) for seed in case.seeds]
-        return [UnitWork(part, self.settings, self.deaths + 1) for part in parts]
+        return [UnitWork(part, self.settings, deaths=self.deaths + 1) for part in parts]
 
     def given_up(self) -> list[Row]:
         """Rows of failed shifts."""

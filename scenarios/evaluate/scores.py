@@ -181,17 +181,17 @@ def _parts(values: Normalised, name: str) -> dict[str, Interval]:
 HEADS = ("policy", "mean", "difference", "", "heat binds", "it does not", "IQM", "better in")
 
 
-def score_cells(scores: SuiteScores, name: str, digits: int = 2) -> tuple[str, ...]:
+def score_cells(scores: SuiteScores, name: str) -> tuple[str, ...]:
     """A row of `HEADS` but for the name."""
     each, base = scores.policies[name], name == scores.baseline
     return (
-        each.mean.text(digits),
-        "" if base else each.difference.text(digits),
+        each.mean.text(),
+        "" if base else each.difference.text(),
         "" if base else each.difference.stars(each.p_holm),
-        each.hot.text(digits) if each.hot else "",
-        each.cool.text(digits) if each.cool else "",
-        each.iqm.text(digits),
-        "" if base else each.improvement.text(digits),
+        each.hot.text() if each.hot else "",
+        each.cool.text() if each.cool else "",
+        each.iqm.text(),
+        "" if base else each.improvement.text(),
     )
 
 

@@ -312,7 +312,7 @@ class Relaxation:
     @cached_property
     def rows(self) -> tuple[csr_array, Array]:
         """The rows A x <= b without heat budgets: A, sparse [row, column], and b, [row]."""
-        pieces, count, arms = self.pieces, len(self.pieces), len(self.world.arms)
+        pieces, count = self.pieces, len(self.pieces)
         table = _Rows(self.columns.total)
         room_s = np.diff(self.edges_s)
         room_s[-1] += self.tail_s
@@ -338,13 +338,14 @@ class Relaxation:
         before = self.world.jobs.after[0, : self.jobs]
         waits = [(job, int(other)) for job in range(self.jobs) for other in before[job] if other >= 0]
         for job, other in waits:
-            table.add(np.zeros(2, int), self.columns.jobs[[job, other]], np.array([1.0, -1.0]), np.zeros(1))
-        for arm in range(arms):
-            lost = self.columns.lost[arm]
-            columns = np.append(lost, self.columns.faults[arm])
-            values = np.append(np.ones(len(lost)), -self.world.horizon_s)
-            table.add(np.zeros(len(columns), int), columns, values, np.zeros(1))
+            table.add_row(self.columns.jobs[[job, other]], np.array([1.0, -1.0]))
+        self.add_losses(table, self.world.horizon_s)
         return table.matrix()
+
+    def add_losses(self, table: "_Rows", most_s: float) -> None:
+        """Add rows that limit the time that each fault costs an arm."""
+        for lost, faults in zip(self.columns.lost, self.columns.faults, strict=True):
+            table.add_row(np.append(lost, faults), np.append(np.ones(len(lost)), -most_s))
 
 
 class _Rows:
@@ -360,6 +361,10 @@ class _Rows:
         self._parts.append((row + self._count, column, value))
         self._bounds.append(bound)
         self._count += len(bound)
+
+    def add_row(self, columns: Array, values: Array, bound: float = 0.0) -> None:
+        """One row."""
+        self.add(np.zeros(len(columns), int), columns, values, np.array([bound]))
 
     def matrix(self) -> tuple[csr_array, Array]:
         """All rows and their right sides."""
@@ -384,15 +389,12 @@ class HeatBudget:
     relaxation: Relaxation
 
     @cached_property
-    def base_c(self) -> tuple[Array, Array]:
-        """Temperatures with the smallest heat at every tick, [arm, tick + 1, node], and their integrals over every
-        interval, K·s, [arm, tick, node]."""
-        world = self.relaxation.world
-        heat_w = np.repeat(self.relaxation.base_w[:, None], world.ticks, axis=1)
-        return self._simulated(heat_w)
+    def base_integral(self) -> Array:
+        """As of `_integral`, with the smallest heat."""
+        return self._integral(np.repeat(self.relaxation.base_w[:, None], self.relaxation.world.ticks, axis=1))
 
-    def _simulated(self, heat_w: Array) -> tuple[Array, Array]:
-        """Temperatures and integrals as in `base_c` with this heat, W, [arm, tick, node]."""
+    def _integral(self, heat_w: Array) -> Array:
+        """Integral of the temperatures over every interval, K·s, [arm, tick, node], with some heat, W, likewise."""
         world, thermal = self.relaxation.world, self.relaxation.world.thermal
         temp_c = np.empty((heat_w.shape[0], world.ticks + 1, heat_w.shape[2]))
         temp_c[:, 0] = world.start_c
@@ -402,8 +404,7 @@ class HeatBudget:
             )
         load_w = heat_w + thermal.to_ambient[:, None] * world.ambient_c.T[..., None]
         stored_j = thermal.capacity[:, None] * np.diff(temp_c, axis=1)
-        integral = np.linalg.solve(thermal.laplacian[:, None], (world.dt_s * load_w - stored_j)[..., None])[..., 0]
-        return temp_c, integral
+        return np.linalg.solve(thermal.laplacian[:, None], (world.dt_s * load_w - stored_j)[..., None])[..., 0]
 
     @cached_property
     def highest_c(self) -> float:
@@ -430,35 +431,21 @@ class HeatBudget:
             temp_c = advance(temp_c, brakes_w, air_c, world.phi, world.gamma, world.thermal.to_ambient)
         return world.horizon_s
 
-    def losses(self) -> tuple[csr_array, Array]:
-        """Rows that limit the time that faults cost an arm."""
-        relaxation, arms = self.relaxation, len(self.relaxation.world.arms)
-        columns = np.column_stack([relaxation.columns.lost, relaxation.columns.faults]).ravel()
-        values = np.tile(np.append(np.ones(relaxation.periods), -self.longest_loss_s), arms)
-        row = np.repeat(np.arange(arms), relaxation.periods + 1)
-        return csr_array((values, (row, columns)), shape=(arms, relaxation.columns.total)), np.zeros(arms)
-
-    def violated(self, shares: Array) -> tuple[csr_array, Array]:
-        """Budgets that a solution [column] violates most, as rows A x <= b: A, sparse [row, column], and b, [row]."""
+    def violated(self, shares: Array) -> list[tuple[Array, Array, float]]:
+        """Budgets that a solution [column] violates most: columns, their values, and the bound."""
         world = self.relaxation.world
         tick_of = self.relaxation.edges_s / world.dt_s
         edges = np.round(tick_of).astype(int)
         period_of = np.searchsorted(edges, np.arange(world.ticks), side="right") - 1
-        _, integral = self._simulated(self._heat_of(shares)[:, period_of])
-        found: list[tuple[Array, Array, float]] = []
+        integral = self._integral(self._heat_of(shares)[:, period_of])
+        budgets: list[tuple[Array, Array, float]] = []
         for arm in range(len(world.arms)):
             above = shares[self.relaxation.columns.above[arm]]
             total = np.concatenate([np.zeros((1, JOINTS)), integral[arm, :, WINDING].cumsum(axis=0)])
             for length_s in WINDOWS_S:
                 for first, last, joint in self._worst(total, above, edges, length_s):
-                    found.append(self._budget(arm, joint, first, last))
-        if not found:
-            return csr_array((0, self.relaxation.columns.total)), np.zeros(0)
-        lengths = [len(columns) for columns, _, _ in found]
-        row = np.repeat(np.arange(len(found)), lengths)
-        columns, values = (np.concatenate([each[i] for each in found]) for i in range(2))
-        matrix = csr_array((values, (row, columns)), shape=(len(found), self.relaxation.columns.total))
-        return matrix, np.array([bound for _, _, bound in found])
+                    budgets.append(self._budget(arm, joint, first, last))
+        return budgets
 
     def _heat_of(self, shares: Array) -> Array:
         """Mean heat of a solution, W, [arm, period, node]."""
@@ -511,7 +498,7 @@ class HeatBudget:
         window = slice(first, last)
         above = np.full(last - first, warning_c - self.highest_c)
         ticks = np.round(edges_s[[first, last]] / world.dt_s).astype(int)
-        base = float(self.base_c[1][arm, ticks[0] : ticks[1], joint].sum())
+        base = float(self.base_integral[arm, ticks[0] : ticks[1], joint].sum())
         bound = warning_c * float(edges_s[last] - edges_s[first]) - base
         columns = np.concatenate([own, relaxation.columns.lost[arm], relaxation.columns.above[arm][window]])
         scale = float(edges_s[last] - edges_s[first])
@@ -579,12 +566,16 @@ def upper_bound(relaxation: Relaxation, *, heat: bool = True, nodes: int = 2000)
     linear, shares = _solve(relaxation, rows, bounds)
     value, count, budget = linear, 0, HeatBudget(relaxation)
     for _ in range(ROUNDS if heat and nodes else 0):
-        more, limits = budget.violated(shares)
-        if not len(limits):
+        violated = budget.violated(shares)
+        if not violated:
             break
-        faults, none = budget.losses()
-        rows, bounds = csr_array(vstack([rows, faults, more])), np.concatenate([bounds, none, limits])
-        count += len(limits)
+        table = _Rows(relaxation.columns.total)
+        relaxation.add_losses(table, budget.longest_loss_s)
+        for columns, values, bound in violated:
+            table.add_row(columns, values, bound)
+        more, limits = table.matrix()
+        rows, bounds = csr_array(vstack([rows, more])), np.concatenate([bounds, limits])
+        count += len(violated)
         better, shares = _solve(relaxation, rows, bounds)
         gain, value = value - better, min(value, better)
         if gain < LEAST_GAIN * abs(value):

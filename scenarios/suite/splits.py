@@ -77,10 +77,10 @@ def instance(name: str) -> Instance:
         ScenarioError: there is no such instance.
     """
     rows = manifest(name.partition("/")[0])
-    for row in rows:
-        if row.name == name:
-            return instance_of(row)
-    raise ScenarioError(f"No instance '{name}' in the suite; they are {rows[0].name} to {rows[-1].name}.")
+    row = _line_of_instance(name)
+    if row is None:
+        raise ScenarioError(f"No instance '{name}' in the suite; they are {rows[0].name} to {rows[-1].name}.")
+    return instance_of(row)
 
 
 @lru_cache(maxsize=len(SPLITS))

@@ -1,6 +1,6 @@
 """Train the network of every arm on a scenario by PPO, with validation on separate seeds."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +14,7 @@ from agents.learned.ppo import PpoConfig, Trainer, imitate
 from fleet.engine.batch import RewardWeights
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Library
+from fleet.fields import option
 from scenarios.evaluate.rollout import Act, acts_of, rollout
 from scenarios.policy_loader import policy_at, policy_of
 from scenarios.prepare.batch import library_of
@@ -36,9 +37,7 @@ VALIDATION_SEED = 2_000_000
 class TrainingPlan(TrainingLength):
     """Length of a training, and its validation."""
 
-    validate_every: int = 20
-    """Iterations from one validation to the next."""
-    validation_envs: int = 32
+    validation_envs: int = option("Shifts of a validation.", 32, low=1, high=65_536)
 
 
 def train(
@@ -79,10 +78,8 @@ def train(
     fleet = prepare(scenario, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
     learner = NetworkLearner(library_of(fleet), weights_of(scenario), config, plan.validation_envs)
     if config.warm_start and not resume:
-        imitate_rule(learner.trainer, learner.library, learner.weights, progress)
-    return run_training(
-        learner, out, plan, card, validate_every=plan.validate_every, resume=resume, progress=progress, tell=tell
-    )
+        imitate_rule(learner.search, learner.library, learner.weights, progress)
+    return run_training(learner, out, plan, card, resume=resume, progress=progress, tell=tell)
 
 
 class NetworkLearner:
@@ -96,55 +93,46 @@ class NetworkLearner:
 
     def __init__(self, library: Library, weights: RewardWeights, config: PpoConfig, count: int) -> None:
         self.library, self.weights, self.config = library, weights, config
-        self.trainer = trainer_of(library, weights, config)
+        self.search = trainer_of(library, weights, config)
         # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in
         # training.
         self._env = BatchEnv(library, count, weights=weights, ahead_s=np.inf)
         self._seeds = [VALIDATION_SEED + i for i in range(count)]
 
-    @property
-    def done(self) -> int:
-        return self.trainer.done
-
     def validate(self) -> float:
         """Mean reward of a validation shift."""
-        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, self.done]))
-        act = partial(self.trainer.act, self._env.layout, rng=rng)
+        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, self.search.done]))
+        act = partial(self.search.act, self._env.layout, rng=rng)
         return self._reward(lambda obs, _: act(self._env.layout.join(obs["shared"], obs["own"]), obs["action_mask"]))
 
     def validate_teacher(self) -> float | None:
         """That of the imitated rule."""
         rule = self.config.warm_start
-        return self._reward(rule_actions(rule, self._env, self._seeds)) if rule else None
+        if not rule:
+            return None
+        return self._reward(acts_of(self._env, {e: policy_at(rule, seed) for e, seed in enumerate(self._seeds)}))
 
     def _reward(self, act: Act) -> float:
         return float(rollout(self._env, self._env.reset(seed=list(self._seeds))[0], act).mean())
 
     def iterate(self) -> Iterator[dict[str, Any]]:
-        return map(asdict, self.trainer.iterate())
-
-    def save(self, path: Path, **numbers: float) -> None:
-        self.trainer.save(path, **numbers)
-
-    def load(self, path: Path) -> Mapping[str, float]:
-        return self.trainer.load(path)
+        return map(asdict, self.search.iterate())
 
     def save_policy(self, out: Path, validation: float, **details: Any) -> None:
-        counts = {"algorithm": self.config.algorithm, "iterations": self.done, "env_steps": self.trainer.env_steps}
-        save_policy(self.trainer.actor, self.config.size, out, **details, **counts, validation_reward=validation)
+        search = self.search
+        counts = {"algorithm": self.config.algorithm, "iterations": search.done, "env_steps": search.env_steps}
+        save_policy(search.actor, self.config.size, out, **details, **counts, validation_reward=validation)
 
 
 def trainer_of(library: Library, weights: RewardWeights, config: PpoConfig) -> Trainer:
     """A trainer on the batched environments of a fleet, with envs spread over the hours of a shift."""
-    options: Any = {
-        "autoreset": False,
-        "decisions": config.decisions,
-        "stagger": True,
-        "ahead_s": np.inf,
-    }  # two kinds of values
 
     def envs(count: int, seed: int) -> TorchRLEnv:
-        return TorchRLEnv(BatchEnv(library, count, seed=seed, weights=weights, **options))
+        batch = BatchEnv(
+            library, count, seed=seed, weights=weights, autoreset=False, decisions=config.decisions, stagger=True,
+            ahead_s=np.inf,
+        )  # fmt: skip
+        return TorchRLEnv(batch)
 
     return Trainer([(envs, BatchEnv(library, 1, ahead_s=np.inf).layout)], config)
 
@@ -179,8 +167,3 @@ def _demonstrations(env: BatchEnv, rule: str, progress: Progress) -> Iterator[tu
             obs, *_ = env.step(actions)
         vectors, masks, actions = (np.concatenate(part) for part in zip(*rows, strict=True))
         yield vectors.reshape(-1, vectors.shape[-1]), masks.reshape(-1, masks.shape[-1]), actions.reshape(-1)
-
-
-def rule_actions(rule: str, env: BatchEnv, seeds: Sequence[int]) -> Act:
-    """Actions of a rule, one instance for each env, [env, arm]."""
-    return acts_of(env, {e: policy_at(rule, seed) for e, seed in enumerate(seeds)})

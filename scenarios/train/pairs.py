@@ -13,6 +13,7 @@ from agents.learned.evolution import Evolution, EvolutionConfig
 from agents.pairs import PARAMETERS, LearnedPrices, save_pairs
 from fleet.engine.batch import RewardWeights
 from fleet.env.vector import BatchEnv, Library
+from fleet.fields import option
 from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import acts_of, rollout
 from scenarios.prepare.batch import library_of
@@ -104,9 +105,10 @@ def rewards(instance: TrainingInstance, parameters: Array, seeds: Sequence[int])
 class PairPlan(TrainingLength):
     """Length of a training, and its validation."""
 
-    instances: int = 24
-    """Instances of an iteration, of different cells; all samples have the same shifts."""
-    validate_every: int = 5
+    instances: int = option(
+        "Instances of an iteration, of different cells; all samples have the same shifts.", 24, low=1, high=10_000
+    )
+    validate_every: int = option("Iterations from one validation to the next.", 5, low=1, high=1_000_000)
 
 
 def train_pairs(
@@ -134,7 +136,7 @@ def train_pairs(
     card = {**card, "config": asdict(config), "instances": plan.instances}
     check_folder(out, card, PAIRS_STATE, resume=resume)
     learner = PairLearner(Evolution(np.zeros(PARAMETERS), config), training, validation, plan.instances)
-    return run_training(learner, out, plan, card, validate_every=plan.validate_every, resume=resume, tell=tell)
+    return run_training(learner, out, plan, card, resume=resume, tell=tell)
 
 
 class PairLearner:
@@ -155,10 +157,6 @@ class PairLearner:
     ) -> None:
         self.search, self.training, self.validation, self.count = search, training, validation, count
 
-    @property
-    def done(self) -> int:
-        return self.search.done
-
     def validate(self) -> float:
         """Score of the running average."""
         return validation_score(self.validation, self.search.average)
@@ -172,7 +170,7 @@ class PairLearner:
             began_s = time.monotonic()
             fitness = self.fitness()
             self.search.tell(fitness)
-            row = {"number": self.done, "fitness": float(fitness.mean()), "spread": float(fitness.std())}
+            row = {"number": self.search.done, "fitness": float(fitness.mean()), "spread": float(fitness.std())}
             yield row | {"seconds": time.monotonic() - began_s}
 
     def fitness(self) -> Array:
@@ -192,14 +190,8 @@ class PairLearner:
             total += np.maximum(scores, scores.max() - MOST_LOSS)
         return total / len(chosen)
 
-    def save(self, path: Path, **numbers: float) -> None:
-        self.search.save(path, **numbers)
-
-    def load(self, path: Path) -> Mapping[str, float]:
-        return self.search.load(path)
-
     def save_policy(self, out: Path, validation: float, **details: Any) -> None:
-        save_pairs(self.search.average, out, **details, iterations=self.done, validation=validation)
+        save_pairs(self.search.average, out, **details, iterations=self.search.done, validation=validation)
 
 
 def validation_score(instances: Sequence[TrainingInstance], parameters: Array) -> float:

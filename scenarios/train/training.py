@@ -30,11 +30,8 @@ class Learner(Protocol):
     """Of a validation."""
     curves: tuple[str, ...]
     """Numbers of an iteration that are plotted."""
-
-    @property
-    def done(self) -> int:
-        """Number of finished iterations."""
-        ...
+    search: Any
+    """`agents.learned.evolution.Evolution` or `agents.learned.ppo.Trainer`."""
 
     def validate(self) -> float:
         """Return the validation of the present policy."""
@@ -48,8 +45,6 @@ class Learner(Protocol):
         """Endless iterations, each as a row of the log."""
         ...
 
-    def save(self, path: Path, **numbers: float) -> None: ...
-    def load(self, path: Path) -> Mapping[str, float]: ...
     def save_policy(self, out: Path, validation: float, **details: Any) -> None: ...
 
 
@@ -70,7 +65,6 @@ def run_training(
     plan: TrainingLength,
     card: Mapping[str, Any],
     *,
-    validate_every: int,
     resume: bool,
     progress: Progress = quiet,
     tell: Callable[[str], None] = lambda sentence: None,
@@ -82,21 +76,21 @@ def run_training(
 
     Args:
         card: Content of training.json and of the policy's card.
-        validate_every: Iterations from one validation to the next.
         tell: Called with a sentence after every validation.
 
     Raises:
         FleetError: the training has the iterations of the plan, which is not `in_total`.
     """
-    numbers = learner.load(out / learner.state_file) if resume else {}
+    search, state = learner.search, out / learner.state_file
+    numbers = search.load(state) if resume else {}
     best, before_s = numbers.get("best", -np.inf), numbers.get("seconds", 0.0)
-    if resume and plan.share(learner.done, before_s, before_s) >= 1.0:
+    if resume and plan.share(search.done, before_s, before_s) >= 1.0:
         if not plan.in_total:
-            raise FleetError(f"The training in '{out}' has {learner.done} iterations: --iterations must be more.")
+            raise FleetError(f"The training in '{out}' has {search.done} iterations: --iterations must be more.")
         tell(f"Skipped the training in '{out}', because it is complete.")
-        return Trained(learner.done, best, before_s, interrupted=False)
+        return Trained(search.done, best, before_s, interrupted=False)
     out.mkdir(parents=True, exist_ok=True)
-    log, interrupted, validated = TrainingLog(out), False, learner.done
+    log, interrupted, validated = TrainingLog(out), False, search.done
     began_s = time.monotonic() - before_s  # as if the sessions had followed each other
     teacher = numbers.get("teacher", np.nan)
     if not resume:
@@ -108,35 +102,35 @@ def run_training(
         nonlocal best, validated
         validation = learner.validate()
         if not holds_training(out):
-            learner.save(out / learner.state_file, teacher=teacher, best=best)  # without a policy yet
+            search.save(state, teacher=teacher, best=best)  # without a policy yet
             _write_card(out, card)
         if validation > best:
             best = validation
             learner.save_policy(out, validation, **card, **compared)
-        seconds, validated = time.monotonic() - began_s, learner.done
-        learner.save(out / learner.state_file, teacher=teacher, best=best, seconds=seconds)
-        log.add(learner.done, {"iteration": learner.done, "validation": validation, **compared})
+        seconds, validated = time.monotonic() - began_s, search.done
+        search.save(state, teacher=teacher, best=best, seconds=seconds)
+        log.add(search.done, {"iteration": search.done, "validation": validation, **compared})
         text = "".join(f", {name} {value:.4g}" for name, value in compared.items())
-        tell(f"Iteration {learner.done}: validation {validation:.4g}, best {best:.4g}{text}.")
+        tell(f"Iteration {search.done}: validation {validation:.4g}, best {best:.4g}{text}.")
 
     if best == -np.inf:
         validate()
-    share = plan.share(learner.done, time.monotonic() - began_s, before_s)
+    share = plan.share(search.done, time.monotonic() - began_s, before_s)
     try:
         for row in learner.iterate() if share < 1.0 else ():
-            log.add(learner.done, row)
-            share = plan.share(learner.done, time.monotonic() - began_s, before_s)
-            progress(f"iteration {learner.done}, best {best:.4g}", min(share, 1.0))
-            if learner.done % validate_every == 0:
+            log.add(search.done, row)
+            share = plan.share(search.done, time.monotonic() - began_s, before_s)
+            progress(f"iteration {search.done}, best {best:.4g}", min(share, 1.0))
+            if search.done % plan.validate_every == 0:
                 validate()
             if share >= 1.0:
                 break
     except KeyboardInterrupt:
         interrupted = True
-    if validated < learner.done:
+    if validated < search.done:
         validate()
     draw_curves([out], out / CURVE, learner.unit, learner.curves)
-    return Trained(learner.done, best, time.monotonic() - began_s, interrupted)
+    return Trained(search.done, best, time.monotonic() - began_s, interrupted)
 
 
 def holds_training(out: Path) -> bool:

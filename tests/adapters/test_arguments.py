@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from fleet.env.adapters.arguments import check_batch, check_choice, check_env
+from fleet.env.adapters.arguments import check_batch, check_env
 from fleet.env.allocation_v2 import parallel_env
+from fleet.env.validation import check_choice
 
 
 def test_an_environment_with_the_masks_in_the_observations_is_taken(small) -> None:

@@ -1,6 +1,7 @@
 """Assignments and auctions, with and without an auctioneer, against every assignment and the Hungarian method."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import networkx as nx
@@ -13,13 +14,13 @@ from scipy.optimize import linear_sum_assignment
 from agents.auction import NOBODY, agree, auction
 from agents.policy import one_fleet
 from agents.registry import RULES, make_policy
-from agents.rules import NONE, RISK, cheapest_options, matched_options, quickest, thermal
+from agents.rules import NONE, RISK, cheapest_options, each_env, matching, quickest, thermal
 from fleet.observation import LONG_S, Layout, Observation
 from tests.agents.observations import NAMES, observation
 from tests.profiles import examples
 
 INF = np.inf
-ASSIGNMENTS = {"ssi": cheapest_options, "matching": matched_options}
+ASSIGNMENTS = {"ssi": cheapest_options, "matching": partial(each_env, matching)}
 COSTS = {"thermal": thermal, "quickest": quickest}
 
 
@@ -59,7 +60,7 @@ def pairs_of(options: np.ndarray) -> list[tuple[int, int]]:
 @given(costs())
 def test_matching_is_the_best_of_all_assignments(cost):
     best = min(worth(cost, pairs) for pairs in every_assignment(cost))
-    pairs = pairs_of(matched_options(cost, 1))
+    pairs = pairs_of(each_env(matching, cost, 1))
     assert allowed(cost, pairs)
     assert worth(cost, pairs) == pytest.approx(best)
 

@@ -303,8 +303,8 @@ def test_heat_costs_nothing_where_limits_are_out_of_reach(small):
 
 
 def test_only_a_central_policy_plans():
-    with pytest.raises(TypeError, match="Alone: Mpc plans in a simulator of its cell, which an arm alone"):
-        type("Alone", (Local,), {"central": Mpc})
+    with pytest.raises(FleetError, match=r"Alone has no central policy that an arm can have alone \(got .*Mpc"):
+        type("Alone", (Local,), {"central": Mpc})()
 
     class Planning:
         def plan_in(self, cell):

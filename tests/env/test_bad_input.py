@@ -87,8 +87,8 @@ def test_invalid_seeds_are_refused(make, seed) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"render_mode": "tv"}, r"render_mode must be None or one of 'ansi', 'rgb_array', 'human' \(got 'tv'\)\."),
-        ({"mask_in": "none"}, r"mask_in must be one of obs, info, both \(got 'none'\)\."),
+        ({"render_mode": "tv"}, r"render_mode must be one of None, 'ansi', 'rgb_array', 'human' \(got 'tv'\)\."),
+        ({"mask_in": "none"}, r"mask_in must be one of 'obs', 'info', 'both' \(got 'none'\)\."),
         ({"max_cycles": 0}, r"max_cycles must be an integer >= 1 \(got 0\)\."),
         ({"max_cycles": 2.5}, r"max_cycles must be an integer >= 1 \(got 2\.5\)\."),
     ],

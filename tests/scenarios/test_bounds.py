@@ -132,7 +132,7 @@ def test_the_effect_of_heat_on_a_motor_is_that_of_a_simulated_joule(small):
     for node, tick in ((1, 12), (8, 40), (1, 70), (9, 95)):
         heat_w = np.repeat(relaxation.base_w[:, None], world.ticks, axis=1)
         heat_w[0, tick, node] += 1000.0 / world.dt_s
-        change = budget._simulated(heat_w)[1] - budget.base_c[1]
+        change = budget._integral(heat_w) - budget.base_integral
         true = change[0, 60:120, 1].sum() / 1000.0
         period = tick // 6
         assert low[period, node] <= true <= high[period, node]

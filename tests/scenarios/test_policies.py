@@ -86,7 +86,7 @@ def test_an_own_class_from_a_file_or_a_module(own):
             "{own}:Needy",
             r"must be a class or function that is called without arguments \(missing a required argument: 'size'\)",
         ),
-        ("{own}:Unset", r"has no central policy \(got None\)\. Add to the class: central = a class with act"),
+        ("{own}:Unset", r"Unset has no central policy that an arm can have alone \(got None\)\. Add to the class"),
         ("nowhere.py:Idle", "there is no file 'nowhere.py'"),
         ("no_such_module:Idle", "cannot import 'no_such_module'"),
     ],

@@ -49,10 +49,7 @@ class Broadcast:
 
 @dataclass(frozen=True, eq=False)
 class PeerView:
-    """Last broadcast that every arm has of every arm after a step, [receiver, sender, ...]; its own at once.
-
-    Do not write to the arrays: receivers with the same knowledge share memory.
-    """
+    """Last broadcast that every arm has of every arm after a step, [receiver, sender, ...]; its own at once."""
 
     mode: Array
     """int, [receiver, sender]; UNHEARD if nothing was received."""
@@ -95,23 +92,22 @@ class Exchange:
             raise ValueError(f"An exchange needs arms with different, non-empty names (got {self.arms}).")
         self.delivered = 0
         self.late = 0
-        self._delivery = None if channel.perfect else Delivery(self.arms, channel, rng)
+        self._channel, self._delivery = channel, Delivery(self.arms, channel, rng)
         self._sent: dict[int, Broadcast] = {}
         """Last broadcasts received by an arm, and those in transit, by tick."""
-        self._tick, self._now_s = -1, -float("inf")
+        self._now_s = -float("inf")
         self._closed = False
 
     @property
     def perfect(self) -> bool:
         """Whether every arm receives every broadcast at once."""
-        return self._delivery is None
+        return self._channel.perfect
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
         """Begin an episode without messages received or in transit; `rng` is for channels with loss or jitter."""
-        self._tick, self._now_s = -1, -float("inf")
+        self._now_s = -float("inf")
         self._sent.clear()
-        if self._delivery is not None:
-            self._delivery.begin(rng)
+        self._delivery.begin(rng)
 
     def share(self, broadcast: Broadcast) -> PeerView:
         """Broadcast one step, and return the view of every arm after it.
@@ -125,12 +121,9 @@ class Exchange:
         if broadcast.time_s < self._now_s:
             sent_s, last_s = f"{broadcast.time_s:g} s", f"{self._now_s:g} s"
             raise ValueError(f"Broadcast of {sent_s} after that of {last_s}; begin() starts a new episode.")
-        self._tick, self._now_s = self._tick + 1, broadcast.time_s
-        if self._delivery is None:
-            self.delivered += len(self.arms) * (len(self.arms) - 1)
-            return _view_at_once(broadcast)
-        self._sent[self._tick] = broadcast
+        self._now_s = broadcast.time_s
         received = self._delivery.carry(self._now_s)
+        self._sent[int(received[0, 0])] = broadcast
         self.delivered, self.late = self._delivery.delivered, self._delivery.late
         kept = self._delivery.in_transit | set(np.unique(received).tolist())
         self._sent = {tick: sent for tick, sent in self._sent.items() if tick in kept}
@@ -233,16 +226,6 @@ class Delivery:
 _OF_ARMS = ("mode", "headroom_k", "busy_s")
 _OF_JOBS = ("difficulty", "duration_s", "peak_c", "p_saturation")
 """Fields that a broadcast and a view have alike: [arm] and [arm, slot, ...]."""
-
-
-def _view_at_once(broadcast: Broadcast) -> PeerView:
-    """The view of every arm that has received this broadcast."""
-    arms = len(broadcast.mode)
-    sent = {name: getattr(broadcast, name) for name in (*_OF_ARMS, *_OF_JOBS)}
-    return PeerView(
-        **{name: np.broadcast_to(values, (arms, *values.shape)) for name, values in sent.items()},
-        age_s=np.zeros((arms, arms)),
-    )
 
 
 def _view(now: Broadcast, received: Array, sent: dict[int, Broadcast]) -> PeerView:

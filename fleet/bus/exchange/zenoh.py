@@ -8,7 +8,6 @@ of a shift depends neither on the load of the machine nor on others on the bus.
 import logging
 import math
 import os
-import weakref
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import NoReturn, Self
@@ -68,8 +67,6 @@ class ZenohExchange(Exchange):
         self._published = 0
         """Steps, over all episodes."""
         self._resources = ExitStack()
-        # A process that exits without closing its router would hang.
-        self._at_exit = weakref.finalize(self, self._resources.close)
 
     def __getstate__(self) -> NoReturn:
         """Refuse to be copied or pickled.
@@ -102,21 +99,17 @@ class ZenohExchange(Exchange):
             raise BusError("This exchange is closed.")
         if self._publishers:
             return self
-        try:
-            if self._endpoint is None:
-                self._endpoint = self._resources.enter_context(Router()).endpoint
-            client = BusClient(self._endpoint, self._fleet, timeout_s=self._timeout_s)
-            self._resources.enter_context(client)
+        with ExitStack() as stack:
+            endpoint = self._endpoint or stack.enter_context(Router()).endpoint
+            client = stack.enter_context(BusClient(endpoint, self._fleet, timeout_s=self._timeout_s))
             present = client.tokens(keys.of_every_arm(self._fleet, "alive"), timeout_s=self._timeout_s)
             if taken := sorted(present & set(self.arms)):
-                raise BusError(f"Fleet '{self._fleet}' already has {', '.join(taken)} on the bus at {self._endpoint}.")
-            self._publishers = [_ArmPublishers(client, arm) for arm in self.arms]
-        except zenoh.ZError as error:
-            self._give_up()
-            raise BusError(f"The bus at {self._endpoint} could not be opened: {error}") from error
-        except BaseException:
-            self._give_up()
-            raise
+                raise BusError(f"Fleet '{self._fleet}' already has {', '.join(taken)} on the bus at {endpoint}.")
+            try:
+                self._publishers = [_ArmPublishers(client, arm) for arm in self.arms]
+            except zenoh.ZError as error:
+                raise BusError(f"The bus at {endpoint} could not be opened: {error}") from error
+            self._endpoint, self._resources = endpoint, stack.pop_all()
         return self
 
     def share(self, broadcast: Broadcast) -> PeerView:
@@ -154,23 +147,16 @@ class ZenohExchange(Exchange):
             self._resources.close()
         except (zenoh.ZError, BusError) as error:
             raise BusError(f"The exchange did not close cleanly: {error}") from error
-        finally:
-            self._at_exit.detach()
 
     def __enter__(self) -> Self:
         return self.open()
 
     def __exit__(self, *exc: object) -> None:
-        if exc[0] is None:
-            self.close()
-        else:
-            self._give_up()
-
-    def _give_up(self) -> None:
-        """Close without hiding the exception that is being raised."""
         try:
             self.close()
         except BusError:
+            if exc[0] is None:
+                raise
             _LOG.exception("While closing after another error:")
 
 

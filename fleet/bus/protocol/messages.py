@@ -10,7 +10,6 @@ from math import isfinite
 from typing import Annotated, TypeVar
 
 import msgspec
-from msgspec import inspect
 
 from fleet.errors import BusError
 from fleet.telemetry import Mode
@@ -40,31 +39,17 @@ class FiniteStruct(msgspec.Struct, frozen=True):
     """A message that refuses NaN and infinity, which JSON cannot express, when it is constructed."""
 
     def __post_init__(self) -> None:
-        for name in _float_fields(type(self)):
-            value: float | tuple[float | None, ...] | None = getattr(self, name)
+        for name in self.__struct_fields__:
+            value: float | tuple[float, ...] | str | None = getattr(self, name)  # and others
             for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not isfinite(number):
+                if isinstance(number, float) and not isfinite(number):
                     raise ValueError(f"{type(self).__name__}.{name} must be finite (got {number}).")
 
 
-@cache
-def _float_fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
-    """Names of the fields that hold a float, None, or a tuple of these."""
-
-    def holds_float(of: inspect.Type) -> bool:
-        match of:
-            case inspect.FloatType():
-                return True
-            case inspect.VarTupleType(item_type):
-                return holds_float(item_type)
-            case inspect.UnionType(types):
-                return any(map(holds_float, types))
-            case _:
-                return False
-
-    described = inspect.type_info(kind)
-    assert isinstance(described, inspect.StructType)
-    return tuple(field.name for field in described.fields if holds_float(field.type))
+def _check_length(message: msgspec.Struct, field: str, item: str, count: int) -> None:
+    values = getattr(message, field)
+    if len(values) != count:
+        raise ValueError(f"{type(message).__name__}.{field} needs one value per {item} ({count}, got {len(values)}).")
 
 
 class State(FiniteStruct, frozen=True, omit_defaults=True):
@@ -117,9 +102,8 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("housing_c", "expected_c", "q", "qd", "tau", "current_a"):
-            values = getattr(self, name)
-            if values and len(values) != len(self.temp_c):
-                raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")
+            if getattr(self, name):
+                _check_length(self, name, "joint", len(self.temp_c))
 
 
 class DifficultyScores(FiniteStruct, frozen=True, omit_defaults=True):
@@ -160,15 +144,11 @@ class DifficultyScores(FiniteStruct, frozen=True, omit_defaults=True):
                 f"DifficultyScores.bid_duration_s needs equally many plans for each of {len(self.jobs)} job(s) (got "
                 f"{bids} values)."
             )
-        for name, least in (("bid_peak_c", bids), ("bid_p_saturation", 0)):
-            if (count := len(getattr(self, name))) not in (bids, least):
-                raise ValueError(f"DifficultyScores.{name} needs one value per plan ({bids}, got {count}).")
-        for name in ("difficulty", "p_saturation", "peak_c"):
-            values = getattr(self, name)
-            if len(values) != len(self.jobs) and (values or name != "peak_c"):
-                raise ValueError(
-                    f"DifficultyScores.{name} needs one value per job ({len(self.jobs)}, got {len(values)})."
-                )
+        _check_length(self, "bid_peak_c", "plan", bids)
+        if self.bid_p_saturation:
+            _check_length(self, "bid_p_saturation", "plan", bids)
+        for name in ("difficulty", "p_saturation", *(["peak_c"] if self.peak_c else [])):
+            _check_length(self, name, "job", len(self.jobs))
         if len(set(self.jobs)) != len(self.jobs):
             raise ValueError(f"DifficultyScores.jobs names a job twice (got {self.jobs}).")
 

@@ -28,7 +28,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fleet.bus.security.access_control import LONGEST_COMMON_NAME, ROSTER, Roster, RosterEntry, read_roster
 from fleet.errors import BusError
-from fleet.files import atomic_path
+from fleet.files import atomic_path, replace_folder
 
 CA = "ca"
 """File name of the certificate authority, without the ending."""
@@ -274,7 +274,7 @@ def make(
         new_authority(work, roster.fleet)
         expires = {one.name: issue(work, one, days=days, hosts=hosts) for one in roster.participants}
         _write_roster(work, roster)
-        _replace(work, place)
+        replace_folder(work, place)
     except OSError as error:
         raise BusError(f"'{folder}' could not be written: {error.strerror}.") from error
     finally:
@@ -343,21 +343,3 @@ def _check_free(folder: Path, overwrite: bool) -> None:
             f"'{folder}' holds the keys of a fleet. --add issues one more certificate; --overwrite makes a new "
             "certificate authority, and every participant then needs a new certificate."
         )
-
-
-def _replace(work: Path, place: Path) -> None:
-    """Rename `work` to `place`; after an error the previous folder is still there."""
-    if not place.exists():
-        work.rename(place)
-        return
-    aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.old.", dir=place.parent))
-    old = aside / place.name
-    try:
-        place.rename(old)
-        work.rename(place)
-    except OSError:
-        if old.exists():
-            old.rename(place)
-        aside.rmdir()
-        raise
-    shutil.rmtree(aside, ignore_errors=True)

@@ -23,7 +23,8 @@ from typing import Any, Literal, get_args
 from gymnasium import spaces
 from pettingzoo.utils import BaseParallelWrapper
 
-from fleet.env.adapters.arguments import ByArm, Env, arm_space, check_choice, check_env
+from fleet.env.adapters.arguments import ByArm, Env, arm_space, check_env
+from fleet.env.validation import check_choice
 
 MaskKind = Literal["list", "array"]
 

@@ -1,6 +1,5 @@
 """Checks of the environments and batches given to adapters, and the infos that adapters pass on."""
 
-from collections.abc import Iterable
 from typing import Any
 
 from gymnasium import spaces
@@ -57,9 +56,3 @@ def arm_space(env: Env, arm: str) -> spaces.Dict:
     space = env.observation_space(arm)
     assert isinstance(space, spaces.Dict)
     return space
-
-
-def check_choice(name: str, value: object, allowed: Iterable[str]) -> None:
-    """Raise a ValueError unless the value is one of the allowed ones."""
-    if value not in (allowed := tuple(allowed)):
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))} (got {value!r}).")

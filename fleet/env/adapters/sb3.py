@@ -25,7 +25,8 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from fleet.env.adapters.arguments import check_batch, check_choice
+from fleet.env.adapters.arguments import check_batch
+from fleet.env.validation import check_choice
 from fleet.env.vector import BatchEnv, Obs
 
 Array = np.ndarray
