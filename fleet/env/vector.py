@@ -2,6 +2,8 @@
 
 It has the engine of `fleet.env.allocation_v2` with a leading env axis: a row equals that env bit for bit, for any
 number of rows.
+
+Large arrays are reused when nobody holds them any more: clearing the pages of a new array costs more than filling it.
 """
 
 import ctypes
@@ -26,6 +28,43 @@ from fleet.observation import Layout, Observation
 from fleet.seeding import exchange_seed, shift_seeds
 
 Array = np.ndarray
+
+
+def _references(arrays: list[Array], place: int) -> int:
+    """Reference count of an array in a list, measured within this function."""
+    array = arrays[place]
+    return sys.getrefcount(array)
+
+
+_ALONE = _references([np.empty(0)], 0)
+"""Reference count of an array that only the list holds, measured because interpreters count differently. A view of an
+array adds one."""
+
+
+class Shelf:
+    """A pool of arrays of one shape and type, with undefined content.
+
+    Args:
+        keep: Maximum number of arrays kept for reuse.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: type, *, keep: int = 4) -> None:
+        self._shape, self._dtype, self._keep = shape, dtype, keep
+        self._arrays: list[Array] = []
+
+    def take(self) -> Array:
+        """An array that nobody else holds."""
+        for place in range(len(self._arrays)):
+            if _references(self._arrays, place) == _ALONE:
+                return self._arrays[place]
+        array = np.empty(self._shape, self._dtype)
+        if len(self._arrays) < self._keep:
+            self._arrays.append(array)
+        return array
+
+    def __getstate__(self) -> dict[str, object]:
+        """State for pickling, without the arrays, which their holders pickle."""
+        return {**vars(self), "_arrays": []}
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
@@ -131,6 +170,7 @@ class BatchEnv:
         self.single_observation_space, self.single_action_space = arm_spaces(self.layout)
         """Of one arm, with both parts as one vector."""
         self.autoreset = autoreset
+        self._shelves = [Shelf(each.shape, np.float32) for each in empty_parts(self.layout, num_envs)]
         self._library = library
         self._engine = Engine(
             library.tables,
@@ -155,7 +195,7 @@ class BatchEnv:
         self._elapsed_s = np.zeros(num_envs)
         """Length of the last step of each env."""
         self._exchanges = exchanges
-        self._delivered = None if exchanges is None else empty_parts(self.layout, self.num_envs)
+        self._delivered = None if exchanges is None else self._no_parts()
         """Knowledge of the arms with their received messages; only with exchanges."""
 
     @property
@@ -198,7 +238,7 @@ class BatchEnv:
         chosen = self._rows_of(rows)
         if not self._begun and len(chosen) < self.num_envs:
             raise RuntimeError("No episode has started: call reset() for all envs before reset(rows=…).")
-        self._parts = empty_parts(self.layout, self.num_envs)
+        self._parts = self._no_parts()
         self._begin(chosen)
         if len(chosen) < self.num_envs:
             self._observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._parts)
@@ -231,7 +271,7 @@ class BatchEnv:
                 f"The shift of {len(which)} env(s) is over (first: env {which[0]}): call reset(rows=…) before step()."
             )
         chosen = self._checked(actions)
-        parts = empty_parts(self.layout, self.num_envs)
+        parts = self._no_parts()
         until = self._last_tick if self._events else None
         outcome = self._engine.step(chosen, parts, until)
         tick, finished = outcome[:, TICK], outcome[:, FINISHED] > 0
@@ -255,7 +295,7 @@ class BatchEnv:
     def knowledge(self) -> Observation:
         """Current observations by field, leading axes [env, arm], as policies read them."""
         self._check_begun("knowledge()")
-        parts = empty_parts(self.layout, self.num_envs)  # the caller may have written into the last ones
+        parts = self._no_parts()  # the caller may have written into the last ones
         self._observe(np.arange(self.num_envs), parts)
         return self.layout.read_parts(*parts, self._engine.mask.copy())
 
@@ -304,14 +344,23 @@ class BatchEnv:
 
     def _info(self, outcome: Array, ended: Array, last: Obs | None) -> dict[str, Any]:
         infos = self._engine.infos.copy()
+        if last is None:
+            shared, own = empty_parts(self.layout, 0)
+            mask = np.zeros((0, self.layout.arms, self.layout.actions), np.int8)
+            last = {"shared": shared, "own": own, "action_mask": mask}
         return {
             **{name: infos[name] for name in INFO.names or ()},
             "jobs_done": outcome[:, JOBS_DONE],
             "elapsed_s": self._elapsed_s,
             **{f"reward_{name}": outcome[:, n] for n, name in enumerate(TERMS)},
             "final_envs": ended,
-            "final_obs": self._obs(np.zeros(0, dtype=int)) if last is None else last,
+            "final_obs": last,
         }
+
+    def _no_parts(self) -> Parts:
+        """Arrays for observations: unused ones of an earlier step, if there are any."""
+        shared, own = (shelf.take() for shelf in self._shelves)
+        return shared, own
 
     def _checked(self, actions: object) -> Array:
         shape = (self.num_envs, self.layout.arms)

@@ -1,5 +1,6 @@
 """The batch: a row equals the single environment bit for bit, does not depend on other rows, and is randomised."""
 
+import gc
 import platform
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import BLOCK, shifts_of
 from fleet.engine.tables import stack_tables, tables_of
 from fleet.engine.world import Space
-from fleet.env.vector import BatchEnv, Library
+from fleet.env.vector import BatchEnv, Library, Shelf
 from fleet.motion import Plan
 from scenarios.evaluate.rollout import outcomes
 from scenarios.prepare.batch import library_of, make_batch
@@ -268,6 +269,31 @@ def test_staggered_envs_end_their_first_shifts_one_after_the_other(small) -> Non
     assert {tick + 1: which for tick, which in enumerate(ends) if which} == {
         4: [0], 8: [1], 12: [2], 16: [3], 20: [4], 24: [0],
     }  # fmt: skip
+
+
+def test_referenced_arrays_are_never_reused() -> None:
+    shelf = Shelf((3, 4), np.float32, keep=2)
+    held = [shelf.take() for _ in range(5)]
+    assert len({id(array) for array in held}) == 5
+    assert all(array.shape == (3, 4) and array.dtype == np.float32 for array in held)
+    for array in held:
+        array[:] = 7.0
+    part, raw = held[0][1, 2:], memoryview(held[1])
+    held.clear()
+    gc.collect()
+    taken = [shelf.take() for _ in range(4)]
+    for array in taken:
+        array[:] = 0.0
+    assert part.tolist() == [7.0, 7.0]
+    assert raw[0, 0] == 7.0
+
+
+def test_released_arrays_are_reused() -> None:
+    shelf = Shelf((8,), np.int64)
+    place = shelf.take().ctypes.data
+    assert shelf.take().ctypes.data == place
+    kept = shelf.take()
+    assert shelf.take().ctypes.data != kept.ctypes.data
 
 
 TURNOVER = """
