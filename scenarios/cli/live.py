@@ -1,6 +1,7 @@
 """Commands that run a live fleet: up, `thermofleet arm run` and `thermofleet bus`."""
 
-from dataclasses import MISSING, replace
+from dataclasses import MISSING, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -255,13 +256,36 @@ def gateway_command(
 
     shown = None
     if page:
-        from scenarios.live.gateway import LivePage
         from scenarios.show.page import three_js
         from scenarios.spec.load import load
 
         three_js()  # if it is missing, say so at once
         shown = LivePage(scene_of(load(scenario)) if scenario else None)
     run_gateway(endpoint, fleet, port, host, token, tokens, shown)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ros2Spec:
+    """How a fleet meets ROS 2."""
+
+    domain: int = option("The ROS 2 domain.", 0, low=0, high=232, env="ROS_DOMAIN_ID")
+    router: str = option("Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.", "")
+    warning_c: float = option("Motor temperature at which a warning begins, °C.", 60.0, low=0, high=200)
+    error_c: float = option("bridge: motor temperature at which an error begins, °C.", 75.0, low=0, high=200)
+    humble: bool = option("bridge: for ROS 2 Humble, whose keys have no type hash.", False)
+    arm: str = option("Name of the arm in the fleet.", "real", is_name=True, panel=_LISTEN)
+    temperatures: str = option(
+        "Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.", "", panel=_LISTEN
+    )
+    hardware: str = option(
+        "Text before /JOINT in the hardware_id of these diagnostics; default: none.", "", panel=_LISTEN
+    )
+    joints: str = option("Names of its joints in ROS 2, from joint 1 on.", "", panel=_LISTEN)
+    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True, panel=_LISTEN)
+    twin: Path | None = option("Folder of the arm's twin, which scores the motion.", None, panel=_LISTEN)
+    network: Path | None = option(
+        "Folder of `thermofleet twin identify`; the temperatures that it yields are in the states.", None, panel=_LISTEN
+    )
 
 
 def ros2_command(
@@ -272,47 +296,13 @@ def ros2_command(
     topic: str = argument("listen: topic of the arm's sensor_msgs/JointState, as /joint_states.", ""),
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
-    domain: int = option("The ROS 2 domain.", 0, low=0, high=232, env="ROS_DOMAIN_ID"),
-    router: str = option("Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.", ""),
-    warning_c: float = option("Motor temperature at which a warning begins, °C.", 60.0, low=0, high=200),
-    error_c: float = option("bridge: motor temperature at which an error begins, °C.", 75.0, low=0, high=200),
-    humble: bool = option("bridge: for ROS 2 Humble, whose keys have no type hash.", False),
-    arm: str = option("Name of the arm in the fleet.", "real", is_name=True, panel=_LISTEN),
-    temperatures: str = option(
-        "Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.", "", panel=_LISTEN
-    ),
-    hardware: str = option(
-        "Text before /JOINT in the hardware_id of these diagnostics; default: none.", "", panel=_LISTEN
-    ),
-    joints: str = option("Names of its joints in ROS 2, from joint 1 on.", "", panel=_LISTEN),
-    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True, panel=_LISTEN),
-    twin: Path | None = option("Folder of the arm's twin, which scores the motion.", None, panel=_LISTEN),
-    network: Path | None = option(
-        "Folder of `thermofleet twin identify`; the temperatures that it yields are in the states.", None, panel=_LISTEN
-    ),
+    *,
+    given: Annotated[Given, From(Ros2Spec)],
 ) -> None:
     """Connect a fleet to ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
     if (mode == "listen") != bool(topic):
         raise FleetError(f"Only listen takes a TOPIC, and needs one (got {mode} {topic}".rstrip() + ").")
     from scenarios.live.ros2 import run_bridge, run_jobs, run_listener
 
-    if mode == "jobs":
-        run_jobs(endpoint, fleet, domain=domain)
-    elif mode == "bridge":
-        run_bridge(endpoint, fleet, domain=domain, router=router, humble=humble, warning_c=warning_c, error_c=error_c)
-    else:
-        run_listener(
-            topic,
-            endpoint,
-            fleet,
-            arm=arm,
-            temperatures=temperatures,
-            hardware=hardware,
-            joints=joints,
-            domain=domain,
-            router=router,
-            rate_hz=rate_hz,
-            warning_c=warning_c,
-            twin=twin,
-            network=network,
-        )
+    run = {"bridge": run_bridge, "listen": partial(run_listener, topic), "jobs": run_jobs}[mode]
+    run(endpoint, fleet, Ros2Spec(**given))

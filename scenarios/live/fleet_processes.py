@@ -162,20 +162,8 @@ def run_fleet(
 def page_of(scenario: str, fleet: str, at: str, tls: Path | None) -> Part:
     """The live page of a fleet, on a port that is free now; it keeps the port when it is restarted."""
     endpoint, port = at if tls is None else Tls(tls, "operator").endpoint(at), free_port(PAGE_PORT)
-    argv = (
-        *PROGRAM,
-        "bus",
-        "gateway",
-        "--page",
-        "--scenario",
-        scenario,
-        "--endpoint",
-        endpoint,
-        "--fleet",
-        fleet,
-        "--port",
-        str(port),
-    )
+    words = ("bus", "gateway", "--page", "--scenario", scenario, "--endpoint", endpoint, "--fleet", fleet)
+    argv = (*PROGRAM, *words, "--port", str(port))
     return Part(name="page", argv=argv, rank=1, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
 
 

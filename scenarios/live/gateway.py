@@ -111,22 +111,16 @@ class LivePage:
     """The page of a gateway; without a model the cell is drawn as the auctioneer describes it."""
 
     def __init__(self, model: Mapping[str, Any] | None = None) -> None:
-        self._given = model
-        self._cell: Cell | None = None
-        self._model: Mapping[str, Any] = {}
+        self._model = model
 
     async def scene(self, ask_cell: Callable[[], Awaitable[Cell]]) -> Mapping[str, Any]:
         """The cell in three dimensions; raises BusError if no participant describes it, or with invalid numbers."""
-        if self._given is not None:
-            return self._given
-        cell = await ask_cell()
-        if cell != self._cell:
-            try:
-                self._model = await asyncio.to_thread(_model_of, cell)
-            except ValueError as error:
-                raise BusError(f"The auctioneer describes an invalid cell: {error}") from error
-            self._cell = cell
-        return self._model
+        if self._model is not None:
+            return self._model
+        try:
+            return await asyncio.to_thread(_model_of, await ask_cell())
+        except ValueError as error:
+            raise BusError(f"The auctioneer describes an invalid cell: {error}") from error
 
     async def file(self, request: Request) -> Response:
         """A file of the page."""

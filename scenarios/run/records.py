@@ -100,6 +100,13 @@ class ShiftLog:
         horizon_s = float(self.card.get("scenario", {}).get("horizon_s", 0.0))
         return schedule(self.events, self.arms, max(ends_s, default=horizon_s))
 
+    def offers_behind(self, job: str, arm: str, time_s: float) -> tuple[Offer, ...]:
+        """Offers of all arms at the award of a job to an arm; in a recording its time is that of another clock, so the
+        award nearest the time is meant."""
+        times_s = [each.time_s for each in self.offers if each.awarded and (each.job, each.arm) == (job, arm)]
+        award_s = min(times_s, key=lambda each: abs(each - time_s), default=None)
+        return tuple(each for each in self.offers if (each.job, each.time_s) == (job, award_s))
+
     @cached_property
     def load_kg(self) -> np.ndarray:
         """Payload in each hand, kg, [sample, arm]."""

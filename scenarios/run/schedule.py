@@ -77,6 +77,11 @@ class Schedule:
     breaks: tuple[Outage, ...] = ()
     """An arm may still finish a cycle or a job in them."""
 
+    def at(self, arm: str, time_s: float, job: str = "") -> JobSpan | None:
+        """The work of an arm at a time; with a job, only that one."""
+        own = (span for span in self.assignments if span.arm == arm and job in ("", span.job))
+        return next((span for span in own if span.start_s <= time_s <= span.end_s), None)
+
 
 def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float) -> Schedule:
     """Schedule of an event log; the order of events within the log does not matter.

@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.show.comparison_page import COLOURS
-from scenarios.show.page import AXIS, GRID, INK, LAYOUT, Chart, Page, Section
+from scenarios.show.page import GRID, INK, LAYOUT, LEGEND_ABOVE, Chart, Section, axis, sections_page
 from scenarios.show.words import duration
 from scenarios.table import Column, Table
 from twin.logs.recording import Recording
@@ -155,10 +155,7 @@ def page(found: ThermalForecast, so_far: Recording, repetitions: int, origin: Ma
         charts=(_chart(found, so_far),),
         tables=(limit_table(found), joint_table(found, so_far)),
     )
-    facts = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
-    content = {"lead": (), "sections": [section], "failed": [], "origin": facts}
-    title = f"Thermal forecast after {so_far.name}"
-    return Page(title=title, template="sections.html", content=content, charts=section.charts, narrow=True).html()
+    return sections_page(f"Thermal forecast after {so_far.name}", [section], origin)
 
 
 def _chart(found: ThermalForecast, so_far: Recording) -> Chart:
@@ -197,9 +194,9 @@ def _chart(found: ThermalForecast, so_far: Recording) -> Chart:
     layout = LAYOUT | {
         "height": 430,
         "margin": {"l": 55, "r": 15, "t": 60, "b": 50},
-        "legend": {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"},
-        "xaxis": AXIS | {"title": {"text": "minutes from the end of the log"}},
-        "yaxis": AXIS | {"title": {"text": "motor temperature, °C"}},
+        "legend": LEGEND_ABOVE,
+        "xaxis": axis("minutes from the end of the log"),
+        "yaxis": axis("motor temperature, °C"),
         "shapes": [*(_rule("x", "y", c, "#b00020") for c in shown_c), _rule("y", "x", 0.0, GRID)],
         "annotations": [
             {"xref": "paper", "x": 1, "xanchor": "right", "y": c, "yanchor": "bottom", "showarrow": False}

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any  # values of a card
+from typing import Any, NamedTuple  # Any: values of a card
 from urllib.parse import quote
 
 from fleet.env.render.heat import heat_scale
@@ -15,8 +15,8 @@ from scenarios.run.schedule import JobSpan, Schedule
 from scenarios.show.lateness import late_jobs, lateness_text
 from scenarios.show.page import Chart, Page, Playback, packed
 from scenarios.show.timeline import figure, hottest_motors, time_unit
-from scenarios.show.words import CANNOT, clock, duration, kind_text, names_text, scores_text, value_text
-from scenarios.table import Moment, Table, render
+from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, value_text
+from scenarios.table import Column, Moment, Table, render
 
 MOST_FAULTS = 2
 """Faults described in a sentence each."""
@@ -45,13 +45,13 @@ def verdict(log: ShiftLog) -> Verdict:
 
     Missing figures of its card are left out; without offers there is no sentence about other choices.
     """
-    metrics, plan, offers, faults = log.card.get("metrics") or {}, log.plan, log.offers, log.faults
+    metrics, plan, faults = log.card.get("metrics") or {}, log.plan, log.faults
     contacts = sum(event.kind == "contact" for event in log.events)
     about = {_fault(fault, plan): fault for fault in faults[:MOST_FAULTS]}
     moments = {sentence: _before(fault) for sentence, fault in about.items()}
     sentences = [*_jobs(metrics), *_outside_shift(log.card.get("scenario") or {})]
     for sentence, fault in about.items():
-        sentences += [sentence, *_cause(fault, plan, offers)]
+        sentences += [sentence, *_cause(fault, log)]
     if len(faults) > MOST_FAULTS:
         arms = sorted({fault.arm for fault in faults})
         sentences.append(f"{len(faults)} faults in all, of {names_text(arms)}: see the events below.")
@@ -62,7 +62,7 @@ def verdict(log: ShiftLog) -> Verdict:
         count = f"{len(failures)} failure{'s' * (len(failures) > 1)} not by heat"
         sentences.append(f"{count}: {names_text(arms)} out for {duration(out_s)} in all.")
     if log.policy != WEIGHS_PEAK:
-        sentences += _foreseen(faults, plan, offers)
+        sentences += _foreseen(log)
     if contacts:
         sentences.append(
             f"Arms touched something {f'{contacts} times' if contacts > 1 else 'once'}: see the events below."
@@ -119,30 +119,19 @@ def _fault(fault: Event, plan: Schedule) -> str:
     return f"{clock(fault.time_s)}: {fault.arm} stopped{at}, {loss}: {why}."
 
 
-def _award(fault: Event, plan: Schedule) -> JobSpan | None:
-    """The work in which an arm faulted."""
-    same = (a for a in plan.assignments if (a.arm, a.job) == (fault.arm, fault.job))
-    return next((a for a in same if a.start_s <= fault.time_s <= a.end_s), None)
-
-
-def _behind(award: JobSpan, offers: Sequence[Offer]) -> list[Offer]:
-    """The offers behind an award; in a live fleet they are a little older than its start."""
-    earlier = [offer for offer in offers if offer.job == award.job and offer.time_s <= award.start_s]
-    last_s = max((offer.time_s for offer in earlier), default=0.0)
-    return [offer for offer in earlier if offer.time_s == last_s]
-
-
-def _own_offer(award: JobSpan, offers: Sequence[Offer]) -> Offer | None:
+def _own_offer(award: JobSpan, log: ShiftLog) -> Offer | None:
     """The offer that got the job; None if its scores are unknown."""
-    own = next((o for o in _behind(award, offers) if o.awarded), None)
+    own = next((offer for offer in log.offers_behind(award.job, award.arm, award.start_s) if offer.awarded), None)
     return own if own is not None and own.peak_c is not None and own.p_saturation is not None else None
 
 
-def _foreseen(faults: Sequence[Event], plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
+def _foreseen(log: ShiftLog) -> Iterable[str]:
     """How many faults were predicted, and what kind of policy avoids them."""
-    awards = [(fault, _award(fault, plan)) for fault in faults]
-    own = [(fault, _own_offer(award, offers)) for fault, award in awards if award is not None]
-    count = sum(offer is not None and (offer.peak_c or 0.0) >= _limit_c(fault) for fault, offer in own)
+    count, faults = 0, log.faults
+    for fault in faults:
+        award = log.plan.at(fault.arm, fault.time_s, fault.job)
+        own = _own_offer(award, log) if award else None
+        count += own is not None and (own.peak_c or 0.0) >= _limit_c(fault)
     if count:
         which = "The fault was" if len(faults) == 1 else f"{count} of {len(faults)} faults were"
         yield f"{which} predicted: a policy that weighs the predicted peak, such as {WEIGHS_PEAK}, avoids such awards."
@@ -152,14 +141,15 @@ def _limit_c(fault: Event) -> float:
     return fault.value if math.isfinite(fault.value) else math.inf
 
 
-def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
+def _cause(fault: Event, log: ShiftLog) -> Iterable[str]:
     """Why an arm faulted, as far as its award tells, and what would have avoided it."""
-    award = _award(fault, plan)
+    plan = log.plan
+    award = plan.at(fault.arm, fault.time_s, fault.job)
     if award is None:
         return
     begin_s = _begin(award, [a for a in plan.assignments if a.arm == fault.arm and a.start_s <= fault.time_s])
     pause = f"at work without a pause since {clock(begin_s)}; " if begin_s < award.start_s else ""
-    own = _own_offer(award, offers)
+    own = _own_offer(award, log)
     if own is None:
         if pause:
             yield f"Why: {pause}no prediction was recorded."
@@ -168,7 +158,7 @@ def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[st
         f"Why: {pause}at the award, {clock(award.start_s)}, predicted peak {own.peak_c:.0f} °C and P(saturation) "
         f"{own.p_saturation:.2f}."
     )
-    yield _avoidable(fault, own, _behind(award, offers), plan)
+    yield _avoidable(fault, own, log.offers_behind(award.job, award.arm, award.start_s), plan)
 
 
 def _begin(award: JobSpan, work: Sequence[JobSpan]) -> float:
@@ -201,11 +191,8 @@ def _occupied(offer: Offer, plan: Schedule) -> str:
     """Why an arm could not take a job, or until when."""
     if offer.state == "faulted":
         return "which was out after a fault"
-    current = next(
-        (a for a in plan.assignments if a.arm == offer.arm and a.start_s <= offer.time_s < a.end_s),
-        None,
-    )
-    if current is None:
+    current = plan.at(offer.arm, offer.time_s)
+    if current is None or current.end_s == offer.time_s:
         return "but its place or space was taken"
     if current.end_s >= plan.horizon_s:
         return "which was busy to the end"
@@ -302,25 +289,46 @@ def _settings(run: Mapping[str, Any], arms: Sequence[str]) -> list[str]:
     return how + [f"{name} {run[name]}" for name in ("plant", "bus", "difficulty") if run.get(name) is not None]
 
 
+class KeyFigure(NamedTuple):
+    """One of the most important metrics."""
+
+    label: str
+    name: str
+    """The metric."""
+    form: str
+    unit: str = ""
+    whole: str = ""
+    """The metric that it is a part of."""
+
+
 KEY_FIGURES = (
-    ("jobs finished", "finished", ",.4g", "", "jobs"),
-    ("value", "value", ",.4g", "", "value_offered"),
-    ("on time", "on_time", ",.4g", "", "finished"),
-    ("tardiness", "tardiness_min", ",.1f", " min", ""),
-    ("jobs per hour", "jobs_per_hour", ".1f", "", ""),
-    ("faults", "faults", ".0f", "", ""),
-    ("contacts", "contacts", ",.0f", "", ""),
-    ("above warning", "above_warning_min", ",.1f", " min", ""),
-    ("hottest motor", "hottest_c", ".1f", " °C", ""),
-    ("too hot to touch", "hot_surface_min", ",.1f", " min", ""),
-    ("availability", "availability", ".1%", "", ""),
-    ("utilisation", "utilisation", ".1%", "", ""),
-    ("energy to heat", "energy_wh", ",.0f", " Wh", ""),
-    ("tool drift", "most_drift_mm", ".2f", " mm", ""),
-    ("insulation used", "most_insulation_ppb", ",.3g", " ppb", ""),
-    ("claims lost to another arm", "lost_claims", ",.0f", "", ""),
+    KeyFigure("jobs finished", "finished", ",.4g", whole="jobs"),
+    KeyFigure("value", "value", ",.4g", whole="value_offered"),
+    KeyFigure("on time", "on_time", ",.4g", whole="finished"),
+    KeyFigure("tardiness", "tardiness_min", ",.1f", "min"),
+    KeyFigure("jobs per hour", "jobs_per_hour", ".1f"),
+    KeyFigure("faults", "faults", ".0f"),
+    KeyFigure("contacts", "contacts", ",.0f"),
+    KeyFigure("given up", "given_up", ",.0f"),
+    KeyFigure("expired", "expired", ",.0f"),
+    KeyFigure("above warning", "above_warning_min", ",.1f", "min"),
+    KeyFigure("hottest motor", "hottest_c", ".1f", "°C"),
+    KeyFigure("too hot to touch", "hot_surface_min", ",.1f", "min"),
+    KeyFigure("availability", "availability", ".1%"),
+    KeyFigure("utilisation", "utilisation", ".1%"),
+    KeyFigure("energy to heat", "energy_wh", ",.0f", "Wh"),
+    KeyFigure("tool drift", "most_drift_mm", ".2f", "mm"),
+    KeyFigure("insulation used", "most_insulation_ppb", ",.3g", "ppb"),
+    KeyFigure("claims lost to another arm", "lost_claims", ",.0f"),
 )
-"""Label, metric, format, unit, and the metric it is a part of."""
+MAIN_FIGURES = tuple(
+    each
+    for each in KEY_FIGURES
+    if each.name in ("finished", "value", "on_time", "faults", "above_warning_min", "hottest_c")
+)
+"""Those by which shifts are compared."""
+RARE = ("contacts", "given_up", "expired")
+"""At the head of a report only where there are some."""
 
 
 def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
@@ -329,11 +337,28 @@ def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
     hottest = max(peaks, key=lambda arm: peaks[arm], default="")
     tiles: list[Tile] = []
     for label, name, form, unit, whole in KEY_FIGURES:
-        if name in values and (name != "contacts" or values[name] > 0):
-            small = f" of {values[whole]:{form}}" if whole in values else f"{unit} {hottest * (name == 'hottest_c')}"
+        if name in values and (name not in RARE or values[name] > 0):
+            small = f" of {values[whole]:{form}}" if whole in values else f" {unit} {hottest * (name == 'hottest_c')}"
             bad = name in ("faults", "contacts") and values[name] > 0
             tiles.append(Tile(label, f"{values[name]:{form}}", small.rstrip(), bad))
     return tiles
+
+
+def figure_table(shifts: Mapping[str, Mapping[str, Any]], *, wholes: bool = False) -> Table:
+    """Key figures, a column for each shift's metrics by its name; "" for a figure that it lacks.
+
+    Args:
+        wholes: Say of what a figure is a part, as in `77 of 87`; without it, cells are plain numbers.
+    """
+    columns, rows = [numbers(metrics) for metrics in shifts.values()], list[tuple[str, ...]]()
+    for label, name, form, unit, whole in KEY_FIGURES:
+        form, percent = form.replace(",", "").replace("%", "f"), form.endswith("%")
+        if any(name in values for values in columns):
+            of = [f" of {values[whole]:{form}}" if wholes and whole in values else "" for values in columns]
+            texts = [f"{values[name] * 100**percent:{form}}" if name in values else "" for values in columns]
+            heading = str(Column(label, "%" if percent else unit))
+            rows.append((heading, *(text + part for text, part in zip(texts, of, strict=True))))
+    return Table(head=("", *shifts), rows=tuple(rows))
 
 
 def _peaks(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -397,12 +422,12 @@ def _award_table(offers: Sequence[Offer], arms: Sequence[str]) -> Mapping[str, o
         winner = next(offer for offer in award if offer.awarded)
         if every_arm:
             of = {offer.arm: offer for offer in award}
-            cells = [_offer_text(of[arm]) if arm in of else "" for arm in arms]
+            cells = [offer_text(of[arm]) if arm in of else "" for arm in arms]
         else:
             others = sorted(
                 (o for o in award if o.free and not o.awarded), key=lambda o: (o.p_saturation or 0.0, o.arm)
             )
-            cells = [_offer_text(winner), *(f"{o.arm}: {_offer_text(o)}" for o in others[:3])]
+            cells = [offer_text(winner), *(f"{o.arm}: {offer_text(o)}" for o in others[:3])]
             cells += [""] * (4 - len(cells))
         rows.append((clock(winner.time_s), winner.job, winner.arm, *cells))
         moments.append(Moment(winner.time_s, winner.arm))
@@ -413,14 +438,6 @@ def _award_table(offers: Sequence[Offer], arms: Sequence[str]) -> Mapping[str, o
         "more": left if len(awards) > MOST_AWARDS else "",
         "rows": table.html(key="choices", moments=moments),
     }
-
-
-def _offer_text(offer: Offer) -> str:
-    if not offer.feasible:
-        return CANNOT
-    parts = [*scores_text(offer), f"{(offer.duration_s or 0.0) / 60:.0f} min"]
-    barred = "" if offer.free else f" ({offer.state if offer.state != 'idle' else 'place or space taken'})"
-    return ", ".join(parts) + barred
 
 
 def _request_table(requests: Sequence[Sequence[str]]) -> Table | None:
@@ -446,26 +463,16 @@ def _provenance(run: Mapping[str, Any]) -> Table:
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 
-MAIN_FIGURES = (
-    ("jobs finished", "finished", ".0f"),
-    ("value of finished jobs", "value", ".4g"),
-    ("jobs on time", "on_time", ".0f"),
-    ("faults", "faults", ".0f"),
-    ("minutes above the warning limit", "above_warning_min", ".1f"),
-    ("hottest motor, °C", "hottest_c", ".1f"),
-)
-"""Label, metric and format of the figures by which two shifts are compared."""
-
-
 def pair_table(logs: Mapping[str, ShiftLog]) -> Table:
     """The main figures of two shifts by name, and the second minus the first; missing figures are left out."""
     columns = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
     rows = list[tuple[str, ...]]()
-    for label, name, form in MAIN_FIGURES:
+    for label, name, form, unit, _ in MAIN_FIGURES:
         values = [column[name] for column in columns if name in column]
         if len(values) == len(columns):
             change = f"{values[1] - values[0]:+{form}}".replace("-", "−")
-            rows.append((label, *(f"{value:{form}}" for value in values), change if float(change[1:]) else "0"))
+            texts = [f"{value:{form}}" for value in values]
+            rows.append((str(Column(label, unit)), *texts, change if float(change[1:]) else "0"))
     return Table(head=("", *logs, "difference"), rows=tuple(rows))
 
 

@@ -1,11 +1,12 @@
 """Several runs side by side: one table of key figures, a chart of the main ones, and the hottest motors over time."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any  # values of Plotly's schema
 
 from scenarios.run.records import ShiftLog
-from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, Section, plain
-from scenarios.show.run_page import KEY_FIGURES, MAIN_FIGURES, numbers, verdict
+from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Section, named_rows, plain, sections_page
+from scenarios.show.run_page import MAIN_FIGURES, figure_table, numbers, verdict
 from scenarios.show.timeline import POLICY_LINES, STREAM_NAME, hottest_motors
 from scenarios.table import Column, Table
 
@@ -22,31 +23,19 @@ def runs_table(logs: Mapping[str, ShiftLog]) -> Table:
         "predictions": [str(log.card.get("difficulty", "")) for log in logs.values()],
         "outcome": [verdict(log).badge for log in logs.values()],
     }
-    values = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
+    figures = figure_table({name: log.card.get("metrics") or {} for name, log in logs.items()})
     rows = [(name, *cells) for name, cells in settings.items()]
-    for label, name, form, unit, _ in KEY_FIGURES:
-        form = form.replace(",", "").replace("%", "f")
-        scale, unit = (100.0, "%") if name in ("availability", "utilisation") else (1.0, unit.strip())
-        if any(name in own for own in values):
-            cells = (f"{scale * own[name]:{form}}" if name in own else "" for own in values)
-            rows.append((str(Column(label, unit)), *cells))
-    return Table(head=("", *logs), rows=tuple(rows))
+    return replace(figures, rows=(*rows, *figures.rows))
 
 
 def runs_page(logs: Mapping[str, ShiftLog]) -> str:
     """Runs by name as one HTML page that opens offline; the same runs give the same text."""
-    table, first = runs_table(logs), next(iter(logs.values()))
+    table = runs_table(logs)
     same = [row[0] for row in table.rows[:4] if len(set(row[1:])) == 1]
     differ = [row[0] for row in table.rows[:4] if len(set(row[1:])) > 1]
     equal_jobs = {"scenario", "seed"} <= set(same)
-    lead = (
-        f"The runs differ in {', '.join(differ) or 'nothing'}. "
-        + (
-            "All have the same jobs."
-            if equal_jobs
-            else "They have other jobs: their figures are no comparison of policies."
-        ),
-    )
+    jobs = "All have the same jobs." if equal_jobs else "They have other jobs: their figures compare no policies."
+    lead = (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",)
     main = Chart(key="main", figure=bars(logs), alt=f"Main figures of {', '.join(logs)}; the table has the numbers")
     sections = [Section(key="figures", title="Key figures", charts=(main,), tables=(table,))]
     if (
@@ -64,34 +53,26 @@ def runs_page(logs: Mapping[str, ShiftLog]) -> str:
         ),
         numbers=False,
     )
-    content = {"lead": lead, "failed": (), "sections": sections, "origin": origin}
-    charts = [chart for section in sections for chart in section.charts]
-    title = (
-        f"{len(logs)} runs of {first.card.get('scenario', {}).get('name', '')}"
-        if "scenario" in same
-        else f"{len(logs)} runs"
-    )
-    return Page(title=title, template="sections.html", content=content, charts=charts, narrow=True).html()
+    title = f"{len(logs)} runs{f' of {table.rows[0][1]}' if 'scenario' in same else ''}"
+    return sections_page(title, sections, origin, lead)
 
 
 def bars(logs: Mapping[str, ShiftLog]) -> Figure:
     """The main figures one below the other, each with a bar for each run."""
     values = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
-    shown = [(label, name, form) for label, name, form in MAIN_FIGURES if any(name in own for own in values)]
+    shown = [each for each in MAIN_FIGURES if any(each.name in own for own in values)]
     block_px = TITLE_PX + BAR_PX * len(logs)
     height_px = block_px * max(1, len(shown))
     names = [plain(name, STREAM_NAME) for name in logs]
-    rows = {"range": [len(names) - 0.5, -0.5], "tickvals": list(range(len(names))), "ticktext": names}
-    rows |= {"showgrid": False, "automargin": True}
     data, layout, titles = list[dict[str, Any]](), dict[str, Any](), list[dict[str, Any]]()
-    for number, (label, name, form) in enumerate(shown, start=1):
+    for number, (label, name, form, unit, _) in enumerate(shown, start=1):
         top = 1 - ((number - 1) * block_px + TITLE_PX) / height_px
         own = [each.get(name) for each in values]
         text = [f"{value:{form}}" if value is not None else "" for value in own]
         axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
         look = {"color": [POLICY_LINES[k % len(POLICY_LINES)][0] for k in range(len(names))]}
         data.append(
-            {"type": "bar", "orientation": "h", "x": own, "y": rows["tickvals"], "text": text, "marker": look}
+            {"type": "bar", "orientation": "h", "x": own, "y": list(range(len(own))), "text": text, "marker": look}
             | {
                 "hovertemplate": "%{text}<extra></extra>",
                 "textposition": "outside",
@@ -102,9 +83,9 @@ def bars(logs: Mapping[str, ShiftLog]) -> Figure:
         )
         layout[f"xaxis{number}"] = AXIS | {"anchor": f"y{number}", "rangemode": "tozero", "visible": False}
         domain = [max(0.0, top - BAR_PX * len(logs) / height_px), top]
-        layout[f"yaxis{number}"] = AXIS | rows | {"anchor": f"x{number}", "domain": domain}
+        layout[f"yaxis{number}"] = named_rows(names, anchor=f"x{number}", domain=domain)
         place = {"x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom"}
-        titles.append({"text": f"<b>{label}</b>", "showarrow": False, **place})
+        titles.append({"text": f"<b>{Column(label, unit)}</b>", "showarrow": False, **place})
     margin = {"l": 60, "r": 48, "t": 4, "b": 12}
     return {
         "data": data,

@@ -48,7 +48,7 @@ def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml,
     assert sorted(p.name for p in out.iterdir()) == sorted(FILES)
     printed = run_json(out)
     assert printed["status"] == "finished"
-    for label in ("jobs finished", "value", "on time", "faults", "min above warning", "energy, Wh"):
+    for label in ("jobs finished", "value", "on time", "faults", "above warning, min", "energy to heat, Wh"):
         assert label in said.out
     assert f"{printed['metrics']['finished']} of {printed['metrics']['jobs']}" in said.out
     for arm, peak_c in printed["metrics"]["peak_c"].items():
