@@ -156,9 +156,9 @@ class _Lines:
 
 def print_json(value: object) -> None:
     """Print a value on standard output as JSON."""
-    import msgspec
+    from scenarios.result_folder import json_text
 
-    echo(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
+    echo(json_text(value), nl=False)
 
 
 WIDE = 200

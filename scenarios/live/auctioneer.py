@@ -20,7 +20,7 @@ from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.rounds import Allocate, Assignment, Bidding, Timing, resolve_claims
 from fleet.live.journal import Journal, quarantine
-from scenarios.live.cell import cell_message, cell_space
+from scenarios.live.cell import cell_of
 from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
 from scenarios.signals import StopRequest, until_stopped
@@ -118,7 +118,7 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
     fleet, folder = folder_of(spec.journal, spec.fleet, scenario)
     refuse_other_way(folder, (arm.name for arm in scenario.arms), alone=False)
     with progress_bar() as progress:
-        excludes, cell = cell_space(scenario, progress=progress), cell_message(scenario, name, progress=progress)
+        cell, excludes = cell_of(scenario, name, progress)
     aside = salvage(quarantine(folder / f"{name}.aside", name))
     with (
         until_stopped() as stop,

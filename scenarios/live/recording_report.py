@@ -28,7 +28,8 @@ from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, segment_
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
-from scenarios.live.recording import SENSORS, SOURCES, Kind, lost_rows, read_card, read_parts
+from scenarios.live.recording import SOURCES, Kind, lost_rows, read_card, read_parts
+from scenarios.run.log import UNITS, joint_values
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import SAME_MOMENT_DIGITS
 from scenarios.show.run_page import report_html
@@ -249,11 +250,7 @@ def telemetry_of(table: pa.Table, arms: Sequence[str]) -> Telemetry:
     step_s = max(float(np.median(steps)), float(all_s[-1] - all_s[0]) / MOST_SAMPLES, 1e-3)
     time_s = np.arange(all_s[0], all_s[-1] + step_s, step_s)
     modes = np.array([MODES.index(mode) for mode in table["mode"].to_pylist()])
-    readings = {
-        name: np.stack([table[f"{name}_{j + 1}"].to_numpy(zero_copy_only=False) for j in range(JOINTS)], axis=-1)
-        for name in SENSORS
-        if name not in ("housing_c", "expected_c")
-    }
+    readings = {name: joint_values(table, name) for name in UNITS}
     shape = (len(time_s), len(arms), JOINTS)
     out = {name: np.full(shape, np.nan, np.float32) for name in readings}
     mode = np.zeros(shape[:2], int)
@@ -326,10 +323,7 @@ def heat_use(table: pa.Table, arms: Sequence[str]) -> dict[str, dict[str, float]
     drift: dict[str, float] = {}
     for arm in arms:
         rows = table.filter(pa.array(names == arm))
-        winding_c, housing_c = (
-            np.stack([rows[f"{name}_{j + 1}"].to_numpy(zero_copy_only=False) for j in range(JOINTS)], axis=-1)
-            for name in ("temp_c", "housing_c")
-        )
+        winding_c, housing_c = (joint_values(rows, name) for name in ("temp_c", "housing_c"))
         measured, estimated = (np.isfinite(values).all(axis=1) for values in (winding_c, housing_c))
         if measured.sum() > 1:
             time_s, rate = rows["time_s"].to_numpy()[measured], arrhenius_rate(winding_c[measured])

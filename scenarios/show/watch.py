@@ -12,6 +12,7 @@ from fleet.bus.protocol.auction import ArmEvent, JobState
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, JobScore
 from fleet.live.space import ANYWHERE
 from scenarios.progress import brief
+from scenarios.show.words import clock
 
 HOT_K, WARM_K = 5.0, 10.0
 """Headroom below which an arm is shown in red, in yellow."""
@@ -94,45 +95,38 @@ def screen(
     if len(arms) < len(fleet.arms):
         parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))
     parts += [jobs_line(fleet), space_line(fleet)]
-    parts += [Text(event, style="dim", no_wrap=True, overflow="ellipsis") for event in events]
-    return Group(*parts, Text(KEYS, style="dim", no_wrap=True, overflow="ellipsis"))
+    return Group(*parts, *(_line((text, "dim")) for text in (*events, KEYS)))
+
+
+def _line(*parts: str | tuple[str, str]) -> Text:
+    """One line of texts, some with a style; its end is cut off on a narrow terminal."""
+    return Text.assemble(*parts, no_wrap=True, overflow="ellipsis")
 
 
 def heading(fleet: FleetSnapshot) -> Text:
     """Fleet, number of arms present, auctioneer."""
     present = sum(arm.present for arm in fleet.arms)
     auctioneers = ", ".join(each.auctioneer for each in fleet.auctioneers if each.token)
-    text = Text(no_wrap=True, overflow="ellipsis")
-    text.append(fleet.fleet, style="bold")
-    text.append(f"   {present} of {len(fleet.arms)} arms present", style="" if present == len(fleet.arms) else "yellow")
-    text.append(f"   auctioneer {auctioneers}" if auctioneers else "   no auctioneer")
-    return text
+    arms = (f"   {present} of {len(fleet.arms)} arms present", "" if present == len(fleet.arms) else "yellow")
+    return _line((fleet.fleet, "bold"), arms, f"   auctioneer {auctioneers}" if auctioneers else "   no auctioneer")
 
 
 def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
     """Fleet time, its speed, and what is left of the shift."""
-    times = [arm.time_s for arm in fleet.arms if arm.time_s is not None and arm.present]
-    text = Text(no_wrap=True, overflow="ellipsis")
-    if not times:
-        text.append("no time yet")
-        return text
-    now_s = max(times)
+    now_s = max((arm.time_s for arm in fleet.arms if arm.time_s is not None and arm.present), default=None)
+    if now_s is None:
+        return _line("no time yet")
     if end_s is None:
-        text.append(format_time(now_s))
-    else:
-        left_s = max(0.0, end_s - now_s)
-        text.append(f"{bar(now_s / end_s, 2 * HEAT_CELLS)} {format_time(now_s)} of {format_time(end_s)}, ")
-        text.append(f"{format_time(left_s)} left")
-        if fleet.speed and fleet.speed != 1.0:
-            text.append(f" ({brief(left_s / fleet.speed)} at {fleet.speed:g} ×)")
-    return text
+        return _line(format_time(now_s))
+    left_s, so_far = max(0.0, end_s - now_s), bar(now_s / end_s, 2 * HEAT_CELLS)
+    faster = fleet.speed and fleet.speed != 1.0
+    real = f" ({brief(left_s / fleet.speed)} at {fleet.speed:g} ×)" if faster else ""
+    return _line(f"{so_far} {format_time(now_s)} of {format_time(end_s)}, {format_time(left_s)} left{real}")
 
 
 def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_DONE, *, wide: bool = False) -> Table:
     """One row per arm; `wide` adds scores of open jobs and ages of messages."""
-    table = _table()
-    table.add_column("arm", min_width=5, no_wrap=True)
-    table.add_column("mode", min_width=7, no_wrap=True)
+    table = _table_of_arms()
     table.add_column("to warning", min_width=HEAT_CELLS + 1, no_wrap=True)
     table.add_column("hot °C", min_width=7, no_wrap=True, justify="right")
     table.add_column("room K", min_width=6, no_wrap=True, justify="right")
@@ -164,9 +158,7 @@ def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_D
 def joint_table(arms: Iterable[ArmSnapshot]) -> Table:
     """One row per arm with the temperature of every motor; ! marks little headroom, !! none."""
     arms = tuple(arms)
-    table = _table()
-    table.add_column("arm", min_width=5, no_wrap=True)
-    table.add_column("mode", min_width=7, no_wrap=True)
+    table = _table_of_arms()
     joints = max((len(arm.temp_c) for arm in arms), default=0)
     for joint in range(joints):
         table.add_column(f"J{joint + 1} °C", justify="right", min_width=6, no_wrap=True)
@@ -212,7 +204,7 @@ def plain_event(event: ArmEvent) -> str:
 def jobs_line(fleet: FleetSnapshot) -> Text:
     """Number of jobs in each state."""
     counts = ", ".join(f"{fleet.counts[state]} {state}" for state in get_args(JobState) if fleet.counts.get(state))
-    return Text(f"jobs: {counts or 'none'}", no_wrap=True, overflow="ellipsis")
+    return _line(f"jobs: {counts or 'none'}")
 
 
 def space_line(fleet: FleetSnapshot) -> Text:
@@ -223,7 +215,7 @@ def space_line(fleet: FleetSnapshot) -> Text:
         arm = arms.get(name)
         where = "not present" if arm is None or not arm.present else "away from home" if arm.away else "has a job"
         parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
-    return Text(f"space closed by: {', '.join(parts) or 'none'}", no_wrap=True, overflow="ellipsis")
+    return _line(f"space closed by: {', '.join(parts) or 'none'}")
 
 
 def arm_line(arm: ArmSnapshot, *, joints: bool = False) -> str:
@@ -282,8 +274,7 @@ def format_age(seconds: float | None) -> str:
 
 def format_time(time_s: float) -> str:
     """Fleet time: `1:02:03`."""
-    minutes, seconds = divmod(int(time_s), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+    return clock(int(time_s))
 
 
 def _headroom_style(headroom_k: float | None) -> str:
@@ -303,5 +294,8 @@ def _name_and_mode(arm: ArmSnapshot) -> tuple[str, Text]:
     return arm.arm, Text(mode, style=_MODE_STYLES.get(mode, ""))
 
 
-def _table() -> Table:
-    return Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), expand=True, header_style="dim")
+def _table_of_arms() -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), expand=True, header_style="dim")
+    table.add_column("arm", min_width=5, no_wrap=True)
+    table.add_column("mode", min_width=7, no_wrap=True)
+    return table

@@ -1,9 +1,12 @@
 """Times, events and offers in words."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from fleet.events import Event
-from scenarios.run.records import Offer
+
+if TYPE_CHECKING:  # slow to import
+    from scenarios.run.records import Offer
 
 SEVERITY = {
     "warning": "warning", "torque_warning": "warning", "return": "warning", "give_up": "error", "expire": "warning",
@@ -59,7 +62,7 @@ def event_text(event: Event) -> str:
     return f"{event.kind.replace('_', ' ')}{f' {event.job}' if event.job else ''}{joint}{reason}"
 
 
-def offer_text(offer: Offer) -> str:
+def offer_text(offer: "Offer") -> str:
     """P(saturation), predicted peak, difficulty and duration of an offer, and why the arm could not take the job."""
     if not offer.feasible:
         return "cannot do it"
