@@ -161,6 +161,14 @@ def print_json(value: object) -> None:
     echo(json_text(value), nl=False)
 
 
+def print_either(as_json: bool, value: object, *parts: RenderableType) -> None:
+    """Print a value as JSON, or else what shows it to people."""
+    if as_json:
+        print_json(value)
+    else:
+        out_console.print(*parts, sep="\n")
+
+
 WIDE = 200
 """Columns of a table with many columns in a file or a pipe, which have no width of their own."""
 

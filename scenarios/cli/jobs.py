@@ -9,7 +9,7 @@ from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
 from scenarios.table import Table
-from scenarios.terminal import out_console, print_json
+from scenarios.terminal import print_either
 
 _RANGES = {name: {"low": bounds.low, "high": bounds.high} for name, bounds in BOUNDS.items()}
 _ONE = "One job instead of a file"
@@ -92,14 +92,11 @@ def list_command(endpoint: str = options.ENDPOINT, fleet: str = options.FLEET, a
         listener = FleetListener(link)
         listener.serve(time.monotonic() + LISTEN_S)
         jobs = sorted(listener.view.snapshot(time.monotonic()).jobs, key=lambda status: status.job)
-    if as_json:
-        print_json(jobs)
-        return
     rows = tuple(
         (each.job, each.state.replace("_", " "), each.arm, f"{each.cycles} of {each.repetitions}", each.reason)
         for each in jobs
     )
-    out_console.print(Table(head=("job", "state", "arm", "cycles", "reason"), rows=rows, numbers=False))
+    print_either(as_json, jobs, Table(head=("job", "state", "arm", "cycles", "reason"), rows=rows, numbers=False))
 
 
 def cancel_command(

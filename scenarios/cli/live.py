@@ -153,7 +153,7 @@ def watch_command(
     scenario: str = option("Scenario of the fleet, to show the remaining time of the shift.", ""),
 ) -> None:
     """Watch temperatures, difficulty, jobs and the age of messages, until the fleet ends or Ctrl-C."""
-    from scenarios.live.watch import watch
+    from scenarios.show.watch import watch
     from scenarios.spec.load import load
 
     watch(endpoint, fleet, as_json=as_json, joints=joints, end_s=load(scenario).horizon_s if scenario else None)

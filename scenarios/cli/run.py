@@ -20,7 +20,6 @@ from scenarios.spec.options import RunSpec
 from scenarios.terminal import INTERRUPTED, Interrupted, out_console, print_json, progress_bar, say
 
 if TYPE_CHECKING:  # slow to import
-    from fleet.events import Event
     from scenarios.prepare.fleet import Fleet
     from scenarios.progress import Progress
     from scenarios.run.log import RunLog
@@ -107,7 +106,7 @@ def demo_command(
 ) -> None:
     """Run the quickstart shift under two policies, and compare them on one page."""
     from scenarios.result_folder import disk_errors
-    from scenarios.show.run_page import pair_page, pair_table
+    from scenarios.show.run_page import figure_table, runs_page
     from scenarios.spec.load import load
 
     chosen, seed = load("quickstart"), given["seed"]
@@ -121,23 +120,21 @@ def demo_command(
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result
-    reports = {f"{policy}/report.html": result for policy, result in results.items()}
     with disk_errors(out):
         about = [sentence.format(policy=DEMO_POLICY) for sentence in ABOUT]
         model = results[DEMO_POLICY].cell_model()
-        page = pair_page(f"{chosen.name} · seed {seed} · two policies", about, reports, model)
+        title = f"{chosen.name} · seed {seed} · two policies"
+        reports = {policy: f"{policy}/report.html" for policy in results}
+        page = runs_page(results, title=title, lead=about, reports=reports, model=model)
         (out / PAIR).write_text(page, encoding="utf-8")
     say(f"{chosen.name}, seed {seed}: {chosen.description}", out_console)
-    out_console.print(pair_table(results))
-    for report, result in sorted(reports.items(), key=lambda each: -len(each[1].faults)):
+    out_console.print(figure_table({policy: result.card["metrics"] for policy, result in results.items()}))
+    for result in sorted(results.values(), key=lambda each: -len(each.faults)):
         count = len(result.faults)
-        how = f"{count} fault{'s' * (count > 1)}, of {_named(result.faults)}" if count else "no fault"
-        say(f"{result.policy}: {how}. {out / report}", out_console)
+        of = ", ".join(dict.fromkeys(f"{fault.arm} (joint {fault.joint})" for fault in result.faults))
+        how = f"{count} fault{'s' * (count > 1)}, of {of}" if count else "no fault"
+        say(f"{result.policy}: {how}. {out / result.policy / 'report.html'}", out_console)
     say(f"Open {out / PAIR} in a browser to see both side by side.", out_console)
-
-
-def _named(faults: "list[Event]") -> str:
-    return ", ".join(dict.fromkeys(f"{fault.arm} (joint {fault.joint})" for fault in faults))
 
 
 def _run_into(

@@ -32,9 +32,8 @@ from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal, own_records, quarantine
 from fleet.motion import Plan
-from scenarios.live.auctioneer import live_fleet, scenario_jobs, summary
+from scenarios.live.auctioneer import folder_of, live_fleet, refuse_other_way, scenario_jobs, summary
 from scenarios.live.cell import cell_of
-from scenarios.live.journals import folder_of, refuse_other_way
 from scenarios.policy_loader import arm_policy_of, scope_of
 from scenarios.progress import Progress
 from scenarios.signals import StopRequest, until_stopped

@@ -13,7 +13,7 @@ from fleet.live.supervisor import Part, Supervisor
 from scenarios.cli.from_fields import flags_of
 from scenarios.cli.options import split_names
 from scenarios.extras import require_extra
-from scenarios.live.journals import folder_of, refuse_other_way
+from scenarios.live.auctioneer import folder_of, refuse_other_way
 from scenarios.policy_loader import plans, scope_of
 from scenarios.signals import until_stopped
 from scenarios.spec.load import load

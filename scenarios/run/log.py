@@ -156,7 +156,11 @@ def open_run(folder: str | Path) -> RunLog:
     folder = Path(folder)
     try:
         card = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        check_format(card, folder)
+        known, found = f"{RUN_FORMAT} in {VERSION}", f"{card['format']} in {card.get('environment', 'allocation_v0')}"
+        if found != known:
+            raise FleetError(
+                f"'{folder}' is a run of format {found}; this version reads {known}. Run the scenario again."
+            )
         scenario = msgspec.convert(card["scenario"], Scenario)
         tables = {name: pq.read_table(folder / f"{name}.parquet") for name in ("telemetry", "events", "jobs", "offers")}
         stored = RunLog(
@@ -207,23 +211,6 @@ def _write_telemetry(telemetry: Telemetry, arms: list[str], path: Path) -> None:
     with pq.ParquetWriter(path, part(0).schema) as writer:
         for first in range(0, len(telemetry.time_s), samples):
             writer.write_table(part(first))
-
-
-def check_format(run: Mapping[str, Any], folder: Path) -> None:
-    """Check that this version can read a run.
-
-    Args:
-        run: The content of its run.json.
-
-    Raises:
-        FleetError: it is of another format or environment.
-    """
-    version, environment = run["format"], run.get("environment", "allocation_v0")
-    if (version, environment) != (RUN_FORMAT, VERSION):
-        raise FleetError(
-            f"'{folder}' is a run of format {version} in {environment}; this "
-            f"version reads {RUN_FORMAT}, {VERSION}. Run the scenario again."
-        )
 
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau": "N·m", "current_a": "A", "temp_c": "°C"}

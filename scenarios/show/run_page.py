@@ -1,4 +1,4 @@
-"""The report of a shift in words, tables and figures; two shifts side by side; a run in a notebook."""
+"""The report of a shift in words, tables and figures; two shifts, or several, side by side; a run in a notebook."""
 
 import math
 from collections import Counter
@@ -13,8 +13,18 @@ from fleet.events import Event
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.schedule import JobSpan, Schedule
 from scenarios.show.lateness import late_jobs, lateness_text
-from scenarios.show.page import Chart, Page, Playback, packed
-from scenarios.show.timeline import figure, hottest_motors, time_unit
+from scenarios.show.page import (
+    AXIS,
+    LAYOUT,
+    Chart,
+    Figure,
+    Page,
+    Playback,
+    named_rows,
+    packed,
+    plain,
+)
+from scenarios.show.timeline import POLICY_LINES, STREAM_NAME, figure, hottest_motors, time_unit
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
@@ -345,7 +355,7 @@ def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
 
 
 def figure_table(shifts: Mapping[str, Mapping[str, Any]], *, wholes: bool = False) -> Table:
-    """Key figures, a column for each shift's metrics by its name; "" for a figure that it lacks.
+    """Key figures, a column for each shift's metrics by its name, and the second of two minus the first.
 
     Args:
         wholes: Say of what a figure is a part, as in `77 of 87`; without it, cells are plain numbers.
@@ -354,11 +364,20 @@ def figure_table(shifts: Mapping[str, Mapping[str, Any]], *, wholes: bool = Fals
     for label, name, form, unit, whole in KEY_FIGURES:
         form, percent = form.replace(",", "").replace("%", "f"), form.endswith("%")
         if any(name in values for values in columns):
+            scaled = [values[name] * 100**percent if name in values else None for values in columns]
             of = [f" of {values[whole]:{form}}" if wholes and whole in values else "" for values in columns]
-            texts = [f"{values[name] * 100**percent:{form}}" if name in values else "" for values in columns]
-            heading = str(Column(label, "%" if percent else unit))
-            rows.append((heading, *(text + part for text, part in zip(texts, of, strict=True))))
-    return Table(head=("", *shifts), rows=tuple(rows))
+            texts = ["" if each is None else f"{each:{form}}{part}" for each, part in zip(scaled, of, strict=True)]
+            rows.append((str(Column(label, "%" if percent else unit)), *texts, *_difference(scaled, form)))
+    return Table(head=("", *shifts, *(["difference"] if len(shifts) == 2 else [])), rows=tuple(rows))
+
+
+def _difference(values: Sequence[float | None], form: str) -> list[str]:
+    """The second value less the first, as the last cell of a row of two; none in other rows."""
+    if len(values) != 2:
+        return []
+    first, second = values
+    change = "" if first is None or second is None else f"{second - first:+{form}}".replace("-", "−")
+    return ["0" if change and not float(change[1:]) else change]
 
 
 def _peaks(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -463,62 +482,11 @@ def _provenance(run: Mapping[str, Any]) -> Table:
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 
-def pair_table(logs: Mapping[str, ShiftLog]) -> Table:
-    """The main figures of two shifts by name, and the second minus the first; missing figures are left out."""
-    columns = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
-    rows = list[tuple[str, ...]]()
-    for label, name, form, unit, _ in MAIN_FIGURES:
-        values = [column[name] for column in columns if name in column]
-        if len(values) == len(columns):
-            change = f"{values[1] - values[0]:+{form}}".replace("-", "−")
-            texts = [f"{value:{form}}" for value in values]
-            rows.append((str(Column(label, unit)), *texts, change if float(change[1:]) else "0"))
-    return Table(head=("", *logs, "difference"), rows=tuple(rows))
-
-
-def pair_page(
-    title: str, sentences: Sequence[str], reports: Mapping[str, ShiftLog], model: Mapping[str, Any] | None = None
-) -> str:
-    """Two shifts of the same jobs in the same cell as one HTML page: the hottest motors in one chart, the movements in
-    step, the main figures, and links to the reports.
-
-    The same input gives the same text.
-
-    Args:
-        sentences: What the page is about.
-        reports: The two shifts, each by the path of its report relative to the page.
-        model: As in `report_html`.
-    """
-    logs = {log.policy: log for log in reports.values()}
-    columns = [
-        {
-            "name": log.policy,
-            "verdict": verdict(log),
-            "first": next(map(_before, log.faults), None),
-            "other_choices": other_choices(log, other),
-            "tiles": key_figures(log.card.get("metrics") or {}),
-            "report": quote(path),
-        }
-        for (path, log), other in zip(reports.items(), [*reports.values()][::-1], strict=True)
-    ]
-    charts, replay = list[Chart](), None
-    if all(len(log.readings.time_s) for log in reports.values()):
-        alt = f"Hottest motor over the shift under {' and '.join(logs)}"
-        charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
-        replay = _playback([*reports.values()], model) if model else None
-    content = {
-        "sentences": sentences,
-        "sides": columns,
-        "charts": charts,
-        "replays": tuple(logs) if replay else (),
-        "table": pair_table(logs),
-    }
-    return Page(title=title, template="pair.html", content=content, charts=charts, replay=replay).html()
-
-
 def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
-    """Of the job of each fault, what became of it in the other shift."""
+    """Of the job of each fault, what became of it in the other shift; nothing for the shift itself."""
     lines: list[str] = []
+    if other is log:
+        return lines
     for job in dict.fromkeys(fault.job for fault in log.faults if fault.job):
         own = [event for event in other.events if event.job == job]
         faults = [event for event in own if event.kind == "fault"]
@@ -530,3 +498,116 @@ def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
             began = any(event.kind == "award" for event in own)
             lines.append(f"Under {other.policy}, {job} was not {'finished' if began else 'begun'}.")
     return lines
+
+
+BAR_PX, TITLE_PX = 24, 44
+"""Height of a bar, and of the title and the gap above the bars of a figure."""
+
+
+def runs_table(logs: Mapping[str, ShiftLog]) -> Table:
+    """Settings, outcome and key figures, a column for each run by its name; "" for a figure that a run lacks."""
+    settings = {
+        "scenario": [str(log.card.get("scenario", {}).get("name", "")) for log in logs.values()],
+        "policy": [log.policy for log in logs.values()],
+        "seed": [str(log.card.get("seed", "")) for log in logs.values()],
+        "predictions": [str(log.card.get("difficulty", "")) for log in logs.values()],
+        "outcome": [verdict(log).badge for log in logs.values()],
+    }
+    figures = figure_table({name: log.card.get("metrics") or {} for name, log in logs.items()})
+    rows = [(name, *cells, *([""] if len(logs) == 2 else [])) for name, cells in settings.items()]
+    return replace(figures, rows=(*rows, *figures.rows))
+
+
+def runs_page(
+    logs: Mapping[str, ShiftLog],
+    *,
+    title: str = "",
+    lead: Sequence[str] = (),
+    reports: Mapping[str, str] | None = None,
+    model: Mapping[str, Any] | None = None,
+) -> str:
+    """Shifts by name as one HTML page that opens offline; the same shifts give the same text.
+
+    It has key figures and what happened in each; of shifts with the same jobs also the hottest motors in one chart.
+
+    Args:
+        title, lead: Heading and first sentences; by default number and differences of the shifts.
+        reports: Paths of their reports relative to the page, by name.
+        model: As in `report_html`, of shifts in one cell: their movements are shown in step.
+    """
+    table = runs_table(logs)
+    settings = {row[0]: set(row[1 : len(logs) + 1]) for row in table.rows[:4]}
+    differ = [name for name, values in settings.items() if len(values) > 1]
+    equal_jobs = not {"scenario", "seed"} & {*differ}
+    jobs = "All have the same jobs." if equal_jobs else "They have other jobs: their figures compare no policies."
+    charts, replay = list[Chart](), None
+    if equal_jobs and all(len(log.readings.time_s) for log in logs.values()):
+        if len({log.limits for log in logs.values()}) == 1:
+            alt = f"Hottest motor over the shift under {', '.join(logs)}"
+            charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
+        replay = _playback([*logs.values()], model) if model else None
+    charts.append(Chart(key="main", figure=bars(logs), alt=f"Main figures of {', '.join(logs)}; the table has them"))
+    hashes = ("code_hash", "scenario_hash")
+    content = {
+        "sentences": lead or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
+        "sides": [
+            {
+                "name": name,
+                "verdict": verdict(log),
+                "first": next(map(_before, log.faults), None),
+                "other_choices": [line for other in logs.values() for line in other_choices(log, other)]
+                if equal_jobs
+                else (),
+                "report": quote((reports or {}).get(name, "")),
+            }
+            for name, log in logs.items()
+        ],
+        "charts": charts,
+        "replays": tuple(logs) if replay else (),
+        "table": table,
+        "origin": Table(
+            head=("run", "hash of the code", "hash of the scenario"),
+            rows=tuple((name, *(str(log.card.get(key, "")) for key in hashes)) for name, log in logs.items()),
+            numbers=False,
+        ),
+    }
+    title = title or f"{len(logs)} runs{'' if 'scenario' in differ else f' of {table.rows[0][1]}'}"
+    return Page(title=title, template="runs.html", content=content, charts=charts, replay=replay).html()
+
+
+def bars(logs: Mapping[str, ShiftLog]) -> Figure:
+    """The main figures one below the other, each with a bar for each run."""
+    values = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
+    shown = [each for each in MAIN_FIGURES if any(each.name in own for own in values)]
+    block_px = TITLE_PX + BAR_PX * len(logs)
+    height_px = block_px * max(1, len(shown))
+    names = [plain(name, STREAM_NAME) for name in logs]
+    data, layout, titles = list[dict[str, Any]](), dict[str, Any](), list[dict[str, Any]]()
+    for number, (label, name, form, unit, _) in enumerate(shown, start=1):
+        top = 1 - ((number - 1) * block_px + TITLE_PX) / height_px
+        own = [each.get(name) for each in values]
+        text = [f"{value:{form}}" if value is not None else "" for value in own]
+        axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+        look = {"color": [POLICY_LINES[k % len(POLICY_LINES)][0] for k in range(len(names))]}
+        data.append(
+            {"type": "bar", "orientation": "h", "x": own, "y": list(range(len(own))), "text": text, "marker": look}
+            | {
+                "hovertemplate": "%{text}<extra></extra>",
+                "textposition": "outside",
+                "textangle": 0,
+                "cliponaxis": False,
+                **axes,
+            }
+        )
+        layout[f"xaxis{number}"] = AXIS | {"anchor": f"y{number}", "rangemode": "tozero", "visible": False}
+        domain = [max(0.0, top - BAR_PX * len(logs) / height_px), top]
+        layout[f"yaxis{number}"] = named_rows(names, anchor=f"x{number}", domain=domain)
+        place = {"x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom"}
+        titles.append({"text": f"<b>{Column(label, unit)}</b>", "showarrow": False, **place})
+    margin = {"l": 60, "r": 48, "t": 4, "b": 12}
+    return {
+        "data": data,
+        "layout": LAYOUT
+        | layout
+        | {"height": height_px + 16, "margin": margin, "annotations": titles, "showlegend": False},
+    }
