@@ -546,7 +546,7 @@ def runs_page(
             alt = f"Hottest motor over the shift under {', '.join(logs)}"
             charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
         replay = _playback([*logs.values()], model) if model else None
-    charts.append(Chart(key="main", figure=bars(logs), alt=f"Main figures of {', '.join(logs)}; the table has them"))
+    main = Chart(key="main", figure=bars(logs), alt=f"Main figures of {', '.join(logs)}; the table has them")
     hashes = ("code_hash", "scenario_hash")
     content = {
         "sentences": lead or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
@@ -564,6 +564,7 @@ def runs_page(
         ],
         "charts": charts,
         "replays": tuple(logs) if replay else (),
+        "main": main,
         "table": table,
         "origin": Table(
             head=("run", "hash of the code", "hash of the scenario"),
@@ -572,7 +573,7 @@ def runs_page(
         ),
     }
     title = title or f"{len(logs)} runs{'' if 'scenario' in differ else f' of {table.rows[0][1]}'}"
-    return Page(title=title, template="runs.html", content=content, charts=charts, replay=replay).html()
+    return Page(title=title, template="runs.html", content=content, charts=[*charts, main], replay=replay).html()
 
 
 def bars(logs: Mapping[str, ShiftLog]) -> Figure:
