@@ -22,8 +22,16 @@ from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.run.records import JobRecord, Offer, ShiftLog
-from scenarios.show.lateness import late_jobs, lateness_text
-from scenarios.show.run_page import ROWS, figure_table, other_choices, report_html, runs_page, verdict
+from scenarios.show.run_page import (
+    ROWS,
+    figure_table,
+    late_jobs,
+    lateness_text,
+    other_choices,
+    report_html,
+    runs_page,
+    verdict,
+)
 from scenarios.show.timeline import decimate, figure, stream_of
 
 ARMS = ("arm_0", "arm_1")

@@ -1,6 +1,6 @@
 """Commands that run a live fleet: up, `thermofleet arm run` and `thermofleet bus`."""
 
-from dataclasses import MISSING, dataclass, replace
+from dataclasses import MISSING, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,13 +11,13 @@ from agents.registry import WRAPPERS_HELP, names_of
 from fleet.errors import FleetError
 from fleet.fields import MAX_SPEED, MIN_SPEED, argument, option
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
 from scenarios.terminal import echo, out_console, say
 
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
-_TLS, _LISTEN = "Mutual TLS", "ros2 listen"
+_TLS = "Mutual TLS"
 
 
 def up_command(
@@ -264,30 +264,6 @@ def gateway_command(
     run_gateway(endpoint, fleet, port, host, token, tokens, shown)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Ros2Spec:
-    """How a fleet meets ROS 2."""
-
-    domain: int = option("The ROS 2 domain.", 0, low=0, high=232, env="ROS_DOMAIN_ID")
-    router: str = option("Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.", "")
-    warning_c: float = option("Motor temperature at which a warning begins, °C.", 60.0, low=0, high=200)
-    error_c: float = option("bridge: motor temperature at which an error begins, °C.", 75.0, low=0, high=200)
-    humble: bool = option("bridge: for ROS 2 Humble, whose keys have no type hash.", False)
-    arm: str = option("Name of the arm in the fleet.", "real", is_name=True, panel=_LISTEN)
-    temperatures: str = option(
-        "Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.", "", panel=_LISTEN
-    )
-    hardware: str = option(
-        "Text before /JOINT in the hardware_id of these diagnostics; default: none.", "", panel=_LISTEN
-    )
-    joints: str = option("Names of its joints in ROS 2, from joint 1 on.", "", panel=_LISTEN)
-    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True, panel=_LISTEN)
-    twin: Path | None = option("Folder of the arm's twin, which scores the motion.", None, panel=_LISTEN)
-    network: Path | None = option(
-        "Folder of `thermofleet twin identify`; the temperatures that it yields are in the states.", None, panel=_LISTEN
-    )
-
-
 def ros2_command(
     mode: Literal["bridge", "listen", "jobs"] = argument(
         "bridge: publish every arm as JointState and DiagnosticArray. listen: show a real arm with a ROS 2 "
@@ -297,7 +273,7 @@ def ros2_command(
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
     *,
-    given: Annotated[Given, From(Ros2Spec)],
+    given: Annotated[Given, From(options.Ros2Spec)],
 ) -> None:
     """Connect a fleet to ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
     if (mode == "listen") != bool(topic):
@@ -305,4 +281,4 @@ def ros2_command(
     from scenarios.live.ros2 import run_bridge, run_jobs, run_listener
 
     run = {"bridge": run_bridge, "listen": partial(run_listener, topic), "jobs": run_jobs}[mode]
-    run(endpoint, fleet, Ros2Spec(**given))
+    run(endpoint, fleet, options.Ros2Spec(**given))

@@ -17,7 +17,7 @@ from fleet.fields import argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING, Cooling
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.spec.options import Shot
 from scenarios.table import Table
 from scenarios.terminal import out_console, print_either, print_json, progress_bar, say

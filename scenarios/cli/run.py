@@ -15,7 +15,7 @@ from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
 from fleet.fields import option
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.spec.options import RunSpec
 from scenarios.terminal import INTERRUPTED, Interrupted, out_console, print_json, progress_bar, say
 

@@ -15,7 +15,7 @@ from fleet.fields import MAX_SEED, argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.result_folder import check_file, check_free, check_overwrite, new_file, new_folder
 from scenarios.table import Table
 from scenarios.terminal import echo, out_console, print_json, print_wide, progress_bar, say

@@ -10,8 +10,7 @@ from agents.policy import no_simulator
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError, nearest
 from fleet.live.supervisor import Part, Supervisor
-from scenarios.cli.from_fields import flags_of
-from scenarios.cli.options import split_names
+from scenarios.cli.options import flags_of, split_names
 from scenarios.extras import require_extra
 from scenarios.live.auctioneer import folder_of, refuse_other_way
 from scenarios.policy_loader import plans, scope_of

@@ -30,8 +30,7 @@ from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
 from scenarios.live.recording import SOURCES, Kind, lost_rows, read_card, read_parts
 from scenarios.run.log import UNITS, joint_values
-from scenarios.run.records import Offer, ShiftLog
-from scenarios.run.schedule import SAME_MOMENT_DIGITS
+from scenarios.run.records import SAME_MOMENT_DIGITS, Offer, ShiftLog
 from scenarios.show.run_page import report_html
 from scenarios.show.words import clock
 from scenarios.spec.schema import Scenario

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from fleet.bus.client import BusClient
 from fleet.errors import FleetError
 from fleet.robot import JOINTS, ThermalLimits
-from scenarios.cli.options import split_names, the_fleet
+from scenarios.cli.options import Ros2Spec, split_names, the_fleet
 from scenarios.extras import require_extra
 from scenarios.live.arm import monitor_of
 from scenarios.signals import StopRequest, until_stopped
@@ -16,14 +16,13 @@ from scenarios.terminal import echo
 
 if TYPE_CHECKING:
     from fleet.ros2.node import Node
-    from scenarios.cli.live import Ros2Spec
 
 TURN_S = 0.25
 """Real seconds between two checks for a stop request."""
 DEFAULTS = ThermalLimits()
 
 
-def run_bridge(endpoint: str, fleet: str, spec: "Ros2Spec") -> None:
+def run_bridge(endpoint: str, fleet: str, spec: Ros2Spec) -> None:
     """Publish every arm of a fleet as JointState and DiagnosticArray, until Ctrl-C or SIGTERM."""
     where = ros2_router(spec.router, endpoint)
     from fleet.ros2.bridge import Bridge
@@ -39,7 +38,7 @@ def run_bridge(endpoint: str, fleet: str, spec: "Ros2Spec") -> None:
         _serve(bridge.serve, stop, "The bridge was interrupted.")
 
 
-def run_listener(topic: str, endpoint: str, fleet: str, spec: "Ros2Spec") -> None:
+def run_listener(topic: str, endpoint: str, fleet: str, spec: Ros2Spec) -> None:
     """Show a real arm with a ROS 2 driver as an arm of the fleet that takes no jobs, until Ctrl-C or SIGTERM.
 
     Raises:
@@ -72,7 +71,7 @@ def run_listener(topic: str, endpoint: str, fleet: str, spec: "Ros2Spec") -> Non
         _serve(follower.serve, stop, f"Stopped listening to {topic}.")
 
 
-def run_jobs(endpoint: str, fleet: str, spec: "Ros2Spec") -> None:
+def run_jobs(endpoint: str, fleet: str, spec: Ros2Spec) -> None:
     """Serve the action thermofleet_msgs/action/DoJob, until Ctrl-C or SIGTERM.
 
     Raises:

@@ -14,8 +14,7 @@ from fleet.env.render.heat import HEAT, heat_marks
 from fleet.events import Event
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import Telemetry
-from scenarios.run.records import ShiftLog
-from scenarios.run.schedule import JobSpan, Outage
+from scenarios.run.records import JobSpan, Outage, ShiftLog
 from scenarios.show import page
 from scenarios.show.page import AXIS, INK, axis, plain
 from scenarios.show.words import clock

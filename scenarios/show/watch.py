@@ -315,8 +315,8 @@ def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
     if end_s is None:
         return _line(format_time(now_s))
     left_s, so_far = max(0.0, end_s - now_s), bar(now_s / end_s, 2 * HEAT_CELLS)
-    faster = fleet.speed and fleet.speed != 1.0
-    real = f" ({brief(left_s / fleet.speed)} at {fleet.speed:g} ×)" if faster else ""
+    speed = fleet.speed or 1.0
+    real = f" ({brief(left_s / speed)} at {speed:g} ×)" if speed != 1.0 else ""
     return _line(f"{so_far} {format_time(now_s)} of {format_time(end_s)}, {format_time(left_s)} left{real}")
 
 

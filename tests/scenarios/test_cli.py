@@ -23,9 +23,8 @@ from fleet.bus.protocol.keys import CHANNEL, STATE_HZ
 from fleet.errors import MAX_NAME, FleetError
 from fleet.fields import check, option, options_of
 from fleet.robot import ThermalLimits
-from scenarios.cli.from_fields import From, Given, flags_of, with_fields
 from scenarios.cli.main import COMMANDS, GROUPS, MOVED, load_command
-from scenarios.cli.options import channel_of
+from scenarios.cli.options import From, Given, channel_of, flags_of, with_fields
 from scenarios.live.gateway import ROLES
 from scenarios.run.log import FILES
 from scenarios.spec.load import library, load
