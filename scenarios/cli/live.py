@@ -195,10 +195,7 @@ def record_command(
 
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
         echo(f"ready record {endpoint}")
-
-        def connect() -> BusClient:
-            return BusClient(endpoint, fleet, timeout_s=CONNECT_S, backlog=BACKLOG)
-
+        connect = partial(BusClient, endpoint, fleet, timeout_s=CONNECT_S, backlog=BACKLOG)
         recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set, connect=connect)
     missed = sum(count.missed for count in recorder.counts.values())
     kept = sum(count.kept for count in recorder.counts.values())

@@ -19,7 +19,7 @@ from sklearn.metrics import roc_auc_score
 
 from fleet.arm.random_motions import random_jobs
 from fleet.errors import FleetError
-from fleet.motion import CHANNELS, RATE_HZ, Plan
+from fleet.motion import CHANNELS, RATE_HZ
 from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.twins import (
     LOG_INPUT,
@@ -251,6 +251,8 @@ def scenario_subjects(
     shown = [plans[i] for i in np.flatnonzero(kind != BETWEEN)]
     shown_hot, once = kind[kind != BETWEEN] == HOT, [1] * len(shown)
     profiles = [np.concatenate([phase.profile for phase in plan.phases]) for plan in shown]
+    works = [(plan.work, plan.work.places[0].name.partition("/")[0]) for plan in shown]
+    names = [f"{place} ({work.kind}, {work.payload_kg:.1f} kg)" for work, place in works]
     trained_on = [*records(own), *exploration_records(scenario, planned)]
     verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
 
@@ -279,7 +281,7 @@ def scenario_subjects(
                 f"its hottest motor when it repeats for {spec.horizon_s / 60:g} min, by the true heat of the arm.",
                 trained_on=trained_on, kind=kind, features=twin.features(plans, repetitions),
                 untrained_features=untrained.features(plans, repetitions), windows=cut_up.windows[few],
-                window_hot=shown_hot[cut_up.job[few]], names=[_job_name(plan) for plan in shown],
+                window_hot=shown_hot[cut_up.job[few]], names=names,
                 recorded_hot=shown_hot, recorded=twin.features(shown, once),
                 motion=lambda i, rate_hz=twin.config.rate_hz: resample(profiles[i], RATE_HZ, rate_hz),
                 cool_jobs=[records([plans[i]]) for i in np.flatnonzero(kind == COOL)],
@@ -287,10 +289,6 @@ def scenario_subjects(
             )
         )  # fmt: skip
     return subjects
-
-
-def _job_name(plan: Plan) -> str:
-    return f"{plan.work.places[0].name.partition('/')[0]} ({plan.work.kind}, {plan.work.payload_kg:.1f} kg)"
 
 
 def _untrained(trained_on: Sequence[Array], config: TwinConfig, seed: int, arm: str, folder: Path) -> Twin:
