@@ -105,7 +105,13 @@ def _cell(
 ) -> tuple[ThermalLimits, dict[str, Any] | None]:
     """Limits of the motors, and the cell in three dimensions."""
     if scenario is not None:
-        return scenario.limits, _model(scenario, arms)
+        robots = {arm.name: arm.robot() for arm in scenario.arms}
+        if missing := [arm for arm in arms if arm not in robots]:
+            raise FleetError(
+                f"The recording has the arm '{missing[0]}', and scenario '{scenario.name}' has only "
+                f"{', '.join(robots)}; give the scenario that the fleet was started with."
+            )
+        return scenario.limits, cell_model([robots[arm] for arm in arms], scenario.places, scenario.fixtures)
     limits, model = ThermalLimits(), None
     if described is not None:
         with suppress(ValueError):  # of numbers that no cell has, or of arms that joined later
@@ -113,16 +119,6 @@ def _cell(
             limits = ThermalLimits(warning_c=described.warning_c, error_c=described.error_c, restart_c=restart_c)
             model = described_model(described, arms)
     return limits, model
-
-
-def _model(scenario: Scenario, arms: Sequence[str]) -> dict[str, Any]:
-    robots = {arm.name: arm.robot() for arm in scenario.arms}
-    if missing := [arm for arm in arms if arm not in robots]:
-        raise FleetError(
-            f"The recording has the arm '{missing[0]}', and scenario '{scenario.name}' has only {', '.join(robots)}; "
-            "give the scenario that the fleet was started with."
-        )
-    return cell_model([robots[arm] for arm in arms], scenario.places, scenario.fixtures)
 
 
 def order_events(events: Iterable[Event], returns: Iterable[Event]) -> list[Event]:

@@ -236,7 +236,8 @@ def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
                 "color": [LATE["color"] if a.late_s else "white" for a in own],
                 "width": [LATE["width"] if a.late_s else 0.6 for a in own],
             },
-            "pattern": HATCH | {"shape": [_shape(a) for a in own]},
+            # For people who see no colours and for dark pages, which show no dark outline.
+            "pattern": HATCH | {"shape": ["/" if a.outcome == "returned" else "." if a.late_s else "" for a in own]},
         }
         traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, log.arms, unit_s, look))
     outcomes = {a.outcome for a in assignments}
@@ -251,11 +252,6 @@ def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
 def _legend_entry(name: str, look: Trace) -> Trace:
     """A grey bar in the legend alone."""
     return BAR | {"name": name, "x": [None], "y": [None], "marker": {"color": "#888888"} | look}
-
-
-def _shape(a: JobSpan) -> str:
-    """Pattern of a bar, for people who see no colours and for dark pages, which show no dark outline."""
-    return "/" if a.outcome == "returned" else "." if a.late_s else ""
 
 
 def _bars(
